@@ -1,0 +1,1 @@
+"""DT-Viz: diffeomorphic transforms for generalised imitation learning, live in the browser."""
