@@ -1,0 +1,177 @@
+"""Vector fields that generate flows, and the separable Gaussian basis they are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.floating[Any]]
+
+
+class VectorField(Protocol):
+    """A Lipschitz vector field V: R^d → R^d that knows its derivative."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        ...
+
+    def __call__(self, s: Array) -> Array:
+        """V at the points `s` (N, d), as (N, d)."""
+        ...
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V (N, d) and its derivative DV (N, d, d), DV[:, i, j] = ∂V_i/∂s_j, at the points `s` (N, d)."""
+        ...
+
+
+@dataclass(frozen=True)
+class GaussianGrid:
+    """Gaussian basis k(s, ŝ) = exp(−ℓ‖s − ŝ‖²) with inducing points ŝ on an equally spaced grid (sec. 5).
+
+    A Gaussian is a product of 1-D Gaussians, so a weighted sum over all inducing points is a chain of small matrix
+    products, one axis after the other; no (N, m) matrix of exponentials is formed.
+    """
+
+    axes: tuple[Array, ...]
+    """Per axis the n_j increasing coordinates of the inducing points."""
+
+    ell: float
+    """Inverse squared width ℓ = 1/(2σ²), in 1/unit²."""
+
+    @classmethod
+    def covering(cls, points: ArrayLike, sigma: float, *, spacing: float = 1.0, pad: float = 1.0) -> GaussianGrid:
+        """Grid of Gaussians of width `sigma` over the bounding box of `points`.
+
+        Args:
+            points: (N, d) points to cover.
+            sigma: width σ of a Gaussian, in the unit of the points.
+            spacing: largest distance between neighbouring inducing points, in σ.
+            pad: margin around the points, in σ.
+        """
+        points = np.asarray(points, dtype=float)
+        lower, upper = points.min(axis=0) - pad * sigma, points.max(axis=0) + pad * sigma
+        counts = np.ceil((upper - lower) / (spacing * sigma) - 1e-9).astype(int) + 1
+        axes = tuple(np.linspace(a, b, max(2, n)) for a, b, n in zip(lower, upper, counts, strict=True))
+        return cls(axes, 0.5 / sigma**2)
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return len(self.axes)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Inducing points per axis."""
+        return tuple(len(axis) for axis in self.axes)
+
+    @property
+    def num_points(self) -> int:
+        """Number m of inducing points."""
+        return int(np.prod(self.shape))
+
+    @property
+    def inducing_points(self) -> Array:
+        """All inducing points, (m, d), last axis fastest."""
+        return np.stack(np.meshgrid(*self.axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
+
+    def factors(self, s: Array, max_order: int = 0) -> list[list[Array]]:
+        """Per axis j the 1-D Gaussians (N, n_j) at `s` (N, d), and their derivatives up to `max_order` (at most 3)."""
+        result = []
+        for j, axis in enumerate(self.axes):
+            offset = s[:, j : j + 1] - axis
+            gauss = np.exp(-self.ell * offset * offset)
+            orders = [gauss]
+            # Hermite recursion: g⁽ⁿ⁺¹⁾ = −2ℓ (offset · g⁽ⁿ⁾ + n · g⁽ⁿ⁻¹⁾)
+            for n in range(max_order):
+                previous = n * orders[n - 1] if n else 0.0
+                orders.append(-2.0 * self.ell * (offset * orders[n] + previous))
+            result.append(orders)
+        return result
+
+    def contract(self, s: Array, weights: Array, orders: Sequence[tuple[int, ...]]) -> list[Array]:
+        """Partial derivatives of Σ_i w_i k(s, ŝ_i).
+
+        Args:
+            s: (N, d) points.
+            weights: (m, k) weights of k such sums.
+            orders: multi-indices; (0, 1) asks for ∂/∂s_2 in the plane.
+
+        Returns:
+            One array (N, k) for each multi-index. Multi-indices that begin alike share the work of their beginning.
+        """
+        num, k = len(s), weights.shape[1]
+        factors = self.factors(s, max(map(max, orders)))
+        partial: dict[tuple[int, ...], Array] = {}
+        first, *others = self.shape
+        flat = weights.reshape(first, -1)
+        for order in _distinct(o[:1] for o in orders):
+            partial[order] = factors[0][order[0]] @ flat
+        for j, n in enumerate(others, start=1):
+            partial = {
+                order: np.matmul(
+                    factors[j][order[j]][:, None, :], partial[order[:j]].reshape(num, n, -1)
+                )[:, 0]
+                for order in _distinct(o[: j + 1] for o in orders)
+            }  # fmt: skip
+        return [partial[order].reshape(num, k) for order in orders]
+
+    def features(self, s: Array) -> Array:
+        """The dense matrix k(s, ŝ), (N, m): for fitting, not for evaluating."""
+        columns = np.ones((len(s), 1))
+        for (gauss,) in self.factors(s):
+            columns = (columns[:, :, None] * gauss[:, None, :]).reshape(len(s), -1)
+        return columns
+
+    def gram(self) -> Array:
+        """Kernel matrix K (m, m) of the inducing points, whose form WᵀKW is the RKHS norm of a field."""
+        return self.features(self.inducing_points)
+
+
+def _distinct(orders: Iterable[tuple[int, ...]]) -> list[tuple[int, ...]]:
+    return list(dict.fromkeys(orders))
+
+
+def unit_orders(dim: int) -> list[tuple[int, ...]]:
+    """Multi-indices of the `dim` first derivatives."""
+    return [tuple(int(i == j) for i in range(dim)) for j in range(dim)]
+
+
+def second_orders(dim: int) -> dict[tuple[int, int], tuple[int, ...]]:
+    """Multi-index of each second derivative ∂²/∂s_i∂s_j, i ≤ j."""
+    first = unit_orders(dim)
+    return {
+        (i, j): tuple(a + b for a, b in zip(first[i], first[j], strict=True)) for i in range(dim) for j in range(i, dim)
+    }
+
+
+@dataclass(frozen=True)
+class GridRBF:
+    """Vector field V(s) = Wᵀ k(s, ŝ) on a Gaussian grid (sec. 4.3; the printed kernel with its norm squared)."""
+
+    grid: GaussianGrid
+    weights: Array
+    """W, (m, d), one row for each inducing point."""
+
+    def __post_init__(self) -> None:
+        expected = (self.grid.num_points, self.grid.dim)
+        if self.weights.shape != expected:
+            raise ValueError(f"weights have shape {self.weights.shape}; the grid needs {expected}")
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.grid.dim
+
+    def __call__(self, s: Array) -> Array:
+        """V at the points `s` (N, d), as (N, d)."""
+        return self.grid.contract(s, self.weights, [(0,) * self.dim])[0]
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
+        value, *columns = self.grid.contract(s, self.weights, [(0,) * self.dim, *unit_orders(self.dim)])
+        return value, np.stack(columns, axis=-1)
