@@ -1,0 +1,401 @@
+"""Demonstrations: what they are, how they are checked, how files become them.
+
+Three kinds of file are read, and a folder of the first:
+
+CSV (``.csv``), UTF-8, one header line and then one line per sample, seconds and metres::
+
+    demo,t,x,y,z
+    first,0.00,0.10,0.20,0.30
+    first,0.04,0.11,0.20,0.30
+    second,0.00,0.12,0.21,0.30
+
+    ``demo`` is any label; lines with the same label are one demonstration, in the order they stand in. ``z`` is
+    left out for motions in the plane. Without the column ``demo`` the file is a single demonstration. Of a folder,
+    every CSV file is read, in the order of their names.
+
+npz (``.npz``), seconds and metres, for i = 0, 1, 2, …:
+    ``times_i`` (T,), ``positions_i`` (T, d), and optionally ``name_i``, a string. Pickled arrays are never opened.
+
+LASA handwriting (``.mat``, MATLAB v5 to v7), seconds and millimetres:
+    ``demos``, a cell array of structures with ``t`` 1×T and ``pos`` d×T; other variables and fields are not used.
+"""
+
+import csv
+import io
+import re
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.io import loadmat
+from scipy.io.matlab import matfile_version
+
+DIMENSIONS = (2, 3)
+MAX_BYTES = 64 * 2**20  # of a file, and of what an npz unpacks to
+MAX_COORDINATE = 100.0  # metres; beyond it the numbers are in another unit
+MAX_DURATION = 3600.0  # seconds; beyond it the numbers are in another unit
+MIN_EXTENT = 1e-6  # metres; a motion that stays within it is a point
+METRES_PER_LASA_UNIT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """One recorded motion. Compared and hashed by identity.
+
+    Attributes:
+        times: shape ``(T,)``, seconds, strictly increasing from 0.
+        positions: shape ``(T, d)``, metres, d is 2 or 3, in the frame of the task.
+        name: what to call it in the page and in messages.
+    """
+
+    times: np.ndarray
+    positions: np.ndarray
+    name: str
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates d."""
+        return self.positions.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample, seconds."""
+        return float(self.times[-1])
+
+
+class DemonstrationError(ValueError):
+    """A demonstration that cannot be used.
+
+    Attributes:
+        source: the file, folder or recording.
+        field: the part of it that is wrong.
+        found: what is there.
+        accepted: what would be right.
+    """
+
+    def __init__(self, source: str | Path, field: str, found: str, accepted: str) -> None:
+        super().__init__(source, field, found, accepted)
+        self.source, self.field, self.found, self.accepted = str(source), field, found, accepted
+
+    def __str__(self) -> str:
+        return f"{self.source}: {self.field}: found {self.found}; accepted: {self.accepted}"
+
+
+def check_demonstrations(
+    demonstrations: Sequence[Demonstration], source: str | Path, lines: Sequence[Sequence[int]] | None = None
+) -> tuple[Demonstration, ...]:
+    """Check recorded motions and bring them into the one form that the rest of the program trusts.
+
+    Every loader ends here; motions recorded in memory go through it as well.
+
+    Args:
+        demonstrations: times ``(T,)`` in seconds from any start, positions ``(T, d)`` in metres, any real number type.
+        source: the file or recording, for messages.
+        lines: for each demonstration, the line of the file that each sample stands on, for messages;
+            without it, samples are counted from 1.
+
+    Returns:
+        The same motions with times from 0, as read-only float64 arrays.
+
+    Raises:
+        DemonstrationError: there are none; they differ in dimension; or one of them has not the shapes, the number
+            of samples, the finite values or the increasing times that :class:`Demonstration` promises, does not
+            move, or has values so large that its unit must be another one.
+    """
+    if not demonstrations:
+        raise DemonstrationError(source, "demonstrations", "none", "at least one")
+    checked = []
+    for i, demonstration in enumerate(demonstrations):
+        where = (lambda row: f"sample {row + 1}") if lines is None else (lambda row, n=lines[i]: f"line {n[row]}")
+        checked.append(_check_one(demonstration, source, where))
+        first, this = checked[0], checked[-1]
+        if this.dimension != first.dimension:
+            raise DemonstrationError(
+                source,
+                "dimension",
+                f"{first.dimension} in {first.name!r} but {this.dimension} in {this.name!r}",
+                "one dimension for all",
+            )
+    return tuple(checked)
+
+
+def _check_one(demonstration: Demonstration, source: str | Path, where: Callable[[int], str]) -> Demonstration:
+    name = demonstration.name
+    times_field, positions_field = f"times of {name!r}", f"positions of {name!r}"
+    times = _real_numbers(demonstration.times, source, times_field)
+    positions = _real_numbers(demonstration.positions, source, positions_field)
+    if times.ndim != 1:
+        raise DemonstrationError(source, times_field, f"an array of shape {times.shape}", "shape (T,)")
+    if positions.ndim != 2 or positions.shape[1] not in DIMENSIONS:
+        raise DemonstrationError(source, positions_field, f"an array of shape {positions.shape}", "(T, 2) or (T, 3)")
+    if len(times) != len(positions):
+        found = f"{len(positions)} positions for {len(times)} times"
+        raise DemonstrationError(source, positions_field, found, "as many positions as times")
+    if len(times) < 2:
+        raise DemonstrationError(source, positions_field, f"{len(times)} sample(s)", "at least 2 samples")
+    for field, values in ((times_field, times[:, None]), (positions_field, positions)):
+        if not np.isfinite(values).all():
+            row, column = np.argwhere(~np.isfinite(values))[0]
+            raise DemonstrationError(source, field, f"{values[row, column]} at {where(row)}", "finite numbers")
+    _check_times(times, source, times_field, where)
+    if np.abs(positions).max() > MAX_COORDINATE:
+        row = int(np.abs(positions).max(axis=1).argmax())
+        found = f"{np.abs(positions[row]).max():.6g} m at {where(row)}; is the file in millimetres?"
+        raise DemonstrationError(source, positions_field, found, f"metres, at most {MAX_COORDINATE:g} from the origin")
+    if np.ptp(positions, axis=0).max() < MIN_EXTENT:
+        raise DemonstrationError(source, positions_field, "a motion that stays at one point", "a motion")
+    times = times - times[0]
+    times.setflags(write=False)
+    positions.setflags(write=False)
+    return Demonstration(times, positions, name)
+
+
+def _check_times(times: np.ndarray, source: str | Path, field: str, where: Callable[[int], str]) -> None:
+    with np.errstate(over="ignore"):
+        elapsed = times - times[0]  # what will be stored: rounding may make close times equal
+    still = np.flatnonzero(elapsed[1:] <= elapsed[:-1])
+    if len(still):
+        row = int(still[0]) + 1
+        found = f"{times[row]:.9g} s at {where(row)}, after {times[row - 1]:.9g} s"
+        raise DemonstrationError(source, field, found, "times that increase from each sample to the next")
+    if elapsed[-1] > MAX_DURATION:
+        found = f"a duration of {elapsed[-1]:.6g} s; is the file in milliseconds?"
+        raise DemonstrationError(source, field, found, f"seconds, at most {MAX_DURATION:g} from first to last")
+
+
+def _real_numbers(values: object, source: str | Path, field: str) -> np.ndarray:
+    """Return a float64 copy of an array that must hold integers or real numbers."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        raise DemonstrationError(source, field, f"values of type {array.dtype}", "integers or real numbers")
+    with np.errstate(over="ignore"):  # a long double too large for float64 becomes inf, which is refused later
+        return array.astype(np.float64)
+
+
+def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:
+    """Read the demonstrations of a file (CSV, npz, LASA .mat) or of a folder of CSV files.
+
+    Args:
+        path: the file, whose suffix says what it is (see the module's docstring), or the folder.
+
+    Raises:
+        DemonstrationError: there is no such file or folder, it cannot be read, is not what its suffix says, or holds
+            demonstrations that :func:`check_demonstrations` refuses. Nothing else is raised, whatever the file holds.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir():
+            return _load_csv_folder(path)
+        size = path.stat().st_size if path.is_file() else 0
+        if size > MAX_BYTES:
+            raise DemonstrationError(path, "file", f"{size} bytes", f"at most {MAX_BYTES} bytes")
+        content = path.read_bytes()
+    except OSError as error:
+        found = f"nothing that can be read ({error.strerror or error})"
+        raise DemonstrationError(path, "path", found, "a readable file or folder") from error
+    return read_demonstrations(content, path)
+
+
+def read_demonstrations(content: bytes, source: str | Path) -> tuple[Demonstration, ...]:
+    """Read the demonstrations in the bytes of a file, such as one uploaded from the browser.
+
+    Args:
+        content: all bytes of the file.
+        source: its name or path; the suffix says what it is, the stem names demonstrations that have no name.
+
+    Raises:
+        DemonstrationError: as :func:`load_demonstrations`.
+    """
+    source = Path(source)
+    reader = _READERS.get(source.suffix.lower())
+    if reader is None:
+        found = repr(source.suffix) if source.suffix else "no suffix"
+        raise DemonstrationError(source, "suffix", found, f"{', '.join(_READERS)} or a folder of .csv files")
+    if not content:
+        raise DemonstrationError(source, "file", "an empty file", "at least one demonstration")
+    return reader(content, source)
+
+
+def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:
+    """Write demonstrations as npz: ``times_i``, ``positions_i`` and ``name_i`` for i = 0, 1, ….
+
+    Args:
+        path: the file to write, ending in ``.npz``; an existing one is replaced.
+        demonstrations: what to write; :func:`load_demonstrations` gives back equal times, positions and names.
+
+    Raises:
+        DemonstrationError: the suffix is another one, or :func:`check_demonstrations` refuses the demonstrations.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".npz":
+        raise DemonstrationError(path, "suffix", repr(path.suffix), ".npz")
+    arrays: dict[str, np.ndarray] = {}
+    for i, demonstration in enumerate(check_demonstrations(demonstrations, path)):
+        arrays[f"times_{i}"] = demonstration.times
+        arrays[f"positions_{i}"] = demonstration.positions
+        arrays[f"name_{i}"] = np.array(demonstration.name)
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def lasa_files(folder: str | Path) -> dict[str, Path]:
+    """List the shapes of a LASA folder by name, without reading them: load one with :func:`load_demonstrations`.
+
+    Args:
+        folder: holds one ``.mat`` file per shape, such as ``Sshape.mat``.
+
+    Raises:
+        DemonstrationError: there is no such folder, it cannot be read, or it holds no ``.mat`` file.
+    """
+    folder = Path(folder)
+    files = {path.stem: path for path in _files_of(folder) if path.suffix.lower() == ".mat"}
+    if not files:
+        raise DemonstrationError(folder, "folder", "no .mat file", "one .mat file per shape")
+    return files
+
+
+def load_lasa_folder(folder: str | Path) -> dict[str, tuple[Demonstration, ...]]:
+    """Read every shape of a LASA folder, by name.
+
+    Raises:
+        DemonstrationError: as :func:`lasa_files`, or any one of the files cannot be used: none is left out.
+    """
+    return {name: load_demonstrations(path) for name, path in lasa_files(folder).items()}
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """Return the visible files of a folder, by name."""
+    try:
+        return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    except OSError as error:
+        found = f"nothing that can be read ({error.strerror or error})"
+        raise DemonstrationError(folder, "folder", found, "a readable folder") from error
+
+
+def _load_csv_folder(folder: Path) -> tuple[Demonstration, ...]:
+    files = _files_of(folder)
+    others = [path.name for path in files if path.suffix.lower() in {".npz", ".mat"}]
+    if others:
+        raise DemonstrationError(folder, "folder", f"{others[0]!r}", "only .csv files; load other files one by one")
+    tables = [path for path in files if path.suffix.lower() == ".csv"]
+    if not tables:
+        raise DemonstrationError(folder, "folder", "no .csv file", "one or more .csv files")
+    return check_demonstrations([demo for path in tables for demo in load_demonstrations(path)], folder)
+
+
+@contextmanager
+def _parsing(source: Path, field: str, accepted: str) -> Iterator[None]:
+    """Turn whatever a parser raises on hostile bytes into one DemonstrationError."""
+    try:
+        yield
+    except DemonstrationError:
+        raise
+    except Exception as error:  # no parser lists what corrupt bytes make it raise
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DemonstrationError(source, field, f"something that cannot be read ({reason})", accepted) from error
+
+
+def _read_csv(content: bytes, source: Path) -> tuple[Demonstration, ...]:
+    with _parsing(source, "file", "comma-separated text in UTF-8"):
+        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(row)]
+    header = tuple(cell.lower() for cell in rows[0][1]) if rows else ()
+    labelled = header[:1] == ("demo",)
+    columns = header[1:] if labelled else header
+    if columns not in {("t", "x", "y"), ("t", "x", "y", "z")}:
+        found = repr(",".join(header)[:80])
+        raise DemonstrationError(source, "header line", found, "'demo,t,x,y', 'demo,t,x,y,z', 't,x,y' or 't,x,y,z'")
+    samples: dict[str, list[list[float]]] = {}
+    lines: dict[str, list[int]] = {}
+    for line, row in rows[1:]:
+        if len(row) != len(header):
+            raise DemonstrationError(source, f"line {line}", f"{len(row)} columns", f"{len(header)}, as in the header")
+        label = row[0] if labelled else source.stem
+        samples.setdefault(label, []).append(_csv_numbers(row[-len(columns) :], columns, line, source))
+        lines.setdefault(label, []).append(line)
+    tables = {label: np.array(table) for label, table in samples.items()}
+    demonstrations = [Demonstration(table[:, 0], table[:, 1:], label) for label, table in tables.items()]
+    return check_demonstrations(demonstrations, source, list(lines.values()))
+
+
+def _csv_numbers(cells: Sequence[str], columns: Sequence[str], line: int, source: Path) -> list[float]:
+    numbers = []
+    for cell, column in zip(cells, columns, strict=True):
+        try:
+            numbers.append(float(cell))
+        except ValueError as error:
+            found = repr(cell[:40])
+            raise DemonstrationError(source, f"line {line}, column {column}", found, "a decimal number") from error
+    return numbers
+
+
+def _read_npz(content: bytes, source: Path) -> tuple[Demonstration, ...]:
+    arrays = _npz_arrays(content, source)
+    accepted = "times_0, positions_0, times_1, positions_1, … and optionally name_0, name_1, …"
+    numbers = set()
+    for key in arrays:
+        match = re.fullmatch(r"(?:times|positions|name)_(0|[1-9][0-9]{0,8})", key)
+        if match is None:
+            raise DemonstrationError(source, "arrays", repr(key[:40]), accepted)
+        numbers.add(int(match[1]))
+    for key in (f"{kind}_{i}" for i in sorted(numbers) for kind in ("times", "positions")):
+        if key not in arrays:
+            raise DemonstrationError(source, "arrays", f"no {key!r}", accepted)
+    demonstrations = [
+        Demonstration(
+            arrays[f"times_{i}"], arrays[f"positions_{i}"], str(arrays.get(f"name_{i}", f"{source.stem} {i}"))
+        )
+        for i in sorted(numbers)
+    ]
+    return check_demonstrations(demonstrations, source)
+
+
+def _npz_arrays(content: bytes, source: Path) -> Mapping[str, np.ndarray]:
+    with _parsing(source, "file", "an npz archive"):
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > MAX_BYTES:  # a small archive may unpack to more than the memory holds
+            raise DemonstrationError(source, "file", f"{size} bytes when unpacked", f"at most {MAX_BYTES} bytes")
+        arrays: dict[str, np.ndarray] = {}
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            for key in archive.files:
+                with _parsing(source, f"array {key[:40]!r}", "plain numbers; pickled objects are never opened"):
+                    arrays[key] = np.asarray(archive[key])
+        return arrays
+
+
+def _read_lasa(content: bytes, source: Path) -> tuple[Demonstration, ...]:
+    accepted = "a MATLAB file of version 5 to 7 (save -v7)"
+    with _parsing(source, "file", accepted):
+        # Other bytes look like version 4, whose reader allocates whatever size they happen to spell.
+        if matfile_version(io.BytesIO(content))[0] != 1:
+            raise DemonstrationError(source, "file", "a version 4 or 7.3 file, or no MATLAB file", accepted)
+        cells = loadmat(io.BytesIO(content), variable_names=["demos"]).get("demos")
+    if not isinstance(cells, np.ndarray) or cells.dtype != object:
+        found = "no such variable" if cells is None else f"a {type(cells).__name__} that is no cell array"
+        raise DemonstrationError(source, "variable 'demos'", found, "a cell array of structures with t and pos")
+    demonstrations = []
+    for i, cell in enumerate(cells.flat):
+        times = _lasa_field(cell, "t", f"demos{{{i + 1}}}", source)
+        positions = _lasa_field(cell, "pos", f"demos{{{i + 1}}}", source)
+        if times.ndim != 2 or 1 not in times.shape:
+            raise DemonstrationError(source, f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
+        demonstrations.append(Demonstration(times.ravel(), positions.T * METRES_PER_LASA_UNIT, f"{source.stem} {i}"))
+    return check_demonstrations(demonstrations, source)
+
+
+def _lasa_field(cell: object, field: str, where: str, source: Path) -> np.ndarray:
+    if not isinstance(cell, np.ndarray) or cell.size != 1 or field not in (cell.dtype.names or ()):
+        raise DemonstrationError(source, f"{where}.{field}", "no such field", "a structure with t (1×T) and pos (d×T)")
+    return _real_numbers(cell[field].item(), source, f"{where}.{field}")
+
+
+_READERS: dict[str, Callable[[bytes, Path], tuple[Demonstration, ...]]] = {
+    ".csv": _read_csv,
+    ".npz": _read_npz,
+    ".mat": _read_lasa,
+}
