@@ -1,0 +1,191 @@
+"""Imitation: a stable system whose motions are the demonstrations (sec. 4.3)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from dt_viz.demos import Demonstration
+from dt_viz.diffeo import Chain, Diffeomorphism, Flow, min_det_jacobian, round_trip_error
+from dt_viz.fields import Array, GaussianGrid, GridRBF
+from dt_viz.integrate import euler, implicit_euler
+from dt_viz.layers import Stack
+from dt_viz.metrics import resample_by_arc_length
+from dt_viz.systems import Attractor, DiffeomorphicSystem
+from dt_viz.trajectory_fit import TrajectoryFit
+from dt_viz.unbend import layers_along, regress, unbending
+
+Progress = Callable[[float, str], None]
+
+
+class ImitationError(ValueError):
+    """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
+
+
+@dataclass(frozen=True)
+class ImitationSettings:
+    """How to fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean)."""
+
+    num_layers: int = 4
+    """Stationary flows that ψ is composed of."""
+    steps: int = 4
+    """Euler steps of each flow."""
+    sigma: float = 0.75
+    """Width of a Gaussian."""
+    spacing: float = 1.0
+    """Distance between neighbouring inducing points, in σ."""
+    reach: float = 1.25
+    """Inducing points farther than this from the data are left out, in σ."""
+    regularisation: float = 3e-5
+    """Weight of the squared RKHS norm, summed over layers, against the mean squared distance."""
+    num_points: int = 30
+    """Points a demonstration that the fit looks at."""
+    max_iterations: int = 20
+    """Of Gauss–Newton."""
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """A learned motion: ψ and the base attractor, in the demonstrations' own units, with certificates."""
+
+    transform: Diffeomorphism
+    """ψ, from the space of the demonstrations to the space of the base attractor."""
+    base: Attractor
+    """The base system; its goal is z_e = ψ(goal)."""
+    starts: Array
+    """(R, d) where the demonstrations start."""
+    goal: Array
+    """(d,) where they all end."""
+    fit_seconds: float
+    min_det_jacobian: float
+    """Smallest det J over the demonstrations' box grown by half its size."""
+    round_trip_error: float
+    """Largest ‖ψ⁻¹(ψ(x)) − x‖ there."""
+    warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def system(self) -> DiffeomorphicSystem:
+        """The learned dynamical system."""
+        return DiffeomorphicSystem(self.transform, self.base)
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Everything as plain arrays, for a file without pickle."""
+        arrays: dict[str, Any] = {
+            "starts": self.starts,
+            "goal": self.goal,
+            "base": np.concatenate([self.base.goal, [self.base.speed, self.base.smoothing]]),
+            "certificates": np.array([self.fit_seconds, self.min_det_jacobian, self.round_trip_error]),
+            "warnings": np.array(self.warnings, dtype=np.str_),
+        }
+        parts = self.transform.parts if isinstance(self.transform, Chain) else (self.transform,)
+        for index, flow in enumerate(parts):
+            assert isinstance(flow, Flow) and isinstance(flow.field, GridRBF)
+            arrays[f"layer_{index}_weights"] = flow.field.weights
+            arrays[f"layer_{index}_ell_steps"] = np.array([flow.field.grid.ell, flow.steps])
+            for axis, coordinates in enumerate(flow.field.grid.axes):
+                arrays[f"layer_{index}_axis_{axis}"] = coordinates
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> Imitation:
+        """The inverse of `to_arrays`. Raises KeyError or ValueError on arrays that are none of ours."""
+        goal = np.asarray(arrays["goal"], dtype=float)
+        d = len(goal)
+        flows: list[Diffeomorphism] = []
+        while f"layer_{len(flows)}_weights" in arrays:
+            prefix = f"layer_{len(flows)}_"
+            ell, steps = arrays[prefix + "ell_steps"]
+            axes = tuple(np.asarray(arrays[f"{prefix}axis_{j}"], dtype=float) for j in range(d))
+            field = GridRBF(GaussianGrid(axes, float(ell)), np.asarray(arrays[prefix + "weights"], dtype=float))
+            flows.append(Flow(field, 1.0, int(steps), implicit_euler, euler))
+        base = np.asarray(arrays["base"], dtype=float)
+        seconds, min_det, error = (float(x) for x in arrays["certificates"])
+        return cls(
+            Chain(flows),
+            Attractor(base[:d], float(base[d]), float(base[d + 1])),
+            np.asarray(arrays["starts"], dtype=float),
+            goal,
+            seconds,
+            min_det,
+            error,
+            tuple(str(w) for w in arrays["warnings"]),
+        )
+
+
+def fit(
+    demonstrations: Sequence[Demonstration],
+    settings: ImitationSettings | None = None,
+    progress: Progress | None = None,
+) -> Imitation:
+    """Learn a stable system from demonstrations of one motion.
+
+    Args:
+        demonstrations: at least one, all ending at (about) the same place.
+        settings: None takes the defaults.
+        progress: called with the fraction done, from 0 to 1, and what is being done. An exception that it raises, to
+            cancel, ends the fit and is let through.
+
+    Raises:
+        ImitationError: no stable system can be learned from these demonstrations.
+    """
+    settings = settings or ImitationSettings()
+    progress = progress or (lambda _fraction, _message: None)
+    began = time.perf_counter()
+    progress(0.0, "checking the demonstrations")
+    paths = [demonstration.positions for demonstration in demonstrations]
+    goal = np.mean([path[-1] for path in paths], axis=0)
+    motions = np.stack([resample_by_arc_length(path, settings.num_points) for path in paths])
+    motions[:, -1] = goal
+    centre = motions.mean(axis=(0, 1))
+    scale = float(np.sqrt(((motions - centre) ** 2).sum(axis=-1).mean()))
+    normalised = (motions - centre) / scale
+
+    progress(0.05, "unbending the mean demonstration")
+    shapes = unbending(normalised, settings.num_layers - 1)
+    layers = layers_along(shapes, settings.sigma, spacing=settings.spacing, reach=settings.reach)
+    stack = Stack(layers, settings.steps)
+    thetas = regress(stack, shapes, settings.regularisation)
+    fractions = np.broadcast_to(np.linspace(0.0, 1.0, settings.num_points), normalised.shape[:2])
+    problem = TrajectoryFit(stack, normalised, fractions, settings.regularisation)
+
+    def report(iteration: int, rms: float) -> None:
+        fraction = 0.1 + 0.8 * iteration / settings.max_iterations
+        progress(fraction, f"fitting, {100 * rms:.1f} % of the spread off")
+
+    thetas, _, _ = problem.solve(
+        thetas,
+        np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]]),
+        max_iterations=settings.max_iterations,
+        report=report,
+    )
+    transform = stack.transform(thetas, centre, scale)
+
+    progress(0.9, "checking that the map is invertible")
+    box = _grown_box(np.concatenate(paths), 40 if transform.dim == 2 else 14)
+    seconds = float(np.mean([demonstration.times[-1] for demonstration in demonstrations]))
+    end, *images = transform.forward(np.concatenate([goal[None], [path[0] for path in paths]]))
+    length = float(np.mean(np.linalg.norm(images - end, axis=1)))
+    result = Imitation(
+        transform,
+        Attractor(end, speed=1.5 * length / seconds, smoothing=0.1 * length),
+        np.array([path[0] for path in paths]),
+        goal,
+        fit_seconds=time.perf_counter() - began,
+        min_det_jacobian=min_det_jacobian(transform.jacobian, box),
+        round_trip_error=round_trip_error(transform, box),
+    )
+    progress(1.0, "done")
+    return result
+
+
+def _grown_box(points: Array, num: int, growth: float = 0.5) -> Array:
+    """A regular grid (num^d, d) over the bounding box of `points` grown by `growth` times its size in all."""
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    margin = growth * (upper - lower)
+    axes = [np.linspace(a, b, num) for a, b in zip(lower - margin, upper + margin, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, points.shape[1])
