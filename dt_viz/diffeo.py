@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.fields import Array, VectorField
-from dt_viz.integrate import Step, integrate, rk4
+from dt_viz.integrate import Step, integrate, integrate_adaptive, rk4
 
 
 class Diffeomorphism(ABC):
@@ -91,6 +91,27 @@ class Flow(Diffeomorphism):
         if inverse:
             return integrate(self.inverse_step or self.step, self.field, s, U, -self.duration, self.steps)
         return integrate(self.step, self.field, s, U, self.duration, self.steps)
+
+
+@dataclass(frozen=True)
+class AdaptiveFlow(Diffeomorphism):
+    """The flow of `Flow`, each point integrated with steps of its own length to a tolerance.
+
+    For fields that are steep in a small core and flat elsewhere, such as those of obstacles.
+    """
+
+    field: VectorField
+    duration: float
+    tolerance: float = 1e-8
+    """Largest estimated error of a step, in the unit of the points."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.field.dim
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        return integrate_adaptive(self.field, s, U, -self.duration if inverse else self.duration, self.tolerance)
 
 
 @dataclass(frozen=True, init=False)

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
+Indices = NDArray[np.integer[Any]]
+Mask = NDArray[np.bool_]
 
 
 class VectorField(Protocol):
@@ -175,3 +177,33 @@ class GridRBF:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
         value, *columns = self.grid.contract(s, self.weights, [(0,) * self.dim, *unit_orders(self.dim)])
         return value, np.stack(columns, axis=-1)
+
+
+@dataclass(frozen=True)
+class PlacedField:
+    """A vector field moved, turned and scaled: V_world(s) = c·R·V(Rᵀ(s − o)/c).
+
+    An obstacle that is only moved is not learned again: its field is evaluated in the obstacle's own frame.
+    """
+
+    inner: VectorField
+    origin: Array
+    """o, (d,), metres."""
+    axes: Array
+    """R, (d, d), orthonormal columns: the frame's axes in the world."""
+    scale: float = 1.0
+    """c, world metres for one unit of `inner`."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.inner.dim
+
+    def __call__(self, s: Array) -> Array:
+        """V at the world points `s` (N, d), as (N, d)."""
+        return self.inner((s - self.origin) @ (self.axes / self.scale)) @ (self.scale * self.axes.T)
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V (N, d) and DV (N, d, d) at the world points `s` (N, d)."""
+        v, DV = self.inner.with_jacobian((s - self.origin) @ (self.axes / self.scale))
+        return v @ (self.scale * self.axes.T), self.axes @ DV @ self.axes.T

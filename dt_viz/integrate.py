@@ -122,13 +122,13 @@ def _augment(field: VectorField, s: Array, U: Array | None) -> tuple[Array, Call
     """The state (s, U) as one array (N, d·(1+k)) and its rate of change."""
     if U is None:
         return s, field
-    num, d, k = U.shape
+    _, d, k = U.shape
 
     def rate(state: Array) -> Array:
         v, DV = field.with_jacobian(state[:, :d])
-        return np.concatenate([v, (DV @ state[:, d:].reshape(num, d, k)).reshape(num, -1)], axis=1)
+        return np.concatenate([v, (DV @ state[:, d:].reshape(-1, d, k)).reshape(len(v), d * k)], axis=1)
 
-    return np.concatenate([s, U.reshape(num, -1)], axis=1), rate
+    return np.concatenate([s, U.reshape(len(s), d * k)], axis=1), rate
 
 
 def _split(state: Array, s: Array, U: Array | None) -> tuple[Array, Array | None]:

@@ -44,9 +44,7 @@ class OccupancyMap:
         """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
         d = self.grid.dim
         second = second_orders(d)
-        value, *partials = self.grid.contract(
-            s, self.weights[:, None], [(0,) * d, *unit_orders(d), *second.values()]
-        )
+        value, *partials = self.grid.contract(s, self.weights[:, None], [(0,) * d, *unit_orders(d), *second.values()])
         hessian = np.empty((len(s), d, d))
         for (i, j), column in zip(second, partials[d:], strict=True):
             hessian[:, i, j] = hessian[:, j, i] = column[:, 0]

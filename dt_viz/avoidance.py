@@ -1,0 +1,91 @@
+"""Avoiding an obstacle: the reverse flow out of what it occupies, for as long as it takes to be clear (sec. 4.4)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dt_viz.behaviours import Built, Motion
+from dt_viz.diffeo import AdaptiveFlow
+from dt_viz.fields import Array, Mask, VectorField
+from dt_viz.integrate import integrate_adaptive
+from dt_viz.obstacles import Sphere
+
+MAX_DURATION = 4.0
+"""Longest flow that is tried to clear an obstacle: a motion that still collides runs through the flow's centre."""
+ACCEPTED_MARGIN = 0.9
+"""Part of the margin that a sample between the checked ones may keep."""
+
+
+class ObstacleAvoidance:
+    """The end effector avoids the obstacle."""
+
+    def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
+        """See `Behaviour`. With `auto` the duration is the shortest that clears all rollouts that can be cleared."""
+        scenario = motion.scenario
+        if not scenario.avoidance:
+            return None
+        obstacle = scenario.obstacle
+        field = obstacle.field(scenario.generator, scenario.temperature)
+        blocked = _blocked(motion)
+        doubts = [f"start {i + 1} is inside the obstacle" for i in np.flatnonzero(blocked)]
+        if obstacle.signed_distance(motion.goal) < 0:
+            doubts.append("the goal is inside the obstacle: motions end beside it")
+        duration = scenario.duration
+        if duration is None:
+            points = motion.positions[~blocked[motion.index]]
+            duration = clearing_duration(field, obstacle, points, scenario.margin, at_least=at_least)
+        if duration is None:
+            duration = MAX_DURATION
+            doubts.append("a motion runs through the dead centre of the obstacle and cannot leave it")
+        return Built(AdaptiveFlow(field, duration, tolerance), duration, tuple(doubts))
+
+    def satisfied(self, motion: Motion) -> bool:
+        """Whether all rollouts with a free start keep (almost) the margin, where that is to be seen to."""
+        if motion.scenario.duration is not None:
+            return True
+        distance = motion.scenario.obstacle.signed_distance(motion.positions)[~_blocked(motion)[motion.index]]
+        return bool((distance >= ACCEPTED_MARGIN * motion.scenario.margin).all())
+
+
+def _blocked(motion: Motion) -> Mask:
+    """(R,) bool: which rollouts start inside the obstacle, so that no transform can keep them out."""
+    return motion.scenario.obstacle.signed_distance(motion.starts) < 0
+
+
+def clearing_duration(
+    field: VectorField, obstacle: Sphere, points: Array, margin: float, *, step: float = 0.05, at_least: float = 0.0
+) -> float | None:
+    """The shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
+
+    γ is a one-parameter group, so one integration with snapshots passes every duration on its way; and occupancy falls
+    along the reverse flow, so what is clear stays clear and can be left behind.
+
+    Args:
+        field: generator of the flow.
+        obstacle: true shape.
+        points: (N, 3) points before the flow, metres.
+        margin: clearance wanted, metres.
+        step: of the snapshots; between two of them the duration is interpolated.
+        at_least: duration to start from.
+
+    Returns:
+        The duration, or None where some point is not clear after `MAX_DURATION`.
+    """
+    tolerance = 1e-4 * margin + 1e-7
+    duration = at_least
+    if duration > 0:
+        points = integrate_adaptive(field, points, None, -duration, tolerance)[0]
+    clearance = obstacle.signed_distance(points)
+    inside = clearance < margin
+    points, clearance = points[inside], clearance[inside]
+    while len(points):
+        if duration >= MAX_DURATION:
+            return None
+        points = integrate_adaptive(field, points, None, -step, tolerance)[0]
+        before, clearance = clearance, obstacle.signed_distance(points)
+        inside = clearance < margin
+        if not inside.any():
+            fraction = (margin - before) / np.maximum(clearance - before, 1e-12)
+            return duration + step * float(np.clip(fraction, 0, 1).max())
+        points, clearance, duration = points[inside], clearance[inside], duration + step
+    return duration

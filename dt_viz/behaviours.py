@@ -1,0 +1,55 @@
+"""What every behaviour that is stacked on the imitation has in common: each is one diffeomorphism (sec. 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from dt_viz.diffeo import Diffeomorphism
+from dt_viz.fields import Array, Indices
+from dt_viz.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion one level down, that a behaviour is to change."""
+
+    scenario: Scenario
+    starts: Array
+    """(R, 3) where the robot starts, metres."""
+    goal: Array
+    """(3,) where the demonstrations end, metres."""
+    index: Indices
+    """(N,) which rollout a sample belongs to."""
+    positions: Array
+    """(N, 3) samples of the rollouts, metres."""
+
+
+@dataclass(frozen=True)
+class Built:
+    """A behaviour made for a motion."""
+
+    transform: Diffeomorphism
+    """ψ, from the manifold with the behaviour to the one without."""
+    duration: float
+    """t of its flow."""
+    doubts: tuple[str, ...] = ()
+    """Why its result is not to be trusted, in words."""
+
+
+class Behaviour(Protocol):
+    """A kind of transform that the engine stacks. A new one is a file with such a class and a line in the engine."""
+
+    def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
+        """The transform for this motion; None where the scenario has it switched off.
+
+        Args:
+            motion: one level down.
+            tolerance: of the flow's integration, metres.
+            at_least: duration to start from where it is chosen automatically.
+        """
+        ...
+
+    def satisfied(self, motion: Motion) -> bool:
+        """Whether the samples of `motion`, taken after the transform, behave as wanted."""
+        ...

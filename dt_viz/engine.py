@@ -1,0 +1,280 @@
+"""Scenario → transforms → frames. Knows no browser; keeps what an edit leaves unchanged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+
+from dt_viz.avoidance import ObstacleAvoidance
+from dt_viz.behaviours import Behaviour, Built, Motion
+from dt_viz.diffeo import Chain, Diffeomorphism, Identity, Placed
+from dt_viz.fields import Array
+from dt_viz.fits import FitStore
+from dt_viz.health import Health, certified
+from dt_viz.imitation import Imitation, Progress
+from dt_viz.metrics import maximum_collision_distance
+from dt_viz.robot import JointPath, Robot, UnreachableError
+from dt_viz.rollouts import Bundle, Rays, evenly_sampled, refined
+from dt_viz.scenario import Scenario
+from dt_viz.systems import Attractor, DiffeomorphicSystem
+from dt_viz.tasks import Task, TaskLoader
+
+BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
+"""What is stacked on the imitation, from the inside out."""
+
+NUM_SAMPLES = 200
+"""Of each rollout before refinement."""
+LIVE_TOLERANCE, FINE_TOLERANCE = 1e-6, 1e-9
+"""Of the flows of the behaviours, metres a step."""
+LIVE_SPACING, FINE_SPACING = 0.012, 0.004
+"""Largest distance between neighbouring samples, metres."""
+START_TOLERANCE = 1e-6
+"""Metres by which a drawn rollout may miss its start."""
+MAX_ATTEMPTS = 5
+"""At a duration that clears the samples that refinement finds, too."""
+ARROW_SPACING = 0.030
+"""Of the picture of the vector field, metres."""
+NUM_ARM_SAMPLES = 200
+MAX_TRACKING_ERROR = 1e-3
+"""Metres by which the hand may miss its path before it is said."""
+
+
+class Stage(IntEnum):
+    """How far a frame is worked out; each stage holds all that the one before it holds."""
+
+    ROLLOUTS = 0
+    """Rollouts and their clearance."""
+    LIVE = 1
+    """Also the vector field and the arm: what follows a drag."""
+    FINE = 2
+    """Refined rollouts, and the certificates."""
+
+
+@dataclass(frozen=True)
+class FieldPicture:
+    """Velocities of the system on the task's slice, outside the obstacle."""
+
+    points: Array
+    """(N, 3), metres."""
+    velocities: Array
+    """(N, 3), m/s."""
+
+
+@dataclass(frozen=True)
+class ArmMotion:
+    """The joint motion along one rollout."""
+
+    times: Array
+    """(T,) seconds."""
+    path: JointPath
+    """Joint angles at these times."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All that the page draws for a scenario. Read only."""
+
+    scenario: Scenario
+    task: Task
+    stage: Stage
+    ghost: tuple[Array, ...]
+    """Undeformed rollouts, (T_i, 3)."""
+    rollouts: tuple[Array, ...]
+    """(T_i, 3), metres."""
+    times: tuple[Array, ...]
+    """(T_i,) seconds of the samples of each rollout."""
+    goal: Array
+    """(3,) where the demonstrations end."""
+    reached: Array
+    """(3,) where the motions end: elsewhere only if the obstacle covers the goal."""
+    health: Health
+    field: FieldPicture | None = None
+    """None before stage LIVE."""
+    arm: ArmMotion | None = None
+    """None before stage LIVE, and where the arm cannot reach the start."""
+    seconds: float = 0.0
+    """From the start of the rebuild until this frame."""
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """What depends on the task and the imitation only: the undeformed motion."""
+
+    task: Task
+    imitation: Imitation
+    transform: Diffeomorphism
+    base: Attractor
+    goal: Array
+    rays: Rays
+    bundle: Bundle
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """The stack that a scenario asks for, and its rollouts from the task's starts."""
+
+    transform: Diffeomorphism
+    rays: Rays
+    bundle: Bundle
+    built: tuple[Built, ...]
+
+
+class Engine:
+    """Computes frames for one visitor. Not thread-safe: one worker thread calls it."""
+
+    def __init__(self, tasks: Mapping[str, TaskLoader], fits: FitStore, robot: Robot) -> None:
+        self._loaders = tasks
+        self._fits = fits
+        self._robot = robot
+        self._tasks: dict[str, Task] = {}
+        self._grounds: dict[tuple[str, bool], _Ground] = {}
+        self._arm_starts: dict[tuple[str, int], Array | UnreachableError] = {}
+        self._arm_before: tuple[tuple[str, int], Array] | None = None
+
+    def task(self, name: str) -> Task:
+        """The task of that name, loaded on first use. Raises DemonstrationError if its file cannot be used."""
+        if name not in self._tasks:
+            self._tasks[name] = self._loaders[name]()
+        return self._tasks[name]
+
+    def frames(self, scenario: Scenario, progress: Progress | None = None) -> Iterator[Frame]:
+        """Frames for a scenario, one for each stage; stop iterating to skip what is not wanted any more.
+
+        Args:
+            scenario: what to show.
+            progress: called while a task is fitted for the first time; see `dt_viz.imitation.fit`.
+
+        Raises:
+            DemonstrationError: the task's demonstrations cannot be read.
+            ImitationError: nothing can be learned from them.
+        """
+        began = time.perf_counter()
+        ground = self._ground(scenario, progress)
+        live = _solve(ground, scenario, LIVE_TOLERANCE, LIVE_SPACING)
+        frame = _frame(ground, scenario, live)
+        yield replace(frame, seconds=time.perf_counter() - began)
+        frame = self._with_field_and_arm(frame, DiffeomorphicSystem(live.transform, ground.base))
+        yield replace(frame, stage=Stage.LIVE, seconds=time.perf_counter() - began)
+
+        fine = _solve(ground, scenario, FINE_TOLERANCE, FINE_SPACING)
+        system = DiffeomorphicSystem(fine.transform, ground.base)
+        frame = self._with_field_and_arm(_frame(ground, scenario, fine), system)
+        health = certified(frame.health, system, fine.rays, fine.bundle)
+        depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
+        health = replace(health, clearance=-depth if depth > 0 else health.clearance)
+        yield replace(frame, stage=Stage.FINE, health=health, seconds=time.perf_counter() - began)
+
+    def _ground(self, scenario: Scenario, progress: Progress | None) -> _Ground:
+        key = (scenario.task, scenario.imitation)
+        if key not in self._grounds:
+            task = self.task(scenario.task)
+            imitation = self._fits.get(task.demonstrations, progress=progress)
+            goal = task.to_world(imitation.goal)
+            end, transform = goal, Identity(len(goal))
+            if scenario.imitation:
+                end = task.to_world(imitation.base.goal)
+                transform = Placed(imitation.transform, task.origin, task.axes, task.scale)
+            base = Attractor(end, task.scale * imitation.base.speed, task.scale * imitation.base.smoothing)
+            rays = Rays(transform.forward(task.starts), base)
+            bundle = evenly_sampled(lambda i, u: _climb(rays.at(i, u), [transform])[:, 1:], len(rays.z0), NUM_SAMPLES)
+            self._grounds[key] = _Ground(task, imitation, transform, base, goal, rays, bundle)
+        return self._grounds[key]
+
+    def _with_field_and_arm(self, frame: Frame, system: DiffeomorphicSystem) -> Frame:
+        lattice = frame.task.slice.lattice(ARROW_SPACING)
+        lattice = lattice[frame.scenario.obstacle.signed_distance(lattice) > 0]
+        picture = FieldPicture(lattice, system.velocity(lattice))
+        arm, doubts = self._arm(frame)
+        return replace(frame, field=picture, arm=arm, health=frame.health.doubting(*doubts))
+
+    def _arm(self, frame: Frame) -> tuple[ArmMotion | None, tuple[str, ...]]:
+        """The joint motion along the chosen rollout, and what is wrong with it."""
+        chosen = frame.scenario.arm_rollout % len(frame.rollouts)
+        path, times = frame.rollouts[chosen], frame.times[chosen]
+        keep = np.linspace(0, len(path) - 1, NUM_ARM_SAMPLES).round().astype(int)
+        path, times = path[keep], times[keep]
+        key = (frame.task.name, chosen)
+        if key not in self._arm_starts:
+            try:
+                self._arm_starts[key] = self._robot.inverse_kinematics(path[0])
+            except UnreachableError as error:
+                self._arm_starts[key] = error
+        start = self._arm_starts[key]
+        if isinstance(start, UnreachableError):
+            return None, (f"the arm cannot reach the start of rollout {chosen + 1}: {start}",)
+        warm = self._arm_before[1] if self._arm_before and self._arm_before[0] == key else None
+        joints = self._robot.track(path, start, warm)
+        self._arm_before = (key, joints.q)
+        doubts: tuple[str, ...] = ()
+        worst = float(joints.error.max())
+        if worst > MAX_TRACKING_ERROR:
+            because = ", a joint is at its limit" if joints.limits_hit.any() else ""
+            doubts = (f"the arm misses the path of rollout {chosen + 1} by up to {1e3 * worst:.0f} mm{because}",)
+        return ArmMotion(times, joints), doubts
+
+
+def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
+    """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
+    levels = [positions]
+    for transform in transforms:
+        levels.append(transform.inverse(levels[-1]))
+    return np.stack(levels, axis=1)
+
+
+def _solve(ground: _Ground, scenario: Scenario, tolerance: float, spacing: float) -> _Solution:
+    """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
+
+    A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and starts that
+    the behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not.
+    """
+    starts, rays, bundle = ground.task.starts, ground.rays, ground.bundle
+    durations = [0.0] * len(BEHAVIOURS)
+    for attempt in range(MAX_ATTEMPTS):
+        motion = Motion(scenario, starts, ground.goal, bundle.index, bundle.levels[:, 0])
+        built: list[tuple[Behaviour, Built]] = []
+        for k, behaviour in enumerate(BEHAVIOURS):
+            if built:
+                motion = replace(motion, positions=built[-1][1].transform.inverse(motion.positions))
+            made = behaviour.build(motion, tolerance, durations[k])
+            if made is not None:
+                built.append((behaviour, made))
+                durations[k] = made.duration
+        outer = [made.transform for _, made in built]
+
+        moved = Chain(outer).forward(starts) if outer else starts
+        if np.abs(moved - starts).max() > START_TOLERANCE:
+            rays = Rays(ground.transform.forward(moved), ground.base)
+            bundle = replace(bundle, levels=_climb(rays.at(bundle.index, bundle.fraction), [ground.transform])[:, 1:])
+        bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
+        stack = [ground.transform, *outer]
+        bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], spacing)
+
+        levels = [replace(motion, index=bundle.index, positions=bundle.levels[:, 1 + k]) for k in range(len(built))]
+        fits = all(behaviour.satisfied(after) for (behaviour, _), after in zip(built, levels, strict=True))
+        if fits or attempt == MAX_ATTEMPTS - 1:
+            return _Solution(Chain(stack), rays, bundle, tuple(made for _, made in built))
+    raise AssertionError("unreachable")
+
+
+def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
+    """The frame of stage ROLLOUTS."""
+    bundle = solution.bundle
+    return Frame(
+        scenario=scenario,
+        task=ground.task,
+        stage=Stage.ROLLOUTS,
+        ghost=ground.bundle.paths,
+        rollouts=bundle.paths,
+        times=bundle.split(solution.rays.times(bundle.index, bundle.fraction)),
+        goal=ground.goal,
+        reached=bundle.positions[-1],
+        health=Health(
+            clearance=float(scenario.obstacle.signed_distance(bundle.positions).min()),
+            duration=solution.built[0].duration if solution.built else None,
+            doubts=ground.imitation.warnings + tuple(doubt for made in solution.built for doubt in made.doubts),
+        ),
+    )

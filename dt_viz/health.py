@@ -1,0 +1,64 @@
+"""Certificates: whether a stack is still a diffeomorphism and its motions still stable. Computed, never assumed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dt_viz.fields import Array, Indices
+from dt_viz.rollouts import Bundle, Rays
+from dt_viz.systems import DiffeomorphicSystem
+
+MAX_ROUND_TRIP = 1e-6
+"""Metres; the workspace is about one metre wide."""
+NUM_CHECKED = 400
+"""Samples that are carried there and back again."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """What is known about how far a result is to be trusted; None is what this stage does not compute."""
+
+    clearance: float
+    """Smallest distance of a rollout from the obstacle, metres, negative inside."""
+    duration: float | None = None
+    """t of the avoidance flow; None where it is off."""
+    min_det_jacobian: float | None = None
+    """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism."""
+    round_trip_error: float | None = None
+    """Largest ‖ψ⁻¹(ψ(y)) − y‖ along the rollouts, metres."""
+    lyapunov_falls: bool | None = None
+    """Whether Φ(ψ(y(t))) falls strictly along every rollout."""
+    doubts: tuple[str, ...] = ()
+    """Why the result is not to be trusted, in words."""
+
+    def doubting(self, *doubts: str) -> Health:
+        """This health with more doubts."""
+        return replace(self, doubts=self.doubts + doubts)
+
+
+def certified(health: Health, system: DiffeomorphicSystem, rays: Rays, bundle: Bundle) -> Health:
+    """Add the certificates of a stack along its rollouts, and a doubt for each that fails."""
+    images = rays.at(bundle.index, bundle.fraction)
+    _, J_inverse = system.transform.inverse_jacobian(images)
+    det = 1 / np.linalg.det(J_inverse)
+    keep = np.unique(np.linspace(0, len(images) - 1, NUM_CHECKED).astype(int))
+    y = bundle.positions[keep]
+    z = system.transform.forward(y)
+    round_trip = float(np.linalg.norm(system.transform.inverse(z) - y, axis=1).max())
+    falls = _falls(system.base.potential(z), bundle.index[keep])
+    health = replace(health, min_det_jacobian=float(det.min()), round_trip_error=round_trip, lyapunov_falls=falls)
+    if not det.min() > 0:
+        health = health.doubting(f"det J falls to {det.min():.2g}: the map folds, the stack is no diffeomorphism there")
+    if not round_trip <= MAX_ROUND_TRIP:
+        health = health.doubting(f"there and back again misses by {1e3 * round_trip:.3g} mm: steps too coarse")
+    if not falls:
+        health = health.doubting("the Lyapunov value does not fall all the way")
+    return health
+
+
+def _falls(potential: Array, index: Indices) -> bool:
+    """Whether the potential falls strictly between neighbouring samples of the same rollout."""
+    same = np.diff(index) == 0
+    return bool((np.diff(potential)[same] < 0).all())

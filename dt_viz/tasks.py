@@ -1,0 +1,164 @@
+"""The named tasks: demonstrations and their place in the robot's world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.demos import Demonstration, lasa_files, load_demonstrations
+from dt_viz.fields import Array
+from dt_viz.metrics import resample_by_arc_length
+
+ASSETS = Path(__file__).resolve().parent.parent / "assets"
+
+DRAWING_CENTRE = np.array([0.0, -0.50, 0.42])
+"""Middle of the vertical drawing plane before the robot, metres. Whoever faces the robot sees it as a blackboard."""
+DRAWING_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
+"""Columns: right, up, and out of the plane towards the viewer."""
+DRAWING_SIZE = 0.40
+"""Metres: larger of width and height of a drawing that comes in other units."""
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The rectangle on which a picture of the vector field is drawn."""
+
+    centre: Array
+    """(3,), metres."""
+    axes: Array
+    """(3, 2) orthonormal columns."""
+    half_size: tuple[float, float]
+    """Metres."""
+
+    def lattice(self, spacing: float) -> Array:
+        """Points (N, 3) at about this spacing, metres."""
+        u, v = (np.linspace(-h, h, max(2, round(2 * h / spacing) + 1)) for h in self.half_size)
+        grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+        return self.centre + grid @ self.axes.T
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Demonstrations of one motion and where in the world they belong.
+
+    A point u (k,) of the demonstrations is the world point origin + scale·axes·u; a drawing has k = 2.
+    """
+
+    name: str
+    title: str
+    hint: str
+    """One line that says what to try."""
+    demonstrations: tuple[Demonstration, ...]
+    origin: Array
+    """(3,), metres."""
+    axes: Array
+    """(3, 3) orthonormal columns."""
+    scale: float
+    slice: Slice
+    camera: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """Position and look-at, metres."""
+    obstacle_position: tuple[float, float, float]
+    """Where the obstacle first stands, metres."""
+
+    def to_world(self, points: Array) -> Array:
+        """World points (*B, 3) of points (*B, k) of the demonstrations."""
+        return self.origin + self.scale * (points @ self.axes[:, : points.shape[-1]].T)
+
+    @property
+    def paths(self) -> tuple[Array, ...]:
+        """Each demonstration in the world, (T_i, 3), metres."""
+        return tuple(self.to_world(d.positions) for d in self.demonstrations)
+
+    @property
+    def starts(self) -> Array:
+        """First points of the demonstrations in the world, (R, 3), metres."""
+        return np.stack([path[0] for path in self.paths])
+
+
+TaskLoader = Callable[[], Task]
+
+
+def draw_s() -> Task:
+    """Draw the letter S in a vertical plane before the robot (sec. 5)."""
+    return drawing_task(
+        "draw_s", "Draw S", "Drag the sphere through the letter.", load_demonstrations(ASSETS / "draw_s.npz")
+    )
+
+
+def lift_box() -> Task:
+    """Reach into a box, then lift abruptly (sec. 5)."""
+    demonstrations = load_demonstrations(ASSETS / "lift_box.npz")
+    points = np.concatenate([d.positions for d in demonstrations])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    # the slice follows the motion: from the mean start towards the corner in the box, and up
+    along = np.array([0.0, -0.55, 0.0]) - np.mean([d.positions[0] for d in demonstrations], axis=0) * np.array(
+        [1.0, 1.0, 0.0]
+    )
+    along /= np.linalg.norm(along)
+    return Task(
+        name="lift_box",
+        title="Lift box",
+        hint="Put the sphere in the way into the box, or on the way up.",
+        demonstrations=demonstrations,
+        origin=np.zeros(3),
+        axes=np.eye(3),
+        scale=1.0,
+        slice=Slice(middle + np.array([0.0, 0.0, 0.02]), np.stack([along, [0.0, 0.0, 1.0]], axis=1), (0.32, 0.26)),
+        camera=((0.75, -1.45, 0.85), (0.08, -0.38, 0.26)),
+        obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.42),
+    )
+
+
+def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonstration, ...]) -> Task:
+    """A task from 2-D demonstrations, on the vertical plane before the robot.
+
+    Drawings between a half and the whole of `DRAWING_SIZE` keep their size; others are scaled to it.
+    """
+    points = np.concatenate([d.positions for d in demonstrations])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    size = float((upper - lower).max())
+    scale = 1.0 if DRAWING_SIZE / 2 <= size <= 1.1 * DRAWING_SIZE else DRAWING_SIZE / size
+    origin = DRAWING_CENTRE - scale * DRAWING_AXES[:, :2] @ ((lower + upper) / 2)
+    half = scale * (upper - lower) / 2 + 0.10
+    return Task(
+        name=name,
+        title=title,
+        hint=hint,
+        demonstrations=demonstrations,
+        origin=origin,
+        axes=DRAWING_AXES,
+        scale=scale,
+        slice=Slice(DRAWING_CENTRE, DRAWING_AXES[:, :2], (float(half[0]), float(half[1]))),
+        camera=((0.55, -1.75, 0.75), (0.06, -0.35, 0.36)),
+        obstacle_position=_on_mean_path(demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, 0.5),
+    )
+
+
+def lasa_tasks(folder: Path) -> dict[str, TaskLoader]:
+    """One drawing task for each .mat file of a folder with the LASA handwriting data, read when it is chosen.
+
+    Raises:
+        DemonstrationError: if the folder cannot be read or holds no .mat file.
+    """
+    return {name: partial(_lasa_task, name, path) for name, path in lasa_files(folder).items()}
+
+
+def _lasa_task(name: str, path: Path) -> Task:
+    return drawing_task(name, f"LASA {name}", "Drag the sphere through the letter.", load_demonstrations(path))
+
+
+def _on_mean_path(
+    demonstrations: tuple[Demonstration, ...], to_world: Callable[[Array], Array], fraction: float
+) -> tuple[float, float, float]:
+    """World point at a fraction of the length of the mean demonstration."""
+    mean = np.mean([resample_by_arc_length(d.positions, 101) for d in demonstrations], axis=0)
+    x, y, z = to_world(mean[round(100 * fraction)])
+    return float(x), float(y), float(z)
+
+
+TASKS: Mapping[str, TaskLoader] = {"draw_s": draw_s, "lift_box": lift_box}
+"""The tasks that ship with DT-Viz, by name."""
