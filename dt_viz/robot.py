@@ -8,7 +8,7 @@ q is always six angles, also for the continuous joints, which pinocchio keeps as
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,8 +18,6 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import ArrayLike, NDArray
 
     Array = NDArray[np.float64]
@@ -29,8 +27,8 @@ DISTRIBUTION = "example-robot-data"
 URDF_IN_DISTRIBUTION = "kinova_description/robots/kinova.urdf"
 END_EFFECTOR_FRAME = "j2s6s200_end_effector"
 
-# The ready pose: upper arm upright, elbow high, hand ahead of the base (the JACO's front is -y), 35° below horizontal.
-HOME = (0.0, 3.2, 1.05, 0.0, 3.7, 0.0)
+HOME = (0.0, 3.2, 1.1, 0.0, 3.4, 0.0)
+"""Ready pose, rad: upper arm upright, elbow high, hand ahead of the base (the JACO's front is -y), 47° downwards."""
 HAND_PITCH = np.deg2rad(40.0)
 """Angle below horizontal at which the hand points when nobody says otherwise."""
 
@@ -62,8 +60,8 @@ STEP_TOLERANCE = 1e-3
 JUMP_PER_ROOT_METRE = 4.0
 """Joint motion over the root of the hand's, rad/√m, above which a warm start has lost its branch. The stretched arm
 moves by the root: 0.4 rad bend it by 2 cm."""
-SINGULAR_MANIPULABILITY = 5e-3
-"""Manipulability, m³, below which a waypoint counts as singular; most of the workspace has 0.05 to 0.2."""
+SINGULAR_MANIPULABILITY = 3e-3
+"""Manipulability, m³, below which the damping takes about 1 % or more of a step; the workspace has 0.05 to 0.2."""
 
 NUM_RESTARTS = 24
 IK_ITERATIONS = 60
@@ -86,8 +84,8 @@ class JointPath:
         error: (*B, T) distance of the end effector from the path, metres.
         limits_hit: (*B, T) whether a joint was held at its limit.
         manipulability: (*B, T) sqrt det(J Jᵀ), m³.
-        damped: (*B, T) whether the waypoint is so near a singularity that damping changed the step: the exact
-            Moore-Penrose pseudo-inverse would move the joints farther there.
+        damped: (*B, T) whether the manipulability is below `SINGULAR_MANIPULABILITY`: the pseudo-inverse is no longer
+            the exact Moore-Penrose one there, which would move the joints fast for little motion of the hand.
     """
 
     q: Array
@@ -110,6 +108,10 @@ class _Posture(NamedTuple):
     soft_lower: Array  # (6, N) or (6, 1), rad, where the springs before the limits start
     soft_upper: Array
     direction_weight: Array  # (1, N) or (1, 1), against 1 for the reference
+
+    def take(self, columns: NDArray[np.intp]) -> _Posture:
+        """The postures of some columns, in their order."""
+        return _Posture(*(field[:, columns] for field in self))
 
 
 class _Chain(NamedTuple):
@@ -251,8 +253,9 @@ class Robot:
         """A natural configuration inside the joint limits that puts the end effector at the target.
 
         Damped Gauss-Newton steps run from many starts at once: the seed, the ready pose turned towards the target, and
-        random ones (always the same). Among those that arrive, the one with the best posture wins: near the seed, hand
-        pointing as wanted, away from joint limits, no joint below the table z = 0.
+        random ones around both (always the same). Among those that arrive, the one with the best posture wins: near the
+        seed, hand pointing as wanted, away from joint limits, no joint below the table z = 0. The arm's collisions with
+        itself are not considered.
 
         Args:
             target: (3,) metres, base frame.
@@ -268,9 +271,10 @@ class Robot:
         """
         target = np.asarray(target, dtype=float)
         azimuth = np.arctan2(target[0], -target[1])  # 0 ahead of the base
+        ready = self.home.copy()
+        ready[0] -= azimuth
         if seed is None:
-            reference = self.home.copy()
-            reference[0] -= azimuth
+            reference = ready
             direction = np.array([np.sin(azimuth), -np.cos(azimuth), -np.tan(HAND_PITCH)])
         else:
             reference = np.asarray(seed, dtype=float)
@@ -280,10 +284,10 @@ class Robot:
             direction, weight = np.asarray(hand_direction, dtype=float), ASKED_DIRECTION_WEIGHT
         direction = direction / np.linalg.norm(direction)
 
-        rng = np.random.default_rng(0)
-        q = reference[:, None] + rng.normal(scale=0.8, size=(NUM_JOINTS, NUM_RESTARTS))
-        q[:, 0] = reference
-        q = np.clip(q, self.lower[:, None], self.upper[:, None])
+        scatter = np.random.default_rng(0).normal(scale=0.8, size=(NUM_RESTARTS, NUM_JOINTS))
+        scatter[:2] = 0.0
+        starts = np.where(np.arange(NUM_RESTARTS)[:, None] % 2 == 0, reference, ready) + scatter
+        q = self.clip(starts).T
         posture = self._posture(reference[:, None], direction[:, None], weight)
         for iteration in range(IK_ITERATIONS):
             gain = 1.0 if iteration < IK_ITERATIONS - FINAL_SWEEPS else 0.0
@@ -291,6 +295,8 @@ class Robot:
             if step.max() < 1e-6:
                 break
 
+        turns = np.where(np.isinf(self.upper), np.round((q.T - reference) / (2 * np.pi)), 0.0)
+        q -= 2 * np.pi * turns.T
         chain = self._chain(q)
         miss = np.linalg.norm(chain.position - target[:, None], axis=0)
         if miss.min() > IK_TOLERANCE:
@@ -341,23 +347,21 @@ class Robot:
             raise ValueError(f"path must be (*B, T, 3) and start (*B, 6), got {path.shape} and {start.shape}")
         shape = (*path.shape[:-1], NUM_JOINTS)
         paths, starts = path.reshape(-1, *path.shape[-2:]), self.clip(start.reshape(-1, NUM_JOINTS))
-        num_waypoints = paths.shape[1]
         posture = self._posture(starts.T, self.hand_direction(starts).T, at_reference=True)
-        columns = _Posture(*(np.repeat(field, num_waypoints, axis=1) for field in posture))
-
-        attempts: list[Callable[[], Array]] = [
-            partial(self._walk, paths, starts, posture, stride) for stride in (STRIDE, STRIDE / 4)
-        ]
-        if initial is not None:
-            warm = np.asarray(initial, dtype=float)
-            if warm.shape != shape:
-                raise ValueError(f"initial must be {shape} like the path, got {warm.shape}")
-            attempts.insert(0, lambda: warm)
-        q = np.empty((*paths.shape[:2], NUM_JOINTS))
-        for attempt in attempts:
-            q = self._sweep(attempt().reshape(-1, NUM_JOINTS), paths, columns)
-            if not _loses_branch(q, paths):
+        strides = [STRIDE, STRIDE / 4]
+        if initial is None:
+            guess = self._walk(paths, starts, posture, strides.pop(0))
+        else:
+            guess = np.asarray(initial, dtype=float)
+            if guess.shape != shape:
+                raise ValueError(f"initial must be {shape} like the path, got {guess.shape}")
+        q = self._sweep(guess.reshape(*paths.shape[:2], NUM_JOINTS), paths, posture)
+        for stride in strides:
+            lost = np.flatnonzero(_loses_branch(q, paths))
+            if not len(lost):
                 break
+            part = posture.take(lost)
+            q[lost] = self._sweep(self._walk(paths[lost], starts[lost], part, stride), paths[lost], part)
         return self._report(q.reshape(shape), path)
 
     def _walk(self, paths: Array, starts: Array, posture: _Posture, stride: float) -> Array:
@@ -383,25 +387,27 @@ class Robot:
         return (1 - fraction) * q[left, :, rows] + fraction * q[left + 1, :, rows]
 
     def _sweep(self, q: Array, paths: Array, posture: _Posture) -> Array:
-        """Newton steps on all waypoints at once, until none moves; q (B·T, 6), paths (B, T, 3), to (B, T, 6)."""
-        q, targets = np.ascontiguousarray(q.T), np.ascontiguousarray(paths.reshape(-1, 3).T)
+        """Steps on all waypoints at once until none moves; q (B, T, 6), paths (B, T, 3), posture of B columns."""
+        shape, targets = q.shape, np.array(paths.reshape(-1, 3).T, order="C")
+        q = np.array(q.reshape(-1, NUM_JOINTS).T, order="C")
+        posture = posture.take(np.repeat(np.arange(shape[0]), shape[1]))
         moving = np.arange(q.shape[1])
         for sweep in range(MAX_SWEEPS + FINAL_SWEEPS):
-            part = _Posture(*(field[:, moving] for field in posture))
             gain = 1.0 if sweep < MAX_SWEEPS else 0.0
-            q[:, moving], step = self._newton(q[:, moving], targets[:, moving], part, gain)
+            q[:, moving], step = self._newton(q[:, moving], targets[:, moving], posture.take(moving), gain)
             moving = moving[step > STEP_TOLERANCE]
             if not len(moving):
                 break
-        return q.T.reshape(*paths.shape[:2], NUM_JOINTS)
+        return np.ascontiguousarray(q.T).reshape(shape)
 
     def _report(self, q: Array, path: Array) -> JointPath:
-        jacobian = self.jacobian(q)
-        gram = jacobian @ np.swapaxes(jacobian, -1, -2)
-        manipulability = np.sqrt(np.maximum(np.linalg.det(gram), 0.0))
+        chain = self._chain(q.reshape(-1, NUM_JOINTS).T)
+        J = _lever(chain)
+        x, y, z = np.einsum("irn,isn->rsn", J, J)
+        manipulability = np.sqrt(np.maximum((x * _cross(y, z)).sum(axis=0), 0.0)).reshape(path.shape[:-1])
         return JointPath(
             q=q,
-            error=np.linalg.norm(self.end_effector(q) - path, axis=-1),
+            error=np.linalg.norm(chain.position.T.reshape(path.shape) - path, axis=-1),
             limits_hit=np.any((q <= self.lower) | (q >= self.upper), axis=-1),
             manipulability=manipulability,
             damped=manipulability < SINGULAR_MANIPULABILITY,
@@ -467,13 +473,10 @@ class Robot:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Cross products over the second axis of a (6, 3, N); b (6, 3, N) or (3, N)."""
-    x, y, z = b[..., 0, :], b[..., 1, :], b[..., 2, :]
-    out = np.empty(a.shape)
-    out[:, 0] = a[:, 1] * z - a[:, 2] * y
-    out[:, 1] = a[:, 2] * x - a[:, 0] * z
-    out[:, 2] = a[:, 0] * y - a[:, 1] * x
-    return out
+    """Cross products over the second last axis of a (*B, 3, N) and b (*B, 3, N)."""
+    ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
+    bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-2)
 
 
 def _lever(chain: _Chain) -> Array:
@@ -493,11 +496,11 @@ def _spd_inverse(A: Array, damping: Array | float) -> Array:
     return out / (a * out[0, 0] + h * out[0, 1] + g * out[0, 2])
 
 
-def _loses_branch(q: Array, paths: Array) -> bool:
-    """Whether joints (B, T, 6) jump by more than paths (B, T, 3) can ask of a continuous solution."""
+def _loses_branch(q: Array, paths: Array) -> NDArray[np.bool_]:
+    """Which (B,) of the joints (B, T, 6) jump by more than paths (B, T, 3) ask of a continuous solution."""
     moved = np.linalg.norm(np.diff(paths, axis=1), axis=-1)
     allowed = 0.05 + JUMP_PER_ROOT_METRE * np.sqrt(moved)  # a floor for repeated samples
-    return bool((np.abs(np.diff(q, axis=1)).max(axis=-1) > allowed).any())
+    return np.any(np.abs(np.diff(q, axis=1)) > allowed[..., None], axis=(1, 2))
 
 
 def _posture_cost(q: Array, chain: _Chain, posture: _Posture) -> Array:
