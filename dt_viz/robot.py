@@ -301,9 +301,10 @@ class Robot:
         miss = np.linalg.norm(chain.position - target[:, None], axis=0)
         if miss.min() > IK_TOLERANCE:
             shoulder = self.joint_translations[0] + self.joint_rotations[0] @ self.joint_translations[1]
+            shoulder = np.round(shoulder, 2) + 0.0  # the sum turns -0 into 0
             raise UnreachableError(
                 f"no configuration reaches {np.round(target, 3).tolist()} m: the nearest misses by {miss.min():.3f} m. "
-                f"The arm reaches at most {self.reach:.2f} m from its shoulder at {np.round(shoulder, 2).tolist()} m; "
+                f"The arm reaches at most {self.reach:.2f} m from its shoulder at {shoulder.tolist()} m; "
                 f"the target is {np.linalg.norm(target - shoulder):.2f} m from it."
             )
         cost = _posture_cost(q, chain, posture) + FLOOR_WEIGHT * np.maximum(0.0, -chain.origins[:, 2]).sum(axis=0)
