@@ -16,7 +16,8 @@ from dt_viz.fields import Array, GaussianGrid, GridRBF
 from dt_viz.integrate import euler, implicit_euler
 from dt_viz.layers import Stack
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.systems import Attractor, DiffeomorphicSystem
+from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.timing import TimedAttractor, learn_timing
 from dt_viz.trajectory_fit import TrajectoryFit
 from dt_viz.unbend import layers_along, regress, unbending
 
@@ -55,7 +56,7 @@ class Imitation:
 
     transform: Diffeomorphism
     """ψ, from the space of the demonstrations to the space of the base attractor."""
-    base: Attractor
+    base: TimedAttractor
     """The base system; its goal is z_e = ψ(goal)."""
     starts: Array
     """(R, d) where the demonstrations start."""
@@ -79,6 +80,9 @@ class Imitation:
             "starts": self.starts,
             "goal": self.goal,
             "base": np.concatenate([self.base.goal, [self.base.speed, self.base.smoothing]]),
+            "base_directions": self.base.directions,
+            "base_knots": self.base.knots,
+            "base_paces": self.base.paces,
             "certificates": np.array([self.fit_seconds, self.min_det_jacobian, self.round_trip_error]),
             "warnings": np.array(self.warnings, dtype=np.str_),
         }
@@ -104,10 +108,11 @@ class Imitation:
             field = GridRBF(GaussianGrid(axes, float(ell)), np.asarray(arrays[prefix + "weights"], dtype=float))
             flows.append(Flow(field, 1.0, int(steps), implicit_euler, euler))
         base = np.asarray(arrays["base"], dtype=float)
+        pace = {k: np.asarray(arrays[f"base_{k}"], dtype=float) for k in ("directions", "knots", "paces")}
         seconds, min_det, error = (float(x) for x in arrays["certificates"])
         return cls(
             Chain(flows),
-            Attractor(base[:d], float(base[d]), float(base[d + 1])),
+            TimedAttractor(base[:d], float(base[d]), float(base[d + 1]), **pace),
             np.asarray(arrays["starts"], dtype=float),
             goal,
             seconds,
@@ -167,12 +172,10 @@ def fit(
 
     progress(0.9, "checking that the map is invertible")
     box = _grown_box(np.concatenate(paths), 40 if transform.dim == 2 else 14)
-    seconds = float(np.mean([demonstration.times[-1] for demonstration in demonstrations]))
-    end, *images = transform.forward(np.concatenate([goal[None], [path[0] for path in paths]]))
-    length = float(np.mean(np.linalg.norm(images - end, axis=1)))
+    base = learn_timing(transform, goal, [demonstration.times for demonstration in demonstrations], paths)
     result = Imitation(
         transform,
-        Attractor(end, speed=1.5 * length / seconds, smoothing=0.1 * length),
+        base,
         np.array([path[0] for path in paths]),
         goal,
         fit_seconds=time.perf_counter() - began,

@@ -48,8 +48,8 @@ class Attractor:
         """z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T) in seconds, in closed form."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
-        log_sinh = _log_sinh(r0 / self.smoothing) - self.speed * times / self.smoothing  # (*B, T)
-        r = self.smoothing * _asinh_exp(log_sinh)
+        log_sinh = log_sinh(r0 / self.smoothing) - self.speed * times / self.smoothing  # (*B, T)
+        r = self.smoothing * asinh_exp(log_sinh)
         shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
         return self.goal + shrink[..., None] * offset[..., None, :]
 
@@ -57,7 +57,7 @@ class Attractor:
         """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (metres) of the goal."""
         r0 = np.linalg.norm(z0 - self.goal, axis=-1)
         farther = np.maximum(r0, distance)
-        span = _log_sinh(farther / self.smoothing) - _log_sinh(np.asarray(distance / self.smoothing))
+        span = log_sinh(farther / self.smoothing) - log_sinh(np.asarray(distance / self.smoothing))
         return self.smoothing / self.speed * span
 
 
@@ -113,13 +113,13 @@ class DiffeomorphicSystem:
         return np.linalg.solve(J, self.base.velocity(z)[..., None])[..., 0]
 
 
-def _log_sinh(a: Array) -> Array:
+def log_sinh(a: Array) -> Array:
     """Logarithm of sinh(a), for a ≥ 0 without overflow; −inf at 0."""
     with np.errstate(divide="ignore"):
         return a + np.log(-np.expm1(-2 * a)) - np.log(2)
 
 
-def _asinh_exp(b: Array) -> Array:
+def asinh_exp(b: Array) -> Array:
     """asinh(exp(b)) without overflow."""
     large = np.maximum(b, 0)
     return np.where(b > 0, large + np.log1p(np.sqrt(1 + np.exp(-2 * large))), np.arcsinh(np.exp(np.minimum(b, 0))))
