@@ -17,7 +17,7 @@ npz (``.npz``), seconds and metres, for i = 0, 1, 2, …:
     ``times_i`` (T,), ``positions_i`` (T, d), and optionally ``name_i``, a string. Pickled arrays are never opened.
 
 LASA handwriting (``.mat``, MATLAB v5 to v7), seconds and millimetres:
-    ``demos``, a cell array of structures with ``t`` 1×T and ``pos`` d×T; other variables and fields are not used.
+    ``demos``, a cell array (or array) of structures with ``t`` 1×T and ``pos`` d×T; nothing else in it is used.
 """
 
 import csv
@@ -28,13 +28,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
-from scipy.io.matlab import matfile_version
+
+from dt_viz.matfile import Value, read_variable
 
 DIMENSIONS = (2, 3)
-MAX_BYTES = 64 * 2**20  # of a file, and of what an npz unpacks to
+MAX_BYTES = 16 * 2**20  # of a file, and of what an npz unpacks to; some 300,000 samples
 MAX_COORDINATE = 100.0  # metres; beyond it the numbers are in another unit
 MAX_DURATION = 3600.0  # seconds; beyond it the numbers are in another unit
 MIN_EXTENT = 1e-6  # metres; a motion that stays within it is a point
@@ -166,13 +167,13 @@ def _check_times(times: np.ndarray, source: str | Path, field: str, where: Calla
         raise DemonstrationError(source, field, found, f"seconds, at most {MAX_DURATION:g} from first to last")
 
 
-def _real_numbers(values: object, source: str | Path, field: str) -> np.ndarray:
-    """Return a float64 copy of an array that must hold integers or real numbers."""
+def _real_numbers(values: object, source: str | Path, field: str, unit: float = 1.0) -> np.ndarray:
+    """Return as float64 what must be an array of integers or real numbers, times ``unit``."""
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":
         raise DemonstrationError(source, field, f"values of type {array.dtype}", "integers or real numbers")
-    with np.errstate(over="ignore"):  # a long double too large for float64 becomes inf, which is refused later
-        return array.astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # what becomes inf or nan is refused later
+        return array.astype(np.float64) * unit
 
 
 def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:
@@ -189,7 +190,9 @@ def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:
     try:
         if path.is_dir():
             return _load_csv_folder(path)
-        size = path.stat().st_size if path.is_file() else 0
+        if not path.is_file():
+            raise DemonstrationError(path, "path", "no such file or folder", "a readable file or folder")
+        size = path.stat().st_size
         if size > MAX_BYTES:
             raise DemonstrationError(path, "file", f"{size} bytes", f"at most {MAX_BYTES} bytes")
         content = path.read_bytes()
@@ -233,13 +236,13 @@ def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration
     path = Path(path)
     if path.suffix.lower() != ".npz":
         raise DemonstrationError(path, "suffix", repr(path.suffix), ".npz")
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     for i, demonstration in enumerate(check_demonstrations(demonstrations, path)):
         arrays[f"times_{i}"] = demonstration.times
         arrays[f"positions_{i}"] = demonstration.positions
         arrays[f"name_{i}"] = np.array(demonstration.name)
     with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+        np.savez_compressed(file, **arrays)
 
 
 def lasa_files(folder: str | Path) -> dict[str, Path]:
@@ -345,12 +348,12 @@ def _read_npz(content: bytes, source: Path) -> tuple[Demonstration, ...]:
     for key in (f"{kind}_{i}" for i in sorted(numbers) for kind in ("times", "positions")):
         if key not in arrays:
             raise DemonstrationError(source, "arrays", f"no {key!r}", accepted)
-    demonstrations = [
-        Demonstration(
-            arrays[f"times_{i}"], arrays[f"positions_{i}"], str(arrays.get(f"name_{i}", f"{source.stem} {i}"))
-        )
-        for i in sorted(numbers)
-    ]
+    demonstrations = []
+    for i in sorted(numbers):
+        name = arrays.get(f"name_{i}", np.array(f"{source.stem} {i}"))
+        if name.dtype.kind != "U" or name.ndim:
+            raise DemonstrationError(source, f"name_{i}", f"{name.dtype} of shape {name.shape}", "one string")
+        demonstrations.append(Demonstration(arrays[f"times_{i}"], arrays[f"positions_{i}"], str(name)))
     return check_demonstrations(demonstrations, source)
 
 
@@ -369,29 +372,32 @@ def _npz_arrays(content: bytes, source: Path) -> Mapping[str, np.ndarray]:
 
 
 def _read_lasa(content: bytes, source: Path) -> tuple[Demonstration, ...]:
-    accepted = "a MATLAB file of version 5 to 7 (save -v7)"
-    with _parsing(source, "file", accepted):
-        # Other bytes look like version 4, whose reader allocates whatever size they happen to spell.
-        if matfile_version(io.BytesIO(content))[0] != 1:
-            raise DemonstrationError(source, "file", "a version 4 or 7.3 file, or no MATLAB file", accepted)
-        cells = loadmat(io.BytesIO(content), variable_names=["demos"]).get("demos")
-    if not isinstance(cells, np.ndarray) or cells.dtype != object:
-        found = "no such variable" if cells is None else f"a {type(cells).__name__} that is no cell array"
-        raise DemonstrationError(source, "variable 'demos'", found, "a cell array of structures with t and pos")
+    accepted = "a cell array of structures with t and pos"
+    with _parsing(source, "file", "a MATLAB file of version 5 to 7"):
+        try:
+            recordings = read_variable(content, "demos")
+        except KeyError as error:
+            raise DemonstrationError(source, "variable 'demos'", "no such variable", accepted) from error
+    if not isinstance(recordings, list):
+        raise DemonstrationError(source, "variable 'demos'", "no cells", accepted)
     demonstrations = []
-    for i, cell in enumerate(cells.flat):
-        times = _lasa_field(cell, "t", f"demos{{{i + 1}}}", source)
-        positions = _lasa_field(cell, "pos", f"demos{{{i + 1}}}", source)
+    for i, recording in enumerate(recordings):
+        times = _lasa_field(recording, "t", f"demos{{{i + 1}}}", source)
+        positions = _lasa_field(recording, "pos", f"demos{{{i + 1}}}", source, METRES_PER_LASA_UNIT)
         if times.ndim != 2 or 1 not in times.shape:
             raise DemonstrationError(source, f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
-        demonstrations.append(Demonstration(times.ravel(), positions.T * METRES_PER_LASA_UNIT, f"{source.stem} {i}"))
+        demonstrations.append(Demonstration(times.ravel(), positions.T, f"{source.stem} {i}"))
     return check_demonstrations(demonstrations, source)
 
 
-def _lasa_field(cell: object, field: str, where: str, source: Path) -> np.ndarray:
-    if not isinstance(cell, np.ndarray) or cell.size != 1 or field not in (cell.dtype.names or ()):
+def _lasa_field(recording: Value, field: str, where: str, source: Path, unit: float = 1.0) -> np.ndarray:
+    fields = recording[0] if isinstance(recording, list) and len(recording) == 1 else recording
+    if not isinstance(fields, dict) or field not in fields:
         raise DemonstrationError(source, f"{where}.{field}", "no such field", "a structure with t (1×T) and pos (d×T)")
-    return _real_numbers(cell[field].item(), source, f"{where}.{field}")
+    numbers = fields[field]
+    if not isinstance(numbers, np.ndarray):
+        raise DemonstrationError(source, f"{where}.{field}", "something else than numbers", "a matrix of real numbers")
+    return _real_numbers(numbers, source, f"{where}.{field}", unit)
 
 
 _READERS: dict[str, Callable[[bytes, Path], tuple[Demonstration, ...]]] = {

@@ -1,0 +1,171 @@
+"""Measures of paths: how far two are apart, how deep one collides, how sharply it turns.
+
+A path is a polyline, an array ``(T, d)`` of points in any unit of length; distances come back in the same unit.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+_DIAGONALS = 32  # of a Fréchet table computed together: few enough to stay in the processor's cache
+
+
+def arc_length(points: np.ndarray) -> np.ndarray:
+    """Return the length of polylines from their first point up to each point.
+
+    Args:
+        points: shape ``(*B, T, d)``.
+
+    Returns:
+        Shape ``(*B, T)``, from 0 up to the whole length, which is ``[..., -1]``.
+    """
+    steps = np.linalg.norm(np.diff(points, axis=-2), axis=-1)
+    return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
+
+
+def resample_by_arc_length(points: np.ndarray, n: int) -> np.ndarray:
+    """Return ``n`` points at equal distances along a polyline, the first and the last being its own.
+
+    Args:
+        points: shape ``(T, d)``; successive points may coincide.
+        n: number of points, at least 2.
+
+    Returns:
+        Shape ``(n, d)``.
+    """
+    length = arc_length(points)
+    keep = np.concatenate([[True], np.diff(length) > 0])
+    resampled = interpolate(np.linspace(0.0, length[-1], n), length[keep], points[keep])
+    resampled[-1] = points[-1]
+    return resampled
+
+
+def interpolate(at: np.ndarray, parameter: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Interpolate linearly between points, holding the first and last beyond the ends.
+
+    Args:
+        at: where, shape ``(N,)``.
+        parameter: the increasing parameter (time, arc length) of each point, shape ``(T,)``.
+        points: shape ``(T, d)``.
+
+    Returns:
+        Shape ``(N, d)``.
+    """
+    return np.stack([np.interp(at, parameter, coordinate) for coordinate in points.T], axis=1)
+
+
+def discrete_frechet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the discrete Fréchet distance between the points of two paths, exactly.
+
+    The least, over all ways of stepping forward along both from their first to their last points, of the largest
+    distance met: F(i, j) = max(‖a_i − b_j‖, min(F(i−1, j), F(i, j−1), F(i−1, j−1))) (Eiter and Mannila, 1994).
+    A cell of the anti-diagonal i + j = k depends only on the two anti-diagonals before it, so each of them is
+    computed at once, and for all pairs of a batch together.
+
+    Args:
+        a: shape ``(*B, n, d)``.
+        b: shape ``(*B, m, d)``, its leading axes broadcast with those of ``a``.
+
+    Returns:
+        Shape ``(*B,)``; for a single pair a 0-d value that ``float`` takes.
+    """
+    if a.shape[-2] > b.shape[-2]:
+        a, b = b, a  # the sweep is as wide as the first is long
+    n, m = a.shape[-2], b.shape[-2]
+    batch = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    a, b = np.broadcast_to(a, (*batch, *a.shape[-2:])), np.broadcast_to(b, (*batch, *b.shape[-2:]))
+    # Slid along b, the reversed a meets on its k-th place the pairs with i + j = k; beyond the ends of b is infinity.
+    reversed_a = np.moveaxis(a[..., ::-1, :], -1, 0).copy()  # (d, *B, n): column c is i = n − 1 − c
+    margins = [(0, 0)] * (b.ndim - 1) + [(n - 1, n - 1)]
+    padded_b = np.pad(np.moveaxis(b, -1, 0), margins, constant_values=np.inf)
+    places = np.moveaxis(sliding_window_view(padded_b, n, axis=-1), -2, 1)  # (d, n + m − 1, *B, n)
+
+    last, before = np.full((2, *batch, n + 1), np.inf)  # F² on the last two anti-diagonals; column n is i = −1
+    before[..., n] = 0.0  # from where F(0, 0) is reached; infinity ever after
+    for k in range(0, n + m - 1, _DIAGONALS):
+        low, high = max(0, n - k - _DIAGONALS), n - max(0, k - m + 1)  # the columns that lie in the table
+        squared = np.zeros(())
+        for place, point in zip(places[:, k : k + _DIAGONALS, ..., low:high], reversed_a[..., low:high], strict=True):
+            squared = squared + np.square(place - point)
+        for distances in squared:
+            reached = np.minimum(last[..., low:high], last[..., low + 1 : high + 1])
+            np.minimum(reached, before[..., low + 1 : high + 1], out=reached)
+            np.maximum(reached, distances, out=before[..., low:high])
+            before[..., n] = np.inf
+            last, before = before, last
+    return np.sqrt(last[..., 0])
+
+
+def rms_at_equal_times(
+    times: np.ndarray, points: np.ndarray, reference_times: np.ndarray, reference_points: np.ndarray
+) -> float:
+    """Return the root mean square distance of a motion from a reference, at the times of the reference.
+
+    Args:
+        times: shape ``(T,)``, increasing; the motion rests at its first point before and at its last point after.
+        points: shape ``(T, d)``.
+        reference_times: shape ``(R,)``, same unit as ``times``.
+        reference_points: shape ``(R, d)``.
+    """
+    error = interpolate(reference_times, times, points) - reference_points
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def maximum_collision_distance(
+    points: np.ndarray, signed_distance: Callable[[np.ndarray], np.ndarray], tolerance: float = 1e-5
+) -> float:
+    """Return how deep a polyline enters an obstacle (M.C.D., sec. 5), also between its points; 0 when it is clear.
+
+    A signed distance changes no faster than the point moves, so on a segment of length L whose ends have distances
+    d₀ and d₁ it is at least (d₀ + d₁ − L)/2. Segments that could still hold a deeper point are halved until none can.
+
+    Args:
+        points: shape ``(T, d)``.
+        signed_distance: takes points ``(N, d)`` and returns ``(N,)``, negative inside. It may be smaller than the
+            true distance, but its slope must nowhere exceed 1.
+        tolerance: how far the result may stay below the true depth, in the unit of the points.
+    """
+    distance = signed_distance(points)
+    deepest = min(0.0, float(distance.min()))
+    start, end, at_start, at_end = points[:-1], points[1:], distance[:-1], distance[1:]
+    while len(start):
+        bound = (at_start + at_end - np.linalg.norm(end - start, axis=1)) / 2
+        open_ = bound < deepest - tolerance
+        start, end, at_start, at_end = start[open_], end[open_], at_start[open_], at_end[open_]
+        if len(start):
+            middle = (start + end) / 2
+            at_middle = signed_distance(middle)
+            deepest = min(deepest, float(at_middle.min()))
+            start, end = np.concatenate([start, middle]), np.concatenate([middle, end])
+            at_start, at_end = np.concatenate([at_start, at_middle]), np.concatenate([at_middle, at_end])
+    return -deepest
+
+
+def sharpest_turn(path: np.ndarray, window: float) -> float:
+    """Return the largest angle between two tangents that lie on a common piece of the path of length ``window``.
+
+    Exact for the polyline: two of its segments count when the path between them is shorter than the window.
+    Adding points on its segments changes nothing. A smooth curve wants samples much closer than the window.
+
+    Args:
+        path: shape ``(T, d)``; successive points may coincide.
+        window: length of the piece, in the unit of the path, greater than 0.
+
+    Returns:
+        Degrees from 0 (straight, or fewer than two segments) to 180 (turns back on itself).
+    """
+    steps = np.diff(path, axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    tangent = steps[length > 0] / length[length > 0, None]
+    end = np.cumsum(length[length > 0])
+    sharpest = 0.0
+    for k in range(1, len(tangent)):
+        # Between segment i and segment i + k lie k − 1 whole segments.
+        near = end[k - 1 : -1] - end[:-k] < window
+        if not near.any():
+            break
+        before, after = tangent[:-k][near], tangent[k:][near]
+        opening, closing = np.linalg.norm(after - before, axis=1), np.linalg.norm(after + before, axis=1)
+        sharpest = max(sharpest, float(2 * np.arctan2(opening, closing).max()))  # accurate near 0 and near 180
+    return float(np.rad2deg(sharpest))

@@ -1,0 +1,367 @@
+"""Loaders: what they accept, that what they give is the same motion, and what they say about everything else."""
+
+import io
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dt_viz.demos import (
+    MAX_BYTES,
+    Demonstration,
+    DemonstrationError,
+    check_demonstrations,
+    lasa_files,
+    load_demonstrations,
+    load_lasa_folder,
+    read_demonstrations,
+    save_demonstrations,
+)
+
+SUFFIXES = [".csv", ".npz", ".mat"]
+
+
+def motion(name="one", n=5, dimension=2):
+    positions = np.stack([np.linspace(0.1 * k, 1, n) for k in range(dimension)], axis=1)
+    return Demonstration(np.linspace(0, 2, n), positions, name)
+
+
+def lasa_bytes(demos=None, **variables):
+    """Return a MATLAB file laid out as the LASA handwriting files are: pos 2×T in millimetres."""
+    if demos is None:
+        demos = [
+            {"pos": 10 * motion(n=4 + i).positions.T, "t": motion(n=4 + i).times[None], "vel": np.zeros((2, 4 + i))}
+            for i in range(7)
+        ]
+    cells = np.empty((1, len(demos)), dtype=object)
+    for i, fields in enumerate(demos):
+        cells[0, i] = fields
+    file = io.BytesIO()
+    scipy.io.savemat(file, {"demos": cells, "dt": 0.1, **variables})
+    return file.getvalue()
+
+
+def npz_bytes(**members):
+    file = io.BytesIO()
+    np.savez(file, **members)
+    return file.getvalue()
+
+
+def refusal(content, source):
+    with pytest.raises(DemonstrationError) as caught:
+        read_demonstrations(content, source)
+    message = str(caught.value)
+    assert message.startswith(f"{source}: ") and "found " in message and "accepted: " in message
+    return message
+
+
+class TestChecks:
+    def test_times_are_shifted_to_zero_and_arrays_are_read_only_floats(self):
+        (checked,) = check_demonstrations([Demonstration(np.array([5, 6, 8]), np.eye(3, dtype=int), "a")], "memory")
+        np.testing.assert_array_equal(checked.times, [0, 1, 3])
+        assert checked.times.dtype == checked.positions.dtype == np.float64
+        assert not checked.times.flags.writeable and not checked.positions.flags.writeable
+        assert (checked.dimension, checked.duration) == (3, 3.0)
+
+    def test_the_arrays_of_the_caller_stay_as_they_were(self):
+        times, positions = np.array([1.0, 2.0]), np.eye(2)
+        check_demonstrations([Demonstration(times, positions, "a")], "memory")
+        assert times.flags.writeable and positions.flags.writeable and times[0] == 1.0
+
+    @pytest.mark.parametrize(
+        ("times", "positions", "words"),
+        [
+            ([0, 1, 2], np.eye(2), ["2 positions for 3 times"]),
+            ([0], np.ones((1, 2)), ["1 sample"]),
+            ([], np.ones((0, 2)), ["0 sample"]),
+            ([0, 1], np.array([[0, 1], [np.nan, 1]]), ["positions of 'a'", "nan at sample 2"]),
+            ([0, np.inf], np.eye(2), ["times of 'a'", "inf at sample 2"]),
+            ([0, 1, 1, 2], np.eye(4)[:, :2], ["times of 'a'", "1 s at sample 3, after 1 s"]),
+            ([0, 2, 1], np.eye(3), ["1 s at sample 3, after 2 s"]),
+            ([-1e3, 1e-300, 2e-300], np.eye(3), ["sample 3"]),
+            ([-1.7e308, 1.7e308], np.eye(2), ["milliseconds"]),
+            ([0, 1], np.array([[1.0], [2.0]]), ["(2, 1)", "(T, 2) or (T, 3)"]),
+            ([0, 1], np.ones((2, 4)), ["(2, 4)"]),
+            ([0, 1], np.array([1.0, 2.0]), ["(2,)"]),
+            ([[0, 1]], np.eye(2), ["times of 'a'", "(1, 2)"]),
+            ([0, 1], np.array([["x", "y"], ["z", "w"]]), ["type <U1"]),
+            ([0, 1], np.eye(2) * 1j, ["type complex128"]),
+            ([0, 5000], np.eye(2), ["5000 s", "milliseconds"]),
+            ([0, 1], np.eye(2) * 300, ["300 m", "millimetres"]),
+            ([0, 1], np.ones((2, 2)), ["stays at one point"]),
+        ],
+    )
+    def test_refusals_say_what_is_wrong(self, times, positions, words):
+        with pytest.raises(DemonstrationError) as caught:
+            check_demonstrations([Demonstration(np.array(times), positions, "a")], "memory")
+        assert all(word in str(caught.value) for word in ["memory: ", "accepted: ", *words]), str(caught.value)
+
+    def test_no_demonstration_is_refused(self):
+        with pytest.raises(DemonstrationError, match="none; accepted: at least one"):
+            check_demonstrations([], "memory")
+
+    def test_mixed_dimensions_are_refused(self):
+        with pytest.raises(DemonstrationError, match="2 in 'flat' but 3 in 'deep'"):
+            check_demonstrations([motion("flat"), motion("deep", dimension=3)], "memory")
+
+    def test_checking_twice_changes_nothing(self):
+        once = check_demonstrations([motion()], "memory")
+        twice = check_demonstrations(once, "memory")
+        np.testing.assert_array_equal(once[0].positions, twice[0].positions)
+        np.testing.assert_array_equal(once[0].times, twice[0].times)
+
+    def test_the_error_survives_pickling(self):
+        error = DemonstrationError("a.csv", "header line", "nothing", "a header")
+        assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+class TestNpz:
+    @given(
+        st.integers(2, 3).flatmap(
+            lambda d: st.lists(
+                arrays(np.float64, st.tuples(st.integers(2, 9), st.just(d)), elements=st.floats(-99, 99)), min_size=1
+            )
+        ),
+        st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])),
+    )
+    @settings(deadline=None, max_examples=50)
+    def test_round_trip(self, tmp_path_factory, tables, name):
+        for table in tables:
+            table[0, 0] = -100  # so that none stays at one point
+        saved = [Demonstration(np.arange(float(len(table))), table, f"{name}{i}") for i, table in enumerate(tables)]
+        path = tmp_path_factory.mktemp("npz") / "demos.npz"
+        save_demonstrations(path, saved)
+        loaded = load_demonstrations(path)
+        assert [d.name for d in loaded] == [d.name for d in saved]
+        for ours, theirs in zip(saved, loaded, strict=True):
+            np.testing.assert_array_equal(ours.times, theirs.times)
+            np.testing.assert_array_equal(ours.positions, theirs.positions)
+
+    def test_names_are_optional_and_order_is_by_number(self):
+        members = {}
+        for i in (10, 2):
+            members |= {f"times_{i}": motion(n=i).times, f"positions_{i}": motion(n=i).positions}
+        loaded = read_demonstrations(npz_bytes(**members), "run.npz")
+        assert [(d.name, len(d.times)) for d in loaded] == [("run 2", 2), ("run 10", 10)]
+
+    def test_pickled_arrays_are_never_opened(self, tmp_path):
+        trap = tmp_path / "opened"
+
+        class Trap:
+            def __reduce__(self):
+                return (open, (str(trap), "w"))
+
+        hostile = np.empty(2, dtype=object)
+        hostile[:] = [Trap(), Trap()]
+        content = npz_bytes(times_0=hostile, positions_0=np.eye(2))
+        assert "never opened" in refusal(content, "trap.npz")
+        refusal(pickle.dumps(Trap()), "trap.npz")
+        assert not trap.exists()
+
+    def test_missing_unknown_and_wrong_arrays_are_named(self):
+        assert "no 'positions_0'" in refusal(npz_bytes(times_0=np.arange(2)), "a.npz")
+        named = {"times_0": np.arange(2), "positions_0": np.eye(2), "name_0": np.arange(3)}
+        assert "name_0: found int64 of shape (3,)" in refusal(npz_bytes(**named), "a.npz")
+        assert "'velocity_0'" in refusal(npz_bytes(velocity_0=np.arange(2)), "a.npz")
+
+    def test_an_archive_without_arrays_is_refused(self):
+        assert "demonstrations: found none" in refusal(npz_bytes(), "a.npz")
+
+    def test_an_archive_that_unpacks_to_more_than_the_limit_is_not_unpacked(self):
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("times_0.npy", bytes(MAX_BYTES + 1))
+        assert "when unpacked" in refusal(file.getvalue(), "bomb.npz")
+
+    def test_a_single_array_with_the_suffix_of_an_archive_is_refused(self):
+        file = io.BytesIO()
+        np.save(file, np.eye(2))
+        refusal(file.getvalue(), "a.npz")
+
+    def test_other_suffixes_are_not_written(self, tmp_path):
+        with pytest.raises(DemonstrationError, match=r"accepted: \.npz"):
+            save_demonstrations(tmp_path / "a.csv", [motion()])
+
+
+class TestCsv:
+    def test_labels_make_demonstrations(self):
+        text = "demo,t,x,y,z\r\nb,0,1,2,3\r\nb,0.5,2,2,3\r\na,3,1,1,1\r\na,4,2,2,2\r\n"
+        b, a = read_demonstrations(text.encode("utf-8-sig"), "two.csv")
+        assert (b.name, a.name) == ("b", "a")
+        np.testing.assert_array_equal(b.positions, [[1, 2, 3], [2, 2, 3]])
+        np.testing.assert_array_equal(a.times, [0, 1])
+
+    def test_without_labels_the_file_is_one_demonstration(self):
+        (only,) = read_demonstrations(b"T, X, Y\n0, 1, 2\n\n1, 2, 3\n", "wave.CSV")
+        assert only.name == "wave" and only.dimension == 2
+
+    def test_a_folder_is_one_demonstration_per_file(self, tmp_path):
+        for name in ("b", "a"):
+            (tmp_path / f"{name}.csv").write_text("t,x,y\n0,0,0\n1,1,0\n")
+        (tmp_path / "notes.txt").write_text("ours")
+        assert [d.name for d in load_demonstrations(tmp_path)] == ["a", "b"]
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            ("x,y\n0,1\n", ["header line", "'x,y'", "'t,x,y'"]),
+            ("0,1,2\n1,2,3\n", ["header line", "'0,1,2'"]),
+            ("t,x,y\n", ["demonstrations: found none"]),
+            ("t,x,y\n0,1,2\n", ["1 sample"]),
+            ("t,x,y\n0,1,2\n1,2\n", ["line 3", "2 columns", "accepted: 3"]),
+            ("t,x,y\n0,1,2\n1,two,2\n", ["line 3, column x", "'two'"]),
+            ("t,x,y\n0,1,2\n1,nan,2\n", ["nan at line 3"]),
+            ("demo,t,x,y\na,0,1,2\na,1,2,2\nb,0,1,2\n\nb,0,2,2\n", ["times of 'b'", "0 s at line 6, after 0 s"]),
+            ('t,x,y\n0,1,"2\n', ["file"]),
+            ("\n\n", ["header line"]),
+        ],
+    )
+    def test_refusals_name_the_line(self, text, words):
+        message = refusal(text.encode(), "bad.csv")
+        assert all(word in message for word in words), message
+
+    def test_text_in_another_encoding_is_refused(self):
+        assert "UTF-8" in refusal("t,x,y\n0,1,2\n".encode("utf-16"), "wide.csv")
+
+    def test_a_folder_of_mixed_dimensions_is_refused(self, tmp_path):
+        (tmp_path / "a.csv").write_text("t,x,y\n0,0,0\n1,1,0\n")
+        (tmp_path / "b.csv").write_text("t,x,y,z\n0,0,0,0\n1,1,0,0\n")
+        with pytest.raises(DemonstrationError, match="2 in 'a' but 3 in 'b'"):
+            load_demonstrations(tmp_path)
+
+    def test_a_folder_with_other_demonstration_files_is_refused_rather_than_read_in_part(self, tmp_path):
+        (tmp_path / "a.csv").write_text("t,x,y\n0,0,0\n1,1,0\n")
+        save_demonstrations(tmp_path / "b.npz", [motion()])
+        with pytest.raises(DemonstrationError, match=r"'b\.npz'"):
+            load_demonstrations(tmp_path)
+
+
+class TestLasa:
+    def test_millimetres_become_metres(self):
+        demonstrations = read_demonstrations(lasa_bytes(), "Zig.mat")
+        assert len(demonstrations) == 7 and demonstrations[6].name == "Zig 6"
+        np.testing.assert_allclose(demonstrations[2].positions, 0.01 * motion(n=6).positions)
+        np.testing.assert_allclose(demonstrations[2].times, motion(n=6).times)
+
+    @pytest.mark.parametrize(
+        ("demos", "words"),
+        [
+            ([{"pos": np.eye(2)}], ["demos{1}.t", "no such field"]),
+            ([{"t": np.array([[0.0, 1]])}], ["demos{1}.pos", "no such field"]),
+            ([{"pos": "left", "t": np.array([[0.0, 1]])}], ["demos{1}.pos", "something else than numbers"]),
+            ([{"pos": np.eye(2), "t": np.eye(2)}], ["demos{1}.t", "(2, 2)", "1×T"]),
+            ([{"pos": np.eye(2), "t": np.array([[0.0, 1, 2]])}], ["2 positions for 3 times"]),
+            ([{"pos": np.ones((9, 2)), "t": np.array([[0.0, 1]])}], ["(2, 9)"]),
+            ([1.0], ["demos{1}.t", "no such field"]),
+            ([], ["demonstrations: found none"]),
+        ],
+    )
+    def test_other_layouts_are_refused(self, demos, words):
+        message = refusal(lasa_bytes(demos), "odd.mat")
+        assert all(word in message for word in words), message
+
+    def test_files_without_demos_are_refused(self):
+        file = io.BytesIO()
+        scipy.io.savemat(file, {"x": 1.0})
+        assert "variable 'demos': found no such" in refusal(file.getvalue(), "x.mat")
+        file = io.BytesIO()
+        scipy.io.savemat(file, {"demos": np.eye(3)})
+        assert "no cells" in refusal(file.getvalue(), "x.mat")
+
+    def test_other_matlab_versions_are_refused(self):
+        file = io.BytesIO()
+        scipy.io.savemat(file, {"demos": np.eye(3)}, format="4")
+        assert "accepted: a MATLAB file of version 5 to 7" in refusal(file.getvalue(), "old.mat")
+
+    def test_a_folder_is_listed_by_shape_and_loaded(self, tmp_path):
+        for name in ("Zig", "Arc"):
+            (tmp_path / f"{name}.mat").write_bytes(lasa_bytes())
+        (tmp_path / "README.md").write_text("terms")
+        assert list(lasa_files(tmp_path)) == ["Arc", "Zig"]
+        assert {name: len(shape) for name, shape in load_lasa_folder(tmp_path).items()} == {"Arc": 7, "Zig": 7}
+
+    def test_a_broken_file_in_the_folder_is_not_skipped(self, tmp_path):
+        (tmp_path / "Arc.mat").write_bytes(lasa_bytes())
+        (tmp_path / "Zig.mat").write_bytes(lasa_bytes()[:300])
+        with pytest.raises(DemonstrationError, match=r"Zig\.mat"):
+            load_lasa_folder(tmp_path)
+
+
+class TestPaths:
+    @pytest.mark.parametrize("load", [load_demonstrations, lasa_files, load_lasa_folder])
+    def test_what_is_missing_is_named(self, tmp_path, load):
+        with pytest.raises(DemonstrationError, match="nowhere"):
+            load(tmp_path / "nowhere")
+
+    @pytest.mark.parametrize("load", [load_demonstrations, lasa_files, load_lasa_folder])
+    def test_an_empty_folder_is_refused(self, tmp_path, load):
+        with pytest.raises(DemonstrationError, match=r"no \.(csv|mat) file"):
+            load(tmp_path)
+
+    @pytest.mark.parametrize("name", ["a.txt", "a", "a.csv.gz"])
+    def test_other_suffixes_are_refused_with_the_list_of_ours(self, name):
+        assert all(suffix in refusal(b"t,x,y\n", name) for suffix in SUFFIXES)
+
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    def test_an_empty_file_is_refused(self, tmp_path, suffix):
+        (tmp_path / f"a{suffix}").touch()
+        with pytest.raises(DemonstrationError, match="an empty file"):
+            load_demonstrations(tmp_path / f"a{suffix}")
+
+    def test_a_file_beyond_the_limit_is_not_read(self, tmp_path):
+        with (tmp_path / "a.csv").open("wb") as file:
+            file.truncate(MAX_BYTES + 1)
+        with pytest.raises(DemonstrationError, match="bytes"):
+            load_demonstrations(tmp_path / "a.csv")
+
+    @pytest.mark.parametrize("path", ["\0.csv", "x" * 5000 + ".csv"])
+    def test_impossible_paths_are_refused(self, path):
+        with pytest.raises(DemonstrationError):
+            load_demonstrations(path)
+
+
+def read_or_refuse(content, source):
+    """Read; the only exception let through is one that is not a DemonstrationError."""
+    try:
+        demonstrations = read_demonstrations(content, source)
+    except DemonstrationError as error:
+        assert str(error)
+        return
+    for demonstration in demonstrations:
+        assert np.isfinite(demonstration.positions).all()
+        assert demonstration.times[0] == 0 and (np.diff(demonstration.times) > 0).all()
+
+
+class TestHostileFiles:
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    @given(content=st.binary(max_size=2000))
+    @example(content=b"\x80\x04")
+    @example(content=b"PK\x05\x06" + bytes(18))
+    @settings(deadline=None)
+    def test_random_bytes(self, suffix, content):
+        read_or_refuse(content, f"a{suffix}")
+
+    @given(st.binary(min_size=8, max_size=500))
+    @settings(deadline=None)
+    def test_random_bytes_behind_a_matlab_header(self, content):
+        read_or_refuse(lasa_bytes()[:128] + content, "a.mat")
+
+    @given(st.text(st.sampled_from("0123456789.,-eainfxyt\n\"' \0\r"), max_size=300))
+    @settings(deadline=None)
+    def test_random_tables(self, text):
+        read_or_refuse(b"demo,t,x,y\n" + text.encode(), "a.csv")
+
+    @pytest.mark.parametrize("suffix", [".npz", ".mat"])
+    @given(data=st.data())
+    @settings(deadline=None, max_examples=200)
+    def test_good_files_with_damaged_bytes(self, suffix, data):
+        good = lasa_bytes() if suffix == ".mat" else npz_bytes(times_0=motion().times, positions_0=motion().positions)
+        content = bytearray(good[: data.draw(st.integers(1, len(good)))])
+        for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=8)):
+            content[place] = data.draw(st.integers(0, 255))
+        read_or_refuse(bytes(content), f"a{suffix}")
