@@ -1,4 +1,4 @@
-"""Make the demonstrations that ship with DT-Viz: ``python assets/make_demonstrations.py`` rewrites the npz files here.
+"""Make the demonstrations that ship with DT-Viz: ``python -m assets.make_demonstrations`` rewrites the npz files.
 
 Nobody recorded them. They imitate how a person moves: each starts a little elsewhere, bows a little differently,
 slows down in bends as the two-thirds power law says (speed ∝ curvature^(-1/3)), starts and stops softly, trembles
