@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from dt_viz.obstacles import Sphere
 from dt_viz.occupancy import Generator
@@ -17,7 +17,7 @@ MAX_MANUAL_DURATION = 2.0
 
 @dataclass(frozen=True)
 class View:
-    """What is drawn; changing it computes nothing anew."""
+    """How a result is looked at; changing it computes nothing anew."""
 
     demonstrations: bool = True
     rollouts: bool = True
@@ -27,6 +27,10 @@ class View:
     """Arrows of the vector field on a slice."""
     arm: bool = True
     table: bool = True
+    playing: bool = True
+    """Whether the arm moves along its rollout."""
+    speed: float = 1.0
+    """Of the playback, times real time."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,8 @@ class Scenario:
     """t of the avoidance flow; None is `auto`, the shortest that clears the obstacle by the margin."""
     arm_rollout: int = 0
     """Which rollout the arm follows."""
-    playing: bool = True
-    speed: float = 1.0
-    """Of the playback, times real time."""
     view: View = field(default_factory=View)
+
+    def moves_like(self, other: Scenario) -> bool:
+        """Whether both give the same motion, however it is looked at."""
+        return replace(self, view=other.view) == other

@@ -162,3 +162,8 @@ def _on_mean_path(
 
 TASKS: Mapping[str, TaskLoader] = {"draw_s": draw_s, "lift_box": lift_box}
 """The tasks that ship with DT-Viz, by name."""
+
+
+def titles(tasks: Mapping[str, TaskLoader]) -> dict[str, str]:
+    """What to call each task in the page, without reading its demonstrations."""
+    return {name: name.replace("_", " ").capitalize() if name in TASKS else f"LASA {name}" for name in tasks}

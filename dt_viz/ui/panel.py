@@ -1,0 +1,290 @@
+"""Controls ↔ scenario, and the status line."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import viser
+
+from dt_viz.demos import DemonstrationError
+from dt_viz.engine import Frame, Stage
+from dt_viz.health import Health
+from dt_viz.occupancy import GENERATORS
+from dt_viz.scenario import (
+    MAX_DIAMETER,
+    MAX_MANUAL_DURATION,
+    MAX_MARGIN,
+    MAX_TEMPERATURE,
+    MIN_DIAMETER,
+    MIN_TEMPERATURE,
+    Scenario,
+)
+from dt_viz.ui.export import RESOLUTIONS
+from dt_viz.ui.session import Pace, Session
+
+VIEW_LABELS: Mapping[str, str] = {
+    "rollouts": "Rollouts",
+    "ghost": "Without the obstacle (dashed)",
+    "demonstrations": "Demonstrations",
+    "field": "Vector field",
+    "arm": "Arm",
+    "table": "Table",
+}
+GENERATOR_LABELS = {"free-space": "Free space (−∇log(1−p))", "probability": "Probability (∇p, the paper's)"}
+assert set(GENERATOR_LABELS) == set(GENERATORS)
+
+
+@dataclass(frozen=True)
+class _Control:
+    """A control and how it reads the scenario."""
+
+    handle: Any
+    """A GUI input handle of viser."""
+    read: Callable[[Scenario], Any]
+
+
+class Panel:
+    """The control panel of one visitor."""
+
+    def __init__(self, gui: viser.GuiApi, titles: Mapping[str, str], save_png: Callable[[str, bool], None]) -> None:
+        """Build the controls; they act once `connect` has given them a session.
+
+        Args:
+            gui: of the visitor.
+            titles: of the tasks, by name.
+            save_png: makes a picture, given the resolution's name and whether it is transparent.
+        """
+        self._gui = gui
+        self._session: Session | None = None
+        self._titles = dict(titles)
+        self._controls: list[_Control] = []
+        self._health = Health(clearance=float("nan"))
+        self._status = gui.add_html("")
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._build_task()
+        self._build_obstacle()
+        self._build_stack()
+        self._build_arm()
+        self._build_view()
+        self._build_export(save_png)
+
+    def connect(self, session: Session) -> None:
+        """Let the controls edit this session."""
+        self._session = session
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's choices."""
+        for control in self._controls:
+            value = control.read(scenario)
+            if control.handle.value != value:
+                control.handle.value = value
+        self._duration.disabled = scenario.duration is None
+        self._play.label = "Pause" if scenario.view.playing else "Play"
+
+    def report(self, frame: Frame, pace: Pace) -> None:
+        """Show how the rebuild went and how far its result is to be trusted."""
+        if frame.stage is Stage.ROLLOUTS:
+            return  # the next stage is a few milliseconds away
+        self._bar.visible = False
+        self._hint.content = f"<div style='{_SMALL}'>{html.escape(frame.task.hint)}</div>"
+        count = len(frame.rollouts)
+        if self._rollout.max != count:
+            self._rollout.max = count
+        self._status.content = status_html(frame, pace)
+
+    def learning(self, fraction: float, message: str) -> None:
+        """Show how far learning a task is."""
+        self._bar.visible = True
+        self._bar.value = 100 * fraction
+        self._status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
+
+    def fail(self, error: Exception) -> None:
+        """Show what went wrong; the picture stays as it was."""
+        self._bar.visible = False
+        self._status.content = _alarm(f"{type(error).__name__}: {error}", "#b3261e", "#fdecea")
+
+    def _edit(self, gesture: str, **changes: Any) -> None:
+        if self._session is not None:
+            self._session.edit(gesture, **changes)
+
+    def _bind(
+        self, handle: Any, read: Callable[[Scenario], Any], change: Callable[[Scenario, Any], dict[str, Any]]
+    ) -> Any:
+        """Tie a control to the scenario: `read` gives its value, `change` the fields that a new value replaces."""
+        self._controls.append(_Control(handle, read))
+
+        @handle.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            session = self._session
+            # setting a value from Python calls back too, without a client
+            if session is not None and event.client is not None:
+                self._edit(handle.label, **change(session.scenario, handle.value))
+
+        return handle
+
+    def _build_task(self) -> None:
+        names = {title: name for name, title in self._titles.items()}
+        task = self._gui.add_dropdown("Task", tuple(names))
+        self._controls.append(_Control(task, lambda s: self._titles[s.task]))
+        self._hint = self._gui.add_html("")
+
+        @task.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            session = self._session
+            if session is None or event.client is None:
+                return
+            try:
+                session.choose_task(names[task.value])
+            except DemonstrationError as error:
+                self.fail(error)
+                self.adopt(session.scenario)
+
+        history = self._gui.add_button_group("History", ("Undo", "Redo", "Reset"))
+
+        @history.on_click
+        async def _(_event: viser.GuiEvent) -> None:
+            if self._session is not None:
+                {"Undo": self._session.undo, "Redo": self._session.redo, "Reset": self._session.reset}[history.value]()
+
+    def _build_obstacle(self) -> None:
+        gui = self._gui
+        with gui.add_folder("Obstacle"):
+            self._bind(
+                gui.add_slider("Diameter [cm]", 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0),
+                lambda s: round(100 * s.obstacle.diameter, 3),
+                lambda s, value: {"obstacle": replace(s.obstacle, diameter=value / 100)},
+            )
+            self._bind(
+                gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
+                lambda s: round(100 * s.margin, 3),
+                lambda _s, value: {"margin": value / 100},
+            )
+
+    def _build_stack(self) -> None:
+        gui = self._gui
+        with gui.add_folder("Transforms"):
+            self._bind(
+                gui.add_checkbox("Avoid the obstacle", True),
+                lambda s: s.avoidance,
+                lambda _s, value: {"avoidance": value},
+            )
+            self._bind(
+                gui.add_checkbox("Imitate", True, hint="off: straight to the goal"),
+                lambda s: s.imitation,
+                lambda _s, value: {"imitation": value},
+            )
+            labels = GENERATOR_LABELS
+            self._bind(
+                gui.add_dropdown("Generator", tuple(labels.values()), hint="the vector field whose flow avoids"),
+                lambda s: labels[s.generator],
+                lambda _s, value: {"generator": next(name for name, label in labels.items() if label == value)},
+            )
+            self._bind(
+                gui.add_slider(
+                    "Reach T",
+                    MIN_TEMPERATURE,
+                    MAX_TEMPERATURE,
+                    0.5,
+                    6.0,
+                    hint="temperature: higher bends more gently, from farther away",
+                ),
+                lambda s: s.temperature,
+                lambda _s, value: {"temperature": value},
+            )
+            self._bind(
+                gui.add_checkbox("Duration t: auto", True, hint="the shortest flow that clears the obstacle"),
+                lambda s: s.duration is None,
+                lambda _s, value: {"duration": None if value else self._auto_duration()},
+            )
+            self._duration = self._bind(
+                gui.add_slider("Duration t", 0.0, MAX_MANUAL_DURATION, 0.01, 0.5, disabled=True),
+                lambda s: self._duration.value if s.duration is None else round(s.duration, 2),
+                lambda s, value: {} if s.duration is None else {"duration": value},
+            )
+
+    def _auto_duration(self) -> float:
+        """The duration that `auto` has chosen, to start from by hand."""
+        return round(min(self._health.duration or 0.5, MAX_MANUAL_DURATION), 2)
+
+    def _build_arm(self) -> None:
+        gui = self._gui
+        with gui.add_folder("Arm"):
+            self._play = gui.add_button("Pause")
+
+            @self._play.on_click
+            async def _(_event: viser.GuiEvent) -> None:
+                session = self._session
+                if session is not None:
+                    view = session.scenario.view
+                    session.edit("play", view=replace(view, playing=not view.playing))
+
+            self._bind(
+                gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
+                lambda s: s.view.speed,
+                lambda s, value: {"view": replace(s.view, speed=value)},
+            )
+            self._rollout = self._bind(
+                gui.add_slider("Follows rollout", 1, 8, 1, 1),
+                lambda s: s.arm_rollout + 1,
+                lambda _s, value: {"arm_rollout": int(value) - 1},
+            )
+
+    def _build_view(self) -> None:
+        with self._gui.add_folder("Show", expand_by_default=False):
+            for name, label in VIEW_LABELS.items():
+                self._bind(
+                    self._gui.add_checkbox(label, True),
+                    lambda s, name=name: getattr(s.view, name),
+                    lambda s, value, name=name: {"view": replace(s.view, **{name: value})},
+                )
+
+    def _build_export(self, save_png: Callable[[str, bool], None]) -> None:
+        with self._gui.add_folder("Picture", expand_by_default=False):
+            resolution = self._gui.add_dropdown("Resolution", tuple(RESOLUTIONS))
+            transparent = self._gui.add_checkbox("Transparent background", False)
+            save = self._gui.add_button("Save PNG", icon=viser.Icon.CAMERA)
+
+            @save.on_click
+            def _(_event: viser.GuiEvent) -> None:  # in a thread: waiting for a render would block the event loop
+                save.disabled = True
+                try:
+                    save_png(resolution.value, transparent.value)
+                finally:
+                    save.disabled = False
+
+
+_SMALL = "font-size:0.8em;line-height:1.45;padding:0.1em 0.9em 0.35em;opacity:0.85"
+
+
+def status_html(frame: Frame, pace: Pace) -> str:
+    """The status line: speed, clearance, certificates, and every reason for doubt."""
+    health = frame.health
+    rows = [
+        ("Rebuild", f"{1e3 * pace.latency:.0f} ms · {pace.rate:.0f} frames/s · {pace.num_skipped} skipped")
+        if frame.stage is Stage.LIVE
+        else ("Rebuild", f"{pace.rate:.0f} frames/s · {pace.num_skipped} skipped · refined"),
+        ("Clearance", f"{1e3 * health.clearance:.1f} mm"),
+        ("Flow time t", "off" if health.duration is None else f"{health.duration:.2f}"),
+        ("min det J", "…" if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
+        ("Round trip", "…" if health.round_trip_error is None else f"{1e3 * health.round_trip_error:.0e} mm"),
+    ]
+    if health.lyapunov_falls is not None:
+        rows.append(("Lyapunov value", "falls" if health.lyapunov_falls else "does not fall"))
+    cells = "".join(
+        f"<tr><td style='opacity:0.65;padding-right:0.8em'>{name}</td><td><b>{html.escape(value)}</b></td></tr>"
+        for name, value in rows
+    )
+    doubts = "".join(_alarm(doubt, "#8a4b00", "#fff4e0") for doubt in health.doubts)
+    if health.clearance < 0 and frame.scenario.avoidance and not doubts:
+        doubts = _alarm("the motions go through the obstacle at this flow time", "#8a4b00", "#fff4e0")
+    return f"<table style='{_SMALL}'>{cells}</table>{doubts}"
+
+
+def _alarm(text: str, colour: str, background: str) -> str:
+    return (
+        f"<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;border-left:3px solid {colour};"
+        f"color:{colour};background:{background}'>{html.escape(text[:1].upper() + text[1:])}</div>"
+    )

@@ -1,0 +1,307 @@
+"""Frame → scene handles. Each picture is a class with `draw(frame)` and `visible`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from dt_viz.engine import Frame
+from dt_viz.fields import Array
+from dt_viz.scenario import MAX_DIAMETER, Scenario
+from dt_viz.tasks import Slice, Task
+from dt_viz.ui import palette
+
+Colour = tuple[int, int, int]
+
+ARROW_LENGTH = 0.024
+"""Of the fastest arrow, metres."""
+GIZMO_SCALE = 0.2
+"""Metres that the handles stick out, about."""
+MIN_SLOPE = 0.2
+"""Of the line of sight to the slice, below which the slice counts as seen on edge."""
+
+
+class Picture(ABC):
+    """Something that is drawn from frames, under one node of the scene tree."""
+
+    def __init__(self, node: viser.SceneNodeHandle) -> None:
+        self._node = node
+
+    @abstractmethod
+    def draw(self, frame: Frame) -> None:
+        """Show what the frame says."""
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self._node.visible
+
+    @visible.setter
+    def visible(self, visible: bool) -> None:
+        if visible != self._node.visible:
+            self._node.visible = visible
+
+
+class Lines:
+    """Polylines of one look, as one set of line segments."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, thickness: float, *, dash: float = 0) -> None:
+        """Make an empty set.
+
+        Args:
+            scene: of the visitor.
+            name: in the scene tree.
+            colour: of all lines.
+            thickness: metres.
+            dash: length of a dash and of the gap after it, metres; 0 draws through.
+        """
+        self._colour = colour
+        self._dash = dash
+        self.node = scene.add_line_segments(
+            name, np.zeros((1, 2, 3), np.float32), _rgb(colour, (1, 2, 3)), thickness=thickness
+        )
+
+    def show(self, paths: Sequence[Array], marked: int | None = None, mark: Colour = palette.CHOSEN_ROLLOUT) -> None:
+        """Show these polylines (T_i, 3), metres, the one with index `marked` in the colour `mark`."""
+        segments, colours = [], []
+        for index, path in enumerate(paths):
+            pieces = np.stack([path[:-1], path[1:]], axis=1)
+            if self._dash:
+                middle = np.cumsum(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1))
+                pieces = pieces[(middle / self._dash).astype(int) % 2 == 0]
+            segments.append(pieces)
+            colours.append(_rgb(mark if index == marked else self._colour, pieces.shape))
+        self.node.points = np.concatenate(segments).astype(np.float32)
+        self.node.colors = np.concatenate(colours)
+
+
+def _rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """One colour for an array of points of that shape."""
+    return np.broadcast_to(np.array(colour, dtype=np.uint8), shape)
+
+
+class Demonstrations(Picture):
+    """What was shown to the robot, thin."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._lines = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018)
+        super().__init__(self._lines.node)
+        self._task: Task | None = None
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        if frame.task is not self._task:
+            self._task = frame.task
+            self._lines.show(frame.task.paths)
+
+
+class Rollouts(Picture):
+    """What the robot will do, bold, with a dot at each start."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._lines = Lines(scene, "/rollouts", palette.ROLLOUT, 0.0048)
+        super().__init__(self._lines.node)
+        self._starts = scene.add_point_cloud(
+            "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.014, point_shape="circle"
+        )
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        self._lines.show(frame.rollouts, marked=frame.scenario.arm_rollout % len(frame.rollouts))
+        self._starts.points = np.stack([path[0] for path in frame.rollouts]).astype(np.float32)
+
+
+class Ghost(Picture):
+    """The undeformed rollouts, dashed."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._lines = Lines(scene, "/ghost", palette.GHOST, 0.0026, dash=0.012)
+        super().__init__(self._lines.node)
+        self._shown: object = None
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        if frame.ghost is not self._shown:
+            self._shown = frame.ghost
+            self._lines.show(frame.ghost)
+
+
+class FieldArrows(Picture):
+    """The vector field on the task's slice: longer and darker is faster."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._arrows = scene.add_arrows(
+            "/field",
+            np.zeros((1, 2, 3), np.float32),
+            _rgb(palette.ARROW_SLOW, (1, 3)),
+            shaft_radius=0.0009,
+            head_radius=0.0028,
+            head_length=0.0075,
+        )
+        super().__init__(self._arrows)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        if frame.field is None:
+            return
+        velocities = frame.field.velocities
+        speed = np.linalg.norm(velocities, axis=1, keepdims=True)
+        # the fastest arrows lie where ψ⁻¹ stretches most; a high quantile keeps the others readable
+        relative = np.minimum(speed / np.quantile(speed, 0.9), 1)
+        arrows = velocities / np.maximum(speed, 1e-12) * ARROW_LENGTH * (0.45 + 0.55 * relative)
+        slow, fast = np.array(palette.ARROW_SLOW), np.array(palette.ARROW_FAST)
+        self._arrows.points = np.stack(
+            [frame.field.points - arrows / 2, frame.field.points + arrows / 2], axis=1
+        ).astype(np.float32)
+        self._arrows.colors = (slow + relative * (fast - slow)).astype(np.uint8)
+
+
+class Goal(Picture):
+    """Where the motions end."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._frame = scene.add_frame("/goal", show_axes=False)
+        super().__init__(self._frame)
+        scene.add_icosphere("/goal/ball", radius=0.012, color=palette.GOAL)
+        scene.add_label("/goal/label", "goal", position=(0.0, 0.0, 0.02), anchor="bottom-center", font_screen_scale=0.8)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        self._frame.position = frame.reached
+
+
+class Obstacle(Picture):
+    """The sphere, which can be dragged itself, and the gizmo that moves it along the axes of the world.
+
+    The browser moves gizmo and sphere together, without asking the server.
+    """
+
+    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, bool], None]) -> None:
+        """Draw the obstacle.
+
+        Args:
+            scene: of the visitor.
+            moved: told of a new centre (3,), metres, and whether the user has let go.
+        """
+        self._slice: Slice | None = None
+        self._gizmo = scene.add_transform_controls(
+            "/obstacle", scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
+        )
+        super().__init__(self._gizmo)
+        self._ball = scene.add_icosphere("/obstacle/ball", radius=1.0, subdivisions=4, color=palette.OBSTACLE)
+
+        @self._gizmo.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            moved(event.target.position.copy(), event.phase == "end")
+
+        @self._ball.on_drag
+        async def _(event: viser.SceneNodeDragEvent) -> None:
+            camera = np.asarray(event.client.camera.position)
+            centre = self._gizmo.position + self._in_slice(camera, event.start_position, event.end_position)
+            self._gizmo.position = centre
+            moved(centre, event.phase == "end")
+
+    def _in_slice(self, camera: Array, grabbed: Sequence[float], pointer: Sequence[float]) -> Array:
+        """How far (3,) the grabbed point must move, parallel to the slice, to lie under the pointer."""
+        shift = np.asarray(pointer) - np.asarray(grabbed)
+        if self._slice is None:
+            return shift
+        normal = np.cross(*self._slice.axes.T)
+        sight = np.asarray(pointer) - camera
+        sight /= np.linalg.norm(sight)
+        slope = float(sight @ normal)
+        if abs(slope) < MIN_SLOPE:
+            return shift  # the slice is seen on edge: move across the line of sight instead
+        return shift - sight * float(shift @ normal) / slope
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`: remembers the slice to be dragged in."""
+        self._slice = frame.task.slice
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Stand where the scenario says, unless that is where the browser has put it already."""
+        obstacle = scenario.obstacle
+        if np.abs(self._gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
+            self._gizmo.position = obstacle.position
+        if self._ball.scale != obstacle.radius:
+            self._ball.scale = obstacle.radius
+            self._gizmo.scale = GIZMO_SCALE * (0.5 + obstacle.radius / MAX_DIAMETER)
+        opacity = None if scenario.avoidance else 0.35
+        if self._ball.opacity != opacity:
+            self._ball.opacity = opacity
+
+    @contextmanager
+    def without_gizmo(self) -> Iterator[None]:
+        """Hide the handles, not the sphere, for as long as a picture takes."""
+        scale, self._gizmo.scale = self._gizmo.scale, 1e-6
+        try:
+            yield
+        finally:
+            self._gizmo.scale = scale
+
+
+class Table(Picture):
+    """The work table under the arm."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        box = scene.add_box(
+            "/table", dimensions=(1.30, 1.10, 0.03), position=(0.0, -0.32, -0.0155), color=palette.TABLE
+        )
+        super().__init__(box)
+        scene.add_grid(
+            "/table/grid",
+            width=1.30,
+            height=1.10,
+            position=(0.0, 0.0, 0.0158),
+            cell_size=0.1,
+            section_size=0.5,
+            cell_thickness=0.6,
+            section_thickness=0.6,
+            cell_color=(205, 196, 182),
+            section_color=(205, 196, 182),
+        )
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`: it never changes."""
+
+
+def set_lights(scene: viser.SceneApi) -> None:
+    """Lights that look the same on the screen and in an exported picture, which has no environment map."""
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map(hdri=None)
+    scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(214, 208, 200), intensity=2.2)
+    scene.add_light_directional("/lights/key", position=(0.8, -1.6, 2.4), intensity=1.9, cast_shadow=True)
+    scene.add_light_directional("/lights/fill", position=(-1.6, -1.0, 1.2), intensity=0.7)
+
+
+class ScenePictures:
+    """Everything in the scene of one visitor that is drawn from frames."""
+
+    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, bool], None]) -> None:
+        """Build the scene; `moved` is told where the user puts the obstacle, see `Obstacle`."""
+        set_lights(scene)
+        self.obstacle = Obstacle(scene, moved)
+        self._always: tuple[Picture, ...] = (self.obstacle, Goal(scene))
+        self._by_view: dict[str, Picture] = {
+            "demonstrations": Demonstrations(scene),
+            "rollouts": Rollouts(scene),
+            "ghost": Ghost(scene),
+            "field": FieldArrows(scene),
+            "table": Table(scene),
+        }
+
+    def draw(self, frame: Frame) -> None:
+        """Assign fresh arrays to the handles."""
+        for picture in (*self._always, *self._by_view.values()):
+            picture.draw(frame)
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show and hide what the scenario's view says, and move the obstacle to where it stands."""
+        self.obstacle.adopt(scenario)
+        for name, picture in self._by_view.items():
+            picture.visible = getattr(scenario.view, name)

@@ -1,0 +1,132 @@
+"""The web server: one private page for each visitor."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections.abc import Mapping
+
+import viser
+
+from dt_viz.engine import Engine
+from dt_viz.fits import FitStore
+from dt_viz.robot import load_jaco
+from dt_viz.tasks import TaskLoader
+from dt_viz.ui.visitor import Visitor
+
+logger = logging.getLogger(__name__)
+
+
+class AddressError(OSError):
+    """The server cannot listen where it was told to; the message says why and what to do."""
+
+
+class Server:
+    """Serves the page until it is closed."""
+
+    def __init__(
+        self,
+        tasks: Mapping[str, TaskLoader],
+        titles: Mapping[str, str],
+        fits: FitStore,
+        *,
+        task: str,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        max_sessions: int = 8,
+    ) -> None:
+        """Listen and wait for visitors.
+
+        Args:
+            tasks: by name.
+            titles: of the tasks, by name.
+            fits: shared by all visitors.
+            task: that each visitor begins with.
+            host: address to listen on.
+            port: to listen on; 0 takes any free one.
+            max_sessions: visitors at a time; further ones are told to wait.
+
+        Raises:
+            AddressError: the address is not to be had.
+        """
+        port = _checked_port(host, port)
+        self._tasks, self._titles, self._fits, self._task = tasks, titles, fits, task
+        self._max_sessions = max_sessions
+        self._robot = load_jaco()
+        self._lock = threading.Lock()
+        self._visitors: dict[int, Visitor | None] = {}
+        self._server = viser.ViserServer(host=host, port=port, label="DT-Viz", verbose=False)
+        if self._server.get_port() != port:  # somebody was faster than the check
+            self._server.stop()
+            raise AddressError(f"port {port} on {host} was taken a moment ago; choose another with --port")
+        self.host, self.port = host, port
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._farewell)
+
+    @property
+    def num_sessions(self) -> int:
+        """Visitors with a page of their own."""
+        return sum(visitor is not None for visitor in self._visitors.values())
+
+    @property
+    def visitors(self) -> tuple[Visitor, ...]:
+        """Who is there."""
+        return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
+
+    def wait(self) -> None:
+        """Serve until interrupted."""
+        self._server.sleep_forever()
+
+    def close(self) -> None:
+        """Send everybody away and stop listening."""
+        for visitor in self.visitors:
+            visitor.close()
+        self._server.stop()
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            full = len(self._visitors) >= self._max_sessions
+            if not full:
+                self._visitors[client.client_id] = None  # a place is taken before the page is built
+        if full:
+            client.gui.add_markdown(
+                f"**All {self._max_sessions} places are taken.** Close another tab of this demo, or reload in a while. "
+                "Whoever runs the server can allow more with `--max-sessions`."
+            )
+            return
+        try:
+            visitor = Visitor(
+                client, Engine(self._tasks, self._fits, self._robot), self._robot, self._titles, self._task
+            )
+        except Exception as error:
+            logger.exception("the page of visitor %d could not be built", client.client_id)
+            client.gui.add_markdown(f"**The page could not be built.** {type(error).__name__}: {error}")
+            self._farewell(client)
+            return
+        with self._lock:
+            if client.client_id in self._visitors:
+                self._visitors[client.client_id] = visitor
+                return
+        visitor.close()  # left while the page was being built
+
+    def _farewell(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            visitor = self._visitors.pop(client.client_id, None)
+        if visitor is not None:
+            visitor.close()
+
+
+def _checked_port(host: str, port: int) -> int:
+    """The port to listen on, if it is free: viser itself would silently take the next one."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise AddressError(
+                f"cannot listen on {host}:{port}: {error.strerror or error}; "
+                "choose another port with --port, or another address with --host"
+            ) from error
+        return probe.getsockname()[1]

@@ -1,0 +1,163 @@
+"""One visitor: owns a scenario, edits it, and has it computed. Knows no browser."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.scenario import Scenario
+from dt_viz.ui.worker import LatestWorker
+
+GESTURE_PAUSE = 1.0
+"""Seconds without an edit after which the next edit of the same control is a step of its own for undo."""
+MAX_UNDO = 200
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How rebuilding goes."""
+
+    latency: float
+    """Seconds from the edit until its frame was ready."""
+    rate: float
+    """Live frames in the last second."""
+    num_skipped: int
+    """Edits that a newer one overtook, since the session began."""
+
+
+class Display(Protocol):
+    """What a session shows its results on: a page, or a measurement."""
+
+    def draw(self, frame: Frame, pace: Pace) -> None:
+        """Show a frame. Called on the worker thread, in the order of the edits."""
+        ...
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's choices on the controls, and what is to be visible."""
+        ...
+
+    def learning(self, fraction: float, message: str) -> None:
+        """Show how far learning a task is, from 0 to 1."""
+        ...
+
+    def fail(self, error: Exception) -> None:
+        """Show that the scenario could not be computed, and why."""
+        ...
+
+
+class Session:
+    """A scenario with its history, and the worker that computes its frames."""
+
+    def __init__(self, engine: Engine, initial: Callable[[str], Scenario], task: str, display: Display) -> None:
+        """Start with a task.
+
+        Args:
+            engine: used by this session only.
+            initial: the scenario that a task begins with. It may raise what `Engine.task` raises.
+            task: the first task's name.
+            display: where results go.
+        """
+        self._engine = engine
+        self._initial = initial
+        self._display = display
+        self._lock = threading.Lock()
+        self.scenario = initial(task)
+        self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
+        self._future: list[Scenario] = []
+        self._gesture: tuple[str, float] = ("", 0.0)
+        self._live_frames: deque[float] = deque(maxlen=120)
+        self._worker = LatestWorker[tuple[Scenario, float]](self._compute, display.fail, name="session")
+        display.adopt(self.scenario)
+        self._submit()
+
+    def edit(self, gesture: str, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
+        """Replace some values of the scenario and have it computed anew.
+
+        Args:
+            gesture: which control is being moved; edits by one control in quick succession are undone together.
+            **changes: fields of `Scenario`.
+        """
+        now = time.monotonic()
+        with self._lock:
+            edited = replace(self.scenario, **changes)
+            if edited == self.scenario:
+                return
+            moves = not edited.moves_like(self.scenario)
+            if moves:
+                name, when = self._gesture
+                if name != gesture or now - when > GESTURE_PAUSE:
+                    self._past.append(self.scenario)
+                self._gesture = (gesture, now)
+                self._future.clear()
+            self.scenario = edited
+            if moves:
+                self._submit()
+        self._display.adopt(edited)
+
+    def end_gesture(self) -> None:
+        """The user let go: the next edit is a step of its own for undo."""
+        with self._lock:
+            self._gesture = ("", 0.0)
+
+    def choose_task(self, name: str) -> None:
+        """Begin another task, with what else was chosen.
+
+        Raises:
+            DemonstrationError: its demonstrations cannot be used; the session stays with its task.
+        """
+        if name != self.scenario.task:
+            fresh = self._initial(name)
+            self.edit("task", task=name, obstacle=replace(fresh.obstacle, diameter=self.scenario.obstacle.diameter))
+            self.end_gesture()
+
+    def reset(self) -> None:
+        """Back to how the task began; can be undone."""
+        fresh = self._initial(self.scenario.task)
+        self.edit("reset", **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "view"})
+        self.end_gesture()
+
+    def undo(self) -> None:
+        """Take the last gesture back."""
+        self._travel(self._past, self._future)
+
+    def redo(self) -> None:
+        """Do again what was undone last."""
+        self._travel(self._future, self._past)
+
+    def wait_idle(self, timeout: float | None = None) -> bool:
+        """Wait until the newest scenario is computed to the end; False if that took longer than `timeout` seconds."""
+        return self._worker.wait_idle(timeout)
+
+    def close(self) -> None:
+        """Stop computing and let go of everything."""
+        self._worker.close()
+
+    def _travel(self, source: Any, target: Any) -> None:  # noqa: ANN401 - both kinds of history
+        with self._lock:
+            if not source:
+                return
+            target.append(self.scenario)
+            self.scenario = replace(source.pop(), view=self.scenario.view)
+            self._gesture = ("", 0.0)
+            self._submit()
+            scenario = self.scenario
+        self._display.adopt(scenario)
+
+    def _submit(self) -> None:
+        self._worker.submit((self.scenario, time.perf_counter()))
+
+    def _compute(self, job: tuple[Scenario, float], superseded: Callable[[], bool]) -> None:
+        scenario, edited = job
+        for frame in self._engine.frames(scenario, self._display.learning):
+            now = time.perf_counter()
+            if frame.stage is Stage.LIVE:
+                self._live_frames.append(now)
+            rate = sum(now - t <= 1.0 for t in self._live_frames)
+            self._display.draw(frame, Pace(now - edited, rate, self._worker.num_skipped))
+            if frame.stage >= Stage.LIVE and superseded():
+                return

@@ -1,0 +1,102 @@
+"""The page of one visitor: a private scene, panel and session, tied together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import viser
+
+from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.fields import Array
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import Robot
+from dt_viz.scenario import Scenario
+from dt_viz.ui import palette
+from dt_viz.ui.arm import ArmPicture
+from dt_viz.ui.export import RESOLUTIONS, render_png
+from dt_viz.ui.panel import Panel
+from dt_viz.ui.playback import Playback
+from dt_viz.ui.scene import ScenePictures
+from dt_viz.ui.session import Pace, Session
+
+
+def initial_scenario(engine: Engine, task: str) -> Scenario:
+    """The scenario that a task begins with. Raises what `Engine.task` raises."""
+    return Scenario(task, Sphere(engine.task(task).obstacle_position))
+
+
+class Visitor:
+    """Shows a session in the browser of one visitor; see `Display`."""
+
+    def __init__(
+        self, client: viser.ClientHandle, engine: Engine, robot: Robot, titles: Mapping[str, str], task: str
+    ) -> None:
+        """Build the page and start computing.
+
+        Args:
+            client: the visitor.
+            engine: used by this visitor only.
+            robot: to draw.
+            titles: of the tasks, by name.
+            task: the first task's name.
+        """
+        self._client = client
+        self._task: str | None = None
+        client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
+        client.gui.set_panel_label("DT-Viz")
+        with client.atomic():
+            self._pictures = ScenePictures(client.scene, self._obstacle_moved)
+            self._arm = ArmPicture(client.scene, robot)
+        self._playback = Playback(self._pose)
+        self._panel = Panel(client.gui, titles, self._save_png)
+        self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
+        self._panel.connect(self.session)
+
+    def draw(self, frame: Frame, pace: Pace) -> None:
+        """See `Display`."""
+        if frame.task.name != self._task:
+            self._task = frame.task.name
+            self._client.camera.position, self._client.camera.look_at = frame.task.camera
+        with self._client.atomic():
+            self._pictures.draw(frame)
+        if frame.stage is not Stage.ROLLOUTS:
+            self._playback.follow(frame.arm)
+            self._panel.report(frame, pace)
+        self._client.flush()
+
+    def adopt(self, scenario: Scenario) -> None:
+        """See `Display`."""
+        self._pictures.adopt(scenario)
+        self._arm.visible = scenario.view.arm
+        self._playback.set_pace(scenario.view.playing, scenario.view.speed)
+        self._panel.adopt(scenario)
+
+    def learning(self, fraction: float, message: str) -> None:
+        """See `Display`."""
+        self._panel.learning(fraction, message)
+
+    def fail(self, error: Exception) -> None:
+        """See `Display`."""
+        self._panel.fail(error)
+
+    def close(self) -> None:
+        """The visitor has left: stop all threads."""
+        self.session.close()
+        self._playback.close()
+
+    def _obstacle_moved(self, centre: Array, released: bool) -> None:
+        scenario = self.session.scenario
+        x, y, z = (float(c) for c in centre)
+        self.session.edit("obstacle", obstacle=Sphere((x, y, z), scenario.obstacle.diameter))
+        if released:
+            self.session.end_gesture()
+
+    def _pose(self, q: Array) -> None:
+        with self._client.atomic():
+            self._arm.pose(q)
+
+    def _save_png(self, resolution: str, transparent: bool) -> None:
+        with self._pictures.obstacle.without_gizmo():
+            content = render_png(self._client, RESOLUTIONS[resolution], transparent=transparent)
+        name = f"dt-viz-{self.session.scenario.task}.png"
+        self._client.send_file_download(name, content, save_immediately=True)
