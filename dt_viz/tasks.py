@@ -108,7 +108,7 @@ def lift_box() -> Task:
         axes=np.eye(3),
         scale=1.0,
         slice=Slice(middle + np.array([0.0, 0.0, 0.02]), np.stack([along, [0.0, 0.0, 1.0]], axis=1), (0.32, 0.26)),
-        camera=((0.75, -1.45, 0.85), (0.08, -0.38, 0.26)),
+        camera=((0.98, -1.60, 0.92), (0.24, -0.33, 0.28)),
         obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.42),
     )
 
@@ -133,7 +133,7 @@ def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonst
         axes=DRAWING_AXES,
         scale=scale,
         slice=Slice(DRAWING_CENTRE, DRAWING_AXES[:, :2], (float(half[0]), float(half[1]))),
-        camera=((0.55, -1.75, 0.75), (0.06, -0.35, 0.36)),
+        camera=((0.84, -1.70, 0.80), (0.15, -0.33, 0.36)),
         obstacle_position=_on_mean_path(demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, 0.5),
     )
 

@@ -6,7 +6,7 @@ ROLLOUT = (213, 94, 0)
 """Bold lines."""
 CHOSEN_ROLLOUT = (150, 45, 0)
 """The one that the arm follows."""
-GHOST = (120, 124, 132)
+GHOST = (84, 88, 96)
 """Dashed lines."""
 GOAL = (0, 158, 115)
 START = (213, 94, 0)
@@ -17,3 +17,9 @@ TABLE = (226, 217, 204)
 ARM = (206, 210, 216)
 ARM_RING = (62, 66, 74)
 BRAND = (0, 114, 178)
+
+
+def linear(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    """The value that shows as this colour where the browser takes colours as linear light: lines and arrows."""
+    red, green, blue = (round(255 * (c / 255) ** 2.2) for c in colour)
+    return red, green, blue

@@ -22,6 +22,8 @@ ARROW_LENGTH = 0.024
 """Of the fastest arrow, metres."""
 GIZMO_SCALE = 0.2
 """Metres that the handles stick out, about."""
+OPACITY = 0.8
+"""Of the obstacle: the path that it blocks shines through."""
 MIN_SLOPE = 0.2
 """Of the line of sight to the slice, below which the slice counts as seen on edge."""
 
@@ -81,8 +83,8 @@ class Lines:
 
 
 def _rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """One colour for an array of points of that shape."""
-    return np.broadcast_to(np.array(colour, dtype=np.uint8), shape)
+    """One colour for an array of points of lines of that shape."""
+    return np.broadcast_to(np.array(palette.linear(colour), dtype=np.uint8), shape)
 
 
 class Demonstrations(Picture):
@@ -107,7 +109,7 @@ class Rollouts(Picture):
         self._lines = Lines(scene, "/rollouts", palette.ROLLOUT, 0.0048)
         super().__init__(self._lines.node)
         self._starts = scene.add_point_cloud(
-            "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.014, point_shape="circle"
+            "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.011, point_shape="circle"
         )
 
     def draw(self, frame: Frame) -> None:
@@ -120,7 +122,7 @@ class Ghost(Picture):
     """The undeformed rollouts, dashed."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._lines = Lines(scene, "/ghost", palette.GHOST, 0.0026, dash=0.012)
+        self._lines = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012)
         super().__init__(self._lines.node)
         self._shown: object = None
 
@@ -139,9 +141,9 @@ class FieldArrows(Picture):
             "/field",
             np.zeros((1, 2, 3), np.float32),
             _rgb(palette.ARROW_SLOW, (1, 3)),
-            shaft_radius=0.0009,
-            head_radius=0.0028,
-            head_length=0.0075,
+            shaft_radius=0.0011,
+            head_radius=0.0034,
+            head_length=0.0085,
         )
         super().__init__(self._arrows)
 
@@ -193,7 +195,7 @@ class Obstacle(Picture):
             "/obstacle", scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
         )
         super().__init__(self._gizmo)
-        self._ball = scene.add_icosphere("/obstacle/ball", radius=1.0, subdivisions=4, color=palette.OBSTACLE)
+        self._ball = scene.add_icosphere("/obstacle/ball", radius=1.0, subdivisions=4, color=palette.OBSTACLE, opacity=OPACITY)
 
         @self._gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
@@ -231,7 +233,7 @@ class Obstacle(Picture):
         if self._ball.scale != obstacle.radius:
             self._ball.scale = obstacle.radius
             self._gizmo.scale = GIZMO_SCALE * (0.5 + obstacle.radius / MAX_DIAMETER)
-        opacity = None if scenario.avoidance else 0.35
+        opacity = OPACITY if scenario.avoidance else 0.3
         if self._ball.opacity != opacity:
             self._ball.opacity = opacity
 
@@ -250,21 +252,14 @@ class Table(Picture):
 
     def __init__(self, scene: viser.SceneApi) -> None:
         box = scene.add_box(
-            "/table", dimensions=(1.30, 1.10, 0.03), position=(0.0, -0.32, -0.0155), color=palette.TABLE
+            "/table",
+            dimensions=(1.10, 0.96, 0.03),
+            position=(0.0, -0.27, -0.0155),
+            color=palette.TABLE,
+            cast_shadow=False,  # on itself it would show as stripes
+            receive_shadow=0.2,
         )
         super().__init__(box)
-        scene.add_grid(
-            "/table/grid",
-            width=1.30,
-            height=1.10,
-            position=(0.0, 0.0, 0.0158),
-            cell_size=0.1,
-            section_size=0.5,
-            cell_thickness=0.6,
-            section_thickness=0.6,
-            cell_color=(205, 196, 182),
-            section_color=(205, 196, 182),
-        )
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`: it never changes."""
@@ -274,9 +269,9 @@ def set_lights(scene: viser.SceneApi) -> None:
     """Lights that look the same on the screen and in an exported picture, which has no environment map."""
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map(hdri=None)
-    scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(214, 208, 200), intensity=2.2)
-    scene.add_light_directional("/lights/key", position=(0.8, -1.6, 2.4), intensity=1.9, cast_shadow=True)
-    scene.add_light_directional("/lights/fill", position=(-1.6, -1.0, 1.2), intensity=0.7)
+    scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(214, 208, 200), intensity=1.8)
+    scene.add_light_directional("/lights/key", position=(0.8, -1.6, 2.4), intensity=2.2, cast_shadow=True)
+    scene.add_light_directional("/lights/fill", position=(-1.6, -1.0, 1.2), intensity=0.8)
 
 
 class ScenePictures:

@@ -20,6 +20,10 @@ from dt_viz.ui.scene import ScenePictures
 from dt_viz.ui.session import Pace, Session
 
 
+FIELD_OF_VIEW = 0.75
+"""Vertical, rad."""
+
+
 def initial_scenario(engine: Engine, task: str) -> Scenario:
     """The scenario that a task begins with. Raises what `Engine.task` raises."""
     return Scenario(task, Sphere(engine.task(task).obstacle_position))
@@ -57,6 +61,7 @@ class Visitor:
         if frame.task.name != self._task:
             self._task = frame.task.name
             self._client.camera.position, self._client.camera.look_at = frame.task.camera
+            self._client.camera.fov = FIELD_OF_VIEW
         with self._client.atomic():
             self._pictures.draw(frame)
         if frame.stage is not Stage.ROLLOUTS:
