@@ -19,8 +19,8 @@ from dt_viz.ui import palette
 class _Body:
     """What moves with one joint."""
 
-    position: tuple[float, float, float]
-    """Of the joint in its parent link, metres."""
+    placement: Array
+    """(4, 4) pose in the parent link, that of the base in the world; all joint angles zero, metres."""
     shell: trimesh.Trimesh
     rings: trimesh.Trimesh | None
 
@@ -46,15 +46,9 @@ def _bodies(joint_names: tuple[str, ...]) -> tuple[_Body, ...]:
         placed.apply_transform(urdf.get_transform(name, link))
         (rings if name.startswith("ring") else shells)[links.index(link)].append(placed)
     bodies = []
-    for index in range(len(links)):
-        origin = urdf.get_transform(links[index], links[index - 1])[:3, 3] if index else np.zeros(3)
-        bodies.append(
-            _Body(
-                (float(origin[0]), float(origin[1]), float(origin[2])),
-                _merged(shells[index]),
-                _merged(rings[index]) if rings[index] else None,
-            )
-        )
+    for index, link in enumerate(links):
+        placement = urdf.get_transform(link, links[index - 1] if index else scene.graph.base_frame)
+        bodies.append(_Body(placement, _merged(shells[index]), _merged(rings[index]) if rings[index] else None))
     return tuple(bodies)
 
 
@@ -70,13 +64,14 @@ class ArmPicture:
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._robot = robot
-        self._root = scene.add_frame("/arm", show_axes=False)
-        self._joints: list[viser.FrameHandle] = []
-        name = "/arm"
+        self._frames: list[viser.FrameHandle] = []
+        name = ""
         for index, body in enumerate(_bodies(robot.joint_names)):
-            if index:
-                name = f"{name}/joint_{index}"
-                self._joints.append(scene.add_frame(name, show_axes=False, position=body.position))
+            name += f"/joint_{index}" if index else "/arm"
+            pose = viser.transforms.SE3.from_matrix(body.placement)
+            self._frames.append(
+                scene.add_frame(name, show_axes=False, wxyz=pose.rotation().wxyz, position=pose.translation())
+            )
             scene.add_mesh_simple(f"{name}/shell", body.shell.vertices, body.shell.faces, color=palette.ARM)
             if body.rings is not None:
                 scene.add_mesh_simple(f"{name}/rings", body.rings.vertices, body.rings.faces, color=palette.ARM_RING)
@@ -84,14 +79,14 @@ class ArmPicture:
 
     def pose(self, q: Array) -> None:
         """Show the joint angles `q` (6,), rad."""
-        for frame, wxyz in zip(self._joints, self._robot.joint_frames(q), strict=True):
+        for frame, wxyz in zip(self._frames[1:], self._robot.joint_frames(q), strict=True):
             frame.wxyz = wxyz
 
     @property
     def visible(self) -> bool:
         """Whether the arm is shown."""
-        return self._root.visible
+        return self._frames[0].visible
 
     @visible.setter
     def visible(self, visible: bool) -> None:
-        self._root.visible = visible
+        self._frames[0].visible = visible

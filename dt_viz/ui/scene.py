@@ -195,7 +195,9 @@ class Obstacle(Picture):
             "/obstacle", scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
         )
         super().__init__(self._gizmo)
-        self._ball = scene.add_icosphere("/obstacle/ball", radius=1.0, subdivisions=4, color=palette.OBSTACLE, opacity=OPACITY)
+        self._ball = scene.add_icosphere(
+            "/obstacle/ball", radius=1.0, subdivisions=4, color=palette.OBSTACLE, opacity=OPACITY
+        )
 
         @self._gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
