@@ -48,8 +48,8 @@ class Attractor:
         """z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T) in seconds, in closed form."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
-        log_sinh = log_sinh(r0 / self.smoothing) - self.speed * times / self.smoothing  # (*B, T)
-        r = self.smoothing * asinh_exp(log_sinh)
+        clock = log_sinh(r0 / self.smoothing) - self.speed * times / self.smoothing  # (*B, T)
+        r = self.smoothing * asinh_exp(clock)
         shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
         return self.goal + shrink[..., None] * offset[..., None, :]
 

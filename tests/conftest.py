@@ -1,0 +1,44 @@
+"""What several test modules share: a robot, learned tasks in a temporary cache, scenarios."""
+
+import pytest
+from hypothesis import settings
+
+from dt_viz.engine import Engine
+from dt_viz.fits import FitStore
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import Robot, load_jaco
+from dt_viz.scenario import Scenario
+from dt_viz.tasks import TASKS
+
+# Nothing here is timed, and a failure must come back on the next run.
+settings.register_profile("dt-viz", deadline=None, derandomize=True, max_examples=25)
+settings.load_profile("dt-viz")
+
+
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    return load_jaco()
+
+
+@pytest.fixture(scope="session")
+def fits(tmp_path_factory) -> FitStore:
+    """Learns each task once for the whole test run."""
+    return FitStore(tmp_path_factory.mktemp("fits"))
+
+
+@pytest.fixture(scope="session")
+def new_engine(fits, robot):
+    """Makes engines that have computed nothing yet."""
+    return lambda: Engine(TASKS, fits, robot)
+
+
+@pytest.fixture(scope="session")
+def engine(new_engine) -> Engine:
+    """One engine for all tests: what it shows may not depend on what it has shown before."""
+    return new_engine()
+
+
+@pytest.fixture(scope="session")
+def initial(engine):
+    """The scenario that a task begins with."""
+    return lambda task: Scenario(task, Sphere(engine.task(task).obstacle_position))

@@ -1,0 +1,216 @@
+"""One list of diffeomorphisms, one set of checks; a new transform joins by one line."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dt_viz.diffeo import (
+    AdaptiveFlow,
+    Chain,
+    Flow,
+    Identity,
+    Inverse,
+    Placed,
+    min_det_jacobian,
+    round_trip_error,
+)
+from dt_viz.fields import GaussianGrid, GridRBF, PlacedField
+from dt_viz.integrate import euler, implicit_euler
+
+
+def field(dim, seed=0, strength=0.3):
+    grid = GaussianGrid(tuple(np.linspace(-1, 1, 4) for _ in range(dim)), 0.5 / 0.6**2)
+    return GridRBF(grid, strength * np.random.default_rng(seed).normal(size=(grid.num_points, dim)))
+
+
+def tilted_axes():
+    q, _ = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+PLANE = Placed(Flow(field(2), 0.8, 12), np.array([0.1, -0.2, 0.3]), tilted_axes(), 0.7)
+
+# name: diffeomorphism, how exactly its inverse undoes it
+INSTANCES = {
+    "flow rk4": (Flow(field(2), 1.0, 16), 1e-6),
+    "flow rk4 in space": (Flow(field(3), 0.7, 16), 1e-6),
+    "flow backwards": (Flow(field(2), -1.0, 16), 1e-6),
+    "flow euler": (Flow(field(2), 0.5, 50, euler), 2e-2),
+    "flow euler, implicit inverse": (Flow(field(2), 0.8, 6, euler, implicit_euler), 1e-13),
+    "flow implicit, euler inverse": (Flow(field(3), 0.8, 6, implicit_euler, euler), 1e-13),
+    "adaptive flow": (AdaptiveFlow(field(2), 1.0, 1e-9), 1e-7),
+    "adaptive flow of a placed field": (
+        AdaptiveFlow(PlacedField(field(3), np.array([0.2, 0.1, -0.1]), tilted_axes(), 0.5), -0.6, 1e-9),
+        1e-7,
+    ),
+    "chain": (Chain([Flow(field(2, 1), 0.4), Flow(field(2, 2), -0.5), AdaptiveFlow(field(2, 3), 0.3)]), 1e-6),
+    "inverse": (Inverse(Flow(field(2), 1.0, 6, euler, implicit_euler)), 1e-12),
+    "inverse of a chain": (Inverse(Chain([Flow(field(3, 1), 0.3), Flow(field(3, 2), 0.3)])), 1e-6),
+    "placed, plane in space": (PLANE, 1e-6),
+    "placed, space in space": (Placed(Flow(field(3), 0.5), np.ones(3), tilted_axes(), 2.0), 1e-6),
+    "chain with a placed": (Chain([PLANE, Identity(3), AdaptiveFlow(field(3, 4), 0.4)]), 1e-6),
+    "identity": (Identity(3), 1e-15),
+}
+
+
+@pytest.fixture(params=INSTANCES, name="case")
+def _case(request):
+    return INSTANCES[request.param]
+
+
+def points(transform, *batch, seed=0):
+    return np.random.default_rng(seed).uniform(-0.8, 0.8, (*batch, transform.dim))
+
+
+def numerical_jacobian(function, y, h=1e-3):
+    columns = []
+    for e in h * np.eye(y.shape[-1]):
+        far, near = function(y + 2 * e) - function(y - 2 * e), function(y + e) - function(y - e)
+        columns.append((8 * near - far) / (12 * h))
+    return np.stack(columns, axis=-1)
+
+
+def test_there_and_back_again_in_both_directions(case):
+    transform, tolerance = case
+    y = points(transform, 40)
+    np.testing.assert_allclose(transform.inverse(transform.forward(y)), y, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(transform.forward(transform.inverse(y)), y, rtol=0, atol=tolerance)
+    assert round_trip_error(transform, y) <= tolerance * np.sqrt(transform.dim)
+
+
+def test_jacobians_are_derivatives(case):
+    transform, _ = case
+    y = points(transform, 15)
+    for function, derivative in (
+        (transform.forward, transform.jacobian),
+        (transform.inverse, transform.inverse_jacobian),
+    ):
+        value, J = derivative(y)
+        np.testing.assert_allclose(value, function(y), rtol=0, atol=1e-8)
+        np.testing.assert_allclose(J, numerical_jacobian(function, y), rtol=0, atol=3e-6)
+
+
+def test_the_inverse_jacobian_is_the_inverse_matrix(case):
+    transform, tolerance = case
+    x, J = transform.jacobian(points(transform, 20))
+    back = transform.inverse_jacobian(x)[1]
+    np.testing.assert_allclose(back @ J, np.broadcast_to(np.eye(transform.dim), J.shape), rtol=0, atol=20 * tolerance)
+
+
+def test_orientation_is_kept(case):
+    transform, _ = case
+    y = points(transform, 100)
+    assert np.linalg.det(transform.jacobian(y)[1]).min() > 0
+    assert min_det_jacobian(transform.jacobian, y) == np.linalg.det(transform.jacobian(y)[1]).min()
+
+
+def test_tangents_are_jacobian_products(case):
+    transform, _ = case
+    y = points(transform, 9)
+    U = np.random.default_rng(1).normal(size=(9, transform.dim, 2))
+    np.testing.assert_allclose(transform.forward_tangents(y, U)[1], transform.jacobian(y)[1] @ U, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        transform.inverse_tangents(y, U)[1], transform.inverse_jacobian(y)[1] @ U, rtol=0, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 3), (2, 0, 3)])
+def test_batch_axes_lead(case, batch):
+    transform, _ = case
+    d = transform.dim
+    y = points(transform, *batch)
+    U = np.random.default_rng(1).normal(size=(*batch, d, 2))
+    flat, flat_U = y.reshape(-1, d), U.reshape(-1, d, 2)
+    for plain, tangent in (
+        (transform.forward, transform.forward_tangents),
+        (transform.inverse, transform.inverse_tangents),
+    ):
+        assert plain(y).shape == y.shape
+        np.testing.assert_allclose(plain(y).reshape(-1, d), plain(flat), rtol=0, atol=1e-12)
+        V = tangent(y, U)[1]
+        assert V.shape == U.shape
+        np.testing.assert_allclose(V.reshape(-1, d, 2), tangent(flat, flat_U)[1], rtol=0, atol=1e-12)
+    assert transform.jacobian(y)[1].shape == transform.inverse_jacobian(y)[1].shape == (*batch, d, d)
+
+
+def test_arguments_stay_as_they_are(case):
+    transform, _ = case
+    y = points(transform, 5)
+    y.setflags(write=False)
+    U = np.broadcast_to(np.eye(transform.dim), (5, transform.dim, transform.dim))
+    transform.forward_tangents(y, U)
+    transform.inverse_tangents(y, U)
+
+
+def test_points_of_another_dimension_are_refused(case):
+    transform, _ = case
+    with pytest.raises(ValueError, match=rf"points have 5 coordinates.*R\^{transform.dim}"):
+        transform.forward(np.zeros((4, 5)))
+    with pytest.raises(ValueError, match="points have 1 coordinates"):
+        transform.inverse(np.zeros(1))
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.sampled_from(["rk4", "adaptive"]))
+def test_flows_are_a_one_parameter_group(s, t, kind):
+    V = field(2)
+    flow = (lambda d: Flow(V, d, 32)) if kind == "rk4" else (lambda d: AdaptiveFlow(V, d, 1e-10))
+    y = points(flow(1.0), 12)
+    np.testing.assert_allclose(flow(s + t).forward(y), flow(s).forward(flow(t).forward(y)), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(flow(-t).forward(y), flow(t).inverse(y), rtol=0, atol=1e-12)
+
+
+def test_the_last_of_a_chain_acts_first():
+    f, g = Flow(field(2, 1), 0.9), Flow(field(2, 2), 0.9)
+    y = points(f, 10)
+    expected = f.forward(g.forward(y))
+    np.testing.assert_array_equal(Chain([f, g]).forward(y), expected)
+    np.testing.assert_array_equal((f @ g).forward(y), expected)
+    assert np.abs(Chain([g, f]).forward(y) - expected).max() > 1e-3  # the order matters here
+    np.testing.assert_array_equal(Chain([f, g]).inverse(y), g.inverse(f.inverse(y)))
+
+
+def test_chains_are_associative():
+    f, g, h = (Flow(field(2, seed), 0.5) for seed in (1, 2, 3))
+    y = points(f, 10)
+    left, right = Chain([Chain([f, g]), h]), Chain([f, Chain([g, h])])
+    assert left == right == Chain([f, g, h])
+    np.testing.assert_array_equal(left.forward(y), right.forward(y))
+    assert ((f @ g) @ h).parts == (f @ (g @ h)).parts == (f, g, h)
+
+
+def test_the_identity_is_neutral_and_the_inverse_undoes():
+    f = Flow(field(2), 0.8, 6, euler, implicit_euler)
+    y = points(f, 10)
+    np.testing.assert_array_equal((f @ Identity(2)).forward(y), f.forward(y))
+    np.testing.assert_array_equal((Identity(2) @ f).forward(y), f.forward(y))
+    np.testing.assert_allclose((Inverse(f) @ f).forward(y), y, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(Inverse(Inverse(f)).forward(y), f.forward(y))
+
+
+@pytest.mark.parametrize("parts", [[], [Identity(2), Identity(3)], [Flow(field(2)), PLANE]])
+def test_chains_of_nothing_or_of_mixed_dimension_are_refused(parts):
+    with pytest.raises(ValueError, match="parts of one dimension"):
+        Chain(parts)
+
+
+def test_a_placed_plane_acts_in_its_plane_and_leaves_the_distance_from_it():
+    y = points(PLANE, 30)
+    frame_before, frame_after = PLANE.to_frame(y), PLANE.to_frame(PLANE.forward(y))
+    np.testing.assert_allclose(frame_after[:, 2], frame_before[:, 2], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(frame_after[:, :2], PLANE.inner.forward(frame_before[:, :2]), rtol=0, atol=1e-13)
+
+
+def test_frame_and_world_coordinates_are_inverse_and_missing_coordinates_are_zero():
+    y = points(PLANE, 2, 4)
+    np.testing.assert_allclose(PLANE.to_world(PLANE.to_frame(y)), y, rtol=0, atol=1e-14)
+    u = points(PLANE.inner, 6)
+    np.testing.assert_allclose(PLANE.to_frame(PLANE.to_world(u))[:, 2], 0, rtol=0, atol=1e-14)
+
+
+def test_a_coarse_euler_flow_that_folds_is_recognised():
+    folding = Flow(field(2, strength=8.0), 1.0, 1, euler)
+    y = points(folding, 400)
+    assert min_det_jacobian(folding.jacobian, y) < 0
+    assert min_det_jacobian(Flow(field(2, strength=8.0), 1.0, 400).jacobian, y) > 0
+    assert round_trip_error(folding, y) > 0.1
