@@ -107,6 +107,8 @@ class GaussianGrid:
             One array (N, k) for each multi-index. Multi-indices that begin alike share the work of their beginning.
         """
         num, k = len(s), weights.shape[1]
+        if not num:  # an obstacle that covers the whole slice leaves no arrows to evaluate
+            return [np.empty((0, k)) for _ in orders]
         factors = self.factors(s, max(map(max, orders)))
         partial: dict[tuple[int, ...], Array] = {}
         first, *others = self.shape

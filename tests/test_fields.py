@@ -1,0 +1,157 @@
+"""The separable Gaussian basis against its dense definition, and derivatives against finite differences."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dt_viz.fields import GaussianGrid, GridRBF, PlacedField, second_orders, unit_orders
+
+seeds = st.integers(0, 2**32 - 1)
+dims = st.sampled_from([2, 3])
+
+
+def random_grid(rng, dim, sigma=0.4):
+    """A grid with a different number of points on each axis, about one unit wide."""
+    return GaussianGrid(tuple(np.linspace(-0.6 - 0.1 * j, 0.7, 3 + j) for j in range(dim)), 0.5 / sigma**2)
+
+
+def random_field(rng, dim):
+    grid = random_grid(rng, dim)
+    return GridRBF(grid, rng.normal(size=(grid.num_points, dim)))
+
+
+def random_rotation(rng, dim):
+    q, r = np.linalg.qr(rng.normal(size=(dim, dim)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else q[:, ::-1]
+
+
+def central_difference(function, s, h):
+    """Derivative of `function` (N, d) → (N, …) by the coordinates of `s`, in a new last axis; error O(h⁴)."""
+    columns = []
+    for e in h * np.eye(s.shape[1]):
+        far = function(s + 2 * e) - function(s - 2 * e)
+        near = function(s + e) - function(s - e)
+        columns.append((8 * near - far) / (12 * h))
+    return np.stack(columns, axis=-1)
+
+
+@given(seeds, dims)
+def test_features_are_gaussians_of_the_distance_to_the_inducing_points(seed, dim):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, dim)
+    s = rng.uniform(-1.5, 1.5, (11, dim))
+    squared = ((s[:, None] - grid.inducing_points) ** 2).sum(axis=-1)
+    assert grid.inducing_points.shape == (grid.num_points, dim)
+    np.testing.assert_allclose(grid.features(s), np.exp(-grid.ell * squared), rtol=1e-12, atol=1e-15)
+
+
+@given(seeds, dims)
+def test_the_separable_field_is_the_dense_one(seed, dim):
+    rng = np.random.default_rng(seed)
+    field = random_field(rng, dim)
+    s = rng.uniform(-1.5, 1.5, (17, dim))
+    np.testing.assert_allclose(field(s), field.grid.features(s) @ field.weights, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(field.with_jacobian(s)[0], field(s), rtol=0, atol=1e-13)
+
+
+@given(seeds, dims)
+def test_the_jacobian_is_the_derivative_of_the_field(seed, dim):
+    rng = np.random.default_rng(seed)
+    field = random_field(rng, dim)
+    s = rng.uniform(-1.2, 1.2, (9, dim))
+    np.testing.assert_allclose(field.with_jacobian(s)[1], central_difference(field, s, 1e-3), rtol=0, atol=1e-8)
+
+
+@given(seeds, dims, st.integers(1, 3))
+def test_contract_gives_partial_derivatives_up_to_second_order(seed, dim, num_sums):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, dim)
+    weights = rng.normal(size=(grid.num_points, num_sums))
+    s = rng.uniform(-1.2, 1.2, (7, dim))
+    zero, first, second = (0,) * dim, unit_orders(dim), second_orders(dim)
+
+    def gradient(points):
+        return np.stack(grid.contract(points, weights, first), axis=-1)
+
+    value, *partials = grid.contract(s, weights, [zero, *first, *second.values()])
+    assert value.shape == (7, num_sums)
+    slopes = central_difference(lambda points: grid.contract(points, weights, [zero])[0], s, 1e-3)
+    curvatures = central_difference(gradient, s, 1e-3)
+    for j in range(dim):
+        np.testing.assert_allclose(partials[j], slopes[..., j], rtol=0, atol=1e-8)
+    for (i, j), column in zip(second, partials[dim:], strict=True):
+        np.testing.assert_allclose(column, curvatures[..., i, j], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(column, curvatures[..., j, i], rtol=0, atol=1e-7)
+
+
+@given(seeds, dims)
+def test_contract_answers_in_the_order_of_the_question(seed, dim):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, dim)
+    weights = rng.normal(size=(grid.num_points, 2))
+    s = rng.uniform(-1, 1, (5, dim))
+    orders = [(0,) * dim, *unit_orders(dim), *second_orders(dim).values()]
+    shuffled = [orders[i] for i in rng.permutation(len(orders))]
+    for order, column in zip(shuffled, grid.contract(s, weights, shuffled), strict=True):
+        np.testing.assert_allclose(column, grid.contract(s, weights, [order])[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_points_give_no_values(dim):
+    field = random_field(np.random.default_rng(0), dim)
+    assert field(np.empty((0, dim))).shape == (0, dim)
+    assert field.with_jacobian(np.empty((0, dim)))[1].shape == (0, dim, dim)
+
+
+@given(seeds, dims, st.floats(0.05, 0.5), st.floats(0.5, 1.5), st.floats(0, 3))
+def test_a_covering_grid_covers_its_points_no_coarser_than_asked(seed, dim, sigma, spacing, pad):
+    points = np.random.default_rng(seed).uniform(-1, 1, (20, dim))
+    grid = GaussianGrid.covering(points, sigma, spacing=spacing, pad=pad)
+    assert grid.ell == pytest.approx(0.5 / sigma**2)
+    for axis, coordinates in zip(grid.axes, points.T, strict=True):
+        assert axis[0] == pytest.approx(coordinates.min() - pad * sigma)
+        assert axis[-1] == pytest.approx(coordinates.max() + pad * sigma)
+        assert np.diff(axis).max() <= spacing * sigma * (1 + 1e-6)
+
+
+@given(seeds, dims)
+def test_the_gram_matrix_is_a_kernel_matrix(seed, dim):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng, dim)
+    K = grid.gram()
+    np.testing.assert_allclose(K, K.T, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.diag(K), 1, rtol=0, atol=1e-15)
+    assert np.linalg.eigvalsh(K).min() > -1e-12
+
+
+def test_weights_of_another_shape_are_refused():
+    grid = random_grid(np.random.default_rng(0), 2)
+    with pytest.raises(ValueError, match=r"weights have shape \(12, 3\); the grid needs \(12, 2\)"):
+        GridRBF(grid, np.zeros((grid.num_points, 3)))
+
+
+@given(seeds, dims, st.floats(0.05, 20))
+def test_a_placed_field_is_the_field_of_the_moved_turned_and_scaled_thing(seed, dim, scale):
+    rng = np.random.default_rng(seed)
+    inner, R, o = random_field(rng, dim), random_rotation(rng, dim), rng.normal(size=dim)
+    placed = PlacedField(inner, o, R, scale)
+    u = rng.uniform(-1, 1, (8, dim))  # in the thing's own frame
+    world = np.stack([o + scale * (R @ point) for point in u])
+    expected = np.stack([scale * (R @ v) for v in inner(u)])
+    np.testing.assert_allclose(placed(world), expected, rtol=0, atol=1e-11 * scale)
+    np.testing.assert_allclose(placed.with_jacobian(world)[0], expected, rtol=0, atol=1e-11 * scale)
+    derivative = central_difference(placed, world, 1e-3 * scale)
+    np.testing.assert_allclose(placed.with_jacobian(world)[1], derivative, rtol=0, atol=1e-8)
+
+
+@given(seeds, dims, st.floats(0.1, 10))
+def test_scaling_a_field_scales_its_motions_and_not_their_duration(seed, dim, scale):
+    rng = np.random.default_rng(seed)
+    inner = random_field(rng, dim)
+    placed = PlacedField(inner, np.zeros(dim), np.eye(dim), scale)
+    u = rng.uniform(-1, 1, (6, dim))
+    np.testing.assert_allclose(
+        scale * (u + 0.1 * inner(u)), scale * u + 0.1 * placed(scale * u), rtol=1e-11, atol=1e-12
+    )
