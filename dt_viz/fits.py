@@ -6,7 +6,7 @@ import hashlib
 import logging
 import os
 import threading
-import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +74,8 @@ class FitStore:
                 partial.replace(path)
             except OSError as error:
                 logger.warning("the fit was not cached: %s", error)
+                with suppress(OSError):
+                    partial.unlink()
         return imitation
 
     def _read(self, key: str) -> Imitation | None:
@@ -81,9 +83,9 @@ class FitStore:
         if path is None or not path.exists():
             return None
         try:
-            with np.load(path, allow_pickle=False) as arrays:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return Imitation.from_arrays(arrays)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except Exception as error:  # damaged bytes make zipfile, zlib and numpy raise almost anything
             logger.warning("%s is damaged and will be fitted anew: %s", path, error)
             return None
 

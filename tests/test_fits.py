@@ -1,0 +1,259 @@
+"""The store of fits: by content, once, and never from a file that is not whole."""
+
+import logging
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dt_viz.fits
+from dt_viz.demos import Demonstration
+from dt_viz.fits import FitStore, default_cache_folder
+from dt_viz.imitation import ImitationError, ImitationSettings, fit
+
+SETTINGS = ImitationSettings(num_layers=2, num_points=12, max_iterations=2)
+
+
+def arcs(bend=1.0, num=2):
+    s = np.linspace(0, 1, 30)
+    return tuple(
+        Demonstration(2 * s, np.stack([s - 1, (bend + 0.1 * k) * s * (1 - s)], axis=1), f"arc {k}") for k in range(num)
+    )
+
+
+@pytest.fixture(scope="module")
+def learned():
+    return fit(arcs(), SETTINGS)
+
+
+@pytest.fixture
+def counted(monkeypatch, learned):
+    """Counts the fits; each gives the same result without the work."""
+    calls = []
+
+    def quick(demonstrations, settings, progress):
+        calls.append(demonstrations)
+        if progress is not None:
+            progress(1.0, "done")
+        return learned
+
+    monkeypatch.setattr(dt_viz.fits, "fit", quick)
+    return calls
+
+
+def same(a, b):
+    first, second = a.to_arrays(), b.to_arrays()
+    return first.keys() == second.keys() and all(np.array_equal(first[k], second[k]) for k in first)
+
+
+def stored(folder) -> Path:
+    (path,) = folder.iterdir()
+    return path
+
+
+def test_a_fit_is_remembered(tmp_path, counted):
+    store = FitStore(tmp_path)
+    first = store.get(arcs(), SETTINGS)
+    assert store.get(arcs(), SETTINGS) is first
+    assert len(counted) == 1
+
+
+def test_a_fit_is_read_back_exactly_by_the_next_process(tmp_path, counted):
+    first = FitStore(tmp_path).get(arcs(), SETTINGS)
+    again = FitStore(tmp_path).get(arcs(), SETTINGS)
+    assert len(counted) == 1
+    assert again is not first and same(again, first)
+    y = np.random.default_rng(0).uniform(-1, 0, (20, 2))
+    np.testing.assert_array_equal(again.transform.forward(y), first.transform.forward(y))
+    np.testing.assert_array_equal(
+        again.system.rollout(again.starts, np.linspace(0, 3, 9)),
+        first.system.rollout(first.starts, np.linspace(0, 3, 9)),
+    )
+
+
+def changed_position(demonstrations):
+    positions = demonstrations[0].positions.copy()
+    positions[3, 1] = np.nextafter(positions[3, 1], 1)
+    return (Demonstration(demonstrations[0].times, positions, "x"), *demonstrations[1:])
+
+
+def changed_times(demonstrations):
+    return (Demonstration(1.001 * demonstrations[0].times, demonstrations[0].positions, "x"), *demonstrations[1:])
+
+
+@pytest.mark.parametrize(
+    "change", [changed_position, changed_times, lambda d: d[:1], lambda d: (*d, d[0]), lambda d: d[::-1]]
+)
+def test_other_demonstrations_are_another_entry(tmp_path, counted, change):
+    store = FitStore(tmp_path)
+    store.get(arcs(), SETTINGS)
+    store.get(change(arcs()), SETTINGS)
+    assert len(counted) == 2
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_other_settings_are_another_entry(tmp_path, counted):
+    store = FitStore(tmp_path)
+    store.get(arcs(), SETTINGS)
+    store.get(arcs(), ImitationSettings(num_layers=3))
+    assert len(counted) == 2
+
+
+def test_what_demonstrations_are_called_does_not_matter(tmp_path, counted):
+    store = FitStore(tmp_path)
+    store.get(arcs(), SETTINGS)
+    store.get(tuple(Demonstration(d.times, d.positions, "other") for d in arcs()), SETTINGS)
+    assert len(counted) == 1
+
+
+def test_progress_is_reported_for_new_fits_only(tmp_path, counted):
+    store, reports = FitStore(tmp_path), []
+    store.get(arcs(), SETTINGS, lambda fraction, message: reports.append((fraction, message)))
+    assert reports == [(1.0, "done")]
+    store.get(arcs(), SETTINGS, lambda fraction, message: reports.append((fraction, message)))
+    assert len(reports) == 1
+
+
+def write_pickled(path):
+    np.savez(path, goal=np.array([{"a": 1}], dtype=object))
+
+
+def write_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def write_other_archive(path):
+    np.savez(path, something=np.zeros(3))
+
+
+def rewrite(path, **changes):
+    with np.load(path) as arrays:
+        content = {name: arrays[name] for name in arrays.files}
+    content.update(changes)
+    np.savez(path, **{name: value for name, value in content.items() if value is not None})
+
+
+DAMAGES = {
+    "empty": lambda path: path.write_bytes(b""),
+    "garbage": lambda path: path.write_bytes(np.random.default_rng(0).bytes(5000)),
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "without its end": lambda path: path.write_bytes(path.read_bytes()[:-1]),
+    "pickled": write_pickled,
+    "one array, no archive": write_array,
+    "another archive": write_other_archive,
+    "a number instead of the goal": lambda path: rewrite(path, goal=np.array(1.0)),
+    "a short base": lambda path: rewrite(path, base=np.zeros(1)),
+    "no layer": lambda path: rewrite(path, layer_0_weights=None),
+    "another dimension": lambda path: rewrite(path, goal=np.zeros(3)),
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_fitted_anew_and_said(tmp_path, counted, learned, caplog, damage):
+    FitStore(tmp_path).get(arcs(), SETTINGS)
+    DAMAGES[damage](stored(tmp_path))
+    with caplog.at_level(logging.WARNING):
+        again = FitStore(tmp_path).get(arcs(), SETTINGS)
+    assert len(counted) == 2
+    assert same(again, learned)
+    assert "damaged" in caplog.text
+
+
+def test_a_damaged_file_is_replaced_by_a_whole_one(tmp_path, counted, caplog):
+    FitStore(tmp_path).get(arcs(), SETTINGS)
+    stored(tmp_path).write_bytes(b"PK\x03\x04 nothing")
+    FitStore(tmp_path).get(arcs(), SETTINGS)
+    assert len(counted) == 2
+    FitStore(tmp_path).get(arcs(), SETTINGS)
+    assert len(counted) == 2
+    assert len(list(tmp_path.iterdir())) == 1  # and nothing else is left
+
+
+def test_no_flipped_byte_is_trusted_or_fatal(tmp_path, counted, learned, caplog):
+    """Either the archive's checksums notice, or the byte meant nothing and the fit is the same."""
+    FitStore(tmp_path).get(arcs(), SETTINGS)
+    path, rng = stored(tmp_path), np.random.default_rng(0)
+    whole = path.read_bytes()
+    for trial in range(200):
+        content = bytearray(whole)
+        for place in rng.integers(0, len(content), 1 + trial % 3):
+            content[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(bytes(content))
+        assert same(FitStore(tmp_path).get(arcs(), SETTINGS), learned)
+    assert len(counted) > 100
+
+
+def test_a_folder_that_cannot_be_made_does_not_stop_the_fit(tmp_path, counted, learned, caplog):
+    file = tmp_path / "file"
+    file.write_text("in the way")
+    with caplog.at_level(logging.WARNING):
+        result = FitStore(file / "folder").get(arcs(), SETTINGS)
+    assert result is learned
+    assert "not cached" in caplog.text
+
+
+def test_a_full_disk_does_not_stop_the_fit_and_leaves_nothing_behind(tmp_path, counted, learned, monkeypatch, caplog):
+    def full(file, **_):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(dt_viz.fits.np, "savez_compressed", full)
+    assert FitStore(tmp_path).get(arcs(), SETTINGS) is learned
+    assert "No space left" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_folder_keeps_fits_in_memory_only(counted):
+    store = FitStore(None)
+    assert store.get(arcs(), SETTINGS) is store.get(arcs(), SETTINGS)
+    assert len(counted) == 1
+
+
+def test_a_failed_fit_is_tried_again(tmp_path, monkeypatch, learned):
+    answers = [ImitationError("too short"), learned]
+
+    def failing(*_):
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(dt_viz.fits, "fit", failing)
+    store = FitStore(tmp_path)
+    with pytest.raises(ImitationError, match="too short"):
+        store.get(arcs(), SETTINGS)
+    assert list(tmp_path.iterdir()) == []
+    assert store.get(arcs(), SETTINGS) is learned
+
+
+def test_two_threads_that_want_the_same_fit_make_it_once(tmp_path, monkeypatch, learned):
+    calls, entered, release = [], threading.Event(), threading.Event()
+
+    def slow(*_):
+        calls.append(threading.current_thread().name)
+        entered.set()
+        assert release.wait(30)
+        return learned
+
+    monkeypatch.setattr(dt_viz.fits, "fit", slow)
+    store, results = FitStore(tmp_path), []
+    threads = [threading.Thread(target=lambda: results.append(store.get(arcs(), SETTINGS))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    assert entered.wait(30)
+    release.set()
+    for thread in threads:
+        thread.join(30)
+    assert len(calls) == 1
+    assert len(results) == 4 and all(result is learned for result in results)
+
+
+def test_the_cache_folder_is_the_users(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_cache_folder() == tmp_path / "dt-viz"
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert default_cache_folder() == tmp_path / "home" / ".cache" / "dt-viz"
