@@ -1,0 +1,127 @@
+"""The duration that clears an obstacle: enough, no more than enough, and the obstacle's own wherever it stands."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dt_viz.avoidance import ACCEPTED_MARGIN, MAX_DURATION, ObstacleAvoidance, clearing_duration
+from dt_viz.behaviours import Motion
+from dt_viz.integrate import integrate_adaptive
+from dt_viz.obstacles import Sphere
+from dt_viz.scenario import Scenario
+
+seeds = st.integers(0, 2**32 - 1)
+SPHERE = Sphere((0.1, -0.4, 0.3), 0.15)
+MARGIN = 0.01
+
+
+def passing_points(seed, num=40, sphere=SPHERE):
+    """Points of a straight path that misses the centre by 5 to 60 mm, as seen from the obstacle."""
+    rng = np.random.default_rng(seed)
+    along, aside, _ = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return np.array(sphere.position) + np.linspace(-0.2, 0.2, num)[:, None] * along + rng.uniform(0.005, 0.06) * aside
+
+
+def carried(field, points, duration):
+    return integrate_adaptive(field, points, None, -duration, 1e-9)[0]
+
+
+@given(seeds, st.sampled_from([1.0, 6.0, 20.0]))
+def test_the_clearing_duration_clears_by_the_margin_and_a_shorter_one_does_not(seed, temperature):
+    field, points = SPHERE.field("free-space", temperature), passing_points(seed)
+    duration = clearing_duration(field, SPHERE, points, MARGIN)
+    assert duration is not None and 0 < duration < MAX_DURATION
+    assert SPHERE.signed_distance(carried(field, points, duration)).min() > ACCEPTED_MARGIN * MARGIN
+    assert SPHERE.signed_distance(carried(field, points, 0.97 * duration - 0.005)).min() < MARGIN
+
+
+def test_what_is_clear_needs_no_flow():
+    points = np.array(SPHERE.position) + 0.2 * np.eye(3)
+    assert clearing_duration(SPHERE.field("free-space", 6.0), SPHERE, points, MARGIN) == 0
+    assert clearing_duration(SPHERE.field("free-space", 6.0), SPHERE, np.empty((0, 3)), MARGIN) == 0
+
+
+def stationary_point(field, start):
+    """Where the field of the obstacle vanishes, close to its centre."""
+    s = np.array([start])
+    for _ in range(30):
+        v, DV = field.with_jacobian(s)
+        s = s - np.linalg.solve(DV, v[..., None])[..., 0]
+    return s
+
+
+def test_a_point_at_the_dead_centre_is_never_clear():
+    field = SPHERE.field("free-space", 6.0)
+    centre = stationary_point(field, SPHERE.position)
+    assert SPHERE.signed_distance(centre) < -0.06
+    assert clearing_duration(field, SPHERE, centre, MARGIN) is None
+    beside = centre + np.array([0.002, 0.0, 0.0])
+    assert clearing_duration(field, SPHERE, beside, MARGIN) is not None
+
+
+@given(seeds, st.floats(0.01, 1.5))
+def test_the_duration_starts_from_where_it_is_told_to(seed, at_least):
+    field, points = SPHERE.field("free-space", 6.0), passing_points(seed)
+    shortest = clearing_duration(field, SPHERE, points, MARGIN)
+    found = clearing_duration(field, SPHERE, points, MARGIN, at_least=at_least)
+    assert shortest is not None and found is not None
+    assert found >= at_least
+    assert found == pytest.approx(max(shortest, at_least), abs=0.01)
+
+
+@given(seeds, st.floats(0.04, 0.3))
+def test_a_moved_and_grown_obstacle_clears_its_points_in_the_same_time(seed, diameter):
+    """The duration is dimensionless: the same picture in another place and size needs the same flow."""
+    rng = np.random.default_rng(seed)
+    x, y, z = (float(c) for c in rng.normal(size=3))
+    moved, scale = Sphere((x, y, z), diameter), diameter / SPHERE.diameter
+    points = passing_points(seed)
+    there = np.array([x, y, z]) + scale * (points - np.array(SPHERE.position))
+    here = clearing_duration(SPHERE.field("free-space", 6.0), SPHERE, points, MARGIN)
+    elsewhere = clearing_duration(moved.field("free-space", 6.0), moved, there, scale * MARGIN)
+    assert elsewhere == pytest.approx(here, rel=1e-3, abs=1e-4)
+
+
+def motion(paths, **changes):
+    index = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+    scenario = Scenario("any", SPHERE, margin=MARGIN, **changes)
+    starts = np.stack([path[0] for path in paths])
+    return Motion(scenario, starts, paths[0][-1], index, np.concatenate(paths))
+
+
+def test_the_built_transform_clears_the_motion_it_was_built_for():
+    before = motion([passing_points(1), passing_points(2)])
+    built = ObstacleAvoidance().build(before, 1e-8, 0.0)
+    assert built is not None and built.doubts == ()
+    after = Motion(before.scenario, before.starts, before.goal, before.index, built.transform.inverse(before.positions))
+    assert not ObstacleAvoidance().satisfied(before)
+    assert ObstacleAvoidance().satisfied(after)
+
+
+def test_nothing_is_built_when_avoidance_is_off():
+    assert ObstacleAvoidance().build(motion([passing_points(1)], avoidance=False), 1e-8, 0.0) is None
+
+
+def test_a_chosen_duration_is_taken_as_it_is():
+    before = motion([passing_points(1)], duration=0.123)
+    built = ObstacleAvoidance().build(before, 1e-8, 0.7)
+    assert built is not None and built.duration == 0.123
+    assert ObstacleAvoidance().satisfied(before)  # nobody asked for more
+
+
+def test_a_covered_start_is_named_and_does_not_keep_the_others_from_being_cleared():
+    covered = passing_points(1)
+    covered = covered[np.argmin(SPHERE.signed_distance(covered)) :]
+    built = ObstacleAvoidance().build(motion([passing_points(2), covered]), 1e-8, 0.0)
+    assert built is not None
+    assert built.doubts == ("start 2 is inside the obstacle",)
+    assert SPHERE.signed_distance(built.transform.inverse(passing_points(2))).min() > ACCEPTED_MARGIN * MARGIN
+
+
+def test_a_covered_goal_is_said():
+    path = passing_points(1)
+    path = path[: np.argmin(SPHERE.signed_distance(path)) + 1]
+    built = ObstacleAvoidance().build(motion([path]), 1e-8, 0.0)
+    assert built is not None
+    assert any("goal is inside the obstacle" in doubt for doubt in built.doubts)

@@ -1,0 +1,166 @@
+"""Integrators by their order of convergence, and tangents as the derivative of the numerical step."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from dt_viz.fields import GaussianGrid, GridRBF
+from dt_viz.integrate import euler, implicit_euler, integrate, integrate_adaptive, rk4
+
+seeds = st.integers(0, 2**32 - 1)
+STEPS = [euler, implicit_euler, rk4]
+
+
+def smooth_field(rng, dim=2, strength=0.5):
+    grid = GaussianGrid(tuple(np.linspace(-1, 1, 5) for _ in range(dim)), 0.5 / 0.5**2)
+    return GridRBF(grid, strength * rng.normal(size=(grid.num_points, dim)))
+
+
+def exact(field, s, duration):
+    """An independent integrator at its finest."""
+    ends = [
+        solve_ivp(lambda _t, y: field(y[None])[0], (0, duration), point, method="DOP853", rtol=1e-13, atol=1e-14).y[
+            :, -1
+        ]
+        for point in s
+    ]
+    return np.stack(ends)
+
+
+def order_of_convergence(step, field, s, reference, counts):
+    errors = [np.linalg.norm(integrate(step, field, s, None, 1.0, n)[0] - reference) for n in counts]
+    return np.polyfit(np.log(counts), -np.log(errors), 1)[0]
+
+
+@pytest.mark.parametrize(("step", "order"), [(euler, 1), (implicit_euler, 1), (rk4, 4)])
+@pytest.mark.parametrize("seed", range(3))
+def test_order_of_convergence(step, order, seed):
+    rng = np.random.default_rng(seed)
+    field, s = smooth_field(rng), rng.uniform(-1, 1, (6, 2))
+    measured = order_of_convergence(step, field, s, exact(field, s, 1.0), [32, 64, 128])
+    assert measured == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize(("step", "order"), [(euler, 1), (implicit_euler, 1), (rk4, 4)])
+def test_tangents_converge_with_the_order_of_their_points(step, order):
+    rng = np.random.default_rng(5)
+    field, s = smooth_field(rng), rng.uniform(-1, 1, (6, 2))
+    U = np.broadcast_to(np.eye(2), (6, 2, 2))
+    reference = integrate(rk4, field, s, U, 1.0, 2000)[1]
+    counts = [32, 64, 128]
+    errors = [np.linalg.norm(integrate(step, field, s, U, 1.0, n)[1] - reference) for n in counts]
+    assert np.polyfit(np.log(counts), -np.log(errors), 1)[0] == pytest.approx(order, abs=0.2)
+
+
+@given(seeds, st.sampled_from([2, 3]), st.floats(0.01, 0.15))
+def test_implicit_euler_inverts_euler_to_rounding(seed, dim, h):
+    rng = np.random.default_rng(seed)
+    field, s = smooth_field(rng, dim, 0.4), rng.uniform(-1.5, 1.5, (12, dim))
+    back, _ = implicit_euler(field, euler(field, s, None, -h)[0], None, h)
+    np.testing.assert_allclose(back, s, rtol=0, atol=1e-14)
+    there, _ = euler(field, implicit_euler(field, s, None, h)[0], None, -h)
+    np.testing.assert_allclose(there, s, rtol=0, atol=1e-14)
+
+
+@given(seeds, st.sampled_from(STEPS), st.floats(-0.15, 0.15))
+def test_tangents_are_the_derivative_of_the_numerical_step(seed, step, h):
+    rng = np.random.default_rng(seed)
+    field, s = smooth_field(rng, 2, 0.4), rng.uniform(-1, 1, (5, 2))
+    U = rng.normal(size=(5, 2, 3))
+    end, V = step(field, s, U, h)
+    np.testing.assert_allclose(end, step(field, s, None, h)[0], rtol=0, atol=1e-13)
+    eps = 1e-4
+    for k in range(3):
+        numeric = (step(field, s + eps * U[..., k], None, h)[0] - step(field, s - eps * U[..., k], None, h)[0]) / (
+            2 * eps
+        )
+        np.testing.assert_allclose(V[..., k], numeric, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("steps", [1, 7])
+def test_zero_duration_moves_nothing(step, steps):
+    rng = np.random.default_rng(0)
+    s = rng.normal(size=(4, 2))
+    end, U = integrate(step, smooth_field(rng), s, np.broadcast_to(np.eye(2), (4, 2, 2)), 0.0, steps)
+    np.testing.assert_array_equal(end, s)
+    np.testing.assert_allclose(U, np.broadcast_to(np.eye(2), (4, 2, 2)), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("duration", [0.7, -0.7])
+def test_adaptive_error_falls_with_its_tolerance(duration):
+    rng = np.random.default_rng(1)
+    field, s = smooth_field(rng, strength=1.5), rng.uniform(-1, 1, (10, 2))
+    reference = exact(field, s, duration)
+    errors = []
+    for tolerance in (1e-4, 1e-6, 1e-8, 1e-10):
+        errors.append(np.abs(integrate_adaptive(field, s, None, duration, tolerance)[0] - reference).max())
+        assert errors[-1] < 30 * tolerance
+    assert errors[3] < errors[2] < errors[1] < errors[0]
+
+
+@given(seeds, st.floats(-1.0, 1.0))
+def test_adaptive_points_do_not_depend_on_their_batch(seed, duration):
+    rng = np.random.default_rng(seed)
+    field, s = smooth_field(rng, strength=1.0), rng.uniform(-1.5, 1.5, (8, 2))
+    together, _ = integrate_adaptive(field, s, None, duration, 1e-7)
+    alone = np.concatenate([integrate_adaptive(field, point[None], None, duration, 1e-7)[0] for point in s])
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
+
+
+@given(seeds)
+def test_adaptive_tangents_are_the_derivative_of_the_flow(seed):
+    rng = np.random.default_rng(seed)
+    field, s = smooth_field(rng, strength=0.8), rng.uniform(-1, 1, (5, 2))
+    U = rng.normal(size=(5, 2, 2))
+    end, V = integrate_adaptive(field, s, U, 0.8, 1e-11)
+    fine_end, fine = integrate(rk4, field, s, U, 0.8, 150)
+    np.testing.assert_allclose(end, fine_end, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(V, fine, rtol=0, atol=1e-7)
+
+
+def test_adaptive_leaves_its_arguments_alone():
+    rng = np.random.default_rng(2)
+    s, U = rng.normal(size=(4, 2)), rng.normal(size=(4, 2, 1))
+    copies = s.copy(), U.copy()
+    integrate_adaptive(smooth_field(rng), s, U, 1.0, 1e-6)
+    integrate_adaptive(smooth_field(rng), s, None, 0.0, 1e-6)
+    np.testing.assert_array_equal(s, copies[0])
+    np.testing.assert_array_equal(U, copies[1])
+
+
+def test_adaptive_takes_no_points_and_no_time():
+    field = smooth_field(np.random.default_rng(3))
+    assert integrate_adaptive(field, np.empty((0, 2)), None, 1.0, 1e-6)[0].shape == (0, 2)
+    s = np.ones((3, 2))
+    np.testing.assert_array_equal(integrate_adaptive(field, s, None, 0.0, 1e-6)[0], s)
+
+
+def test_adaptive_gives_up_with_a_reason_on_a_field_that_is_too_steep():
+    field = smooth_field(np.random.default_rng(4), strength=1e4)
+    with pytest.raises(ArithmeticError, match="too steep"):
+        integrate_adaptive(field, np.zeros((2, 2)), None, 1.0, 1e-9, max_rounds=20)
+
+
+def test_adaptive_spends_its_steps_where_the_field_is_steep():
+    calls = []
+    inner = smooth_field(np.random.default_rng(6), strength=20.0)
+
+    class Counting:
+        dim = 2
+
+        def __call__(self, s):
+            calls.append(len(s))
+            return inner(s)
+
+        with_jacobian = partial(inner.with_jacobian)
+
+    far, near = np.full((50, 2), 30.0), np.zeros((1, 2))
+    integrate_adaptive(Counting(), np.concatenate([far, near]), None, 1.0, 1e-8)
+    assert calls[:8].count(51) == 7  # the first try of all
+    assert calls[-1] == 1
+    assert sum(calls) < 51 * 7 + 7 * len(calls)

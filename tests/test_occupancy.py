@@ -1,0 +1,180 @@
+"""Occupancy maps against the shapes they were learned from, and flows out of what is occupied."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dt_viz.integrate import integrate_adaptive
+from dt_viz.obstacles import Sphere, unit_sphere_map
+from dt_viz.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels
+
+seeds = st.integers(0, 2**32 - 1)
+BALL = unit_sphere_map()
+
+
+def directions(num, dim=3, seed=0):
+    v = np.random.default_rng(seed).normal(size=(num, dim))
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def in_ball(num, radius=1.0, seed=0):
+    """Uniform points of a ball, the very middle left out: there a symmetric field has to vanish."""
+    share = np.random.default_rng(seed).uniform(0.05**3, 1, (num, 1)) ** (1 / 3)
+    return radius * share * directions(num, seed=seed + 1)
+
+
+def central_difference(function, s, h=1e-4):
+    columns = []
+    for e in h * np.eye(s.shape[1]):
+        far, near = function(s + 2 * e) - function(s - 2 * e), function(s + e) - function(s - e)
+        columns.append((8 * near - far) / (12 * h))
+    return np.stack(columns, axis=-1)
+
+
+def learned_box(dim, seed=0):
+    half = np.array([1.0, 0.5, 0.7][:dim])
+    samples, labels = sample_labels(
+        lambda s: (np.abs(s) < half).all(axis=1), -half, half, 3000, np.random.default_rng(seed)
+    )
+    return fit_occupancy(samples, labels, 0.4, regularisation=1.0), half
+
+
+def test_the_probability_is_that_of_the_logit():
+    s = in_ball(50, 2.0)
+    np.testing.assert_allclose(BALL.probability(s), 1 / (1 + np.exp(-BALL.logit(s))), rtol=1e-12)
+    np.testing.assert_allclose(BALL.logit_gradient(s)[0], BALL.logit(s), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(BALL.logit_hessian(s)[0], BALL.logit(s), rtol=0, atol=1e-12)
+
+
+def test_derivatives_of_the_logit_are_derivatives():
+    s = in_ball(40, 2.0)
+    gradient = central_difference(BALL.logit, s)
+    np.testing.assert_allclose(BALL.logit_gradient(s)[1], gradient, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(BALL.logit_hessian(s)[1], gradient, rtol=0, atol=1e-8)
+    hessian = central_difference(lambda points: BALL.logit_gradient(points)[1], s)
+    np.testing.assert_allclose(BALL.logit_hessian(s)[2], hessian, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("generator", GENERATORS)
+@pytest.mark.parametrize("temperature", [1.0, 3.0, 12.0])
+def test_the_generator_is_the_gradient_of_its_potential(generator, temperature):
+    V = AvoidanceField(BALL, generator, temperature)
+    width_squared = 0.5 / BALL.grid.ell
+    s = in_ball(40, 2.0)
+
+    def potential(points):
+        if generator == "probability":
+            return BALL.probability(points)
+        return temperature * np.logaddexp(0, BALL.logit(points) / temperature)
+
+    np.testing.assert_allclose(V(s), width_squared * central_difference(potential, s), rtol=0, atol=1e-8)
+    value, DV = V.with_jacobian(s)
+    np.testing.assert_allclose(value, V(s), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(DV, central_difference(V, s), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(DV, DV.transpose(0, 2, 1), rtol=0, atol=1e-12)
+
+
+def test_at_temperature_one_the_potential_is_the_papers_free_space():
+    s = in_ball(40, 1.5)
+    gradient = central_difference(lambda points: -np.log1p(-BALL.probability(points)), s)
+    expected = 0.5 / BALL.grid.ell * gradient
+    np.testing.assert_allclose(AvoidanceField(BALL, temperature=1.0)(s), expected, rtol=0, atol=1e-6)
+
+
+def test_the_learned_boundary_is_near_the_true_one():
+    for direction in directions(30):
+        radii = np.linspace(0, 2, 401)
+        occupied = BALL.logit(radii[:, None] * direction) > 0
+        assert occupied[0] and np.diff(occupied.astype(int)).sum() == -1  # one crossing, outwards
+        assert radii[occupied][-1] == pytest.approx(1, abs=0.06)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_box_is_learned_from_its_labels(dim):
+    learned, half = learned_box(dim)
+    fresh, truth = sample_labels(lambda s: (np.abs(s) < half).all(axis=1), -half, half, 2000, np.random.default_rng(99))
+    wrong = (learned.logit(fresh) > 0) != (truth > 0.5)
+    assert wrong.mean() < 0.06
+    # what is wrong is close to the boundary, or in a corner that a Gaussian rounds
+    outside = np.abs(fresh[wrong]) - half
+    assert np.abs(outside.max(axis=1)).max() < 0.25
+
+
+@given(seeds)
+def test_the_fit_is_the_maximum_of_its_penalised_likelihood(seed):
+    """Convex: a zero gradient is the only optimum."""
+    rng = np.random.default_rng(seed)
+    samples = rng.uniform(-2, 2, (300, 2))
+    labels = (np.linalg.norm(samples - rng.normal(size=2) * 0.3, axis=1) < 1).astype(float)
+    learned = fit_occupancy(samples, labels, 0.7, regularisation=0.5)
+    residual = labels - learned.probability(samples)
+    gradient = learned.grid.features(samples).T @ residual - 0.5 * learned.weights
+    assert np.abs(gradient).max() < 1e-5
+    assert residual.sum() - 1e-3 * learned.bias == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize(("label", "word"), [(0.0, "free"), (1.0, "occupied")])
+def test_labels_of_one_kind_are_refused(label, word):
+    with pytest.raises(ValueError, match=f"all 50 samples are {word}"):
+        fit_occupancy(np.random.default_rng(0).normal(size=(50, 3)), np.full(50, label), 0.5)
+
+
+def test_samples_lie_in_the_grown_box_and_half_of_them_close_to_the_shape():
+    lower, upper = np.array([0.0, 1.0]), np.array([1.0, 3.0])
+    samples, labels = sample_labels(lambda s: s[:, 0] > 0.5, lower, upper, 1000, np.random.default_rng(0))
+    offset = np.abs(samples - (lower + upper) / 2) / ((upper - lower) / 2)
+    assert samples.shape == (1000, 2)
+    assert offset.max() <= 3.0
+    assert (offset.max(axis=1) <= 1.25).mean() > 0.5
+    np.testing.assert_array_equal(labels, samples[:, 0] > 0.5)
+
+
+@pytest.mark.parametrize("temperature", [1.0, 3.0, 6.0, 20.0])
+def test_every_point_inside_leaves_along_the_reverse_free_space_flow(temperature):
+    V = AvoidanceField(BALL, "free-space", temperature)
+    ends, _ = integrate_adaptive(V, in_ball(500), None, -4.0, 1e-6)
+    assert np.linalg.norm(ends, axis=1).min() > 1.05
+
+
+def test_deep_points_stay_under_the_probability_generator():
+    """The contrast that "free-space" is there for: where p saturates, its gradient is dead."""
+    deep = 0.1 * directions(100)
+    ends = {g: integrate_adaptive(AvoidanceField(BALL, g), deep, None, -1.0, 1e-6)[0] for g in GENERATORS}
+    assert np.linalg.norm(ends["probability"], axis=1).max() < 0.5
+    assert np.linalg.norm(ends["free-space"], axis=1).min() > 1.0
+
+
+@pytest.mark.parametrize("generator", GENERATORS)
+def test_occupancy_never_rises_along_the_reverse_flow(generator):
+    V = AvoidanceField(BALL, generator)
+    s = in_ball(200, 1.5)
+    logits = [BALL.logit(s)]
+    for _ in range(20):
+        s, _ = integrate_adaptive(V, s, None, -0.1, 1e-7)
+        logits.append(BALL.logit(s))
+    assert np.diff(logits, axis=0).max() <= 1e-9
+    assert np.diff(logits, axis=0).min() < -0.1
+
+
+@pytest.mark.parametrize("generator", GENERATORS)
+def test_far_from_the_obstacle_nothing_moves(generator):
+    V = AvoidanceField(BALL, generator, 6.0)
+    assert np.abs(V(12.0 * directions(50))).max() < 1e-12
+
+
+@given(seeds, st.floats(0.04, 0.3), st.sampled_from(GENERATORS))
+def test_a_moved_and_grown_sphere_has_the_moved_and_grown_field(seed, diameter, generator):
+    rng = np.random.default_rng(seed)
+    x, y, z = (float(c) for c in rng.normal(size=3))
+    local = rng.uniform(-1.5, 1.5, (20, 3))
+    field = Sphere((x, y, z), diameter).field(generator, 6.0)
+    expected = diameter / 2 * AvoidanceField(BALL, generator, 6.0)(local)
+    np.testing.assert_allclose(field(np.array([x, y, z]) + diameter / 2 * local), expected, rtol=0, atol=1e-12)
+
+
+def test_the_signed_distance_of_a_sphere():
+    sphere = Sphere((1.0, 2.0, 3.0), 0.2)
+    s = np.array([1.0, 2.0, 3.0]) + np.linspace(0, 1, 11)[:, None, None] * directions(7)
+    expected = np.broadcast_to(np.linspace(-0.1, 0.9, 11)[:, None], (11, 7))
+    np.testing.assert_allclose(sphere.signed_distance(s), expected, rtol=0, atol=1e-14)

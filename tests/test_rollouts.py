@@ -1,0 +1,117 @@
+"""Bundles of rollouts: even sampling, and refinement that reaches its spacing and keeps what was there."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dt_viz.rollouts import ARRIVED, Bundle, Rays, evenly_sampled, refined
+from dt_viz.systems import Attractor
+
+RAYS = Rays(
+    np.array([[1.0, 0.0, 0.0], [0.0, 0.7, 0.2], [-0.5, -0.4, 0.3]]), Attractor(np.array([0.05, 0.02, -0.01]), 0.2, 0.05)
+)
+
+
+def bent(index, fraction):
+    """Two levels: the rays, and above them the rays squeezed and stretched a hundredfold near x = 0.4."""
+    z = RAYS.at(index, fraction)
+    push = np.tanh(100 * (z[:, :1] - 0.4)) * np.array([0.0, 0.3, 0.1])
+    return np.stack([z, z + push + 0.1 * np.sin(5 * z[:, ::-1])], axis=1)
+
+
+def gaps(bundle):
+    return [np.linalg.norm(np.diff(path, axis=0), axis=1) for path in bundle.paths]
+
+
+def test_rays_run_straight_from_their_start_to_the_goal():
+    index = np.arange(3)
+    np.testing.assert_allclose(RAYS.at(index, np.zeros(3)), RAYS.z0, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(RAYS.at(index, np.ones(3)), np.tile(RAYS.base.goal, (3, 1)))
+    np.testing.assert_allclose(RAYS.at(index, np.full(3, 0.5)), (RAYS.z0 + RAYS.base.goal) / 2, rtol=0, atol=1e-15)
+
+
+@given(st.integers(0, 2), st.floats(0, 0.999))
+def test_times_are_when_the_base_motion_is_there(which, fraction):
+    index, fractions = np.array([which]), np.array([fraction])
+    times = RAYS.times(index, fractions)
+    flowed = RAYS.base.flow(RAYS.z0[index], times[:, None])[:, 0]
+    np.testing.assert_allclose(flowed, RAYS.at(index, fractions), rtol=0, atol=1e-9)
+
+
+def test_times_start_at_zero_increase_and_end_on_arrival():
+    for which in range(3):
+        fraction = np.linspace(0, 1, 50)
+        times = RAYS.times(np.full(50, which), fraction)
+        assert times[0] == pytest.approx(0, abs=1e-12)
+        assert (np.diff(times) > 0).all() and np.isfinite(times).all()
+        end = RAYS.base.flow(RAYS.z0[which], times[-1:])[0]
+        assert np.linalg.norm(end - RAYS.base.goal) == pytest.approx(ARRIVED, rel=1e-6)
+
+
+def straight(index, fraction):
+    return RAYS.at(index, fraction)[:, None]
+
+
+def test_even_samples_are_evenly_apart_from_start_to_goal():
+    # a clock that runs ten times as fast at the end changes where samples are asked for, not where they land
+    bundle = evenly_sampled(lambda i, u: straight(i, u**3), 3, 60)
+    assert [len(path) for path in bundle.paths] == [60, 60, 60]
+    for path, gap, start in zip(bundle.paths, gaps(bundle), RAYS.z0, strict=True):
+        np.testing.assert_allclose(path[[0, -1]], [start, RAYS.base.goal], rtol=0, atol=1e-12)
+        assert gap.max() < 1.05 * gap[2:].min()
+
+
+def test_splitting_puts_each_sample_to_its_rollout():
+    bundle = evenly_sampled(bent, 3, 20)
+    parts = bundle.split(bundle.index)
+    assert [set(part) for part in parts] == [{0}, {1}, {2}]
+    np.testing.assert_array_equal(np.concatenate(bundle.split(bundle.positions)), bundle.positions)
+
+
+@given(st.floats(0.002, 0.05))
+def test_refinement_reaches_its_spacing(spacing):
+    rough = evenly_sampled(bent, 3, 12)
+    fine = refined(rough, bent, spacing)
+    assert max(gap.max() for gap in gaps(rough)) > spacing
+    assert max(gap.max() for gap in gaps(fine)) <= spacing * (1 + 1e-12)
+
+
+def test_refinement_keeps_order_starts_goals_and_all_samples():
+    rough = evenly_sampled(bent, 3, 12)
+    fine = refined(rough, bent, 0.004)
+    assert (np.diff(fine.index) >= 0).all()
+    for before, after in zip(rough.split(rough.fraction), fine.split(fine.fraction), strict=True):
+        assert (np.diff(after) > 0).all()
+        assert (after[0], after[-1]) == (0, 1)
+        assert np.isin(before, after).all()
+    for before, after in zip(rough.paths, fine.paths, strict=True):
+        np.testing.assert_array_equal(before[[0, -1]], after[[0, -1]])
+    np.testing.assert_allclose(fine.levels, bent(fine.index, fine.fraction), rtol=0, atol=1e-12)
+
+
+def test_what_is_fine_enough_is_not_touched():
+    rough = evenly_sampled(bent, 3, 12)
+    assert refined(rough, bent, 10.0) is rough
+
+
+def test_refinement_ends_at_a_jump_that_no_sample_can_divide():
+    def torn(index, fraction):
+        z = RAYS.at(index, fraction)
+        return (z + np.where(fraction > 1 / 3, 0.5, 0.0)[:, None])[:, None]
+
+    fine = refined(evenly_sampled(torn, 1, 10), torn, 0.01)
+    fraction = fine.fraction
+    (wide,) = np.flatnonzero(gaps(fine)[0] > 0.01)
+    assert fraction[wide] <= 1 / 3 <= fraction[wide + 1]
+    assert fraction[wide + 1] - fraction[wide] < 1e-9
+
+
+def test_neighbouring_rollouts_are_not_joined():
+    """The end of one rollout and the start of the next are far apart, and stay so."""
+    rough = Bundle(
+        np.array([0, 0, 1, 1]), np.array([0.0, 1.0, 0.0, 1.0]), straight(np.array([0, 0, 1, 1]), np.tile([0.0, 1.0], 2))
+    )
+    fine = refined(rough, straight, 0.1)
+    assert np.linalg.norm(fine.paths[1][0] - fine.paths[0][-1]) > 0.5
+    assert len(fine.paths) == 2
