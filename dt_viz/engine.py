@@ -28,12 +28,6 @@ BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
 
 NUM_SAMPLES = 200
 """Of each rollout before refinement."""
-LIVE_TOLERANCE, FINE_TOLERANCE = 1e-6, 1e-9
-"""Of the flows of the behaviours, metres a step."""
-LIVE_SPACING, FINE_SPACING = 0.012, 0.004
-"""Largest distance between neighbouring samples, metres."""
-START_TOLERANCE = 1e-6
-"""Metres by which a drawn rollout may miss its start."""
 MAX_ATTEMPTS = 5
 """At a duration that clears the samples that refinement finds, too."""
 ARROW_SPACING = 0.030
@@ -41,6 +35,23 @@ ARROW_SPACING = 0.030
 NUM_ARM_SAMPLES = 200
 MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How exactly a motion is worked out, all in metres."""
+
+    tolerance: float
+    """Of a step of the behaviours' flows."""
+    spacing: float
+    """Largest distance between neighbouring samples."""
+    start: float
+    """By which a rollout may miss its start before the motion below is worked out again from where it should begin."""
+
+
+LIVE = Precision(tolerance=1e-5, spacing=0.012, start=1e-4)
+"""Nothing of this is seen at the size of a screen."""
+FINE = Precision(tolerance=1e-9, spacing=0.004, start=1e-7)
 
 
 class Stage(IntEnum):
@@ -154,13 +165,13 @@ class Engine:
         """
         began = time.perf_counter()
         ground = self._ground(scenario, progress)
-        live = _solve(ground, scenario, LIVE_TOLERANCE, LIVE_SPACING)
+        live = _solve(ground, scenario, LIVE)
         frame = _frame(ground, scenario, live)
         yield replace(frame, seconds=time.perf_counter() - began)
         frame = self._with_field_and_arm(frame, DiffeomorphicSystem(live.transform, ground.base))
         yield replace(frame, stage=Stage.LIVE, seconds=time.perf_counter() - began)
 
-        fine = _solve(ground, scenario, FINE_TOLERANCE, FINE_SPACING)
+        fine = _solve(ground, scenario, FINE)
         system = DiffeomorphicSystem(fine.transform, ground.base)
         frame = self._with_field_and_arm(_frame(ground, scenario, fine), system)
         health = certified(frame.health, system, fine.rays, fine.bundle)
@@ -225,7 +236,7 @@ def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
     return np.stack(levels, axis=1)
 
 
-def _solve(ground: _Ground, scenario: Scenario, tolerance: float, spacing: float) -> _Solution:
+def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Solution:
     """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
 
     A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and starts that
@@ -239,19 +250,19 @@ def _solve(ground: _Ground, scenario: Scenario, tolerance: float, spacing: float
         for k, behaviour in enumerate(BEHAVIOURS):
             if built:
                 motion = replace(motion, positions=built[-1][1].transform.inverse(motion.positions))
-            made = behaviour.build(motion, tolerance, durations[k])
+            made = behaviour.build(motion, precision.tolerance, durations[k])
             if made is not None:
                 built.append((behaviour, made))
                 durations[k] = made.duration
         outer = [made.transform for _, made in built]
 
         moved = Chain(outer).forward(starts) if outer else starts
-        if np.abs(moved - starts).max() > START_TOLERANCE:
+        if np.abs(moved - starts).max() > precision.start:
             rays = Rays(ground.transform.forward(moved), ground.base)
             bundle = replace(bundle, levels=_climb(rays.at(bundle.index, bundle.fraction), [ground.transform])[:, 1:])
         bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
         stack = [ground.transform, *outer]
-        bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], spacing)
+        bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
 
         levels = [replace(motion, index=bundle.index, positions=bundle.levels[:, 1 + k]) for k in range(len(built))]
         fits = all(behaviour.satisfied(after) for (behaviour, _), after in zip(built, levels, strict=True))

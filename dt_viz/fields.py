@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -81,21 +81,36 @@ class GaussianGrid:
         """All inducing points, (m, d), last axis fastest."""
         return np.stack(np.meshgrid(*self.axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
 
-    def factors(self, s: Array, max_order: int = 0) -> list[list[Array]]:
-        """Per axis j the 1-D Gaussians (N, n_j) at `s` (N, d), and their derivatives up to `max_order` (at most 3)."""
-        result = []
-        for j, axis in enumerate(self.axes):
-            offset = s[:, j : j + 1] - axis
-            gauss = np.exp(-self.ell * offset * offset)
-            orders = [gauss]
-            # Hermite recursion: g⁽ⁿ⁺¹⁾ = −2ℓ (offset · g⁽ⁿ⁾ + n · g⁽ⁿ⁻¹⁾)
-            for n in range(max_order):
-                previous = n * orders[n - 1] if n else 0.0
-                orders.append(-2.0 * self.ell * (offset * orders[n] + previous))
-            result.append(orders)
-        return result
+    @cached_property
+    def _flat_axes(self) -> tuple[NDArray[np.intp], Array, tuple[slice, ...]]:
+        """The axes one after the other: to which coordinate each entry belongs, the entries, and each axis' part."""
+        ends = np.cumsum(self.shape)
+        parts = tuple(slice(int(end) - n, int(end)) for n, end in zip(self.shape, ends, strict=True))
+        return np.repeat(np.arange(self.dim), self.shape), np.concatenate(self.axes), parts
 
-    def contract(self, s: Array, weights: Array, orders: Sequence[tuple[int, ...]]) -> list[Array]:
+    def factors(self, s: Array, max_order: int = 0) -> list[Array]:
+        """1-D Gaussians of each axis and their derivatives.
+
+        Args:
+            s: (N, d) points.
+            max_order: K, the highest derivative.
+
+        Returns:
+            For each axis j an array (K + 1, N, n_j), the derivative's order first.
+        """
+        coordinate, entries, parts = self._flat_axes
+        offset = s[:, coordinate] - entries
+        values = np.empty((len(s), max_order + 1, len(entries)))
+        values[:, 0] = np.exp(-self.ell * (offset * offset))
+        # Hermite recursion: g⁽ⁿ⁺¹⁾ = −2ℓ (offset · g⁽ⁿ⁾ + n · g⁽ⁿ⁻¹⁾)
+        offset *= -2.0 * self.ell
+        for n in range(max_order):
+            np.multiply(offset, values[:, n], out=values[:, n + 1])
+            if n:
+                values[:, n + 1] -= 2.0 * self.ell * n * values[:, n - 1]
+        return [values[:, :, part].swapaxes(0, 1) for part in parts]
+
+    def contract(self, s: Array, weights: Array, orders: tuple[tuple[int, ...], ...]) -> list[Array]:
         """Partial derivatives of Σ_i w_i k(s, ŝ_i).
 
         Args:
@@ -109,26 +124,28 @@ class GaussianGrid:
         num, k = len(s), weights.shape[1]
         if not num:  # an obstacle that covers the whole slice leaves no arrows to evaluate
             return [np.empty((0, k)) for _ in orders]
-        factors = self.factors(s, max(map(max, orders)))
-        partial: dict[tuple[int, ...], Array] = {}
-        first, *others = self.shape
-        flat = weights.reshape(first, -1)
-        for order in _distinct(o[:1] for o in orders):
-            partial[order] = factors[0][order[0]] @ flat
-        for j, n in enumerate(others, start=1):
-            partial = {
-                order: np.matmul(
-                    factors[j][order[j]][:, None, :], partial[order[:j]].reshape(num, n, -1)
-                )[:, 0]
-                for order in _distinct(o[: j + 1] for o in orders)
-            }  # fmt: skip
+        axes = [factor.swapaxes(0, 1) for factor in self.factors(s, max(map(max, orders)))]  # (N, K + 1, n_j)
+        partial: dict[tuple[int, ...], Array] = {(): weights.reshape(self.shape[0], -1)}
+        for j, plan in enumerate(_contraction_plan(orders)):
+            after: dict[tuple[int, ...], Array] = {}
+            for parent, highest in plan:
+                # all derivatives along this axis that continue the same beginning are one matrix product
+                factor = axes[j][:, : highest + 1]
+                if j:
+                    product = np.matmul(factor, partial[parent].reshape(num, self.shape[j], -1))
+                else:  # the weights are the same for all points
+                    rows = factor.reshape(-1, self.shape[0]) @ partial[parent]
+                    product = rows.reshape(num, highest + 1, -1)
+                for order in range(highest + 1):
+                    after[(*parent, order)] = product[:, order]
+            partial = after
         return [partial[order].reshape(num, k) for order in orders]
 
     def features(self, s: Array) -> Array:
         """The dense matrix k(s, ŝ), (N, m): for fitting, not for evaluating."""
         columns = np.ones((len(s), 1))
-        for (gauss,) in self.factors(s):
-            columns = (columns[:, :, None] * gauss[:, None, :]).reshape(len(s), -1)
+        for factor in self.factors(s):
+            columns = (columns[:, :, None] * factor[0][:, None, :]).reshape(len(s), -1)
         return columns
 
     def gram(self) -> Array:
@@ -136,15 +153,25 @@ class GaussianGrid:
         return self.features(self.inducing_points)
 
 
-def _distinct(orders: Iterable[tuple[int, ...]]) -> list[tuple[int, ...]]:
-    return list(dict.fromkeys(orders))
+@lru_cache(maxsize=64)
+def _contraction_plan(orders: tuple[tuple[int, ...], ...]) -> list[list[tuple[tuple[int, ...], int]]]:
+    """For each axis the beginnings that multi-indices share, and the highest derivative that continues each."""
+    plan = []
+    for j in range(len(orders[0])):
+        highest: dict[tuple[int, ...], int] = {}
+        for order in orders:
+            highest[order[:j]] = max(highest.get(order[:j], 0), order[j])
+        plan.append(list(highest.items()))
+    return plan
 
 
-def unit_orders(dim: int) -> list[tuple[int, ...]]:
+@lru_cache
+def unit_orders(dim: int) -> tuple[tuple[int, ...], ...]:
     """Multi-indices of the `dim` first derivatives."""
-    return [tuple(int(i == j) for i in range(dim)) for j in range(dim)]
+    return tuple(tuple(int(i == j) for i in range(dim)) for j in range(dim))
 
 
+@lru_cache
 def second_orders(dim: int) -> dict[tuple[int, int], tuple[int, ...]]:
     """Multi-index of each second derivative ∂²/∂s_i∂s_j, i ≤ j."""
     first = unit_orders(dim)
@@ -173,11 +200,11 @@ class GridRBF:
 
     def __call__(self, s: Array) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
-        return self.grid.contract(s, self.weights, [(0,) * self.dim])[0]
+        return self.grid.contract(s, self.weights, ((0,) * self.dim,))[0]
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
-        value, *columns = self.grid.contract(s, self.weights, [(0,) * self.dim, *unit_orders(self.dim)])
+        value, *columns = self.grid.contract(s, self.weights, ((0,) * self.dim, *unit_orders(self.dim)))
         return value, np.stack(columns, axis=-1)
 
 

@@ -14,6 +14,9 @@ from dt_viz.fields import Array, GaussianGrid, second_orders, unit_orders
 
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")
+PAD = 0.5
+"""Margin of the inducing points around the occupied samples, in kernel widths. More of it lets the map tell apart free
+places far from the obstacle, which only makes the field reach where it is not wanted."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,8 @@ class OccupancyMap:
     """b, the logit far away from every inducing point."""
 
     def logit(self, s: Array) -> Array:
-        """log p/(1 − p) at the points `s` (N, d), as (N,)."""
-        return self.grid.contract(s, self.weights[:, None], [(0,) * self.grid.dim])[0][:, 0] + self.bias
+        """Log-odds log p/(1 − p) at the points `s` (N, d), as (N,)."""
+        return self.grid.contract(s, self.weights[:, None], ((0,) * self.grid.dim,))[0][:, 0] + self.bias
 
     def probability(self, s: Array) -> Array:
         """p(o = 1 | s) at the points `s` (N, d), as (N,)."""
@@ -37,14 +40,14 @@ class OccupancyMap:
     def logit_gradient(self, s: Array) -> tuple[Array, Array]:
         """The logit (N,) and its gradient (N, d) at the points `s` (N, d)."""
         d = self.grid.dim
-        value, *partials = self.grid.contract(s, self.weights[:, None], [(0,) * d, *unit_orders(d)])
+        value, *partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d)))
         return value[:, 0] + self.bias, np.concatenate(partials, axis=1)
 
     def logit_hessian(self, s: Array) -> tuple[Array, Array, Array]:
         """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
         d = self.grid.dim
         second = second_orders(d)
-        value, *partials = self.grid.contract(s, self.weights[:, None], [(0,) * d, *unit_orders(d), *second.values()])
+        value, *partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d), *second.values()))
         hessian = np.empty((len(s), d, d))
         for (i, j), column in zip(second, partials[d:], strict=True):
             hessian[:, i, j] = hessian[:, j, i] = column[:, 0]
@@ -76,7 +79,7 @@ def fit_occupancy(
     if occupied.all() or not occupied.any():
         found = "occupied" if occupied.any() else "free"
         raise ValueError(f"all {len(labels)} samples are {found}; an occupancy map needs both occupied and free ones")
-    grid = GaussianGrid.covering(samples[occupied], kernel_width, pad=2.0)
+    grid = GaussianGrid.covering(samples[occupied], kernel_width, pad=PAD)
     features = np.concatenate([grid.features(samples), np.ones((len(samples), 1))], axis=1)
     penalty = np.full(features.shape[1], regularisation)
     penalty[-1] = 1e-3  # the bias is data: the share of free space

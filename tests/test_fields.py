@@ -75,9 +75,9 @@ def test_contract_gives_partial_derivatives_up_to_second_order(seed, dim, num_su
     def gradient(points):
         return np.stack(grid.contract(points, weights, first), axis=-1)
 
-    value, *partials = grid.contract(s, weights, [zero, *first, *second.values()])
+    value, *partials = grid.contract(s, weights, (zero, *first, *second.values()))
     assert value.shape == (7, num_sums)
-    slopes = central_difference(lambda points: grid.contract(points, weights, [zero])[0], s, 1e-3)
+    slopes = central_difference(lambda points: grid.contract(points, weights, (zero,))[0], s, 1e-3)
     curvatures = central_difference(gradient, s, 1e-3)
     for j in range(dim):
         np.testing.assert_allclose(partials[j], slopes[..., j], rtol=0, atol=1e-8)
@@ -94,8 +94,8 @@ def test_contract_answers_in_the_order_of_the_question(seed, dim):
     s = rng.uniform(-1, 1, (5, dim))
     orders = [(0,) * dim, *unit_orders(dim), *second_orders(dim).values()]
     shuffled = [orders[i] for i in rng.permutation(len(orders))]
-    for order, column in zip(shuffled, grid.contract(s, weights, shuffled), strict=True):
-        np.testing.assert_allclose(column, grid.contract(s, weights, [order])[0], rtol=0, atol=1e-12)
+    for order, column in zip(shuffled, grid.contract(s, weights, tuple(shuffled)), strict=True):
+        np.testing.assert_allclose(column, grid.contract(s, weights, (order,))[0], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
