@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from dt_viz.fits import FitStore, default_cache_folder  # noqa: PLC0415
     from dt_viz.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.obstacles import unit_sphere_map  # noqa: PLC0415
-    from dt_viz.tasks import TASKS, lasa_tasks, titles  # noqa: PLC0415
+    from dt_viz.tasks import TASKS, lasa_tasks  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
@@ -38,7 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         unit_sphere_map()
         server = Server(
             tasks,
-            titles(tasks),
             fits,
             task=options.task,
             host=options.host,

@@ -21,7 +21,7 @@ from dt_viz.robot import JointPath, Robot, UnreachableError
 from dt_viz.rollouts import Bundle, Rays, evenly_sampled, refined
 from dt_viz.scenario import Scenario
 from dt_viz.systems import Attractor, DiffeomorphicSystem
-from dt_viz.tasks import Task, TaskLoader
+from dt_viz.tasks import Task, TaskEntry
 
 BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
 """What is stacked on the imitation, from the inside out."""
@@ -51,7 +51,7 @@ class Precision:
 
 LIVE = Precision(tolerance=1e-5, spacing=0.012, start=1e-4)
 """Nothing of this is seen at the size of a screen."""
-FINE = Precision(tolerance=1e-9, spacing=0.004, start=1e-7)
+FINE = Precision(tolerance=1e-8, spacing=0.005, start=1e-7)
 
 
 class Stage(IntEnum):
@@ -62,7 +62,9 @@ class Stage(IntEnum):
     LIVE = 1
     """Also the vector field and the arm: what follows a drag."""
     FINE = 2
-    """Refined rollouts, and the certificates."""
+    """All of it refined, for a scenario that rests."""
+    CERTIFIED = 3
+    """Also the certificates."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ class _Solution:
 class Engine:
     """Computes frames for one visitor. Not thread-safe: one worker thread calls it."""
 
-    def __init__(self, tasks: Mapping[str, TaskLoader], fits: FitStore, robot: Robot) -> None:
+    def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot) -> None:
         self._loaders = tasks
         self._fits = fits
         self._robot = robot
@@ -174,10 +176,11 @@ class Engine:
         fine = _solve(ground, scenario, FINE)
         system = DiffeomorphicSystem(fine.transform, ground.base)
         frame = self._with_field_and_arm(_frame(ground, scenario, fine), system)
-        health = certified(frame.health, system, fine.rays, fine.bundle)
+        yield replace(frame, stage=Stage.FINE, seconds=time.perf_counter() - began)
+        health = certified(frame.health, system, fine.bundle)
         depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
         health = replace(health, clearance=-depth if depth > 0 else health.clearance)
-        yield replace(frame, stage=Stage.FINE, health=health, seconds=time.perf_counter() - began)
+        yield replace(frame, stage=Stage.CERTIFIED, health=health, seconds=time.perf_counter() - began)
 
     def _ground(self, scenario: Scenario, progress: Progress | None) -> _Ground:
         key = (scenario.task, scenario.imitation)

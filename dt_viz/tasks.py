@@ -79,7 +79,16 @@ class Task:
         return np.stack([path[0] for path in self.paths])
 
 
-TaskLoader = Callable[[], Task]
+@dataclass(frozen=True)
+class TaskEntry:
+    """A task to choose from. Calling it reads the demonstrations, and raises DemonstrationError if it cannot."""
+
+    title: str
+    load: Callable[[], Task]
+
+    def __call__(self) -> Task:
+        """Load the task."""
+        return self.load()
 
 
 def draw_s() -> Task:
@@ -138,13 +147,15 @@ def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonst
     )
 
 
-def lasa_tasks(folder: Path) -> dict[str, TaskLoader]:
+def lasa_tasks(folder: Path) -> dict[str, TaskEntry]:
     """One drawing task for each .mat file of a folder with the LASA handwriting data, read when it is chosen.
 
     Raises:
         DemonstrationError: if the folder cannot be read or holds no .mat file.
     """
-    return {name: partial(_lasa_task, name, path) for name, path in lasa_files(folder).items()}
+    return {
+        name: TaskEntry(f"LASA {name}", partial(_lasa_task, name, path)) for name, path in lasa_files(folder).items()
+    }
 
 
 def _lasa_task(name: str, path: Path) -> Task:
@@ -160,10 +171,8 @@ def _on_mean_path(
     return float(x), float(y), float(z)
 
 
-TASKS: Mapping[str, TaskLoader] = {"draw_s": draw_s, "lift_box": lift_box}
+TASKS: Mapping[str, TaskEntry] = {
+    "draw_s": TaskEntry("Draw S", draw_s),
+    "lift_box": TaskEntry("Lift box", lift_box),
+}
 """The tasks that ship with DT-Viz, by name."""
-
-
-def titles(tasks: Mapping[str, TaskLoader]) -> dict[str, str]:
-    """What to call each task in the page, without reading its demonstrations."""
-    return {name: name.replace("_", " ").capitalize() if name in TASKS else f"LASA {name}" for name in tasks}

@@ -25,7 +25,7 @@ def bundle_of(transform):
 
 
 def certify(transform, bundle=None):
-    return certified(CLEAR, DiffeomorphicSystem(transform, BASE), RAYS, bundle or bundle_of(transform))
+    return certified(CLEAR, DiffeomorphicSystem(transform, BASE), bundle or bundle_of(transform))
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ class Panel:
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
         self._bar.visible = False
-        self._status.content = _alarm(f"{type(error).__name__}: {error}", "#b3261e", "#fdecea")
+        self._status.content = _alarm(f"{type(error).__name__}: {error}", *_RED)
 
     def _edit(self, gesture: str, **changes: Any) -> None:
         if self._session is not None:
@@ -256,30 +256,31 @@ class Panel:
                     save.disabled = False
 
 
+_AMBER = ("#8a4b00", "#fff4e0")
+_RED = ("#b3261e", "#fdecea")
 _SMALL = "font-size:0.8em;line-height:1.45;padding:0.1em 0.9em 0.35em;opacity:0.85"
 
 
 def status_html(frame: Frame, pace: Pace) -> str:
     """The status line: speed, clearance, certificates, and every reason for doubt."""
     health = frame.health
-    rows = [
-        ("Rebuild", f"{1e3 * pace.latency:.0f} ms · {pace.rate:.0f} frames/s · {pace.num_skipped} skipped")
-        if frame.stage is Stage.LIVE
-        else ("Rebuild", f"{pace.rate:.0f} frames/s · {pace.num_skipped} skipped · refined"),
+    rebuild = f"{1e3 * pace.latency:.0f} ms" if frame.stage is Stage.LIVE else "refined"
+    rows = (
+        ("Rebuild", f"{rebuild} · {pace.rate:.0f} frames/s · {pace.num_skipped} skipped"),
         ("Clearance", f"{1e3 * health.clearance:.1f} mm"),
         ("Flow time t", "off" if health.duration is None else f"{health.duration:.2f}"),
-        ("min det J", "…" if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
-        ("Round trip", "…" if health.round_trip_error is None else f"{1e3 * health.round_trip_error:.0e} mm"),
-    ]
-    if health.lyapunov_falls is not None:
-        rows.append(("Lyapunov value", "falls" if health.lyapunov_falls else "does not fall"))
+        ("Smallest det J", "…" if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
+        ("There and back", "…" if health.round_trip_error is None else f"{1e3 * health.round_trip_error:.0e} mm"),
+        ("Lyapunov value", {None: "…", True: "falls", False: "does not fall"}[health.lyapunov_falls]),
+    )
     cells = "".join(
-        f"<tr><td style='opacity:0.65;padding-right:0.8em'>{name}</td><td><b>{html.escape(value)}</b></td></tr>"
+        f"<tr><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
+        f"<td style='font-weight:600;white-space:nowrap'>{html.escape(value)}</td></tr>"
         for name, value in rows
     )
-    doubts = "".join(_alarm(doubt, "#8a4b00", "#fff4e0") for doubt in health.doubts)
+    doubts = "".join(_alarm(doubt, *_AMBER) for doubt in health.doubts)
     if health.clearance < 0 and frame.scenario.avoidance and not doubts:
-        doubts = _alarm("the motions go through the obstacle at this flow time", "#8a4b00", "#fff4e0")
+        doubts = _alarm("the motions go through the obstacle at this flow time", *_AMBER)
     return f"<table style='{_SMALL}'>{cells}</table>{doubts}"
 
 

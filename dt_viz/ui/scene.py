@@ -242,11 +242,13 @@ class Obstacle(Picture):
     @contextmanager
     def without_gizmo(self) -> Iterator[None]:
         """Hide the handles, not the sphere, for as long as a picture takes."""
-        scale, self._gizmo.scale = self._gizmo.scale, 1e-6
+        # hiding the gizmo itself would hide the sphere that hangs on it
+        scale, opacity = self._gizmo.scale, self._gizmo.opacity
+        self._gizmo.scale, self._gizmo.opacity = 1e-6, 0.0
         try:
             yield
         finally:
-            self._gizmo.scale = scale
+            self._gizmo.scale, self._gizmo.opacity = scale, opacity
 
 
 class Table(Picture):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+import warnings
 from collections.abc import Mapping
 
 import viser
@@ -12,10 +13,13 @@ import viser
 from dt_viz.engine import Engine
 from dt_viz.fits import FitStore
 from dt_viz.robot import load_jaco
-from dt_viz.tasks import TaskLoader
+from dt_viz.tasks import TaskEntry
 from dt_viz.ui.visitor import Visitor
 
 logger = logging.getLogger(__name__)
+
+# a visitor may leave between two pictures of the arm; what is then sent to nobody is no news
+warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
 
 
 class AddressError(OSError):
@@ -27,8 +31,7 @@ class Server:
 
     def __init__(
         self,
-        tasks: Mapping[str, TaskLoader],
-        titles: Mapping[str, str],
+        tasks: Mapping[str, TaskEntry],
         fits: FitStore,
         *,
         task: str,
@@ -40,7 +43,6 @@ class Server:
 
         Args:
             tasks: by name.
-            titles: of the tasks, by name.
             fits: shared by all visitors.
             task: that each visitor begins with.
             host: address to listen on.
@@ -51,7 +53,8 @@ class Server:
             AddressError: the address is not to be had.
         """
         port = _checked_port(host, port)
-        self._tasks, self._titles, self._fits, self._task = tasks, titles, fits, task
+        self._tasks, self._fits, self._task = tasks, fits, task
+        self._titles = {name: entry.title for name, entry in tasks.items()}
         self._max_sessions = max_sessions
         self._robot = load_jaco()
         self._lock = threading.Lock()

@@ -16,6 +16,8 @@ from dt_viz.ui.worker import LatestWorker
 GESTURE_PAUSE = 1.0
 """Seconds without an edit after which the next edit of the same control is a step of its own for undo."""
 MAX_UNDO = 200
+REST = 0.1
+"""Seconds that a scenario must rest before it is refined: while a hand moves, edits come faster."""
 
 
 @dataclass(frozen=True)
@@ -159,5 +161,7 @@ class Session:
                 self._live_frames.append(now)
             rate = sum(now - t <= 1.0 for t in self._live_frames)
             self._display.draw(frame, Pace(now - edited, rate, self._worker.num_skipped))
+            if frame.stage is Stage.LIVE:
+                self._worker.rest(REST)
             if frame.stage >= Stage.LIVE and superseded():
                 return

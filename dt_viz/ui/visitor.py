@@ -19,7 +19,6 @@ from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene import ScenePictures
 from dt_viz.ui.session import Pace, Session
 
-
 FIELD_OF_VIEW = 0.75
 """Vertical, rad."""
 

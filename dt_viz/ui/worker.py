@@ -54,6 +54,11 @@ class LatestWorker(Generic[Job]):
         """Whether a newer job than the running one is waiting, or the worker is closing."""
         return self._waiting is not None or self._closed
 
+    def rest(self, seconds: float) -> None:
+        """Called by a running job: pause it for so long, or until it is superseded."""
+        with self._wake:
+            self._wake.wait_for(self.superseded, seconds)
+
     def wait_idle(self, timeout: float | None = None) -> bool:
         """Wait until nothing runs or waits; False if that took longer than `timeout` seconds."""
         with self._wake:
