@@ -1,0 +1,226 @@
+"""Fit demonstrations and compare each rollout with its own demonstration.
+
+Of each file the folder gets an npz, all lengths in the file's own unit (LASA: millimetres, others: metres):
+
+``rollout_i`` (T, d), ``times_i`` (T,)
+    the motion learned, from the first point of demonstration i until it is at the goal; seconds from 0.
+``goal`` (d,)
+    where it ends.
+``fit_seconds``
+    the whole of `dt_viz.imitation.fit`, certificates included, never from a cache.
+``min_det_jacobian``, ``round_trip_error``
+    smallest det J and largest ‖ψ⁻¹(ψ(x)) − x‖ on a grid over the demonstrations' box grown by half its size on every
+    side, computed here, not taken from the fit.
+
+``figures.json`` holds what the table shows, and ``shapes.png`` all shapes: the paper's fig. 5.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dt_viz.demos import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
+from dt_viz.diffeo import min_det_jacobian, round_trip_error
+from dt_viz.evaluate.options import InputError, print_table, ready_folder, write_json
+from dt_viz.evaluate.picture import Panel, draw_panels
+from dt_viz.fields import Array
+from dt_viz.imitation import Imitation, ImitationError, ImitationSettings, fit
+from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
+
+OBJECTIVES = ("trajectory", "velocity")
+AT_GOAL = 5e-5
+"""Metres from the goal at which a rollout ends."""
+NUM_SAMPLES = 1000
+"""Of a rollout, evenly in time."""
+NUM_COMPARED = 400
+"""Points by arc length that a Fréchet distance is taken between."""
+GRID = {2: 101, 3: 25}
+"""Points a side of the grid of the certificates, by dimension."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """The demonstrations of one file."""
+
+    path: Path
+    demonstrations: tuple[Demonstration, ...]
+    """In metres."""
+    unit: float
+    """Metres for one unit of the file."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the table says of a shape. Fréchet distances and RMS are of each rollout to its own demonstration."""
+
+    name: str
+    demonstrations: int
+    frechet_mean_mm: float
+    frechet_max_mm: float
+    rms_mm: float
+    """At the demonstration's own times; mean over demonstrations."""
+    fit_seconds: float
+    end_error_mm: float
+    """Largest distance of a rollout's last point from the goal."""
+    round_trip_of_extent: float
+    """Round trip error over the larger side of the demonstrations' box."""
+    min_det_jacobian: float
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the subcommand's arguments."""
+    parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and picture")
+    parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand; 2 if one of the shapes could not be fitted."""
+    settings = _settings(options.objective)
+    sources = _sources(options.files)
+    folder = ready_folder(options.out)
+    results: list[Figures] = []
+    panels: list[Panel] = []
+    for source in sources:
+        began = time.perf_counter()
+        try:
+            imitation = fit(source.demonstrations, settings)
+        except ImitationError as error:
+            print(f"{source.path}: {error}", file=sys.stderr)
+            continue
+        seconds = time.perf_counter() - began
+        for warning in imitation.warnings:
+            print(f"{source.path}: {warning}", file=sys.stderr)
+        arrays = measured(imitation, source, seconds)
+        np.savez_compressed(folder / f"{source.path.stem}.npz", allow_pickle=False, **arrays)
+        results.append(compared(arrays, source))
+        demonstrations = [d.positions / source.unit for d in source.demonstrations]
+        panels.append(Panel(source.path.stem, demonstrations, _rollouts(arrays, len(demonstrations))))
+    if results:
+        _report(results)
+        shapes = [asdict(figures) for figures in results]
+        write_json(folder / "figures.json", {"objective": options.objective, "shapes": shapes})
+        draw_panels(folder / "shapes.png", panels)
+    return 0 if len(results) == len(sources) else 2
+
+
+def measured(imitation: Imitation, source: Source, fit_seconds: float) -> dict[str, Any]:
+    """The arrays of the file's npz: see the module's docstring."""
+    transform, base = imitation.transform, imitation.base
+    starts = np.stack([d.positions[0] for d in source.demonstrations])
+    # near the goal ψ⁻¹ stretches by at most the norm of its Jacobian there
+    stretch = np.linalg.norm(transform.inverse_jacobian(base.goal)[1], 2)
+    ends = base.arrival_time(transform.forward(starts), float(AT_GOAL / max(stretch, 1.0)))
+    times = ends[:, None] * np.linspace(0.0, 1.0, NUM_SAMPLES)
+    rollouts = imitation.system.rollout(starts, times)
+    grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]))
+    arrays: dict[str, Any] = {
+        "fit_seconds": fit_seconds,
+        "min_det_jacobian": min_det_jacobian(transform.jacobian, grid),
+        "round_trip_error": round_trip_error(transform, grid) / source.unit,
+        "goal": imitation.goal / source.unit,
+    }
+    for i in range(len(starts)):
+        arrays[f"rollout_{i}"] = rollouts[i] / source.unit
+        arrays[f"times_{i}"] = times[i]
+    return arrays
+
+
+def compared(arrays: dict[str, Any], source: Source) -> Figures:
+    """The figures that the arrays of a file's npz give."""
+    demonstrations = [d.positions / source.unit for d in source.demonstrations]
+    rollouts = _rollouts(arrays, len(demonstrations))
+    frechet = discrete_frechet(
+        np.stack([resample_by_arc_length(path, NUM_COMPARED) for path in rollouts]),
+        np.stack([resample_by_arc_length(path, NUM_COMPARED) for path in demonstrations]),
+    )
+    rms = [
+        rms_at_equal_times(arrays[f"times_{i}"], rollouts[i], demonstration.times, demonstrations[i])
+        for i, demonstration in enumerate(source.demonstrations)
+    ]
+    end_error = max(float(np.linalg.norm(path[-1] - arrays["goal"])) for path in rollouts)
+    millimetres = 1e3 * source.unit
+    return Figures(
+        name=source.path.stem,
+        demonstrations=len(demonstrations),
+        frechet_mean_mm=millimetres * float(frechet.mean()),
+        frechet_max_mm=millimetres * float(frechet.max()),
+        rms_mm=millimetres * float(np.mean(rms)),
+        fit_seconds=arrays["fit_seconds"],
+        end_error_mm=millimetres * end_error,
+        round_trip_of_extent=arrays["round_trip_error"] / float(np.ptp(np.concatenate(demonstrations), axis=0).max()),
+        min_det_jacobian=arrays["min_det_jacobian"],
+    )
+
+
+def grown_grid(points: Array) -> Array:
+    """A regular grid (N, d) over the bounding box of `points` (M, d) grown by half its size on every side."""
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    margin = (upper - lower) / 2
+    num = GRID[points.shape[1]]
+    axes = [np.linspace(a, b, num) for a, b in zip(lower - margin, upper + margin, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, points.shape[1])
+
+
+def _settings(objective: str) -> ImitationSettings:
+    if "objective" in {field.name for field in fields(ImitationSettings)}:
+        return replace(ImitationSettings(), **{"objective": objective})
+    if objective != OBJECTIVES[0]:
+        raise InputError("--objective", repr(objective), f"{OBJECTIVES[0]}, the only objective that can be fitted yet")
+    return ImitationSettings()
+
+
+def _sources(paths: Sequence[Path]) -> list[Source]:
+    """All files, read before any is fitted."""
+    sources: dict[str, Source] = {}
+    for path in paths:
+        if path.stem in sources:
+            found = f"{str(sources[path.stem].path)!r} and {str(path)!r}, which would both become {path.stem}.npz"
+            raise InputError("SHAPE", found, "files of different names")
+        unit = METRES_PER_LASA_UNIT if path.suffix.lower() == ".mat" else 1.0
+        sources[path.stem] = Source(path, load_demonstrations(path), unit)
+    return list(sources.values())
+
+
+def _rollouts(arrays: dict[str, Any], num: int) -> list[Array]:
+    return [arrays[f"rollout_{i}"] for i in range(num)]
+
+
+def _report(results: Sequence[Figures]) -> None:
+    header = ("shape", "demos", "Fréchet mean mm", "max mm", "RMS mm", "fit s", "end mm", "round trip/extent", "det J")
+    rows = [
+        (
+            r.name,
+            str(r.demonstrations),
+            f"{r.frechet_mean_mm:.2f}",
+            f"{r.frechet_max_mm:.2f}",
+            f"{r.rms_mm:.2f}",
+            f"{r.fit_seconds:.2f}",
+            f"{r.end_error_mm:.3f}",
+            f"{r.round_trip_of_extent:.1e}",
+            f"{r.min_det_jacobian:.2g}",
+        )
+        for r in results
+    ]
+    print_table(header, rows)
+    worst = max(results, key=lambda r: r.frechet_mean_mm)
+    slowest = max(results, key=lambda r: r.fit_seconds)
+    tightest = min(results, key=lambda r: r.min_det_jacobian)
+    print(f"\nmeans over {len(results)} shape(s), each the mean over its demonstrations:")
+    mean = np.mean([r.frechet_mean_mm for r in results])
+    largest = max(r.frechet_max_mm for r in results)
+    print(f"Fréchet distance {mean:.2f} mm; worst shape {worst.frechet_mean_mm:.2f} mm ({worst.name})")
+    print(f"largest of a rollout {largest:.2f} mm; RMS at equal times {np.mean([r.rms_mm for r in results]):.2f} mm")
+    median = np.median([r.fit_seconds for r in results])
+    print(f"fit: median {median:.2f} s, worst {slowest.fit_seconds:.2f} s ({slowest.name})")
+    print(f"largest distance from the goal at the end {max(r.end_error_mm for r in results):.3f} mm")
+    print(f"largest round trip error {max(r.round_trip_of_extent for r in results):.1e} of the extent")
+    print(f"smallest det J {tightest.min_det_jacobian:.2g} ({tightest.name})")

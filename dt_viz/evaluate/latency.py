@@ -1,0 +1,198 @@
+"""Drag an obstacle through a motion and measure the time from each edit until its frame is ready.
+
+The real session, worker and engine run; only the page is replaced, by a display that records. The JSON file holds, in
+milliseconds and over all sessions together:
+
+``median_ms``, ``p95_ms``
+    from an edit until its rollouts are ready (stage ROLLOUTS, the first frame of a rebuild).
+``live_median_ms``, ``live_p95_ms``
+    until the vector field and the arm are ready, too (stage LIVE).
+``rebuild_median_ms``
+    of computing the rollouts alone, without the wait for the frame before.
+``frames``, ``skipped``
+    rebuilds, and edits that a newer one overtook before they were begun.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.engine import NUM_SAMPLES, Engine, Frame, Stage
+from dt_viz.evaluate.options import (
+    InputError,
+    add_space,
+    add_task,
+    chosen_task,
+    positive_number,
+    print_table,
+    ready_to_write,
+    whole_number,
+    write_json,
+)
+from dt_viz.fits import FitStore, default_cache_folder
+from dt_viz.metrics import resample_by_arc_length
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import load_jaco
+from dt_viz.scenario import Scenario
+from dt_viz.tasks import Task
+from dt_viz.ui.session import Pace, Session
+
+EDITS_PER_SECOND = 60
+WARM_UP_SECONDS = 1.0
+AMPLITUDE = 0.06
+"""Of the obstacle's motion to each side, metres."""
+PERIODS = 2.9, 4.3
+"""Of the obstacle's motion along the two axes of the task's slice, seconds; it comes back only after many rounds."""
+PATIENCE = 120.0
+"""Seconds that the last frames may take."""
+
+
+@dataclass
+class Recorder:
+    """A display that only records."""
+
+    frames: list[tuple[Stage, float, float]] = field(default_factory=list)
+    """Stage, seconds from the edit until the frame was ready, seconds of computing alone."""
+    num_skipped: int = 0
+    """Since the session began."""
+    num_rollouts: int = 0
+    error: Exception | None = None
+
+    def draw(self, frame: Frame, pace: Pace) -> None:
+        """See `Display`."""
+        self.frames.append((frame.stage, pace.latency, frame.seconds))
+        self.num_skipped, self.num_rollouts = pace.num_skipped, len(frame.rollouts)
+
+    def adopt(self, scenario: Scenario) -> None:
+        """See `Display`."""
+
+    def learning(self, fraction: float, message: str) -> None:
+        """See `Display`."""
+
+    def fail(self, error: Exception) -> None:
+        """See `Display`."""
+        self.error = error
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the subcommand's arguments."""
+    add_task(parser)
+    add_space(parser)
+    parser.add_argument("--sessions", type=whole_number(1), default=1, help="that drag at once (default: %(default)s)")
+    parser.add_argument("--seconds", type=positive_number("seconds", 3600), required=True, help="to measure")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand; 1 if a session reported an error."""
+    tasks, task = chosen_task(options)
+    out = ready_to_write(options.out, ".json")
+    fits = FitStore(default_cache_folder())
+    fits.get(task.demonstrations)
+    scenario = Scenario(task.name, Sphere(task.obstacle_position))
+    recorders = [Recorder() for _ in range(options.sessions)]
+    robot = load_jaco()
+    sessions = [Session(Engine(tasks, fits, robot), lambda _: scenario, task.name, shown) for shown in recorders]
+    positions = moving_through(task)
+    try:
+        _settle(sessions)
+        _drag(sessions, positions, WARM_UP_SECONDS)
+        _settle(sessions)
+        skipped_before = sum(recorder.num_skipped for recorder in recorders)
+        for recorder in recorders:
+            recorder.frames.clear()
+        num_edits, elapsed = _drag(sessions, positions, options.seconds)
+        _settle(sessions)
+    finally:
+        for session in sessions:
+            session.close()
+    for recorder in recorders:
+        if recorder.error is not None:
+            print(f"a session failed: {recorder.error}", file=sys.stderr)
+            return 1
+
+    frames = [frame for recorder in recorders for frame in recorder.frames]
+    first = 1e3 * np.array([seconds for stage, seconds, _ in frames if stage is Stage.ROLLOUTS])
+    live = 1e3 * np.array([seconds for stage, seconds, _ in frames if stage is Stage.LIVE])
+    rebuild = 1e3 * np.array([seconds for stage, _, seconds in frames if stage is Stage.ROLLOUTS])
+    figures = {
+        "median_ms": float(np.median(first)),
+        "p95_ms": float(np.percentile(first, 95)),
+        "frames": len(first),
+        "skipped": sum(recorder.num_skipped for recorder in recorders) - skipped_before,
+        "live_median_ms": float(np.median(live)),
+        "live_p95_ms": float(np.percentile(live, 95)),
+        "rebuild_median_ms": float(np.median(rebuild)),
+        "settings": {
+            "task": task.name,
+            "space": options.space,
+            "sessions": options.sessions,
+            "seconds": options.seconds,
+            "edits": num_edits,
+            "edits_per_second": num_edits / options.sessions / elapsed,
+            "rollouts": recorders[0].num_rollouts,
+            "points_a_rollout": NUM_SAMPLES,
+            "diameter": scenario.obstacle.diameter,
+            "cores": os.cpu_count(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+        },
+    }
+    write_json(out, figures)
+    print(f"{task.name}, {options.sessions} session(s), {recorders[0].num_rollouts} rollouts × {NUM_SAMPLES} points")
+    print_table(
+        ("edit → frame ready", "median ms", "95 % ms"),
+        [
+            ("rollouts", f"{figures['median_ms']:.1f}", f"{figures['p95_ms']:.1f}"),
+            ("also field and arm", f"{figures['live_median_ms']:.1f}", f"{figures['live_p95_ms']:.1f}"),
+            ("computing rollouts", f"{figures['rebuild_median_ms']:.1f}", f"{np.percentile(rebuild, 95):.1f}"),
+        ],
+    )
+    rate = len(first) / options.sessions / elapsed
+    print(f"{num_edits} edits, {len(first)} frames ({rate:.1f} a second and session), {figures['skipped']} skipped")
+    return 0
+
+
+def moving_through(task: Task) -> Callable[[float], tuple[float, float, float]]:
+    """Where the obstacle is at a time in seconds: on a smooth curve around the middle of the mean demonstration."""
+    middle = np.mean([resample_by_arc_length(path, 101)[50] for path in task.paths], axis=0)
+
+    def position(seconds: float) -> tuple[float, float, float]:
+        offset = [AMPLITUDE * math.sin(2 * math.pi * seconds / period) for period in PERIODS]
+        x, y, z = middle + task.slice.axes @ offset
+        return float(x), float(y), float(z)
+
+    return position
+
+
+def _drag(
+    sessions: Sequence[Session], position: Callable[[float], tuple[float, float, float]], seconds: float
+) -> tuple[int, float]:
+    """Edit all sessions at `EDITS_PER_SECOND` from this thread, as a server's event loop does.
+
+    Each session is at a place of its own on the curve. Returns the number of edits and the seconds that they took.
+    """
+    began = time.perf_counter()
+    ticks = max(1, round(EDITS_PER_SECOND * seconds))
+    for tick in range(1, ticks + 1):
+        time.sleep(max(0.0, began + tick / EDITS_PER_SECOND - time.perf_counter()))
+        for k, session in enumerate(sessions):
+            place = position(tick / EDITS_PER_SECOND + 1.7 * k)
+            session.edit("obstacle", obstacle=replace(session.scenario.obstacle, position=place))
+    return ticks * len(sessions), time.perf_counter() - began
+
+
+def _settle(sessions: Sequence[Session]) -> None:
+    for session in sessions:
+        if not session.wait_idle(PATIENCE):
+            raise InputError("--task", f"frames that take more than {PATIENCE:g} s", "a task that can be shown live")

@@ -1,0 +1,213 @@
+"""Time exact rollouts against stepping the same system to the same accuracy.
+
+Eight rollouts of 200 points at even times, without an obstacle and with one on the motion. How it is kept fair:
+
+- The truth is a much finer stepping, with the flows of ψ integrated far more finely, too.
+- Both sides must be within the same distance of it at every point. On each side the cheapest setting that is so is
+  timed: of exact rollouts the tolerance of the obstacle's flow (nothing else in them is approximate), of stepping the
+  step and that tolerance.
+- Stepping may choose between the Runge–Kutta steps of `DiffeomorphicSystem.stepped_rollout`, fixed in length, and
+  scipy's DOP853: eighth order, adaptive, with dense output, so that it need not stop at every point. It steps all eight
+  rollouts together, and gets ẏ from one integration of ψ with its Jacobian. The faster of the two is compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from dt_viz.diffeo import AdaptiveFlow, Chain
+from dt_viz.engine import Engine
+from dt_viz.evaluate.options import (
+    add_task,
+    chosen_task,
+    positive_number,
+    print_table,
+    ready_to_write,
+    whole_number,
+    write_json,
+)
+from dt_viz.evaluate.system import learned_system
+from dt_viz.fields import Array
+from dt_viz.fits import FitStore, default_cache_folder
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import load_jaco
+from dt_viz.scenario import Scenario
+from dt_viz.systems import DiffeomorphicSystem
+
+NUM_ROLLOUTS, NUM_POINTS = 8, 200
+ARRIVED = 1e-4
+"""Metres from the goal in base space at which the last of the rollouts ends."""
+FINER = 1e-3
+"""The truth's tolerances, relative to the accuracy asked for."""
+NUM_REFINEMENTS = 6
+"""Settings that are tried on each side, each ten times (fixed steps: two times) as fine as the one before."""
+
+Systems = Callable[[float], DiffeomorphicSystem]
+"""The system with the obstacle's flow integrated to a tolerance in metres."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """The cheapest setting of one side that is accurate enough."""
+
+    setting: str
+    seconds: float
+    error: float
+    """Largest distance from the truth, metres."""
+    accurate: bool
+    """Whether that is within what was asked for."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the subcommand's arguments."""
+    add_task(parser)
+    parser.add_argument(
+        "--accuracy",
+        type=positive_number("metres", 1),
+        default=1e-6,
+        metavar="M",
+        help="metres from the truth that both sides must keep to (default: %(default)s)",
+    )
+    parser.add_argument("--repeats", type=whole_number(1), default=3, help="median of so many (default: %(default)s)")
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help="for the figures")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand; 1 if one of the sides cannot be made accurate enough."""
+    tasks, task = chosen_task(options)
+    out = None if options.out is None else ready_to_write(options.out, ".json")
+    fits = FitStore(default_cache_folder())
+    learned = learned_system(task, fits.get(task.demonstrations))
+    scenario = Scenario(task.name, Sphere(task.obstacle_position))
+    frame = next(iter(Engine(tasks, fits, load_jaco()).frames(scenario)))
+    field = scenario.obstacle.field(scenario.generator, scenario.temperature)
+    duration = frame.health.duration or 0.0
+
+    def with_obstacle(tolerance: float) -> DiffeomorphicSystem:
+        avoiding = AdaptiveFlow(field, duration, tolerance)
+        return replace(learned, transform=Chain([learned.transform, avoiding]))
+
+    starts = _eight(task.starts)
+    results: dict[str, Any] = {}
+    rows = []
+    scenes: dict[str, Systems] = {"no obstacle": lambda _: learned, "obstacle": with_obstacle}
+    for scene, systems in scenes.items():
+        exact, stepped = compare(systems, starts, options.accuracy, options.repeats)
+        results[scene] = {"exact": vars(exact), "stepped": vars(stepped), "ratio": stepped.seconds / exact.seconds}
+        for name, side in (("exact", exact), ("stepped", stepped)):
+            accuracy = f"{side.error:.1e}" + ("" if side.accurate else " (too coarse)")
+            rows.append((f"{scene}, {name}", f"{1e3 * side.seconds:.1f}", accuracy, side.setting))
+    if out is not None:
+        settings = {"task": task.name, "accuracy": options.accuracy, "repeats": options.repeats, "duration": duration}
+        write_json(out, {**results, "settings": settings})
+    print(
+        f"{task.name}, {NUM_ROLLOUTS} rollouts × {NUM_POINTS} points, both within {options.accuracy:g} m of the truth"
+    )
+    print_table(("", "ms", "error m", "setting"), rows)
+    print()
+    for scene, result in results.items():
+        print(f"{scene}: exact rollouts are {result['ratio']:.0f} × faster")
+    return 0 if all(side["accurate"] for r in results.values() for side in (r["exact"], r["stepped"])) else 1
+
+
+def compare(systems: Systems, starts: Array, accuracy: float, repeats: int) -> tuple[Run, Run]:
+    """The cheapest accurate exact rollouts and the cheapest accurate stepping, both timed.
+
+    Args:
+        systems: what to roll out.
+        starts: (R, 3), metres.
+        accuracy: largest distance from the truth, metres.
+        repeats: of each timing.
+    """
+    finest = systems(1e-2 * FINER * accuracy)
+    end = finest.base.arrival_time(finest.transform.forward(starts), ARRIVED).max()
+    times = np.linspace(0.0, float(end), NUM_POINTS)
+    truth = stepped_adaptively(finest, starts, times, FINER * accuracy)
+
+    def distance(motion: Array) -> float:
+        return float(np.linalg.norm(motion - truth, axis=-1).max())
+
+    tolerances = accuracy * 10.0 ** -np.arange(NUM_REFINEMENTS)
+    exact = _cheapest(
+        [(f"flow to {t:.0e} m", lambda t=t: systems(t).rollout(starts, times)) for t in tolerances],
+        distance,
+        accuracy,
+        max(repeats, 5),
+    )
+    # a stepper whose field is rougher than its own tolerance takes ever smaller steps: the flow is ten times finer
+    adaptive = _cheapest(
+        [
+            (f"DOP853 to {t:.0e} m", lambda t=t: stepped_adaptively(systems(t / 10), starts, times, t))
+            for t in 10 * tolerances
+        ],
+        distance,
+        accuracy,
+        repeats,
+    )
+    fixed = _cheapest(
+        [
+            (f"RK4, {n} steps a point", lambda n=n: systems(accuracy / 10).stepped_rollout(starts, times, n))
+            for n in (2**k for k in range(NUM_REFINEMENTS))
+        ],
+        distance,
+        accuracy,
+        repeats,
+        give_up=adaptive.seconds if adaptive.accurate else np.inf,
+    )
+    return exact, min(adaptive, fixed, key=lambda side: (not side.accurate, side.seconds))
+
+
+def stepped_adaptively(system: DiffeomorphicSystem, starts: Array, times: Array, tolerance: float) -> Array:
+    """The motion (R, T, 3) by DOP853 on ẏ = J⁻¹ f(ψ(y)), all rollouts in one state, steps to `tolerance` metres."""
+
+    def velocity(_: float, state: Array) -> Array:
+        z, J = system.transform.jacobian(state.reshape(starts.shape))
+        return np.linalg.solve(J, system.base.velocity(z)[..., None]).ravel()
+
+    span = (float(times[0]), float(times[-1]))
+    solution = solve_ivp(velocity, span, starts.ravel(), "DOP853", times, rtol=tolerance, atol=tolerance)
+    return np.moveaxis(solution.y.reshape(*starts.shape, -1), -1, 1)
+
+
+def _cheapest(
+    settings: list[tuple[str, Callable[[], Array]]],
+    distance: Callable[[Array], float],
+    accuracy: float,
+    repeats: int,
+    give_up: float = np.inf,
+) -> Run:
+    """The first accurate one of settings in order of cost, or the last tried: none after one that took `give_up` s."""
+    best = Run("", np.inf, np.inf, False)
+    for setting, motion in settings:
+        began = time.perf_counter()
+        error = distance(motion())
+        best = Run(setting, time.perf_counter() - began, error, error <= accuracy)
+        if best.accurate:
+            return replace(best, seconds=_median_seconds(motion, repeats))
+        if best.seconds > give_up:
+            break
+    return best
+
+
+def _median_seconds(motion: Callable[[], Array], repeats: int) -> float:
+    seconds = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        motion()
+        seconds.append(time.perf_counter() - began)
+    return float(np.median(seconds))
+
+
+def _eight(starts: Array) -> Array:
+    """Eight starts: the task's own, and where these are fewer, middles between neighbours."""
+    while len(starts) < NUM_ROLLOUTS:
+        starts = np.concatenate([starts, (starts + np.roll(starts, -1, axis=0)) / 2])
+    return starts[:NUM_ROLLOUTS]
