@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dt_viz.fields import Array, VectorField
+from dt_viz.fields import Array, Mask, VectorField
 
 Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
 
@@ -73,22 +73,24 @@ def integrate_adaptive(
     """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` with the Dormand–Prince 5(4) pair.
 
     Every point has its own step length, chosen so that the estimated error of each step is below `tolerance` (in the
-    unit of `s`): points that the field hardly moves take one step, only those in its stiff core take many.
+    unit of `s`) and, for motions as small as that and for tangents, below `RELATIVE_TOLERANCE` of them: points that the
+    field hardly moves take one step, only those in its stiff core take many.
 
     Raises:
         ArithmeticError: if some point needs more than `max_rounds` steps.
     """
+    total = np.abs(duration)
+    if total == 0 or not len(s):
+        return s, U
     d = s.shape[1]
     state, rate = _augment(field, s, U)
     state = state.copy()
-    total = np.abs(duration)
-    done, h = np.zeros(len(s)), np.full(len(s), total)
-    active = np.arange(len(s)) if total > 0 else np.empty(0, dtype=int)
-    first = rate(state) if len(active) else state
+    first = rate(state)
     # what the field would carry less than the tolerance needs no method of higher order
-    still = np.abs(first[:, :d]).max(axis=1, initial=0.0) * total <= tolerance
-    state[active[still]] += duration * first[still]
-    active, first = active[~still], first[~still]
+    still = np.abs(first[:, :d]).max(axis=1) * total <= tolerance
+    state[still] += duration * first[still]
+    active, first = np.flatnonzero(~still), first[~still]
+    done, h = np.zeros(len(s)), np.full(len(s), total)
     for _ in range(max_rounds):
         if not len(active):
             return _split(state, s, U)
@@ -99,7 +101,12 @@ def integrate_adaptive(
         # the last stage point is the fifth-order result: first same as last
         end = start + step * sum(a * k for a, k in zip(_DP_STAGES[-1], stages[:-1], strict=True) if a)
         defect = step * sum(e * k for e, k in zip(_DP_ERROR, stages, strict=True) if e)
-        error = np.abs(defect[:, :d]).max(axis=1) / tolerance
+        # beside a rest point a small error is a large part of the motion, which grows with the motion
+        allowed = np.clip(RELATIVE_TOLERANCE * np.abs(end - start)[:, :d].max(axis=1), ROUNDING, tolerance)
+        error = np.abs(defect[:, :d]).max(axis=1) / allowed
+        if U is not None:
+            largest = np.maximum(np.abs(end[:, d:]).max(axis=1), np.finfo(float).tiny)
+            error = np.maximum(error, np.abs(defect[:, d:]).max(axis=1) / (RELATIVE_TOLERANCE * largest))
         accepted = error <= 1
         state[active[accepted]] = end[accepted]
         done[active] += np.where(accepted, h[active], 0)
@@ -120,6 +127,30 @@ _DP_STAGES = (
     (35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
 )
 _DP_ERROR = (71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+
+
+RELATIVE_TOLERANCE = 3e-4
+"""Of the motion of a step, and of a tangent."""
+ROUNDING = 1e-15
+"""Below which differences of coordinates mean nothing, in their unit."""
+
+
+def _still(field: VectorField, state: Array, rate: Array, alone: bool, duration: float, tolerance: float) -> Mask:
+    """Which states (N, ·) with that `rate` one Euler step carries well enough: those that hardly move or turn.
+
+    That the field is weak is not enough: it is so, too, beside a rest point, where motions grow from nothing and
+    tangents are stretched most.
+    """
+    d, total = field.dim, np.abs(duration)
+    still = np.abs(rate[:, :d]).max(axis=1, initial=0.0) * total <= tolerance
+    if not alone:
+        return still & (
+            np.abs(rate[:, d:]).max(axis=1) * total <= RELATIVE_TOLERANCE * np.abs(state[:, d:]).max(axis=1)
+        )
+    velocity = rate[still]
+    change = field(state[still] + duration * velocity) - velocity
+    still[still] = np.abs(change).max(axis=1, initial=0.0) <= 0.1 * np.abs(velocity).max(axis=1, initial=0.0)
+    return still
 
 
 def _augment(field: VectorField, s: Array, U: Array | None) -> tuple[Array, Callable[[Array], Array]]:
