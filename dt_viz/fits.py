@@ -84,6 +84,8 @@ class FitStore:
             return None
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                if damaged := arrays.zip.testzip():  # numpy stops reading before a member's checksum is looked at
+                    raise ValueError(f"{damaged} does not match its checksum")
                 return Imitation.from_arrays(arrays)
         except Exception as error:  # damaged bytes make zipfile, zlib and numpy raise almost anything
             logger.warning("%s is damaged and will be fitted anew: %s", path, error)
