@@ -10,7 +10,7 @@ import dt_viz
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 BROWSERLESS_UI = {"session.py", "worker.py"}
-MAY_IMPORT_UI = {"cli.py", "evaluate.py"}
+MAY_IMPORT_UI = ("cli.py", "evaluate")
 
 
 def imported(path: Path) -> set[str]:
@@ -64,7 +64,7 @@ def test_only_the_robot_talks_to_pinocchio():
 
 def test_computing_never_imports_the_ui():
     outside = {name for name in importers("dt_viz.ui") if not name.startswith("ui/")}
-    assert outside <= MAY_IMPORT_UI
+    assert not [name for name in outside if not name.startswith(MAY_IMPORT_UI)]
 
 
 @pytest.mark.parametrize("module", ["matplotlib", "torch", "jax", "pickle"])

@@ -48,7 +48,8 @@ def test_the_smallest_determinant_is_that_of_the_forward_map():
 
 def test_a_folding_euler_map_is_recognised():
     folding = Flow(field(6.0), 1.0, 1, euler)
-    health = certify(folding)
+    bundle = bundle_of(Identity(3))  # straight through where it folds
+    health = certify(folding, bundle)
     assert health.min_det_jacobian is not None and health.min_det_jacobian < 0
     assert any("no diffeomorphism" in doubt for doubt in health.doubts)
 
