@@ -86,8 +86,7 @@ def integrate_adaptive(
     state, rate = _augment(field, s, U)
     state = state.copy()
     first = rate(state)
-    # what the field would carry less than the tolerance needs no method of higher order
-    still = np.abs(first[:, :d]).max(axis=1) * total <= tolerance
+    still = _still(field, state, first, U is None, duration, tolerance)
     state[still] += duration * first[still]
     active, first = np.flatnonzero(~still), first[~still]
     done, h = np.zeros(len(s)), np.full(len(s), total)
