@@ -15,7 +15,8 @@ from dt_viz.diffeo import Chain, Diffeomorphism, Flow, min_det_jacobian, round_t
 from dt_viz.fields import Array, GaussianGrid, GridRBF
 from dt_viz.integrate import euler, implicit_euler
 from dt_viz.layers import Stack
-from dt_viz.metrics import resample_by_arc_length
+from dt_viz.metrics import arc_length
+from dt_viz.preparation import ImitationError, Motions, prepare
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.timing import TimedAttractor, learn_timing
 from dt_viz.trajectory_fit import TrajectoryFit
@@ -23,21 +24,22 @@ from dt_viz.unbend import layers_along, regress, unbending
 
 Progress = Callable[[float, str], None]
 
-
-class ImitationError(ValueError):
-    """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
+MIN_STEP_DETERMINANT = 0.05  # of an Euler step's derivative; at 0 it would fold
+STEP_LENGTH = 0.8  # how far an Euler step of the start may move a point, in σ
+MAX_LAYERS = 10
+MAX_ATTEMPTS = 5  # each smoother than the one before
 
 
 @dataclass(frozen=True)
 class ImitationSettings:
     """How to fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean)."""
 
-    num_layers: int = 4
-    """Stationary flows that ψ is composed of."""
+    num_layers: int = 3
+    """Stationary flows that ψ is composed of, at least; motions that turn far get more."""
     steps: int = 4
     """Euler steps of each flow."""
-    sigma: float = 0.75
-    """Width of a Gaussian."""
+    sigma: float | None = None
+    """Width of a Gaussian. None takes 1 in the plane and 0.65 in space, less for motions folded into little room."""
     spacing: float = 1.0
     """Distance between neighbouring inducing points, in σ."""
     reach: float = 1.25
@@ -45,7 +47,7 @@ class ImitationSettings:
     regularisation: float = 3e-5
     """Weight of the squared RKHS norm, summed over layers, against the mean squared distance."""
     num_points: int = 30
-    """Points a demonstration that the fit looks at."""
+    """Points a demonstration that the fit looks at, at least; long motions get more."""
     max_iterations: int = 20
     """Of Gauss–Newton."""
 
@@ -142,48 +144,65 @@ def fit(
     progress = progress or (lambda _fraction, _message: None)
     began = time.perf_counter()
     progress(0.0, "checking the demonstrations")
-    paths = [demonstration.positions for demonstration in demonstrations]
-    goal = np.mean([path[-1] for path in paths], axis=0)
-    motions = np.stack([resample_by_arc_length(path, settings.num_points) for path in paths])
-    motions[:, -1] = goal
-    centre = motions.mean(axis=(0, 1))
-    scale = float(np.sqrt(((motions - centre) ** 2).sum(axis=-1).mean()))
-    normalised = (motions - centre) / scale
+    motions = prepare(demonstrations)
+    transform, warnings = _fit_trajectories(motions, settings, progress)
 
-    progress(0.05, "unbending the mean demonstration")
-    shapes = unbending(normalised, settings.num_layers - 1)
-    layers = layers_along(shapes, settings.sigma, spacing=settings.spacing, reach=settings.reach)
-    stack = Stack(layers, settings.steps)
-    thetas = regress(stack, shapes, settings.regularisation)
-    fractions = np.broadcast_to(np.linspace(0.0, 1.0, settings.num_points), normalised.shape[:2])
-    problem = TrajectoryFit(stack, normalised, fractions, settings.regularisation)
-
-    def report(iteration: int, rms: float) -> None:
-        fraction = 0.1 + 0.8 * iteration / settings.max_iterations
-        progress(fraction, f"fitting, {100 * rms:.1f} % of the spread off")
-
-    thetas, _, _ = problem.solve(
-        thetas,
-        np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]]),
-        max_iterations=settings.max_iterations,
-        report=report,
-    )
-    transform = stack.transform(thetas, centre, scale)
-
-    progress(0.9, "checking that the map is invertible")
-    box = _grown_box(np.concatenate(paths), 40 if transform.dim == 2 else 14)
-    base = learn_timing(transform, goal, [demonstration.times for demonstration in demonstrations], paths)
+    progress(0.92, "learning the timing")
+    base = learn_timing(transform, motions.goal, motions.times, motions.positions)
+    progress(0.96, "checking that the map is invertible")
+    box = _grown_box(np.concatenate(motions.positions), 40 if transform.dim == 2 else 12)
     result = Imitation(
         transform,
         base,
-        np.array([path[0] for path in paths]),
-        goal,
+        np.array([path[0] for path in motions.positions]),
+        motions.goal,
         fit_seconds=time.perf_counter() - began,
         min_det_jacobian=min_det_jacobian(transform.jacobian, box),
         round_trip_error=round_trip_error(transform, box),
+        warnings=(*motions.warnings, *warnings),
     )
+    if not (result.min_det_jacobian > 0 and result.round_trip_error < 1e-9 * motions.spread):
+        raise ImitationError(
+            f"no invertible map was found: smallest det J {result.min_det_jacobian:.2g}, round trip "
+            f"{result.round_trip_error:.2g} off; more regularisation may help"
+        )
     progress(1.0, "done")
     return result
+
+
+def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
+    """ψ by the trajectory objective, as closely as it can be had without folding the space."""
+    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / motions.spread
+    num_points = int(np.clip(4 * length, settings.num_points, max(settings.num_points, 60)))
+    points = motions.resampled(num_points)
+    centre, scale = points.mean(axis=(0, 1)), motions.spread
+    normalised = (points - centre) / scale
+    fractions = np.broadcast_to(np.linspace(0.0, 1.0, num_points), points.shape[:2])
+    sigma = settings.sigma or (1.0 if points.shape[-1] == 2 else 0.65) * min(1.0, 7.5 / length)
+
+    warnings: list[str] = []
+    for attempt in range(MAX_ATTEMPTS):
+        progress(0.05, "unbending the mean demonstration")
+        regularisation, steps = settings.regularisation * 10.0**attempt, settings.steps * min(2**attempt, 4)
+        shapes = unbending(normalised, settings.num_layers - 1, STEP_LENGTH * sigma * steps, MAX_LAYERS - 1)
+        stack = Stack(layers_along(shapes, sigma, spacing=settings.spacing, reach=settings.reach), steps)
+        thetas = regress(stack, shapes, regularisation)
+
+        def report(iteration: int, rms: float) -> None:
+            done = 0.1 + 0.8 * iteration / settings.max_iterations
+            progress(done, f"fitting, {100 * rms:.1f} % of the spread off")
+
+        problem = TrajectoryFit(stack, normalised, fractions, regularisation)
+        ends = np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]])
+        thetas, ends, _ = problem.solve(thetas, ends, max_iterations=settings.max_iterations, report=report)
+        if stack.min_step_determinant(thetas) > MIN_STEP_DETERMINANT:
+            if attempt:
+                warnings.append(
+                    f"the closest fit would fold the space over itself; regularised {10**attempt} times as much, it is "
+                    "invertible and follows the demonstrations less closely"
+                )
+            return stack.transform(thetas, centre, scale), warnings
+    raise ImitationError("no invertible map follows these demonstrations; do they contradict each other?")
 
 
 def _grown_box(points: Array, num: int, growth: float = 0.5) -> Array:

@@ -151,6 +151,27 @@ class Stack:
                 end = start
         return z, later, sensitivity.transpose(1, 0, 2)
 
+    def min_step_determinant(self, thetas: Sequence[Array], spacing: float | None = None) -> float:
+        """Smallest determinant of an Euler step's derivative, over all of space.
+
+        A step s + h·F(s) with bounded F is proper, so by Hadamard's theorem it is a diffeomorphism of R^d if this
+        determinant is positive everywhere. Outside the grids the fields vanish and it is 1.
+
+        Args:
+            thetas: coefficients.
+            spacing: distance between the points where it is computed, in σ; None takes 1/4 in the plane and 1/2 in
+                space.
+        """
+        spacing = spacing or (0.25 if self.dim == 2 else 0.5)
+        h, smallest = 1.0 / self.steps, np.inf
+        for layer, theta in zip(self.layers, thetas, strict=True):
+            sigma = np.sqrt(0.5 / layer.grid.ell)
+            axes = [np.arange(axis[0] - 2 * sigma, axis[-1] + 2 * sigma, spacing * sigma) for axis in layer.grid.axes]
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
+            derivative = layer.field(theta).with_jacobian(points)[1]
+            smallest = min(smallest, float(np.linalg.det(np.eye(self.dim) + h * derivative).min()))
+        return smallest
+
     def transform(self, thetas: Sequence[Array], centre: Array, scale: float) -> Chain:
         """ψ in the user's coordinates y = centre + scale·s, with an inverse exact to rounding.
 

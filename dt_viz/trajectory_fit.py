@@ -29,7 +29,7 @@ class TrajectoryFit:
     regularisation: float
     end_weight: float = 10.0
     """Weight of a residual at a ray's end against one between."""
-    along_weight: float = 0.5
+    along_weight: float = 0.3
     """Weight of a residual's component along the motion: being early or late is not being off the path."""
 
     def weights(self) -> Array:
@@ -61,7 +61,7 @@ class TrajectoryFit:
                 fit.
 
         Returns:
-            The coefficients, the images, and the cost.
+            The coefficients, the images, and the root mean square of the weighted distances.
         """
         damping = 1e-3
         weights = self.weights().reshape(-1, self.stack.dim, self.stack.dim)
@@ -98,7 +98,7 @@ class TrajectoryFit:
         return (
             self.stack.split(vector),
             vector[-num_ends * self.stack.dim :].reshape(num_ends, -1),
-            cost,
+            float(np.sqrt(max(0.0, cost - (self._prior(len(vector)) * vector**2).sum()))),
         )
 
     def _prior(self, size: int) -> Array:
