@@ -25,7 +25,7 @@ class Pace:
     """How rebuilding goes."""
 
     latency: float
-    """Seconds from the edit until its frame was ready."""
+    """Seconds from the last edit until its live frame was ready."""
     rate: float
     """Live frames in the last second."""
     num_skipped: int
@@ -68,10 +68,12 @@ class Session:
         self._initial = initial
         self._display = display
         self._lock = threading.Lock()
+        self._adopting = threading.RLock()
         self.scenario = initial(task)
         self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
         self._future: list[Scenario] = []
         self._gesture: tuple[str, float] = ("", 0.0)
+        self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
         self._worker = LatestWorker[tuple[Scenario, float]](self._compute, display.fail, name="session")
         display.adopt(self.scenario)
@@ -99,7 +101,7 @@ class Session:
             self.scenario = edited
             if moves:
                 self._submit()
-        self._display.adopt(edited)
+        self._adopt()
 
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo."""
@@ -147,8 +149,12 @@ class Session:
             self.scenario = replace(source.pop(), view=self.scenario.view)
             self._gesture = ("", 0.0)
             self._submit()
-            scenario = self.scenario
-        self._display.adopt(scenario)
+        self._adopt()
+
+    def _adopt(self) -> None:
+        """Show the newest scenario on the controls: one thread after the other, so that the newest is shown last."""
+        with self._adopting:
+            self._display.adopt(self.scenario)
 
     def _submit(self) -> None:
         self._worker.submit((self.scenario, time.perf_counter()))
@@ -157,10 +163,12 @@ class Session:
         scenario, edited = job
         for frame in self._engine.frames(scenario, self._display.learning):
             now = time.perf_counter()
+            if frame.stage <= Stage.LIVE:
+                self._latency = now - edited
             if frame.stage is Stage.LIVE:
                 self._live_frames.append(now)
             rate = sum(now - t <= 1.0 for t in self._live_frames)
-            self._display.draw(frame, Pace(now - edited, rate, self._worker.num_skipped))
+            self._display.draw(frame, Pace(self._latency, rate, self._worker.num_skipped))
             if frame.stage is Stage.LIVE:
                 self._worker.rest(REST)
             if frame.stage >= Stage.LIVE and superseded():

@@ -46,6 +46,8 @@ class LatestWorker(Generic[Job]):
     def submit(self, job: Job) -> None:
         """Do this job next, instead of any that is still waiting. Never blocks for long."""
         with self._wake:
+            if self._closed:  # a control that still moves while its page goes away
+                return
             self.num_skipped += self._waiting is not None
             self._waiting = job
             self._wake.notify_all()
@@ -85,4 +87,10 @@ class LatestWorker(Generic[Job]):
                 self._run(job, self.superseded)
             except Exception as error:  # the one place where whatever a job raises is caught: the session goes on
                 logger.exception("a job of %s failed", self._thread.name)
-                self._on_error(error)
+                self._report(error)
+
+    def _report(self, error: Exception) -> None:
+        try:
+            self._on_error(error)
+        except Exception:  # the page that is to show it may be what broke
+            logger.exception("an error of %s could not be shown", self._thread.name)

@@ -1,0 +1,339 @@
+"""A session by its contract: the last picture belongs to the last scenario, and every edit can be taken back."""
+
+import logging
+import threading
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from dt_viz.demos import DemonstrationError
+from dt_viz.engine import Stage
+from dt_viz.obstacles import Sphere
+from dt_viz.scenario import Scenario, View
+from dt_viz.ui import session as session_module
+from dt_viz.ui.session import MAX_UNDO, Session
+
+PATIENCE = 30.0
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """Stands in for a frame: what a session looks at, and what it was computed from."""
+
+    scenario: Scenario
+    stage: Stage
+
+
+class FakeEngine:
+    """Computes at once; notes what it was asked for; fails on request; waits at a gate if there is one."""
+
+    def __init__(self):
+        self.asked = []
+        self.begun, self.gate = threading.Event(), None
+
+    def frames(self, scenario, progress=None):
+        self.asked.append(scenario)
+        self.begun.set()
+        if self.gate is not None:
+            assert self.gate.wait(PATIENCE)
+        if scenario.temperature == 13.0:
+            raise DemonstrationError("unlucky.csv", "file", "13", "another")
+        for stage in Stage:
+            yield Sketch(scenario, stage)
+
+
+class Page:
+    """A display that remembers."""
+
+    def __init__(self):
+        self.frames, self.paces, self.adopted, self.errors = [], [], [], []
+
+    def draw(self, frame, pace):
+        self.frames.append(frame)
+        self.paces.append(pace)
+
+    def adopt(self, scenario):
+        self.adopted.append(scenario)
+
+    def learning(self, fraction, message):
+        pass
+
+    def fail(self, error):
+        self.errors.append(error)
+
+
+def fresh(task):
+    if task == "broken":
+        raise DemonstrationError("broken.csv", "lines", "none", "two or more")
+    return Scenario(task, Sphere((0.1, 0.2, 0.3 if task == "draw_s" else 0.6)))
+
+
+@dataclass
+class Opened:
+    session: Session
+    engine: FakeEngine
+    page: Page
+    clock: list
+
+    def settle(self):
+        assert self.session.wait_idle(PATIENCE)
+
+    @property
+    def shown(self):
+        return self.page.frames[-1].scenario
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """A session that has shown its first picture, on a clock that only moves when told to."""
+    clock = [100.0]
+    monkeypatch.setattr(session_module.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(session_module, "REST", 0.0)
+    engine, page = FakeEngine(), Page()
+    session = Session(engine, fresh, "draw_s", page)
+    result = Opened(session, engine, page, clock)
+    result.settle()
+    yield result
+    session.close()
+
+
+def at(x):
+    return Sphere((x, 0.0, 0.0))
+
+
+def test_a_session_begins_with_its_task(opened):
+    assert opened.session.scenario == fresh("draw_s")
+    assert opened.page.adopted == [fresh("draw_s")]
+    assert [frame.stage for frame in opened.page.frames] == list(Stage)
+    assert opened.shown == fresh("draw_s")
+
+
+def test_an_edit_is_adopted_computed_and_shown(opened):
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.settle()
+    assert opened.session.scenario.obstacle == at(1.0)
+    assert opened.page.adopted[-1] == opened.shown == opened.session.scenario
+    assert opened.page.frames[-1].stage is max(Stage)
+
+
+def test_an_edit_that_changes_nothing_does_nothing(opened):
+    before = (len(opened.engine.asked), len(opened.page.adopted))
+    opened.session.edit("obstacle", obstacle=opened.session.scenario.obstacle)
+    opened.settle()
+    assert (len(opened.engine.asked), len(opened.page.adopted)) == before
+    opened.session.undo()
+    assert opened.session.scenario == fresh("draw_s")
+
+
+def test_a_view_is_adopted_and_nothing_is_computed(opened):
+    asked, hidden = len(opened.engine.asked), View(ghost=False)
+    opened.session.edit("ghost", view=hidden)
+    opened.settle()
+    assert opened.page.adopted[-1].view == opened.session.scenario.view == hidden
+    assert len(opened.engine.asked) == asked
+
+
+def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("ghost", view=View(ghost=False))
+    opened.session.undo()
+    assert opened.session.scenario == replace(fresh("draw_s"), view=View(ghost=False))
+
+
+def test_one_gesture_is_one_step_of_undo(opened):
+    for x in np.linspace(0, 1, 20):
+        opened.clock[0] += 0.05
+        opened.session.edit("obstacle", obstacle=at(x))
+    opened.session.undo()
+    assert opened.session.scenario == fresh("draw_s")
+    opened.session.redo()
+    assert opened.session.scenario.obstacle == at(1.0)
+
+
+@pytest.mark.parametrize("ending", ["let go", "pause", "another control"])
+def test_the_next_gesture_is_a_step_of_its_own(opened, ending):
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    if ending == "let go":
+        opened.session.end_gesture()
+    if ending == "pause":
+        opened.clock[0] += 1.1
+    if ending == "another control":
+        opened.session.edit("temperature", temperature=2.0)
+    middle = opened.session.scenario
+    opened.session.edit("obstacle", obstacle=at(2.0))
+    opened.session.undo()
+    assert opened.session.scenario == middle
+
+
+def test_undo_and_redo_are_inverse_and_shown(opened):
+    states = [opened.session.scenario]
+    for step in range(5):
+        opened.session.edit(f"control {step}", temperature=2.0 + step)
+        states.append(opened.session.scenario)
+    for state in reversed(states[:-1]):
+        opened.session.undo()
+        opened.settle()
+        assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == state
+    opened.session.undo()
+    assert opened.session.scenario == states[0]
+    for state in states[1:]:
+        opened.session.redo()
+        opened.settle()
+        assert opened.session.scenario == opened.shown == state
+    opened.session.redo()
+    assert opened.session.scenario == states[-1]
+
+
+def test_a_new_edit_ends_what_could_be_redone(opened):
+    opened.session.edit("a", temperature=2.0)
+    opened.session.undo()
+    opened.session.edit("b", temperature=3.0)
+    opened.session.redo()
+    assert opened.session.scenario.temperature == 3.0
+    opened.session.undo()
+    assert opened.session.scenario == fresh("draw_s")
+
+
+def test_history_does_not_grow_without_end(opened):
+    for step in range(MAX_UNDO + 50):
+        opened.session.edit(f"control {step}", temperature=20.0 + step)
+    for _ in range(MAX_UNDO + 50):
+        opened.session.undo()
+    assert opened.session.scenario.temperature == 20.0 + 49
+
+
+def test_reset_goes_back_to_the_beginning_keeps_the_view_and_can_be_undone(opened):
+    opened.session.edit("ghost", view=View(ghost=False))
+    opened.session.edit("a", temperature=2.0, obstacle=at(1.0), generator="probability")
+    changed = opened.session.scenario
+    opened.session.reset()
+    opened.settle()
+    assert opened.session.scenario == opened.shown == replace(fresh("draw_s"), view=View(ghost=False))
+    opened.session.undo()
+    assert opened.session.scenario == changed
+
+
+def test_another_task_brings_its_place_and_keeps_other_choices(opened):
+    opened.session.edit("size", obstacle=Sphere((0.0, 0.0, 0.0), 0.22), temperature=3.0)
+    opened.session.choose_task("lift_box")
+    opened.settle()
+    scenario = opened.session.scenario
+    assert (scenario.task, scenario.temperature) == ("lift_box", 3.0)
+    assert scenario.obstacle == Sphere(fresh("lift_box").obstacle.position, 0.22)
+    assert opened.shown == scenario
+    opened.session.undo()
+    assert opened.session.scenario.task == "draw_s"
+    assert opened.session.scenario.obstacle == Sphere((0.0, 0.0, 0.0), 0.22)
+
+
+def test_choosing_the_same_task_changes_nothing(opened):
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.choose_task("draw_s")
+    assert opened.session.scenario.obstacle == at(1.0)
+
+
+def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
+    with pytest.raises(DemonstrationError, match=r"broken\.csv"):
+        opened.session.choose_task("broken")
+    assert opened.session.scenario == fresh("draw_s")
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.settle()
+    assert opened.shown.obstacle == at(1.0)
+
+
+def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        opened.session.edit("temperature", temperature=13.0)
+        opened.settle()
+    assert [str(error) for error in opened.page.errors] == ["unlucky.csv: file: found 13; accepted: another"]
+    opened.session.edit("temperature", temperature=5.0)
+    opened.settle()
+    assert opened.shown.temperature == 5.0
+    assert len(opened.page.errors) == 1
+
+
+def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
+    opened.engine.begun.clear()
+    opened.engine.gate = threading.Event()
+    opened.session.edit("obstacle", obstacle=at(0.0))
+    assert opened.engine.begun.wait(PATIENCE)
+    for x in range(1, 8):
+        opened.session.edit("obstacle", obstacle=at(float(x)))
+    opened.engine.gate.set()
+    opened.settle()
+    assert [scenario.obstacle.position[0] for scenario in opened.engine.asked[1:]] == [0.0, 7.0]
+    stages = [frame.stage for frame in opened.page.frames if frame.scenario.obstacle == at(0.0)]
+    assert stages == [Stage.ROLLOUTS, Stage.LIVE]  # something is shown while dragging; refined is only what rests
+    assert opened.page.paces[-1].num_skipped == 6
+
+
+def test_paces_are_those_of_the_edits(opened):
+    assert all(pace.latency >= 0 for pace in opened.page.paces)
+    assert opened.page.paces[-1].rate >= 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_after_a_storm_from_several_threads_the_last_picture_is_that_of_the_last_scenario(opened, seed):
+    plans = np.random.default_rng(seed)
+    seeds = plans.integers(0, 2**32, 4)
+
+    def storm(own_seed):
+        rng = np.random.default_rng(own_seed)
+        for _ in range(150):
+            what = rng.integers(0, 7)
+            if what <= 2:
+                opened.session.edit("obstacle", obstacle=at(float(rng.normal())))
+            elif what == 3:
+                opened.session.edit("temperature", temperature=float(rng.uniform(1, 12)))
+            elif what == 4:
+                opened.session.undo()
+            elif what == 5:
+                opened.session.redo()
+            else:
+                opened.session.choose_task(str(rng.choice(["draw_s", "lift_box"])))
+
+    threads = [threading.Thread(target=storm, args=(own,)) for own in seeds]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    opened.settle()
+    assert opened.page.errors == []
+    assert opened.shown == opened.session.scenario
+    assert opened.page.frames[-1].stage is max(Stage)
+    # frames come in the order of their computations, each computation's in the order of its stages
+    last = [frame for frame in opened.page.frames if frame.scenario == opened.session.scenario][-len(Stage) :]
+    assert [frame.stage for frame in last] == list(Stage)
+
+
+def test_what_the_controls_show_last_is_the_last_scenario_also_from_several_threads(opened):
+    """A slower page: controls must not end on a scenario that another thread has replaced meanwhile."""
+    inside, release = threading.Event(), threading.Event()
+    original = opened.page.adopt
+
+    def slow_first(scenario):
+        if scenario.obstacle == at(1.0):
+            inside.set()
+            release.wait(1.0)
+        original(scenario)
+
+    opened.page.adopt = slow_first
+    thread = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacle": at(1.0)})
+    thread.start()
+    assert inside.wait(PATIENCE)
+    second = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacle": at(2.0)})
+    second.start()
+    second.join(0.2)
+    release.set()
+    thread.join(PATIENCE)
+    second.join(PATIENCE)
+    assert opened.page.adopted[-1] == opened.session.scenario
+
+
+def test_a_closed_session_computes_nothing_more(opened):
+    opened.session.close()
+    asked = len(opened.engine.asked)
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    assert opened.session.wait_idle(1.0)
+    assert len(opened.engine.asked) == asked
