@@ -35,6 +35,8 @@ ARROW_SPACING = 0.030
 NUM_ARM_SAMPLES = 200
 MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
+MAX_GOAL_MISS = 1e-3
+"""Metres from the goal at which motions may end before it is said."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Frame:
     goal: Array
     """(3,) where the demonstrations end."""
     reached: Array
-    """(3,) where the motions end: elsewhere only if the obstacle covers the goal."""
+    """(3,) where the motions end: elsewhere where the obstacle covers the goal or its field reaches it."""
     health: Health
     field: FieldPicture | None = None
     """None before stage LIVE."""
@@ -277,6 +279,13 @@ def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Soluti
 def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
     """The frame of stage ROLLOUTS."""
     bundle = solution.bundle
+    clearance = float(scenario.obstacle.signed_distance(bundle.positions).min())
+    missed = float(np.linalg.norm(bundle.positions[-1] - ground.goal))
+    doubts = [*ground.imitation.warnings, *(doubt for made in solution.built for doubt in made.doubts)]
+    if scenario.avoidance and clearance < 0 and not doubts:
+        doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
+    if missed > MAX_GOAL_MISS:
+        doubts.append(f"the obstacle keeps the motions {1e3 * missed:.0f} mm from the goal")
     return Frame(
         scenario=scenario,
         task=ground.task,
@@ -287,8 +296,8 @@ def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
         goal=ground.goal,
         reached=bundle.positions[-1],
         health=Health(
-            clearance=float(scenario.obstacle.signed_distance(bundle.positions).min()),
+            clearance=clearance,
             duration=solution.built[0].duration if solution.built else None,
-            doubts=ground.imitation.warnings + tuple(doubt for made in solution.built for doubt in made.doubts),
+            doubts=tuple(doubts),
         ),
     )

@@ -8,6 +8,7 @@ from functools import lru_cache
 import trimesh
 import viser
 import yourdfpy
+from viser import transforms
 
 from dt_viz.fields import Array
 from dt_viz.robot import Robot, package_folder, urdf_path
@@ -67,7 +68,7 @@ class ArmPicture:
         name = ""
         for index, body in enumerate(_bodies(robot.joint_names)):
             name += f"/joint_{index}" if index else "/arm"
-            pose = viser.transforms.SE3.from_matrix(body.placement)
+            pose = transforms.SE3.from_matrix(body.placement)
             self._frames.append(
                 scene.add_frame(name, show_axes=False, wxyz=pose.rotation().wxyz, position=pose.translation())
             )

@@ -264,9 +264,8 @@ _SMALL = "font-size:0.8em;line-height:1.45;padding:0.1em 0.9em 0.35em;opacity:0.
 def status_html(frame: Frame, pace: Pace) -> str:
     """The status line: speed, clearance, certificates, and every reason for doubt."""
     health = frame.health
-    rebuild = f"{1e3 * pace.latency:.0f} ms" if frame.stage is Stage.LIVE else "refined"
     rows = (
-        ("Rebuild", f"{rebuild} · {pace.rate:.0f} frames/s · {pace.num_skipped} skipped"),
+        ("Rebuild", f"{1e3 * pace.latency:.0f} ms · {pace.rate:.0f} frames/s · {pace.num_skipped} skipped"),
         ("Clearance", f"{1e3 * health.clearance:.1f} mm"),
         ("Flow time t", "off" if health.duration is None else f"{health.duration:.2f}"),
         ("Smallest det J", "…" if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),

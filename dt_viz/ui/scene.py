@@ -191,23 +191,23 @@ class Obstacle(Picture):
             moved: told of a new centre (3,), metres, and whether the user has let go.
         """
         self._slice: Slice | None = None
-        self._gizmo = scene.add_transform_controls(
+        self.gizmo = scene.add_transform_controls(
             "/obstacle", scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
         )
-        super().__init__(self._gizmo)
+        super().__init__(self.gizmo)
         self._ball = scene.add_icosphere(
             "/obstacle/ball", radius=1.0, subdivisions=4, color=palette.OBSTACLE, opacity=OPACITY
         )
 
-        @self._gizmo.on_update
+        @self.gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
             moved(event.target.position.copy(), event.phase == "end")
 
         @self._ball.on_drag
         async def _(event: viser.SceneNodeDragEvent) -> None:
             camera = np.asarray(event.client.camera.position)
-            centre = self._gizmo.position + self._in_slice(camera, event.start_position, event.end_position)
-            self._gizmo.position = centre
+            centre = self.gizmo.position + self._in_slice(camera, event.start_position, event.end_position)
+            self.gizmo.position = centre
             moved(centre, event.phase == "end")
 
     def _in_slice(self, camera: Array, grabbed: Sequence[float], pointer: Sequence[float]) -> Array:
@@ -230,11 +230,11 @@ class Obstacle(Picture):
     def adopt(self, scenario: Scenario) -> None:
         """Stand where the scenario says, unless that is where the browser has put it already."""
         obstacle = scenario.obstacle
-        if np.abs(self._gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
-            self._gizmo.position = obstacle.position
+        if np.abs(self.gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
+            self.gizmo.position = obstacle.position
         if self._ball.scale != obstacle.radius:
             self._ball.scale = obstacle.radius
-            self._gizmo.scale = GIZMO_SCALE * (0.5 + obstacle.radius / MAX_DIAMETER)
+            self.gizmo.scale = GIZMO_SCALE * (0.5 + obstacle.radius / MAX_DIAMETER)
         opacity = OPACITY if scenario.avoidance else 0.3
         if self._ball.opacity != opacity:
             self._ball.opacity = opacity
@@ -243,12 +243,12 @@ class Obstacle(Picture):
     def without_gizmo(self) -> Iterator[None]:
         """Hide the handles, not the sphere, for as long as a picture takes."""
         # hiding the gizmo itself would hide the sphere that hangs on it
-        scale, opacity = self._gizmo.scale, self._gizmo.opacity
-        self._gizmo.scale, self._gizmo.opacity = 1e-6, 0.0
+        scale, opacity = self.gizmo.scale, self.gizmo.opacity
+        self.gizmo.scale, self.gizmo.opacity = 1e-6, 0.0
         try:
             yield
         finally:
-            self._gizmo.scale, self._gizmo.opacity = scale, opacity
+            self.gizmo.scale, self.gizmo.opacity = scale, opacity
 
 
 class Table(Picture):

@@ -43,12 +43,13 @@ class Visitor:
             titles: of the tasks, by name.
             task: the first task's name.
         """
-        self._client = client
-        self._task: str | None = None
+        self.client = client
+        self.shown: Frame | None = None
+        """The frame that was drawn last."""
         client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
-            self._pictures = ScenePictures(client.scene, self._obstacle_moved)
+            self.pictures = ScenePictures(client.scene, self._obstacle_moved)
             self._arm = ArmPicture(client.scene, robot)
         self._playback = Playback(self._pose)
         self._panel = Panel(client.gui, titles, self._save_png)
@@ -57,20 +58,20 @@ class Visitor:
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         """See `Display`."""
-        if frame.task.name != self._task:
-            self._task = frame.task.name
-            self._client.camera.position, self._client.camera.look_at = frame.task.camera
-            self._client.camera.fov = FIELD_OF_VIEW
-        with self._client.atomic():
-            self._pictures.draw(frame)
+        if self.shown is None or frame.task is not self.shown.task:
+            self.client.camera.position, self.client.camera.look_at = frame.task.camera
+            self.client.camera.fov = FIELD_OF_VIEW
+        with self.client.atomic():
+            self.pictures.draw(frame)
         if frame.stage is not Stage.ROLLOUTS:
             self._playback.follow(frame.arm)
             self._panel.report(frame, pace)
-        self._client.flush()
+        self.client.flush()
+        self.shown = frame
 
     def adopt(self, scenario: Scenario) -> None:
         """See `Display`."""
-        self._pictures.adopt(scenario)
+        self.pictures.adopt(scenario)
         self._arm.visible = scenario.view.arm
         self._playback.set_pace(scenario.view.playing, scenario.view.speed)
         self._panel.adopt(scenario)
@@ -96,11 +97,11 @@ class Visitor:
             self.session.end_gesture()
 
     def _pose(self, q: Array) -> None:
-        with self._client.atomic():
+        with self.client.atomic():
             self._arm.pose(q)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
-        with self._pictures.obstacle.without_gizmo():
-            content = render_png(self._client, RESOLUTIONS[resolution], transparent=transparent)
+        with self.pictures.obstacle.without_gizmo():
+            content = render_png(self.client, RESOLUTIONS[resolution], transparent=transparent)
         name = f"dt-viz-{self.session.scenario.task}.png"
-        self._client.send_file_download(name, content, save_immediately=True)
+        self.client.send_file_download(name, content, save_immediately=True)

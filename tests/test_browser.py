@@ -1,0 +1,205 @@
+"""The page in a real browser: headless Chromium, real mouse events."""
+
+import io
+import os
+import shutil
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dt_viz.fits import FitStore
+from dt_viz.metrics import maximum_collision_distance
+from dt_viz.tasks import TASKS
+from dt_viz.ui.server import Server
+from dt_viz.ui.visitor import Visitor
+
+playwright_api = pytest.importorskip("playwright.sync_api")
+
+CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+WIDTH, HEIGHT = 900, 560
+PATIENCE = 90.0  # seconds: software rendering is slow
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (Debian: apt-get install chromium)"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright_api.sync_playwright() as playwright:
+        args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=args)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    server = Server(TASKS, FitStore(tmp_path_factory.mktemp("fits")), task="draw_s", port=0, max_sessions=2)
+    yield server
+    server.close()
+
+
+def wait_until(condition, what):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.05)
+
+
+def open_page(browser, server):
+    """A new tab and the visitor that the server made for it, once its first scenario is drawn."""
+    known = set(server.visitors)
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    page.goto(f"http://127.0.0.1:{server.port}")
+    wait_until(lambda: set(server.visitors) - known, "the page of a visitor")
+    (visitor,) = set(server.visitors) - known
+    assert visitor.session.wait_idle(PATIENCE)
+    page.get_by_text("Smallest det J").wait_for(timeout=1000 * PATIENCE)
+    close_notice = page.locator("button.mantine-Notification-closeButton")
+    if close_notice.count():
+        close_notice.first.click()
+    return page, visitor
+
+
+@pytest.fixture
+def visit(browser, server):
+    page, visitor = open_page(browser, server)
+    wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
+    yield page, visitor
+    page.close()
+    wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
+
+
+def camera_rests(visitor: Visitor) -> bool:
+    camera = visitor.client.camera
+    wanted, _ = TASKS["draw_s"]().camera
+    return bool(np.abs(np.asarray(camera.position) - wanted).max() < 1e-3)
+
+
+def project(visitor: Visitor, point) -> tuple[float, float]:
+    """CSS pixels of a world point: the camera looks along its z axis, y down, vertical field of view."""
+    camera = visitor.client.camera
+    w, x, y, z = camera.wxyz
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    seen = rotation.T @ (np.asarray(point) - camera.position)
+    focal = HEIGHT / 2 / np.tan(camera.fov / 2)
+    return WIDTH / 2 + focal * seen[0] / seen[2], HEIGHT / 2 + focal * seen[1] / seen[2]
+
+
+def drag(page, start, end, steps=12):
+    page.mouse.move(*start)
+    page.mouse.down()
+    for k in range(1, steps + 1):
+        page.mouse.move(*(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)))
+        time.sleep(0.03)
+    page.mouse.up()
+
+
+def assert_shows_the_obstacle_where_it_is(visitor: Visitor) -> None:
+    session, frame = visitor.session, visitor.shown
+    assert frame is not None
+    assert frame.scenario.obstacle == session.scenario.obstacle
+    np.testing.assert_allclose(visitor.pictures.obstacle.gizmo.position, session.scenario.obstacle.position, atol=1e-9)
+
+
+def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
+    page, visitor = visit
+    before = visitor.shown
+    centre = np.array(visitor.session.scenario.obstacle.position)
+    tip = centre + np.array([0, 0, 0.8 * visitor.pictures.obstacle.gizmo.scale])
+    drag(page, project(visitor, tip), project(visitor, tip + np.array([0, 0, 0.06])))
+    wait_until(lambda: visitor.session.scenario.obstacle.position[2] > centre[2] + 0.03, "the drag to arrive")
+    assert visitor.session.wait_idle(PATIENCE)
+    moved = np.array(visitor.session.scenario.obstacle.position) - centre
+    np.testing.assert_allclose(moved[:2], 0, atol=1e-6)  # the arrow moves it upwards only
+
+    assert_shows_the_obstacle_where_it_is(visitor)
+    after = visitor.shown
+    assert (
+        max(np.abs(a[len(a) // 2] - b[len(b) // 2]).max() for a, b in zip(after.rollouts, before.rollouts, strict=True))
+        > 0.01
+    )
+    obstacle = after.scenario.obstacle
+    assert max(maximum_collision_distance(path, obstacle.signed_distance) for path in after.rollouts) == 0
+    assert after.health.clearance > 0.005
+
+
+def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_pose_is_shown(visit):
+    page, visitor = visit
+    centre = np.array(visitor.session.scenario.obstacle.position)
+    x, y = project(visitor, centre)
+    grabbed = (x - 18, y + 14)  # off the handles
+    for target in ((x + 40, y - 30), (x - 60, y + 20), (x + 25, y + 35)):
+        drag(page, grabbed, target, steps=6)
+        time.sleep(0.2)
+        grabbed = target
+    assert visitor.session.wait_idle(PATIENCE)
+    wait_until(lambda: visitor.session.wait_idle(0.3), "the last event")
+    shift = np.array(visitor.session.scenario.obstacle.position) - centre
+    assert np.linalg.norm(shift) > 0.02
+    assert abs(shift[1]) < 1e-6  # the drawing plane is y = const
+    assert_shows_the_obstacle_where_it_is(visitor)
+
+
+def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
+    page, visitor = visit
+    first = visitor.session.scenario
+    x, y = project(visitor, first.obstacle.position)
+    drag(page, (x - 18, y + 14), (x + 30, y - 20))
+    wait_until(lambda: visitor.session.scenario != first and visitor.session.wait_idle(0.5), "the drag")
+    second = visitor.session.scenario
+    page.get_by_text("Undo", exact=True).click()
+    wait_until(lambda: visitor.session.scenario.obstacle == first.obstacle, "undo")
+    page.get_by_text("Redo", exact=True).click()
+    wait_until(lambda: visitor.session.scenario.obstacle == second.obstacle, "redo")
+    assert visitor.session.wait_idle(PATIENCE)
+    assert_shows_the_obstacle_where_it_is(visitor)
+
+
+def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
+    page, _ = visit
+    page.get_by_role("button", name="Picture").or_(page.get_by_text("Picture", exact=True)).first.click()
+    with page.expect_download(timeout=1000 * PATIENCE) as download:
+        page.get_by_text("Save PNG").click()
+    image = Image.open(io.BytesIO(download.value.path().read_bytes()))
+    assert image.size == (1280, 720)
+    assert image.mode == "RGB"
+    pixels = np.asarray(image).reshape(-1, 3)
+    assert len(np.unique(pixels, axis=0)) > 200
+    assert 0.05 < (pixels < 250).any(axis=1).mean() < 0.95
+    # the rollouts are there, in their colour; the gizmo's blue and green arrows are not
+    assert (np.abs(pixels.astype(int) - (213, 94, 0)).max(axis=1) < 40).sum() > 300
+    assert (np.abs(pixels.astype(int) - (32, 128, 255)).max(axis=1) < 40).sum() == 0
+
+
+def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):
+    _, first = visit
+    page, second = open_page(browser, server)
+    second.session.edit("test", avoidance=False)
+    assert second.session.wait_idle(PATIENCE)
+    assert first.session.scenario.avoidance
+    third = browser.new_page()
+    third.goto(f"http://127.0.0.1:{server.port}")
+    third.get_by_text("All 2 places are taken").wait_for(timeout=1000 * PATIENCE)
+    third.close()
+    page.close()
+    wait_until(lambda: second not in server.visitors, "the second visitor to leave")
+    assert server.num_sessions == 1
+
+
+def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
+    page, visitor = visit
+    page.get_by_role("textbox", name="Task").or_(page.locator("input[value='Draw S']")).first.click()
+    page.get_by_role("option", name="Lift box").click()
+    wait_until(lambda: visitor.shown is not None and visitor.shown.task.name == "lift_box", "the other task")
+    assert len(visitor.shown.rollouts) == 8
