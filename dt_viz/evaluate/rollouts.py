@@ -28,6 +28,7 @@ from dt_viz.engine import Engine
 from dt_viz.evaluate.options import (
     add_task,
     chosen_task,
+    point,
     positive_number,
     print_table,
     ready_to_write,
@@ -47,8 +48,10 @@ ARRIVED = 1e-4
 """Metres from the goal in base space at which the last of the rollouts ends."""
 FINER = 1e-3
 """The truth's tolerances, relative to the accuracy asked for."""
-NUM_REFINEMENTS = 6
-"""Settings that are tried on each side, each ten times (fixed steps: two times) as fine as the one before."""
+NUM_REFINEMENTS = 4
+"""Tolerances that are tried on each side, each a tenth of the one before; the truth's is finer than the last."""
+MAX_STEPS = 64
+"""Fixed steps between neighbouring points, tried from 1 by doubling."""
 
 Systems = Callable[[float], DiffeomorphicSystem]
 """The system with the obstacle's flow integrated to a tolerance in metres."""
@@ -76,6 +79,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="metres from the truth that both sides must keep to (default: %(default)s)",
     )
+    parser.add_argument("--obstacle", type=point, metavar="X,Y,Z", help="centre, metres (default: the task's)")
+    parser.add_argument("--diameter", type=positive_number("metres", 1), metavar="D", default=0.15, help="metres")
     parser.add_argument("--repeats", type=whole_number(1), default=3, help="median of so many (default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="for the figures")
 
@@ -86,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
     out = None if options.out is None else ready_to_write(options.out, ".json")
     fits = FitStore(default_cache_folder())
     learned = learned_system(task, fits.get(task.demonstrations))
-    scenario = Scenario(task.name, Sphere(task.obstacle_position))
+    scenario = Scenario(task.name, Sphere(options.obstacle or task.obstacle_position, options.diameter))
     frame = next(iter(Engine(tasks, fits, load_jaco()).frames(scenario)))
     field = scenario.obstacle.field(scenario.generator, scenario.temperature)
     duration = frame.health.duration or 0.0
@@ -106,7 +111,8 @@ def run(options: argparse.Namespace) -> int:
             accuracy = f"{side.error:.1e}" + ("" if side.accurate else " (too coarse)")
             rows.append((f"{scene}, {name}", f"{1e3 * side.seconds:.1f}", accuracy, side.setting))
     if out is not None:
-        settings = {"task": task.name, "accuracy": options.accuracy, "repeats": options.repeats, "duration": duration}
+        settings = {"task": task.name, "accuracy": options.accuracy, "repeats": options.repeats}
+        settings |= {"obstacle": scenario.obstacle.position, "diameter": options.diameter, "duration": duration}
         write_json(out, {**results, "settings": settings})
     print(
         f"{task.name}, {NUM_ROLLOUTS} rollouts × {NUM_POINTS} points, both within {options.accuracy:g} m of the truth"
@@ -127,7 +133,7 @@ def compare(systems: Systems, starts: Array, accuracy: float, repeats: int) -> t
         accuracy: largest distance from the truth, metres.
         repeats: of each timing.
     """
-    finest = systems(1e-2 * FINER * accuracy)
+    finest = systems(0.1 * FINER * accuracy)
     end = finest.base.arrival_time(finest.transform.forward(starts), ARRIVED).max()
     times = np.linspace(0.0, float(end), NUM_POINTS)
     truth = stepped_adaptively(finest, starts, times, FINER * accuracy)
@@ -155,7 +161,7 @@ def compare(systems: Systems, starts: Array, accuracy: float, repeats: int) -> t
     fixed = _cheapest(
         [
             (f"RK4, {n} steps a point", lambda n=n: systems(accuracy / 10).stepped_rollout(starts, times, n))
-            for n in (2**k for k in range(NUM_REFINEMENTS))
+            for n in (2**k for k in range(MAX_STEPS.bit_length()))
         ],
         distance,
         accuracy,

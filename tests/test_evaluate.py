@@ -1,0 +1,351 @@
+"""The command line of the measurements, each subcommand from arguments to files, on small settings."""
+
+import json
+
+import numpy as np
+import pytest
+import scipy.io
+from PIL import Image
+
+from dt_viz.demos import Demonstration, save_demonstrations
+from dt_viz.diffeo import Identity
+from dt_viz.evaluate import rollouts
+from dt_viz.evaluate.__main__ import main
+from dt_viz.evaluate.imitation import grown_grid
+from dt_viz.evaluate.options import with_negative_values
+from dt_viz.evaluate.rollouts import compare, stepped_adaptively
+from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
+from dt_viz.systems import Attractor, DiffeomorphicSystem
+
+NUM_DEMONSTRATIONS = 2
+
+
+def hook(i):
+    """A hook some 50 mm wide that ends in the origin: seconds (T,) and millimetres (T, 2)."""
+    s = np.linspace(0, 1, 80 + 7 * i)
+    progress = s**2 * (3 - 2 * s)
+    angle = 2.2 * (1 - progress)
+    radius = 25 + 6 * i * (1 - progress)
+    positions = radius[:, None] * np.stack([np.cos(angle) - 1, np.sin(angle)], axis=1)
+    positions[:, 0] -= 20 * (1 - progress)
+    return (3 + 0.4 * i) * s, positions
+
+
+def write_mat(path):
+    cells = np.empty((1, NUM_DEMONSTRATIONS), dtype=object)
+    for i in range(NUM_DEMONSTRATIONS):
+        times, positions = hook(i)
+        cells[0, i] = {"t": times[None], "pos": positions.T, "dt": times[1]}
+    scipy.io.savemat(path, {"demos": cells, "dt": 0.04})
+    return path
+
+
+@pytest.fixture(scope="module")
+def lasa(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lasa")
+    write_mat(folder / "Hook.mat")
+    return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """Fits go to a folder of the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def number_after(text, label):
+    """The number that first follows `label` in `text`."""
+    return float(text.split(label)[1].split()[0])
+
+
+# --- imitation ---
+
+
+@pytest.fixture(scope="module")
+def imitated(lasa, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "new"
+    assert main(["imitation", str(lasa / "Hook.mat"), "--out", str(out)]) == 0
+    return out
+
+
+def test_imitation_writes_each_rollout_in_the_unit_of_the_file_from_start_to_goal(imitated):
+    with np.load(imitated / "Hook.npz") as arrays:
+        assert arrays["fit_seconds"] > 0
+        for i in range(NUM_DEMONSTRATIONS):
+            rollout, times = arrays[f"rollout_{i}"], arrays[f"times_{i}"]
+            assert rollout.shape == (len(times), 2)
+            assert times[0] == 0 and (np.diff(times) > 0).all()
+            np.testing.assert_allclose(rollout[0], hook(i)[1][0], atol=1e-6)
+            assert np.linalg.norm(rollout[-1]) < 0.1  # millimetres
+        assert f"rollout_{NUM_DEMONSTRATIONS}" not in arrays
+
+
+def test_the_figures_of_imitation_can_be_computed_again_from_the_arrays(imitated):
+    (figures,) = json.loads((imitated / "figures.json").read_text())["shapes"]
+    with np.load(imitated / "Hook.npz") as arrays:
+        frechet, rms = [], []
+        for i in range(NUM_DEMONSTRATIONS):
+            times, positions = hook(i)
+            rollout = arrays[f"rollout_{i}"]
+            a, b = (resample_by_arc_length(path, 400) for path in (rollout, positions))
+            frechet.append(float(discrete_frechet(a, b)))
+            rms.append(rms_at_equal_times(arrays[f"times_{i}"], rollout, times, positions))
+        extent = np.ptp(np.concatenate([hook(i)[1] for i in range(NUM_DEMONSTRATIONS)]), axis=0).max()
+        assert figures["round_trip_of_extent"] == pytest.approx(arrays["round_trip_error"] / extent)
+        assert figures["min_det_jacobian"] == arrays["min_det_jacobian"]
+    assert figures["frechet_mean_mm"] == pytest.approx(np.mean(frechet), rel=1e-6)
+    assert figures["frechet_max_mm"] == pytest.approx(np.max(frechet), rel=1e-6)
+    assert figures["rms_mm"] == pytest.approx(np.mean(rms), rel=1e-6)
+
+
+def test_imitation_prints_what_it_writes(lasa, tmp_path, capsys):
+    assert main(["imitation", str(lasa / "Hook.mat"), "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    (figures,) = json.loads((tmp_path / "figures.json").read_text())["shapes"]
+    assert number_after(printed, "Fréchet distance") == pytest.approx(figures["frechet_mean_mm"], abs=0.006)
+    assert number_after(printed, "RMS at equal times") == pytest.approx(figures["rms_mm"], abs=0.006)
+    assert number_after(printed, "fit: median") == pytest.approx(figures["fit_seconds"], abs=0.006)
+
+
+def test_the_picture_has_both_colours(imitated):
+    with Image.open(imitated / "shapes.png") as image:
+        red, green, _ = np.moveaxis(np.asarray(image.convert("RGB")).astype(int), -1, 0)
+    assert (green - red > 50).sum() > 500
+    assert (red - green > 100).sum() > 500
+
+
+def test_imitation_takes_other_files_in_metres_and_in_space(tmp_path):
+    times, positions = hook(0)
+    lifted = np.column_stack([positions, 10 * np.linspace(1, 0, len(times)) ** 2]) / 100  # some 0.5 m
+    lines = [",".join(map(str, row)) for row in np.column_stack([times, positions / 1000])]
+    (tmp_path / "plane.csv").write_text("\n".join(["t,x,y", *lines]))
+    save_demonstrations(tmp_path / "space.npz", [Demonstration(times, lifted, "lifted")])
+    files = [str(tmp_path / "plane.csv"), str(tmp_path / "space.npz")]
+    assert main(["imitation", *files, "--out", str(tmp_path / "out")]) == 0
+    for name, start in {"plane": positions[0] / 1000, "space": lifted[0]}.items():
+        with np.load(tmp_path / "out" / f"{name}.npz") as arrays:
+            np.testing.assert_allclose(arrays["rollout_0"][0], start, atol=1e-9)
+            assert np.linalg.norm(arrays["rollout_0"][-1]) < 1e-4
+
+
+def test_the_grid_of_the_certificates_covers_the_box_and_half_its_size_on_every_side():
+    grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]))
+    np.testing.assert_allclose([grid.min(axis=0), grid.max(axis=0)], [[-1, -2], [3, 6]])
+
+
+# --- latency ---
+
+
+@pytest.mark.parametrize("sessions", [1, 2])
+def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessions, capsys):
+    out = tmp_path / "latency.json"
+    task = ["--task", "Hook", "--lasa", str(lasa)]
+    assert main(["latency", *task, "--sessions", str(sessions), "--seconds", "0.3", "--out", str(out)]) == 0
+    figures = json.loads(out.read_text())
+    assert figures["settings"]["edits"] == 18 * sessions == figures["frames"] + figures["skipped"]
+    assert 0 < figures["rebuild_median_ms"] <= figures["median_ms"] <= figures["p95_ms"]
+    assert figures["median_ms"] < figures["live_median_ms"] <= figures["live_p95_ms"]
+    assert figures["settings"]["rollouts"] == NUM_DEMONSTRATIONS
+    assert number_after(capsys.readouterr().out, "rollouts  ") == pytest.approx(figures["median_ms"], abs=0.06)
+
+
+# --- avoidance ---
+
+
+@pytest.fixture(scope="module")
+def middle(lasa):
+    """The middle of the mean demonstration in the world, metres."""
+    from dt_viz.demos import load_demonstrations
+    from dt_viz.tasks import drawing_task
+
+    paths = drawing_task("Hook", "", "", load_demonstrations(lasa / "Hook.mat")).paths
+    return np.mean([resample_by_arc_length(path, 101)[50] for path in paths], axis=0)
+
+
+def run_avoidance(lasa, out, centre, *more):
+    where = ["--obstacle", ",".join(f"{value:.6f}" for value in centre), "--diameter", "0.1"]
+    assert main(["avoidance", "--task", "Hook", "--lasa", str(lasa), *where, "--out", str(out), *more]) == 0
+    with np.load(out) as arrays:
+        return dict(arrays)
+
+
+def test_avoidance_writes_angles_end_effector_and_demonstration_that_belong_together(
+    lasa, tmp_path, middle, robot, capsys
+):
+    arrays = run_avoidance(lasa, tmp_path / "a.npz", middle)
+    printed = capsys.readouterr().out
+    distances, clearances = [], []
+    for i in range(NUM_DEMONSTRATIONS):
+        q, x, demo = arrays[f"q_{i}"], arrays[f"x_{i}"], arrays[f"demo_{i}"]
+        assert q.shape == (len(x), 6) and x.shape[1] == demo.shape[1] == 3
+        np.testing.assert_allclose(robot.end_effector(q), x, atol=1e-12)
+        assert np.abs(np.diff(q, axis=0)).max() < 1  # unwrapped
+        assert len(demo) == len(hook(i)[0])
+        clearances.append(np.linalg.norm(x - middle, axis=1).min() - 0.05)
+        a, b = (resample_by_arc_length(path, 400) for path in (x, demo))
+        distances.append(float(discrete_frechet(a, b)))
+    assert min(clearances) > 0
+    assert number_after(printed, "F.D. mean") == pytest.approx(1e3 * np.mean(distances), abs=0.06)
+    assert number_after(printed, "; clearance") == pytest.approx(1e3 * min(clearances), abs=0.06)
+    assert number_after(printed, "\nM.C.D.") == 0
+    assert "joint-limit violations: 0 " in printed
+
+
+def test_without_avoidance_the_same_command_shows_the_collision(lasa, tmp_path, middle, capsys):
+    arrays = run_avoidance(lasa, tmp_path / "a.npz", middle, "--no-avoidance")
+    printed = capsys.readouterr().out
+    deepest = max(0.05 - np.linalg.norm(arrays[f"x_{i}"] - middle, axis=1).min() for i in range(NUM_DEMONSTRATIONS))
+    assert deepest > 0.03
+    # sampled points may lie a little less deep than the line between them
+    assert number_after(printed, "\nM.C.D.") == pytest.approx(1e3 * deepest, abs=1.0)
+
+
+def test_avoidance_says_what_is_not_to_be_trusted(lasa, tmp_path, capsys):
+    start = run_avoidance(lasa, tmp_path / "a.npz", [0.5, -0.5, 0.9])["demo_0"][0]
+    assert "doubt" not in capsys.readouterr().out
+    run_avoidance(lasa, tmp_path / "a.npz", start)
+    assert "doubt: start 1 is inside the obstacle" in capsys.readouterr().out
+
+
+def test_values_may_begin_with_a_minus():
+    assert with_negative_values(["--obstacle", "-0.1,-0.5,0.4", "-h"]) == ["--obstacle=-0.1,-0.5,0.4", "-h"]
+
+
+# --- starts ---
+
+
+def test_starts_are_spread_over_the_grown_box_and_arrive(lasa, tmp_path, capsys):
+    out = tmp_path / "starts.npz"
+    assert main(["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "600", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    with np.load(out) as arrays:
+        starts, ends, goal = arrays["starts"], arrays["ends"], arrays["goal"]
+        det = arrays["min_det_jacobian"]
+    assert starts.shape == ends.shape == (600, 3) and det.shape == (600,)
+    assert np.ptp(starts, axis=0).max() == pytest.approx(2 * 0.4, rel=0.05)  # a drawing is 0.4 m large
+    distance = np.linalg.norm(ends - goal, axis=1).max()
+    assert distance < 1e-4
+    assert number_after(printed, "at the end, mm") == pytest.approx(1e3 * distance, abs=1e-4)
+    assert number_after(printed, "smallest det J on the rollouts") == pytest.approx(det.min(), rel=1e-3)
+    assert "600 of 600" in printed
+
+
+def test_the_same_seed_gives_the_same_starts(lasa, tmp_path):
+    starts = []
+    for seed in ("3", "3", "4"):
+        out = tmp_path / "starts.npz"
+        main(["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "5", "--seed", seed, "--out", str(out)])
+        with np.load(out) as arrays:
+            starts.append(arrays["starts"])
+    assert (starts[0] == starts[1]).all() and (starts[0] != starts[2]).any()
+
+
+# --- rollouts ---
+
+
+def test_rollouts_reports_both_sides_at_the_accuracy_asked_for(lasa, tmp_path, middle, monkeypatch, capsys):
+    monkeypatch.setattr(rollouts, "NUM_POINTS", 40)
+    out = tmp_path / "rollouts.json"
+    beside = np.add(middle, [0, 0.045, 0])  # a little way into the motion: cheap to step through
+    where = ["--obstacle", ",".join(map(str, beside)), "--diameter", "0.1"]
+    task = ["--task", "Hook", "--lasa", str(lasa), *where]
+    assert main(["rollouts", *task, "--accuracy", "0.01", "--repeats", "1", "--out", str(out)]) == 0
+    figures = json.loads(out.read_text())
+    printed = capsys.readouterr().out
+    for scene in ("no obstacle", "obstacle"):
+        exact, stepped = figures[scene]["exact"], figures[scene]["stepped"]
+        assert 0 < exact["error"] <= 0.01 and 0 < stepped["error"] <= 0.01
+        assert figures[scene]["ratio"] == pytest.approx(stepped["seconds"] / exact["seconds"])
+        assert f"{scene}: exact rollouts are {figures[scene]['ratio']:.0f} × faster" in printed
+
+
+def straight():
+    return DiffeomorphicSystem(Identity(3), Attractor(np.zeros(3), 0.1, 0.05))
+
+
+def test_stepping_adaptively_is_as_accurate_as_asked_for():
+    starts, times = np.array([[0.3, 0.0, 0.1], [0.0, -0.2, 0.2]]), np.linspace(0, 3, 20)
+    exact = straight().rollout(starts, times)
+    errors = [np.abs(stepped_adaptively(straight(), starts, times, t) - exact).max() for t in (1e-4, 1e-7, 1e-10)]
+    assert (np.array(errors) < [1e-3, 1e-6, 1e-9]).all()
+
+
+def test_the_cheapest_stepping_is_no_finer_than_needed():
+    starts = np.array([[0.3, 0.0, 0.1]])
+    coarse = compare(lambda _: straight(), starts, 1e-3, 1)[1]
+    fine = compare(lambda _: straight(), starts, 1e-9, 1)[1]
+    assert coarse.accurate and fine.accurate
+    assert coarse.error > fine.error
+
+
+# --- bad input ---
+
+TASK = ["--task", "draw_s"]
+SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["imitation", "missing.mat", "--out", "out"], "missing.mat: path: found no such file or folder; accepted: "),
+        (["imitation", "a/S.mat", "b/S.mat", "--out", "out"], "a/S.mat: path: found no such file"),
+        (["imitation", "Hook.mat", "Hook.csv", "--out", "out"], "SHAPE: found 'Hook.mat' and 'Hook.csv'"),
+        (["imitation", "Hook.mat", "--out", "file/below"], "--out: found 'file/below', which cannot be made"),
+        (["latency", "--task", "none", "--seconds", "1", "--out", "a.json"], "--task: found 'none'; accepted: draw_s,"),
+        (["latency", *TASK, "--seconds", "1", "--out", "a.txt"], "--out: found 'a.txt'; accepted: a file that ends in"),
+        (["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"], "no: folder: found nothing that can"),
+        (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),
+        (["starts", *TASK, "--out", "folder.npz"], "--out: found 'folder.npz', which cannot be written"),
+        (["rollouts", "--task", "Draw S"], "--task: found 'Draw S'; accepted: draw_s, "),
+    ],
+)
+def test_what_cannot_be_used_is_named(lasa, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    write_mat(tmp_path / "Hook.mat")
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.npz").mkdir()
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["latency", *TASK, "--seconds", "0", "--out", "a.json"], "argument --seconds: found '0'; accepted: seconds, "),
+        (["latency", *TASK, "--seconds", "nan", "--out", "a.json"], "argument --seconds: found 'nan'"),
+        (["latency", *TASK, "--seconds", "1", "--sessions", "0", "--out", "a.json"], "argument --sessions: found '0'"),
+        (["avoidance", *TASK, "--obstacle", "0,0", "--diameter", "1"], "argument --obstacle: found '0,0'; accepted: "),
+        (["avoidance", *TASK, "--obstacle", "-0,inf,0", "--diameter", "1"], "argument --obstacle: found '-0,inf,0'"),
+        (["avoidance", *TASK, "--obstacle", "0,0,0", "--diameter", "-1"], "argument --diameter: found '-1'; accepted"),
+        (["avoidance", *TASK, *SPHERE, "--space", "cspace"], "argument --space: found 'cspace'; accepted: task "),
+        (["starts", *TASK, "--count", "many"], "argument --count: found 'many'; accepted: a whole number, 1 or more"),
+        (["imitation", "Hook.mat"], "the following arguments are required: --out"),
+        ([], "the following arguments are required: SUBCOMMAND"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(capsys, arguments, message):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_shape_that_cannot_be_fitted_does_not_keep_the_others_from_it(lasa, tmp_path, monkeypatch, capsys):
+    from dt_viz.evaluate import imitation
+    from dt_viz.imitation import ImitationError
+
+    def fit_only_in_the_plane(demonstrations, settings):
+        if demonstrations[0].dimension == 3:
+            raise ImitationError("demonstration 'lifted' is too strange")
+        return real(demonstrations, settings)
+
+    real = imitation.fit
+    monkeypatch.setattr(imitation, "fit", fit_only_in_the_plane)
+    times, positions = hook(0)
+    space = tmp_path / "space.npz"
+    save_demonstrations(space, [Demonstration(times, np.column_stack([positions, times]) / 1000, "lifted")])
+    assert main(["imitation", str(space), str(lasa / "Hook.mat"), "--out", str(tmp_path / "out")]) == 2
+    assert f"{space}: demonstration 'lifted' is too strange" in capsys.readouterr().err
+    assert (tmp_path / "out" / "Hook.npz").exists() and not (tmp_path / "out" / "space.npz").exists()
