@@ -35,7 +35,7 @@ ARROW_SPACING = 0.030
 NUM_ARM_SAMPLES = 200
 MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
-MAX_GOAL_MISS = 1e-3
+MAX_GOAL_MISS = 3e-3
 """Metres from the goal at which motions may end before it is said."""
 
 

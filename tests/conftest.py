@@ -15,6 +15,14 @@ settings.register_profile("dt-viz", deadline=None, derandomize=True, max_example
 settings.load_profile("dt-viz")
 
 
+def pytest_collection_modifyitems(config, items):
+    """What is marked slow runs when it is asked for by its marker."""
+    if "slow" not in config.getoption("-m"):
+        for item in items:
+            if item.get_closest_marker("slow"):
+                item.add_marker(pytest.mark.skip(reason="slow: run with pytest -m slow"))
+
+
 @pytest.fixture(scope="session")
 def robot() -> Robot:
     return load_jaco()

@@ -1,0 +1,275 @@
+"""Scenario to frames, for the tasks that ship: what a picture promises, whatever the scenario."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.demos import Demonstration
+from dt_viz.engine import MAX_GOAL_MISS, Stage
+from dt_viz.metrics import maximum_collision_distance
+from dt_viz.obstacles import Sphere
+from dt_viz.scenario import Scenario
+
+TASK_NAMES = ["draw_s", "lift_box"]
+MARGIN_KEPT = 0.9
+
+
+@pytest.fixture(params=TASK_NAMES, name="scenario")
+def _scenario(request, initial) -> Scenario:
+    return initial(request.param)
+
+
+def stage(engine, scenario, wanted):
+    """The frame of one stage; what comes after it is not computed."""
+    return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+
+
+def placed(scenario, position, diameter=0.15, **changes):
+    x, y, z = (float(c) for c in position)
+    return replace(scenario, obstacle=Sphere((x, y, z), diameter), **changes)
+
+
+def mean_end(task):
+    return np.mean([path[-1] for path in task.paths], axis=0)
+
+
+def starts_of(frame):
+    return np.stack([path[0] for path in frame.rollouts])
+
+
+def ends_of(frame):
+    return np.stack([path[-1] for path in frame.rollouts])
+
+
+def depth(frame):
+    """How deep a drawn line enters the obstacle, also between its points."""
+    return max(maximum_collision_distance(path, frame.scenario.obstacle.signed_distance) for path in frame.rollouts)
+
+
+def assert_finite(frame):
+    for path, times in zip(frame.rollouts, frame.times, strict=True):
+        assert np.isfinite(path).all() and np.isfinite(times).all()
+    assert np.isfinite(frame.reached).all() and np.isfinite(frame.health.clearance)
+    if frame.field is not None:
+        assert np.isfinite(frame.field.points).all() and np.isfinite(frame.field.velocities).all()
+    if frame.arm is not None:
+        assert np.isfinite(frame.arm.path.q).all()
+
+
+def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(engine, scenario):
+    frames = list(engine.frames(scenario))
+    assert [frame.stage for frame in frames] == list(Stage)
+    seconds = [frame.seconds for frame in frames]
+    assert seconds == sorted(seconds)
+    for frame in frames:
+        assert frame.scenario == scenario
+        assert len(frame.rollouts) == len(frame.times) == len(frame.ghost) == len(frame.task.demonstrations)
+        assert (frame.field is not None) == (frame.stage >= Stage.LIVE)
+        assert (frame.arm is not None) == (frame.stage >= Stage.LIVE)
+        assert (frame.health.min_det_jacobian is not None) == (frame.stage >= Stage.CERTIFIED)
+        assert_finite(frame)
+        for path, times in zip(frame.rollouts, frame.times, strict=True):
+            assert len(path) == len(times)
+            assert (np.diff(times) > 0).all() and times[0] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_first_picture_is_clear_healthy_and_undoubted(engine, scenario):
+    live = stage(engine, scenario, Stage.LIVE)
+    assert depth(live) == 0
+    assert live.health.clearance > MARGIN_KEPT * scenario.margin
+    certified = stage(engine, scenario, Stage.CERTIFIED)
+    health = certified.health
+    assert depth(certified) == 0
+    assert health.min_det_jacobian is not None and health.min_det_jacobian > 0
+    assert health.round_trip_error is not None and health.round_trip_error < 1e-6
+    assert health.lyapunov_falls is True
+    assert health.doubts == ()
+
+
+def poses_near(paths, num, seed):
+    """Places up to 5 cm from the mean path, ends left out."""
+    rng = np.random.default_rng(seed)
+    count = min(len(path) for path in paths)
+    mean = np.mean([path[np.linspace(0, len(path) - 1, count).astype(int)] for path in paths], axis=0)
+    along = rng.integers(round(0.3 * count), round(0.7 * count), num)
+    offset = rng.normal(size=(num, 3))
+    offset *= rng.uniform(0, 0.05, (num, 1)) / np.linalg.norm(offset, axis=1, keepdims=True)
+    return mean[along] + offset
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_no_drawn_segment_crosses_the_obstacle_wherever_it_stands(engine, initial, task):
+    starts = engine.task(task).starts
+    for pose in poses_near(engine.task(task).paths, 10, seed=0):
+        for frame in engine.frames(placed(initial(task), pose, diameter=0.12)):
+            if frame.stage in (Stage.LIVE, Stage.FINE):
+                where = f"obstacle at {pose}, {frame.stage.name}"
+                assert depth(frame) == 0, where
+                assert frame.health.clearance > 0.8 * frame.scenario.margin, where
+                tolerance = 1e-5 if frame.stage is Stage.FINE else 5e-4
+                np.testing.assert_allclose(starts_of(frame), starts, rtol=0, atol=tolerance, err_msg=where)
+                said = any("from the goal" in doubt for doubt in frame.health.doubts)
+                assert said or np.linalg.norm(ends_of(frame) - frame.goal, axis=1).max() <= MAX_GOAL_MISS, where
+            if frame.stage is Stage.FINE:
+                break
+
+
+def test_motions_end_at_a_goal_that_the_obstacle_is_far_from(engine, scenario):
+    """Within 0.1 mm, once the obstacle is six of its radii away."""
+    goal = stage(engine, scenario, Stage.ROLLOUTS).goal
+    away = np.array(scenario.obstacle.position) - goal
+    position = goal + 0.31 * away / np.linalg.norm(away)
+    for frame in engine.frames(placed(scenario, position, diameter=0.1)):
+        if frame.stage is Stage.FINE:
+            np.testing.assert_allclose(ends_of(frame), np.broadcast_to(frame.goal, ends_of(frame).shape), atol=1e-4)
+            np.testing.assert_allclose(frame.reached, frame.goal, rtol=0, atol=1e-4)
+            break
+
+
+def test_without_avoidance_the_rollouts_are_the_ghost(engine, scenario):
+    without = replace(scenario, avoidance=False)
+    for frame in engine.frames(without):
+        assert frame.health.duration is None
+        for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
+            if frame.stage <= Stage.LIVE:
+                np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
+            distance = np.linalg.norm(path[:, None] - ghost, axis=-1)
+            assert distance.min(axis=0).max() < 1e-12  # every ghost point is on it
+
+
+def test_with_an_obstacle_far_away_nothing_changes(engine, scenario):
+    frame = stage(engine, placed(scenario, (3.0, 3.0, 3.0)), Stage.LIVE)
+    assert frame.health.duration == 0
+    for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
+        np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
+
+
+def test_without_imitation_motions_are_straight(engine, scenario):
+    frame = stage(engine, replace(scenario, imitation=False, avoidance=False), Stage.LIVE)
+    for path, start in zip(frame.rollouts, frame.task.starts, strict=True):
+        np.testing.assert_allclose(path[[0, -1]], [start, frame.goal], rtol=0, atol=1e-12)
+        along = (frame.goal - start) / np.linalg.norm(frame.goal - start)
+        aside = (path - start) - np.outer((path - start) @ along, along)
+        assert np.abs(aside).max() < 1e-12
+
+
+def test_the_field_is_drawn_outside_the_obstacle_and_is_the_velocity_of_the_motion(engine, scenario):
+    frame = stage(engine, scenario, Stage.LIVE)
+    assert frame.field is not None
+    assert scenario.obstacle.signed_distance(frame.field.points).min() > 0
+    fine = stage(engine, scenario, Stage.FINE)
+    assert fine.field is not None
+    np.testing.assert_array_equal(fine.field.points, frame.field.points)
+    largest = np.linalg.norm(fine.field.velocities, axis=1).max()
+    assert np.abs(fine.field.velocities - frame.field.velocities).max() < 0.02 * largest
+
+
+AWKWARD = {
+    "on the goal": ("goal", 0.15, "goal is inside the obstacle"),
+    "on a start": ("start", 0.15, "start 1 is inside the obstacle"),
+    "around everything": ("middle", 2.0, "inside the obstacle"),
+}
+
+
+@pytest.mark.parametrize("case", AWKWARD)
+@pytest.mark.parametrize("imitation", [True, False])
+def test_an_awkward_obstacle_is_said_in_words_and_everything_stays_finite(engine, scenario, case, imitation):
+    where, diameter, words = AWKWARD[case]
+    task = engine.task(scenario.task)
+    position = {"goal": mean_end(task), "start": task.starts[0], "middle": scenario.obstacle.position}[where]
+    for frame in engine.frames(placed(scenario, position, diameter, imitation=imitation)):
+        assert_finite(frame)
+        assert any(words in doubt for doubt in frame.health.doubts), frame.health.doubts
+        if frame.stage is Stage.FINE:
+            break
+
+
+@pytest.mark.parametrize("duration", [None, 0.0, 0.3])
+@pytest.mark.parametrize("generator", ["probability", "free-space"])
+def test_a_motion_either_clears_the_obstacle_or_that_is_said(engine, scenario, generator, duration):
+    frame = stage(engine, replace(scenario, generator=generator, duration=duration), Stage.LIVE)
+    assert_finite(frame)
+    assert (depth(frame) == 0) != bool([d for d in frame.health.doubts if "from the goal" not in d])
+
+
+def test_an_edit_of_the_view_gives_the_same_motion(engine, scenario):
+    seen = stage(engine, scenario, Stage.ROLLOUTS)
+    hidden = stage(engine, replace(scenario, view=replace(scenario.view, ghost=False)), Stage.ROLLOUTS)
+    for a, b in zip(seen.rollouts, hidden.rollouts, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
+    for chosen in (0, 3):
+        frame = stage(engine, replace(scenario, arm_rollout=chosen), Stage.LIVE)
+        assert frame.arm is not None
+        hand = robot.end_effector(frame.arm.path.q)
+        path = frame.rollouts[chosen]
+        nearest = np.linalg.norm(hand[:, None] - path, axis=-1).min(axis=1)
+        said = any("arm misses" in doubt for doubt in frame.health.doubts)
+        assert said or nearest.max() < 1e-3
+        np.testing.assert_allclose(frame.arm.times[[0, -1]], frame.times[chosen][[0, -1]], rtol=0, atol=1e-12)
+
+
+def random_edit(rng, scenario, initial):
+    kind = rng.integers(0, 6)
+    if kind == 0:
+        return replace(initial(str(rng.choice(TASK_NAMES))), temperature=scenario.temperature)
+    if kind == 1:
+        return replace(scenario, generator=str(rng.choice(["free-space", "probability"])), duration=0.4)
+    if kind == 2:
+        return replace(scenario, imitation=bool(rng.integers(2)), avoidance=bool(rng.integers(2)))
+    if kind == 3:
+        return replace(scenario, arm_rollout=int(rng.integers(7)), temperature=float(rng.uniform(1, 12)))
+    position = np.array(scenario.obstacle.position) + rng.normal(size=3) * 0.03
+    return placed(scenario, position, float(rng.uniform(0.05, 0.2)))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_same_scenario_gives_the_same_frame_whatever_was_shown_before(new_engine, initial, seed):
+    used, rng = new_engine(), np.random.default_rng(seed)
+    scenario = initial(TASK_NAMES[seed])
+    for _ in range(8):
+        scenario = random_edit(rng, scenario, initial)
+        stage(used, scenario, Stage.LIVE)
+    a, b = stage(used, scenario, Stage.LIVE), stage(new_engine(), scenario, Stage.LIVE)
+    for first, second in ((a.rollouts, b.rollouts), (a.times, b.times), (a.ghost, b.ghost)):
+        for left, right in zip(first, second, strict=True):
+            np.testing.assert_array_equal(left, right)
+    assert a.field is not None and b.field is not None
+    np.testing.assert_array_equal(a.field.velocities, b.field.velocities)
+    assert a.health == b.health
+    assert (a.arm is None) == (b.arm is None)
+
+
+def reach_of_random_starts(engine, fits, task, num):
+    """Largest miss of the goal, metres, and smallest det J along the motions of random starts."""
+    task = engine.task(task)
+    imitation = fits.get(task.demonstrations)
+    points = np.concatenate([d.positions for d in task.demonstrations])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    grow = (upper - lower) / 4  # by half its size in all
+    starts = np.random.default_rng(0).uniform(lower - grow, upper + grow, (num, len(lower)))
+    duration = max(d.times[-1] for d in task.demonstrations)
+    motion = imitation.system.rollout(starts, duration * np.array([0.0, 0.2, 0.5, 0.8, 1.0, 20.0]))
+    np.testing.assert_allclose(motion[:, 0], starts, rtol=0, atol=1e-9)
+    values = imitation.system.lyapunov(motion[:, :5])
+    arrived = values[:, :-1] < 1e-12 * values.max()  # what is below is rounding
+    falls = bool((arrived | (np.diff(values, axis=-1) < 0)).all())
+    miss = task.scale * np.linalg.norm(motion[:, -1] - imitation.goal, axis=1).max()
+    return miss, np.linalg.det(imitation.transform.jacobian(motion)[1]).min(), falls
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("num", [2000, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_random_starts_around_the_demonstrations_all_reach_the_goal(engine, fits, task, num):
+    miss, det, falls = reach_of_random_starts(engine, fits, task, num)
+    assert miss < 1e-4
+    assert det > 0
+    assert falls
+
+
+def test_a_task_is_loaded_once(engine):
+    assert engine.task("draw_s") is engine.task("draw_s")
+    assert all(isinstance(d, Demonstration) for d in engine.task("draw_s").demonstrations)
