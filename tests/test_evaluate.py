@@ -1,6 +1,8 @@
 """The command line of the measurements, each subcommand from arguments to files, on small settings."""
 
 import json
+from contextlib import redirect_stdout
+from io import StringIO
 
 import numpy as np
 import pytest
@@ -65,8 +67,11 @@ def number_after(text, label):
 
 @pytest.fixture(scope="module")
 def imitated(lasa, tmp_path_factory):
+    """Its folder."""
     out = tmp_path_factory.mktemp("out") / "new"
-    assert main(["imitation", str(lasa / "Hook.mat"), "--out", str(out)]) == 0
+    with redirect_stdout(StringIO()) as printed:
+        assert main(["imitation", str(lasa / "Hook.mat"), "--out", str(out)]) == 0
+    (out / "printed.txt").write_text(printed.getvalue(), encoding="utf-8")
     return out
 
 
@@ -100,10 +105,9 @@ def test_the_figures_of_imitation_can_be_computed_again_from_the_arrays(imitated
     assert figures["rms_mm"] == pytest.approx(np.mean(rms), rel=1e-6)
 
 
-def test_imitation_prints_what_it_writes(lasa, tmp_path, capsys):
-    assert main(["imitation", str(lasa / "Hook.mat"), "--out", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
-    (figures,) = json.loads((tmp_path / "figures.json").read_text())["shapes"]
+def test_imitation_prints_what_it_writes(imitated):
+    printed = (imitated / "printed.txt").read_text(encoding="utf-8")
+    (figures,) = json.loads((imitated / "figures.json").read_text())["shapes"]
     assert number_after(printed, "Fréchet distance") == pytest.approx(figures["frechet_mean_mm"], abs=0.006)
     assert number_after(printed, "RMS at equal times") == pytest.approx(figures["rms_mm"], abs=0.006)
     assert number_after(printed, "fit: median") == pytest.approx(figures["fit_seconds"], abs=0.006)
