@@ -38,8 +38,9 @@ class Playback:
         self._playing, self._speed = playing, speed
 
     def close(self) -> None:
-        """Stop. Does not wait for the thread."""
+        """Stop, and wait for the picture that is being sent."""
         self._closed.set()
+        self._thread.join(timeout=1)
 
     def _loop(self) -> None:
         before, shown = time.monotonic(), None

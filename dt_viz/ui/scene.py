@@ -183,12 +183,12 @@ class Obstacle(Picture):
     The browser moves gizmo and sphere together, without asking the server.
     """
 
-    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, bool], None]) -> None:
+    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, str], None]) -> None:
         """Draw the obstacle.
 
         Args:
             scene: of the visitor.
-            moved: told of a new centre (3,), metres, and whether the user has let go.
+            moved: told of a new centre (3,), metres, and the phase of the drag: "start", "update" or "end".
         """
         self._slice: Slice | None = None
         self.gizmo = scene.add_transform_controls(
@@ -201,14 +201,14 @@ class Obstacle(Picture):
 
         @self.gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
-            moved(event.target.position.copy(), event.phase == "end")
+            moved(event.target.position.copy(), event.phase)
 
         @self._ball.on_drag
         async def _(event: viser.SceneNodeDragEvent) -> None:
             camera = np.asarray(event.client.camera.position)
             centre = self.gizmo.position + self._in_slice(camera, event.start_position, event.end_position)
             self.gizmo.position = centre
-            moved(centre, event.phase == "end")
+            moved(centre, event.phase)
 
     def _in_slice(self, camera: Array, grabbed: Sequence[float], pointer: Sequence[float]) -> Array:
         """How far (3,) the grabbed point must move, parallel to the slice, to lie under the pointer."""
@@ -281,7 +281,7 @@ def set_lights(scene: viser.SceneApi) -> None:
 class ScenePictures:
     """Everything in the scene of one visitor that is drawn from frames."""
 
-    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, bool], None]) -> None:
+    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, str], None]) -> None:
         """Build the scene; `moved` is told where the user puts the obstacle, see `Obstacle`."""
         set_lights(scene)
         self.obstacle = Obstacle(scene, moved)

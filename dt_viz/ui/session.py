@@ -73,6 +73,7 @@ class Session:
         self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
         self._future: list[Scenario] = []
         self._gesture: tuple[str, float] = ("", 0.0)
+        self._held = False
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
         self._worker = LatestWorker[tuple[Scenario, float]](self._compute, display.fail, name="session")
@@ -94,7 +95,7 @@ class Session:
             moves = not edited.moves_like(self.scenario)
             if moves:
                 name, when = self._gesture
-                if name != gesture or now - when > GESTURE_PAUSE:
+                if name != gesture or (now - when > GESTURE_PAUSE and not self._held):
                     self._past.append(self.scenario)
                 self._gesture = (gesture, now)
                 self._future.clear()
@@ -103,10 +104,15 @@ class Session:
                 self._submit()
         self._adopt()
 
+    def begin_gesture(self) -> None:
+        """The user took hold of something: edits until `end_gesture` are undone together, however slow."""
+        with self._lock:
+            self._gesture, self._held = ("", 0.0), True
+
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo."""
         with self._lock:
-            self._gesture = ("", 0.0)
+            self._gesture, self._held = ("", 0.0), False
 
     def choose_task(self, name: str) -> None:
         """Begin another task, with what else was chosen.

@@ -89,11 +89,12 @@ class Visitor:
         self.session.close()
         self._playback.close()
 
-    def _obstacle_moved(self, centre: Array, released: bool) -> None:
-        scenario = self.session.scenario
+    def _obstacle_moved(self, centre: Array, phase: str) -> None:
+        if phase == "start":
+            self.session.begin_gesture()
         x, y, z = (float(c) for c in centre)
-        self.session.edit("obstacle", obstacle=Sphere((x, y, z), scenario.obstacle.diameter))
-        if released:
+        self.session.edit("obstacle", obstacle=Sphere((x, y, z), self.session.scenario.obstacle.diameter))
+        if phase == "end":
             self.session.end_gesture()
 
     def _pose(self, q: Array) -> None:
