@@ -190,11 +190,11 @@ class Engine:
             task = self.task(scenario.task)
             imitation = self._fits.get(task.demonstrations, progress=progress)
             goal = task.to_world(imitation.goal)
-            end, transform = goal, Identity(len(goal))
+            base = imitation.base.placed(task.origin, task.axes[:, : imitation.base.dim], task.scale)
             if scenario.imitation:
-                end = task.to_world(imitation.base.goal)
                 transform = Placed(imitation.transform, task.origin, task.axes, task.scale)
-            base = Attractor(end, task.scale * imitation.base.speed, task.scale * imitation.base.smoothing)
+            else:
+                transform, base = Identity(len(goal)), replace(base, goal=goal)
             rays = Rays(transform.forward(task.starts), base)
             bundle = evenly_sampled(lambda i, u: _climb(rays.at(i, u), [transform])[:, 1:], len(rays.z0), NUM_SAMPLES)
             self._grounds[key] = _Ground(task, imitation, transform, base, goal, rays, bundle)

@@ -53,8 +53,8 @@ class Attractor:
         shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
         return self.goal + shrink[..., None] * offset[..., None, :]
 
-    def arrival_time(self, z0: Array, distance: float) -> Array:
-        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (metres) of the goal."""
+    def arrival_time(self, z0: Array, distance: float | Array) -> Array:
+        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (*B,) or (), metres, of the goal."""
         r0 = np.linalg.norm(z0 - self.goal, axis=-1)
         farther = np.maximum(r0, distance)
         span = log_sinh(farther / self.smoothing) - log_sinh(np.asarray(distance / self.smoothing))

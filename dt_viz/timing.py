@@ -7,7 +7,7 @@ has learned of the demonstrations' shape stays as it is, and their timing is lea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -58,13 +58,30 @@ class TimedAttractor(Attractor):
         shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
         return self.goal + shrink[..., None] * offset[..., None, :]
 
-    def arrival_time(self, z0: Array, distance: float) -> Array:
-        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (metres) of the goal."""
+    def arrival_time(self, z0: Array, distance: float | Array) -> Array:
+        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (*B,) or (), metres, of the goal."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
+        near = np.broadcast_to(distance, r0.shape[:-1])[..., None]
         paces = self._blended(offset)
-        span = self._time_to_go(self._clock(np.maximum(r0, distance)), paces)
-        return (span - self._time_to_go(self._clock(np.full_like(r0, distance)), paces))[..., 0]
+        span = self._time_to_go(self._clock(np.maximum(r0, near)), paces)
+        return (span - self._time_to_go(self._clock(near), paces))[..., 0]
+
+    def placed(self, origin: Array, axes: Array, scale: float) -> TimedAttractor:
+        """The same attractor in a space of more dimensions: a point z becomes origin + scale·axes·z.
+
+        Args:
+            origin: (D,), metres.
+            axes: (D, d) orthonormal columns.
+            scale: metres for one unit of z.
+        """
+        return replace(
+            self,
+            goal=origin + scale * (axes @ self.goal),
+            speed=scale * self.speed,
+            smoothing=scale * self.smoothing,
+            directions=self.directions @ axes.T,
+        )
 
     def _clock(self, r: Array) -> Array:
         """τ(r); a number far below all knots at the goal itself."""
