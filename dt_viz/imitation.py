@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,13 +14,14 @@ from dt_viz.demos import Demonstration
 from dt_viz.diffeo import Chain, Diffeomorphism, Flow, min_det_jacobian, round_trip_error
 from dt_viz.fields import Array, GaussianGrid, GridRBF
 from dt_viz.integrate import euler, implicit_euler
-from dt_viz.layers import Stack
-from dt_viz.metrics import arc_length
+from dt_viz.layers import Layer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
+from dt_viz.metrics import arc_length, interpolate
 from dt_viz.preparation import ImitationError, Motions, prepare
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.timing import TimedAttractor, learn_timing
 from dt_viz.trajectory_fit import TrajectoryFit
 from dt_viz.unbend import layers_along, regress, unbending
+from dt_viz.velocity_fit import VelocityFit
 
 Progress = Callable[[float, str], None]
 
@@ -28,18 +29,28 @@ MIN_STEP_DETERMINANT = 0.05  # of an Euler step's derivative; at 0 it would fold
 STEP_LENGTH = 0.8  # how far an Euler step of the start may move a point, in σ
 MAX_LAYERS = 10
 MAX_ATTEMPTS = 5  # each smoother than the one before
+VELOCITY_REGULARISATION = 100.0  # how much more of it the velocity objective takes
+NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
 
 
 @dataclass(frozen=True)
 class ImitationSettings:
     """How to fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean)."""
 
+    objective: Literal["trajectory", "velocity"] = "trajectory"
+    """What is fitted: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
     num_layers: int = 3
-    """Stationary flows that ψ is composed of, at least; motions that turn far get more."""
+    """Stationary flows that ψ is composed of, at least; motions that turn far get more. The velocity objective
+    has one."""
     steps: int = 4
     """Euler steps of each flow."""
     sigma: float | None = None
-    """Width of a Gaussian. None takes 1 in the plane and 0.65 in space, less for motions folded into little room."""
+    """Width of a Gaussian. None takes 1 in the plane and 0.65 in space, less for motions folded into little room; half
+    of that for the velocity objective."""
+    ell: float | None = None
+    """ℓ of the Gaussians in 1/m², instead of `sigma`."""
+    num_inducing: int | None = None
+    """Inducing points of a layer, equally spaced over a box; None takes what `spacing` and `reach` give."""
     spacing: float = 1.0
     """Distance between neighbouring inducing points, in σ."""
     reach: float = 1.25
@@ -49,14 +60,19 @@ class ImitationSettings:
     num_points: int = 30
     """Points a demonstration that the fit looks at, at least; long motions get more."""
     max_iterations: int = 20
-    """Of Gauss–Newton."""
+    """Of Gauss–Newton; L-BFGS, whose iterations are cheaper, may take ten times as many."""
+
+
+def paper_preset(objective: Literal["trajectory", "velocity"] = "velocity") -> ImitationSettings:
+    """The paper's choices (sec. 5): m = 720 equally spaced states, ℓ = 0.005 with LASA in millimetres, Euler steps."""
+    return ImitationSettings(objective, steps=10 if objective == "velocity" else 4, ell=0.005e6, num_inducing=720)
 
 
 @dataclass(frozen=True)
 class Imitation:
     """A learned motion: ψ and the base attractor, in the demonstrations' own units, with certificates."""
 
-    transform: Diffeomorphism
+    transform: Chain
     """ψ, from the space of the demonstrations to the space of the base attractor."""
     base: TimedAttractor
     """The base system; its goal is z_e = ψ(goal)."""
@@ -88,11 +104,10 @@ class Imitation:
             "certificates": np.array([self.fit_seconds, self.min_det_jacobian, self.round_trip_error]),
             "warnings": np.array(self.warnings, dtype=np.str_),
         }
-        parts = self.transform.parts if isinstance(self.transform, Chain) else (self.transform,)
-        for index, flow in enumerate(parts):
+        for index, flow in enumerate(self.transform.parts):
             assert isinstance(flow, Flow) and isinstance(flow.field, GridRBF)
             arrays[f"layer_{index}_weights"] = flow.field.weights
-            arrays[f"layer_{index}_ell_steps"] = np.array([flow.field.grid.ell, flow.steps])
+            arrays[f"layer_{index}_ell_steps_forward"] = np.array([flow.field.grid.ell, flow.steps, flow.step is euler])
             for axis, coordinates in enumerate(flow.field.grid.axes):
                 arrays[f"layer_{index}_axis_{axis}"] = coordinates
         return arrays
@@ -105,10 +120,11 @@ class Imitation:
         flows: list[Diffeomorphism] = []
         while f"layer_{len(flows)}_weights" in arrays:
             prefix = f"layer_{len(flows)}_"
-            ell, steps = arrays[prefix + "ell_steps"]
+            ell, steps, forward = arrays[prefix + "ell_steps_forward"]
             axes = tuple(np.asarray(arrays[f"{prefix}axis_{j}"], dtype=float) for j in range(d))
             field = GridRBF(GaussianGrid(axes, float(ell)), np.asarray(arrays[prefix + "weights"], dtype=float))
-            flows.append(Flow(field, 1.0, int(steps), implicit_euler, euler))
+            integrators = (euler, implicit_euler) if forward else (implicit_euler, euler)
+            flows.append(Flow(field, 1.0, int(steps), *integrators))
         base = np.asarray(arrays["base"], dtype=float)
         pace = {k: np.asarray(arrays[f"base_{k}"], dtype=float) for k in ("directions", "knots", "paces")}
         seconds, min_det, error = (float(x) for x in arrays["certificates"])
@@ -145,7 +161,8 @@ def fit(
     began = time.perf_counter()
     progress(0.0, "checking the demonstrations")
     motions = prepare(demonstrations)
-    transform, warnings = _fit_trajectories(motions, settings, progress)
+    fit_transform = _fit_trajectories if settings.objective == "trajectory" else _fit_velocities
+    transform, warnings = fit_transform(motions, settings, progress)
 
     progress(0.92, "learning the timing")
     base = learn_timing(transform, motions.goal, motions.times, motions.positions)
@@ -178,14 +195,19 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
     centre, scale = points.mean(axis=(0, 1)), motions.spread
     normalised = (points - centre) / scale
     fractions = np.broadcast_to(np.linspace(0.0, 1.0, num_points), points.shape[:2])
-    sigma = settings.sigma or (1.0 if points.shape[-1] == 2 else 0.65) * min(1.0, 7.5 / length)
+    sigma = _width(motions, settings)
 
-    warnings: list[str] = []
     for attempt in range(MAX_ATTEMPTS):
         progress(0.05, "unbending the mean demonstration")
         regularisation, steps = settings.regularisation * 10.0**attempt, settings.steps * min(2**attempt, 4)
         shapes = unbending(normalised, settings.num_layers - 1, STEP_LENGTH * sigma * steps, MAX_LAYERS - 1)
-        stack = Stack(layers_along(shapes, sigma, spacing=settings.spacing, reach=settings.reach), steps)
+        if settings.num_inducing is None:
+            layers = layers_along(shapes, sigma, spacing=settings.spacing, reach=settings.reach)
+        else:
+            flat = np.concatenate(shapes).reshape(-1, normalised.shape[-1])
+            layer = Layer.of(equally_spaced_grid(flat, settings.num_inducing, 0.5 / sigma**2))
+            layers = (layer,) * (len(shapes) - 1)
+        stack = Stack(layers, steps)
         thetas = regress(stack, shapes, regularisation)
 
         def report(iteration: int, rms: float) -> None:
@@ -196,13 +218,68 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
         ends = np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]])
         thetas, ends, _ = problem.solve(thetas, ends, max_iterations=settings.max_iterations, report=report)
         if stack.min_step_determinant(thetas) > MIN_STEP_DETERMINANT:
-            if attempt:
-                warnings.append(
-                    f"the closest fit would fold the space over itself; regularised {10**attempt} times as much, it is "
-                    "invertible and follows the demonstrations less closely"
-                )
-            return stack.transform(thetas, centre, scale), warnings
-    raise ImitationError("no invertible map follows these demonstrations; do they contradict each other?")
+            return stack.transform(thetas, centre, scale), _smoothed(attempt)
+    raise ImitationError(NOT_INVERTIBLE)
+
+
+def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
+    """ψ by the velocity objective: one flow, ψ in explicit Euler steps as in the paper and ψ⁻¹ their exact inverse."""
+    scale, duration = motions.spread, float(np.mean([t[-1] for t in motions.times]))
+    centre = motions.resampled(settings.num_points).mean(axis=(0, 1))
+    positions, velocities = [], []
+    for t, path in zip(motions.times, motions.positions, strict=True):
+        even = np.linspace(0.0, t[-1], 2 * settings.num_points)
+        positions.append(interpolate(even, t, path))
+        velocities.append(interpolate(even, t, np.gradient(path, t, axis=0)))
+    x, v = (np.concatenate(positions) - centre) / scale, np.concatenate(velocities) * duration / scale
+    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / scale
+    sigma = _width(motions, settings)
+    if settings.num_inducing is None:
+        grid = GaussianGrid.covering(x, sigma, spacing=settings.spacing, pad=settings.reach)
+    else:
+        grid = equally_spaced_grid(x, settings.num_inducing, 0.5 / sigma**2)
+    max_iterations = 10 * settings.max_iterations
+
+    def report(iteration: int, cost: float) -> None:
+        progress(0.05 + 0.85 * iteration / max_iterations, f"fitting velocities, mean square error {cost:.3g}")
+
+    for attempt in range(MAX_ATTEMPTS):
+        problem = VelocityFit(
+            grid,
+            x,
+            v,
+            (motions.goal - centre) / scale,
+            speed=length,
+            smoothing=0.1 * length,
+            regularisation=settings.regularisation * VELOCITY_REGULARISATION * 10.0**attempt,
+            steps=settings.steps,
+        )
+        field = GridRBF(grid, problem.solve(max_iterations, report))
+        if min_step_determinant(field, 1.0 / settings.steps) > MIN_STEP_DETERMINANT:
+            return Chain(
+                [Flow(scaled_field(field, centre, scale), 1.0, settings.steps, euler, implicit_euler)]
+            ), _smoothed(attempt)
+    raise ImitationError(NOT_INVERTIBLE)
+
+
+def _width(motions: Motions, settings: ImitationSettings) -> float:
+    """σ of the Gaussians in units of the spread."""
+    if settings.ell is not None:
+        return float(np.sqrt(0.5 / settings.ell)) / motions.spread
+    if settings.sigma is not None:
+        return settings.sigma
+    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / motions.spread
+    width = (1.0 if len(motions.goal) == 2 else 0.65) * min(1.0, 7.5 / length)
+    return width if settings.objective == "trajectory" else 0.5 * width
+
+
+def _smoothed(attempt: int) -> list[str]:
+    if attempt == 0:
+        return []
+    return [
+        f"the closest fit would fold the space over itself; regularised {10**attempt} times as much, it is invertible "
+        "and follows the demonstrations less closely"
+    ]
 
 
 def _grown_box(points: Array, num: int, growth: float = 0.5) -> Array:

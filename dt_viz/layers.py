@@ -44,11 +44,16 @@ class Layer:
             reach: inducing points farther than this from all points are left out, in σ.
         """
         grid = GaussianGrid.covering(points, sigma, spacing=spacing, pad=reach)
-        centres = grid.inducing_points
-        distance, _ = KDTree(points).query(centres)
-        active = np.flatnonzero(distance <= max(reach, 0.5 * spacing * np.sqrt(grid.dim)) * sigma)
-        offset = centres[active, None] - centres[None, active]
-        gram = np.exp(-grid.ell * (offset**2).sum(axis=-1))
+        distance, _ = KDTree(points).query(grid.inducing_points)
+        return cls.of(grid, np.flatnonzero(distance <= max(reach, 0.5 * spacing * np.sqrt(grid.dim)) * sigma))
+
+    @classmethod
+    def of(cls, grid: GaussianGrid, active: NDArray[np.integer[Any]] | None = None) -> Layer:
+        """The Gaussians with indices `active` of a grid; None takes all."""
+        if active is None:
+            active = np.arange(grid.num_points)
+        centres = grid.inducing_points[active]
+        gram = np.exp(-grid.ell * ((centres[:, None] - centres) ** 2).sum(axis=-1))
         lower = cholesky(gram + JITTER * np.eye(len(active)), lower=True)
         return cls(grid, active, solve_triangular(lower, np.eye(len(active)), lower=True).T)
 
@@ -151,26 +156,10 @@ class Stack:
                 end = start
         return z, later, sensitivity.transpose(1, 0, 2)
 
-    def min_step_determinant(self, thetas: Sequence[Array], spacing: float | None = None) -> float:
-        """Smallest determinant of an Euler step's derivative, over all of space.
-
-        A step s + h·F(s) with bounded F is proper, so by Hadamard's theorem it is a diffeomorphism of R^d if this
-        determinant is positive everywhere. Outside the grids the fields vanish and it is 1.
-
-        Args:
-            thetas: coefficients.
-            spacing: distance between the points where it is computed, in σ; None takes 1/4 in the plane and 1/2 in
-                space.
-        """
-        spacing = spacing or (0.25 if self.dim == 2 else 0.5)
-        h, smallest = 1.0 / self.steps, np.inf
-        for layer, theta in zip(self.layers, thetas, strict=True):
-            sigma = np.sqrt(0.5 / layer.grid.ell)
-            axes = [np.arange(axis[0] - 2 * sigma, axis[-1] + 2 * sigma, spacing * sigma) for axis in layer.grid.axes]
-            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
-            derivative = layer.field(theta).with_jacobian(points)[1]
-            smallest = min(smallest, float(np.linalg.det(np.eye(self.dim) + h * derivative).min()))
-        return smallest
+    def min_step_determinant(self, thetas: Sequence[Array]) -> float:
+        """Smallest determinant of an Euler step's derivative, of all layers and over all of space."""
+        pairs = zip(self.layers, thetas, strict=True)
+        return min(min_step_determinant(layer.field(theta), 1.0 / self.steps) for layer, theta in pairs)
 
     def transform(self, thetas: Sequence[Array], centre: Array, scale: float) -> Chain:
         """ψ in the user's coordinates y = centre + scale·s, with an inverse exact to rounding.
@@ -180,7 +169,45 @@ class Stack:
         flows = []
         for layer, theta in zip(self.layers, thetas, strict=True):
             field = layer.field(theta)
-            axes = tuple(c + scale * axis for c, axis in zip(centre, layer.grid.axes, strict=True))
-            scaled = GridRBF(GaussianGrid(axes, layer.grid.ell / scale**2), -scale * field.weights)
-            flows.append(Flow(scaled, 1.0, self.steps, implicit_euler, euler))
+            reversed_field = GridRBF(field.grid, -field.weights)
+            flows.append(Flow(scaled_field(reversed_field, centre, scale), 1.0, self.steps, implicit_euler, euler))
         return Chain(flows)
+
+
+def min_step_determinant(field: GridRBF, h: float) -> float:
+    """Smallest determinant of the derivative of the Euler step s + h·V(s), over all of space.
+
+    With a bounded V the step is proper, so by Hadamard's theorem it is a diffeomorphism of R^d if this determinant is
+    positive everywhere. Away from the grid the field vanishes and it is 1; on the grid it is computed every quarter of
+    a Gaussian's width in the plane and every half in space.
+    """
+    sigma = np.sqrt(0.5 / field.grid.ell)
+    spacing = (0.25 if field.dim == 2 else 0.5) * sigma
+    axes = [np.arange(axis[0] - 2 * sigma, axis[-1] + 2 * sigma, spacing) for axis in field.grid.axes]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, field.dim)
+    return float(np.linalg.det(np.eye(field.dim) + h * field.with_jacobian(points)[1]).min())
+
+
+def scaled_field(field: GridRBF, centre: Array, scale: float) -> GridRBF:
+    """The field in coordinates y = centre + scale·s."""
+    axes = tuple(c + scale * axis for c, axis in zip(centre, field.grid.axes, strict=True))
+    return GridRBF(GaussianGrid(axes, field.grid.ell / scale**2), scale * field.weights)
+
+
+def equally_spaced_grid(points: Array, num: int, ell: float) -> GaussianGrid:
+    """`num` Gaussians over the box of `points` (N, d) and one width more, as equally spaced as factors of `num` allow."""
+    sigma = np.sqrt(0.5 / ell)
+    lower, upper = points.min(axis=0) - sigma, points.max(axis=0) + sigma
+
+    def unevenness(counts: tuple[int, ...]) -> float:
+        return float(np.ptp(np.log((upper - lower) / (np.array(counts) - 1))))
+
+    counts = min(_factorings(num, len(lower)), key=unevenness)
+    return GaussianGrid(tuple(np.linspace(a, b, n) for a, b, n in zip(lower, upper, counts, strict=True)), ell)
+
+
+def _factorings(num: int, parts: int) -> list[tuple[int, ...]]:
+    """All ways to write `num` as a product of `parts` factors of at least 2."""
+    if parts == 1:
+        return [(num,)] if num > 1 else []
+    return [(n, *rest) for n in range(2, num) if num % n == 0 for rest in _factorings(num // n, parts - 1)]

@@ -16,6 +16,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from dt_viz.fields import Array
 from dt_viz.layers import Stack
 
+IMAGE_PRIOR = 1e-7  # against drifting, on the images of the rays' ends, which are otherwise free
+
 
 @dataclass(frozen=True)
 class TrajectoryFit:
@@ -71,19 +73,13 @@ class TrajectoryFit:
             residual, jacobian = self._linearise(vector, weights)
             if report:
                 report(iteration, float(np.sqrt((residual**2).sum() / len(weights))))
-            num = len(weights)
-            gradient = jacobian.T @ residual / num - self._prior(len(vector)) * vector
-            normal = jacobian.T @ jacobian / num
+            gradient = jacobian.T @ residual / len(weights) - self._prior(len(vector)) * vector
+            system = _DampedSystem(jacobian / np.sqrt(len(weights)), sum(self.stack.sizes))
             before, accepted = cost, False
             for _ in range(6):
-                shifted = normal.copy()
-                # Damp the coefficients like the prior does, the images like the data does.
-                shifted[np.diag_indices_from(shifted)] += (
-                    self._prior(len(vector)) + damping * self.regularisation + 1e-9
-                )
-                try:
-                    step = cho_solve(cho_factor(shifted, check_finite=False), gradient)
-                except LinAlgError:
+                extra = damping * self.regularisation
+                step = system.solve(gradient, self.regularisation + extra, IMAGE_PRIOR + extra)
+                if step is None:
                     damping *= 8
                     continue
                 trial = self._cost(vector + step, weights)
@@ -135,3 +131,38 @@ class TrajectoryFit:
             jacobian[i, :, :, size + i * d : size + (i + 1) * d] = remaining[i] * by_ends[i]
         jacobian[..., -d:] = (1 - remaining) * by_ends
         return residual.reshape(-1), jacobian.reshape(num * n * d, -1)
+
+
+class _DampedSystem:
+    """(JᵀJ + D)·step = gradient with a diagonal D of two values, solved in the smaller of the two spaces.
+
+    With more unknowns than residuals, which is the rule in space, by Woodbury's identity:
+    step = D⁻¹(g − Jᵀ(I + J·D⁻¹·Jᵀ)⁻¹·J·D⁻¹·g).
+    """
+
+    def __init__(self, jacobian: Array, num_first: int) -> None:
+        self._jacobian = jacobian
+        self._num_first = num_first
+        self._dual = jacobian.shape[1] > 1.2 * jacobian.shape[0]
+        if self._dual:
+            first, second = jacobian[:, :num_first], jacobian[:, num_first:]
+            self._grams = first @ first.T, second @ second.T
+        else:
+            self._normal = jacobian.T @ jacobian
+
+    def solve(self, gradient: Array, first: float, second: float) -> Array | None:
+        """The step for D = (first, …, first, second, …), or None where rounding makes the matrix indefinite."""
+        diagonal = np.full(len(gradient), second)
+        diagonal[: self._num_first] = first
+        try:
+            if not self._dual:
+                matrix = self._normal.copy()
+                matrix[np.diag_indices_from(matrix)] += diagonal
+                return cho_solve(cho_factor(matrix, overwrite_a=True, check_finite=False), gradient)
+            matrix = self._grams[0] / first + self._grams[1] / second
+            matrix[np.diag_indices_from(matrix)] += 1.0
+            scaled = gradient / diagonal
+            inner = cho_solve(cho_factor(matrix, overwrite_a=True, check_finite=False), self._jacobian @ scaled)
+            return scaled - (self._jacobian.T @ inner) / diagonal
+        except LinAlgError:
+            return None
