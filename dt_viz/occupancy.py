@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
-from dt_viz.fields import Array, GaussianGrid, second_orders, unit_orders
+from dt_viz.fields import Array, GaussianGrid, Mask, second_orders, unit_orders
 
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")
@@ -98,7 +98,7 @@ def fit_occupancy(
 
 
 def sample_labels(
-    inside: Callable[[Array], Array], lower: Array, upper: Array, num_samples: int, rng: np.random.Generator
+    inside: Callable[[Array], Mask], lower: Array, upper: Array, num_samples: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Labelled samples {(s_k, o_k)} of a shape: uniform in its grown bounding box, half of them close to the shape.
 

@@ -59,6 +59,7 @@ def test_a_bad_round_trip_is_recognised_and_measured():
     bundle = bundle_of(coarse)
     health = certify(coarse, bundle)
     error = np.linalg.norm(coarse.inverse(coarse.forward(bundle.positions)) - bundle.positions, axis=1).max()
+    assert health.round_trip_error is not None
     assert health.round_trip_error == pytest.approx(error, rel=0.05)
     assert any(f"misses by {1e3 * health.round_trip_error:.3g} mm" in doubt for doubt in health.doubts)
     assert health.doubts[0] == "said before"

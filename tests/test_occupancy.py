@@ -35,7 +35,7 @@ def central_difference(function, s, h=1e-4):
 def learned_box(dim, seed=0):
     half = np.array([1.0, 0.5, 0.7][:dim])
     samples, labels = sample_labels(
-        lambda s: (np.abs(s) < half).all(axis=1), -half, half, 3000, np.random.default_rng(seed)
+        lambda s: np.all(np.abs(s) < half, axis=1), -half, half, 3000, np.random.default_rng(seed)
     )
     return fit_occupancy(samples, labels, 0.4, regularisation=1.0), half
 
@@ -93,7 +93,9 @@ def test_the_learned_boundary_is_near_the_true_one():
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_box_is_learned_from_its_labels(dim):
     learned, half = learned_box(dim)
-    fresh, truth = sample_labels(lambda s: (np.abs(s) < half).all(axis=1), -half, half, 2000, np.random.default_rng(99))
+    fresh, truth = sample_labels(
+        lambda s: np.all(np.abs(s) < half, axis=1), -half, half, 2000, np.random.default_rng(99)
+    )
     wrong = (learned.logit(fresh) > 0) != (truth > 0.5)
     assert wrong.mean() < 0.06
     # what is wrong is close to the boundary, or in a corner that a Gaussian rounds
@@ -122,7 +124,7 @@ def test_labels_of_one_kind_are_refused(label, word):
 
 def test_samples_lie_in_the_grown_box_and_half_of_them_close_to_the_shape():
     lower, upper = np.array([0.0, 1.0]), np.array([1.0, 3.0])
-    samples, labels = sample_labels(lambda s: s[:, 0] > 0.5, lower, upper, 1000, np.random.default_rng(0))
+    samples, labels = sample_labels(lambda s: np.asarray(s[:, 0] > 0.5), lower, upper, 1000, np.random.default_rng(0))
     offset = np.abs(samples - (lower + upper) / 2) / ((upper - lower) / 2)
     assert samples.shape == (1000, 2)
     assert offset.max() <= 3.0

@@ -64,7 +64,7 @@ def test_even_samples_are_evenly_apart_from_start_to_goal():
 
 def test_splitting_puts_each_sample_to_its_rollout():
     bundle = evenly_sampled(bent, 3, 20)
-    parts = bundle.split(bundle.index)
+    parts = bundle.split(bundle.index.astype(float))
     assert [set(part) for part in parts] == [{0}, {1}, {2}]
     np.testing.assert_array_equal(np.concatenate(bundle.split(bundle.positions)), bundle.positions)
 

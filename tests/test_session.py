@@ -3,12 +3,13 @@
 import logging
 import threading
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from dt_viz.demos import DemonstrationError
-from dt_viz.engine import Stage
+from dt_viz.engine import Engine, Stage
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Scenario, View
 from dt_viz.ui import session as session_module
@@ -91,7 +92,7 @@ def opened(monkeypatch):
     monkeypatch.setattr(session_module.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(session_module, "REST", 0.0)
     engine, page = FakeEngine(), Page()
-    session = Session(engine, fresh, "draw_s", page)
+    session = Session(cast(Engine, engine), fresh, "draw_s", page)
     result = Opened(session, engine, page, clock)
     result.settle()
     yield result

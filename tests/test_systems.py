@@ -21,9 +21,9 @@ def field(dim, seed=0, strength=0.25):
 ATTRACTOR = Attractor(np.array([0.2, -0.1]), speed=0.3, smoothing=0.2)
 TRANSFORMS = {
     "identity": Identity(2),
-    "flow": Flow(field(2), 1.0, 40),
+    "flow": Flow(field(2), 1.0, 20),
     "euler with exact inverse": Flow(field(2), 0.8, 6, implicit_euler, euler),
-    "chain": Chain([Flow(field(2, 1), 0.6, 20), AdaptiveFlow(field(2, 2), -0.6, 1e-12)]),
+    "chain": Chain([Flow(field(2, 1), 0.6, 12), AdaptiveFlow(field(2, 2), -0.6, 1e-10)]),
     "placed": Placed(Flow(field(2), 0.8, 30), np.array([0.1, 0.2]), np.array([[0.6, -0.8], [0.8, 0.6]]), 0.8),
 }
 

@@ -97,7 +97,7 @@ def test_jobs_run_one_at_a_time_in_order_and_the_last_is_always_run(started):
         running.release()
 
     worker, _, errors = started(run)
-    last, lock, pauses = [None], threading.Lock(), np.random.default_rng(0).integers(0, 3, (4, 300))
+    last, lock, pauses = [(0, 0)], threading.Lock(), np.random.default_rng(0).integers(0, 3, (4, 300))
 
     def storm(thread):
         for k in range(300):
