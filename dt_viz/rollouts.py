@@ -29,9 +29,13 @@ class Rays:
         return self.base.goal + (1 - fraction)[:, None] * (self.z0[index] - self.base.goal)
 
     def times(self, index: Indices, fraction: Array) -> Array:
-        """Seconds (N,) at which the motions are there; the goal itself counts as reached within `ARRIVED`."""
-        remaining = (1 - fraction) * np.linalg.norm(self.z0 - self.base.goal, axis=1)[index]
-        return self.base.arrival_time(self.z0[index], np.maximum(remaining, ARRIVED))
+        """Seconds (N,) at which the motions are there, `index` not decreasing; the goal is reached within `ARRIVED`."""
+        radius = np.linalg.norm(self.z0 - self.base.goal, axis=1)
+        # one row for each ray, filled up with starts: what holds for a whole ray is worked out once
+        column = np.arange(len(index)) - np.searchsorted(index, index)
+        remaining = np.repeat(radius[:, None], int(column.max()) + 1, axis=1)
+        remaining[index, column] = np.maximum((1 - fraction) * radius[index], ARRIVED)
+        return self.base.times_at(self.z0, remaining)[index, column]
 
 
 @dataclass(frozen=True)

@@ -53,12 +53,18 @@ class Attractor:
         shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
         return self.goal + shrink[..., None] * offset[..., None, :]
 
-    def arrival_time(self, z0: Array, distance: float | Array) -> Array:
-        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (*B,) or (), metres, of the goal."""
-        r0 = np.linalg.norm(z0 - self.goal, axis=-1)
-        farther = np.maximum(r0, distance)
-        span = log_sinh(farther / self.smoothing) - log_sinh(np.asarray(distance / self.smoothing))
-        return self.smoothing / self.speed * span
+    def times_at(self, z0: Array, distances: Array) -> Array:
+        """Seconds, (*B, T), at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of the goal.
+
+        Zero for distances that the start is within already.
+        """
+        r0 = np.linalg.norm(z0 - self.goal, axis=-1, keepdims=True)
+        farther = np.maximum(r0, distances)
+        return self.smoothing / self.speed * (log_sinh(farther / self.smoothing) - log_sinh(distances / self.smoothing))
+
+    def arrival_time(self, z0: Array, distance: float) -> Array:
+        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (metres) of the goal."""
+        return self.times_at(z0, np.full((*z0.shape[:-1], 1), distance))[..., 0]
 
 
 @dataclass(frozen=True)

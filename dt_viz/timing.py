@@ -58,14 +58,13 @@ class TimedAttractor(Attractor):
         shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
         return self.goal + shrink[..., None] * offset[..., None, :]
 
-    def arrival_time(self, z0: Array, distance: float | Array) -> Array:
-        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (*B,) or (), metres, of the goal."""
+    def times_at(self, z0: Array, distances: Array) -> Array:
+        """Seconds, (*B, T), at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of the goal."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
-        near = np.broadcast_to(distance, r0.shape[:-1])[..., None]
         paces = self._blended(offset)
-        span = self._time_to_go(self._clock(np.maximum(r0, near)), paces)
-        return (span - self._time_to_go(self._clock(near), paces))[..., 0]
+        togo = self._time_to_go(self._clock(np.minimum(distances, r0)), paces)
+        return self._time_to_go(self._clock(r0), paces) - togo
 
     def placed(self, origin: Array, axes: Array, scale: float) -> TimedAttractor:
         """The same attractor in a space of more dimensions: a point z becomes origin + scale·axes·z.
