@@ -142,7 +142,7 @@ def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonst
         axes=DRAWING_AXES,
         scale=scale,
         slice=Slice(DRAWING_CENTRE, DRAWING_AXES[:, :2], (float(half[0]), float(half[1]))),
-        camera=((0.84, -1.70, 0.80), (0.15, -0.33, 0.36)),
+        camera=((0.79, -1.56, 0.75), (0.15, -0.33, 0.355)),
         obstacle_position=_on_mean_path(demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, 0.5),
     )
 

@@ -265,7 +265,8 @@ def status_html(frame: Frame, pace: Pace) -> str:
     """The status line: speed, clearance, certificates, and every reason for doubt."""
     health = frame.health
     rows = (
-        ("Rebuild", f"{1e3 * pace.latency:.0f} ms · {pace.rate:.0f} frames/s · {pace.num_skipped} skipped"),
+        ("Rebuild", f"{1e3 * pace.latency:.0f} ms · {pace.rate:.0f} frames/s"),
+        ("Skipped edits", f"{pace.num_skipped}"),
         ("Clearance", f"{1e3 * health.clearance:.1f} mm"),
         ("Flow time t", "off" if health.duration is None else f"{health.duration:.2f}"),
         ("Smallest det J", "…" if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),

@@ -109,7 +109,7 @@ class Rollouts(Picture):
         self._lines = Lines(scene, "/rollouts", palette.ROLLOUT, 0.0048)
         super().__init__(self._lines.node)
         self._starts = scene.add_point_cloud(
-            "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.011, point_shape="circle"
+            "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
         )
 
     def draw(self, frame: Frame) -> None:

@@ -50,7 +50,7 @@ class Visitor:
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
             self.pictures = ScenePictures(client.scene, self._obstacle_moved)
-            self._arm = ArmPicture(client.scene, robot)
+            self.arm = ArmPicture(client.scene, robot)
         self._playback = Playback(self._pose)
         self._panel = Panel(client.gui, titles, self._save_png)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
@@ -72,7 +72,7 @@ class Visitor:
     def adopt(self, scenario: Scenario) -> None:
         """See `Display`."""
         self.pictures.adopt(scenario)
-        self._arm.visible = scenario.view.arm
+        self.arm.visible = scenario.view.arm
         self._playback.set_pace(scenario.view.playing, scenario.view.speed)
         self._panel.adopt(scenario)
 
@@ -99,7 +99,7 @@ class Visitor:
 
     def _pose(self, q: Array) -> None:
         with self.client.atomic():
-            self._arm.pose(q)
+            self.arm.pose(q)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.obstacle.without_gizmo():
