@@ -29,6 +29,7 @@ MIN_STEP_DETERMINANT = 0.05  # of an Euler step's derivative; at 0 it would fold
 STEP_LENGTH = 0.8  # how far an Euler step of the start may move a point, in σ
 MAX_LAYERS = 10
 MAX_ATTEMPTS = 5  # each smoother than the one before
+STRAYED = 0.6  # of the spread: a rollout that far off at some time is worth a word
 VELOCITY_REGULARISATION = 100.0  # how much more of it the velocity objective takes
 NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
 
@@ -176,7 +177,7 @@ def fit(
         fit_seconds=time.perf_counter() - began,
         min_det_jacobian=min_det_jacobian(transform.jacobian, box),
         round_trip_error=round_trip_error(transform, box),
-        warnings=(*motions.warnings, *warnings),
+        warnings=(*motions.warnings, *warnings, *_strayed(motions, DiffeomorphicSystem(transform, base))),
     )
     if not (result.min_det_jacobian > 0 and result.round_trip_error < 1e-9 * motions.spread):
         raise ImitationError(
@@ -280,6 +281,17 @@ def _smoothed(attempt: int) -> list[str]:
         f"the closest fit would fold the space over itself; regularised {10**attempt} times as much, it is invertible "
         "and follows the demonstrations less closely"
     ]
+
+
+def _strayed(motions: Motions, system: DiffeomorphicSystem) -> list[str]:
+    """A word on each motion that the rollouts do not follow."""
+    warnings = []
+    for name, times, path in zip(motions.names, motions.times, motions.positions, strict=True):
+        at = np.linspace(0, len(times) - 1, min(len(times), 100)).astype(int)
+        off = np.linalg.norm(system.rollout(path[0], times[at]) - path[at], axis=1).max()
+        if off > STRAYED * motions.spread:
+            warnings.append(f"the learned motion strays up to {off:.2g} from '{name}'")
+    return warnings
 
 
 def _grown_box(points: Array, num: int, growth: float = 0.5) -> Array:

@@ -195,7 +195,7 @@ def scaled_field(field: GridRBF, centre: Array, scale: float) -> GridRBF:
 
 
 def equally_spaced_grid(points: Array, num: int, ell: float) -> GaussianGrid:
-    """`num` Gaussians over the box of `points` (N, d) and one width more, as equally spaced as factors of `num` allow."""
+    """`num` Gaussians over the box of `points` (N, d) and a width more, as equally spaced as factors of `num` allow."""
     sigma = np.sqrt(0.5 / ell)
     lower, upper = points.min(axis=0) - sigma, points.max(axis=0) + sigma
 

@@ -27,6 +27,7 @@ class ImitationError(ValueError):
 class Motions:
     """What a fit works on."""
 
+    names: tuple[str, ...]
     times: tuple[Array, ...]
     """For each motion (T_i,) seconds, increasing from 0."""
     positions: tuple[Array, ...]
@@ -62,7 +63,7 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     spread = _spread(usable)
     usable, goal = _with_common_goal(usable, spread, warnings)
 
-    times, positions = [], []
+    names, times, positions = [], [], []
     for demonstration in usable:
         t, path = demonstration.times - demonstration.times[0], _end_moved(demonstration.positions, goal)
         away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
@@ -77,11 +78,12 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
             )
             t, path = t[first:] - t[first], path[first:]
         _remark_on(demonstration.name, t, path, spread, warnings)
+        names.append(demonstration.name)
         times.append(t)
         positions.append(path)
     if not positions:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
-    return Motions(tuple(times), tuple(positions), goal, spread, tuple(warnings))
+    return Motions(tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
 
 
 def _check(demonstrations: Sequence[Demonstration]) -> None:

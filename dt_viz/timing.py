@@ -174,7 +174,8 @@ def learn_timing(
     )
     matched = _monotone_match(samples, rollouts)
     clocks = plain.smoothing / plain.speed * log_sinh(fractions * radii[:, None] / plain.smoothing)
-    knots = np.linspace(clocks[:, -1].min(), clocks[:, 0].max(), num_knots)
+    nearest, farthest = clocks[:, -1].min(), clocks[:, 0].max()
+    knots = np.linspace(nearest, farthest + 3 * (farthest - nearest) / (num_knots - 4), num_knots)
     paces = np.stack(
         [
             _fit_pace(knots, clock[match], at, _speeds(at, sample))
@@ -224,7 +225,10 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array
     smooth = np.diff(np.eye(len(knots)), n=2, axis=0) * SMOOTHNESS * elapsed[-1]
     A = np.concatenate([weight * rows, smooth])
     b = np.concatenate([weight[:, 0] * elapsed, np.zeros(len(smooth))])
-    return lsq_linear(A, b, bounds=(0.05, np.inf), tol=1e-6).x
+    pace = lsq_linear(A, b, bounds=(0.05, np.inf), tol=1e-6).x
+    # A demonstration starts from rest. Motions that come from farther away must not be that slow all the way.
+    pace[int(np.ceil((clock[0] - knots[0]) / spacing)) + 1 :] = elapsed[-1] / (clock[0] - clock[-1])
+    return pace
 
 
 def _hat_integrals(position: Array, num: int) -> Array:

@@ -29,7 +29,7 @@ class TrajectoryFit:
     fractions: Array
     """(R, n) where on its ray, from 0 (start) to 1 (goal), each point belongs."""
     regularisation: float
-    end_weight: float = 10.0
+    end_weight: float = 20.0
     """Weight of a residual at a ray's end against one between."""
     along_weight: float = 0.3
     """Weight of a residual's component along the motion: being early or late is not being off the path."""

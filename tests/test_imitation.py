@@ -281,6 +281,16 @@ def test_a_step_that_folds_is_found():
     assert min_step_determinant(gentle, 200.0) < 0
 
 
+def test_motions_from_far_away_do_not_take_the_slow_start_of_the_demonstrations():
+    slow = [
+        Demonstration(np.append(0.0, d.times + 2.0), np.concatenate([d.positions[:1], d.positions]), d.name)
+        for d in hooks(2)
+    ]
+    base = fit(slow).base
+    z0 = base.goal + 2 * base.directions * 0.4
+    assert base.arrival_time(z0, 1e-3).max() < 10.0
+
+
 # ---- input that is not as it should be ----
 
 
