@@ -20,7 +20,8 @@ from dt_viz.fields import Array
 from dt_viz.systems import Attractor, asinh_exp, log_sinh
 
 ARRIVED = 3e-4  # part of a ray's length: a demonstration's last point counts as this far from the goal
-SMOOTHNESS = 0.01  # weight of a pace's second differences against errors in time, relative to the duration
+MIN_PACE = 0.15  # a motion is at most about seven times as fast as the plain attractor
+SMOOTHNESS = 0.03  # weight of a pace's second differences against errors in time, relative to the duration
 SHARPNESS = 0.1  # of the blend between demonstrations, relative to the distance between neighbours
 
 
@@ -225,7 +226,7 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array
     smooth = np.diff(np.eye(len(knots)), n=2, axis=0) * SMOOTHNESS * elapsed[-1]
     A = np.concatenate([weight * rows, smooth])
     b = np.concatenate([weight[:, 0] * elapsed, np.zeros(len(smooth))])
-    pace = lsq_linear(A, b, bounds=(0.05, np.inf), tol=1e-6).x
+    pace = lsq_linear(A, b, bounds=(MIN_PACE, np.inf), tol=1e-6).x
     # A demonstration starts from rest. Motions that come from farther away must not be that slow all the way.
     pace[int(np.ceil((clock[0] - knots[0]) / spacing)) + 1 :] = elapsed[-1] / (clock[0] - clock[-1])
     return pace
