@@ -9,6 +9,7 @@ from dt_viz.demos import Demonstration
 from dt_viz.diffeo import Flow
 from dt_viz.fields import GaussianGrid, GridRBF
 from dt_viz.imitation import Imitation, ImitationSettings, fit, paper_preset
+from dt_viz.integrate import euler, implicit_euler
 from dt_viz.layers import Layer, Stack, equally_spaced_grid, min_step_determinant
 from dt_viz.preparation import ImitationError
 from dt_viz.unbend import unbending
@@ -289,6 +290,18 @@ def test_motions_from_far_away_do_not_take_the_slow_start_of_the_demonstrations(
     base = fit(slow).base
     z0 = base.goal + 2 * base.directions * 0.4
     assert base.arrival_time(z0, 1e-3).max() < 20.0
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 36])
+def test_a_step_that_nearly_folds_is_still_inverted_exactly(seed):
+    rng = np.random.default_rng(seed)
+    grid = GaussianGrid((np.linspace(-1, 1, 5), np.linspace(-1, 1, 5)), 2.0)
+    field, h = GridRBF(grid, rng.normal(size=(25, 2))), 1.0
+    while min_step_determinant(field, h) < 0.05:
+        h *= 0.9
+    y = rng.uniform(-2, 2, (2000, 2))
+    x, _ = euler(field, y, None, h)
+    assert np.abs(implicit_euler(field, x, None, -h)[0] - y).max() < 1e-12
 
 
 # ---- input that is not as it should be ----
