@@ -33,24 +33,33 @@ def rk4(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array,
 
 
 def implicit_euler(
-    field: VectorField, s: Array, U: Array | None, h: float, *, max_iterations: int = 20
+    field: VectorField, s: Array, U: Array | None, h: float, *, max_iterations: int = 200
 ) -> tuple[Array, Array | None]:
     """Implicit Euler: the y with y − h·V(y) = s. First order, and the exact inverse of `euler` with −h.
 
-    Newton's method with backtracking-free quadratic convergence while h·Lip(V) < 1, where the step is also known to be
-    invertible.
+    Newton's method, point by point going back half the way where the residual has grown. While I − h·DV is regular
+    everywhere, which is also when the step is invertible, that leads to the one solution from everywhere.
     """
     identity = np.eye(field.dim)
-    y = s
     scale = 1.0 + np.abs(s).max(initial=0.0)
+    y = best = s
+    direction = np.zeros_like(s)
+    smallest = np.full(len(s), np.inf)  # residual at `best`
+    length = np.ones((len(s), 1))
     for _ in range(max_iterations):
         v, DV = field.with_jacobian(y)
         residual = y - h * v - s
-        if np.abs(residual).max(initial=0.0) <= 1e-15 * scale:
+        size = np.abs(residual).max(axis=1)
+        if size.max(initial=0.0) <= 1e-15 * scale:
             break
         update = np.linalg.solve(identity - h * DV, residual[..., None])[..., 0]
-        y = y - update
-        if np.abs(update).max(initial=0.0) <= 1e-9 * scale:
+        worse = (size > smallest) & (size > 1e-13 * scale)
+        length = np.where(worse[:, None], 0.5 * length, 1.0)
+        best = np.where(worse[:, None], best, y)
+        direction = np.where(worse[:, None], direction, update)
+        smallest = np.where(worse, smallest, size)
+        y = best - length * direction
+        if not worse.any() and np.abs(update).max(initial=0.0) <= 1e-9 * scale:
             break  # quadratic convergence: the next correction would be far below rounding
     if U is None:
         return y, None
