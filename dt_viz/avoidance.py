@@ -17,6 +17,8 @@ SNAPSHOT = 0.05
 off by micrometres; between the last two the duration is interpolated."""
 TOLERANCE = 1e-5
 """Of the integration up to the duration that is known to be needed, metres a step."""
+ROUNDING = 1e-6
+"""Metres that do not count: a motion may end on the surface."""
 ACCEPTED_MARGIN = 0.9
 """Part of the margin that a sample between the checked ones may keep."""
 
@@ -25,36 +27,74 @@ class ObstacleAvoidance:
     """The end effector avoids the obstacle."""
 
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
-        """See `Behaviour`. With `auto` the duration is the shortest that clears all rollouts that can be cleared."""
+        """See `Behaviour`. With `auto` the duration is the shortest that clears all that can be cleared."""
         scenario = motion.scenario
         if not scenario.avoidance:
             return None
         obstacle = scenario.obstacle
         field = obstacle.field(scenario.generator, scenario.temperature)
-        blocked = _blocked(motion)
-        doubts = [f"start {i + 1} is inside the obstacle" for i in np.flatnonzero(blocked)]
+        doubts = [f"start {i + 1} is inside the obstacle" for i in np.flatnonzero(_blocked(motion))]
         if obstacle.signed_distance(motion.goal) < 0:
             doubts.append("the goal is inside the obstacle: motions end beside it")
         duration = scenario.duration
         if duration is None:
-            points = motion.positions[~blocked[motion.index]]
-            duration = clearing_duration(field, obstacle, points, scenario.margin, at_least=at_least)
+            points = motion.positions[_avoidable(motion)]
+            duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
         if duration is None:
             duration = MAX_DURATION
-            doubts.append("a motion runs through the dead centre of the obstacle and cannot leave it")
-        return Built(AdaptiveFlow(field, duration, tolerance), duration, tuple(doubts))
+            doubts.append(
+                "a motion does not leave the obstacle: "
+                + ("∇p is flat inside it" if scenario.generator == "probability" else "it runs through its dead centre")
+            )
+        flow = AdaptiveFlow(field, duration, tolerance)
+        return Built(flow, duration, _goal(motion) if motion.keeps_goal else flow.inverse(motion.goal), tuple(doubts))
 
     def satisfied(self, motion: Motion) -> bool:
-        """Whether all rollouts with a free start keep (almost) the margin, where that is to be seen to."""
+        """Whether all that can be cleared keeps (almost) the margin, where that is to be seen to."""
         if motion.scenario.duration is not None:
             return True
-        distance = motion.scenario.obstacle.signed_distance(motion.positions)[~_blocked(motion)[motion.index]]
-        return bool((distance >= ACCEPTED_MARGIN * motion.scenario.margin).all())
+        distance = motion.scenario.obstacle.signed_distance(motion.positions[_avoidable(motion)])
+        return bool((distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING).all())
+
+
+def _goal(motion: Motion) -> Array:
+    """Where motions around the obstacle end: at the goal, or beside the obstacle if that covers it."""
+    return motion.scenario.obstacle.nearest_free(motion.goal)
 
 
 def _blocked(motion: Motion) -> Mask:
-    """(R,) bool: which rollouts start inside the obstacle, so that no transform can keep them out."""
+    """(R,) bool: which rollouts start inside the obstacle."""
     return motion.scenario.obstacle.signed_distance(motion.starts) < 0
+
+
+def _margin(motion: Motion) -> float:
+    """The clearance to keep, metres: the wanted one, or what start and goal leave of it."""
+    ends = motion.starts[~_blocked(motion)]
+    if motion.keeps_goal:
+        ends = np.concatenate([ends, _goal(motion)[None]])
+    room = motion.scenario.obstacle.signed_distance(ends).min(initial=motion.scenario.margin)
+    return max(0.0, float(room))
+
+
+def _avoidable(motion: Motion) -> Mask:
+    """(N,) bool: samples that a transform can keep out of the obstacle.
+
+    Not the first ones of a motion that starts inside it, and not the last ones if it covers the goal.
+    """
+    obstacle = motion.scenario.obstacle
+    free = obstacle.signed_distance(motion.positions) >= 0
+    goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
+    avoidable = np.ones(len(free), dtype=bool)
+    for rollout, blocked in enumerate(_blocked(motion)):
+        if not (blocked or goal_covered):
+            continue
+        rows = np.flatnonzero(motion.index == rollout)
+        outside = np.flatnonzero(free[rows])
+        if blocked:
+            avoidable[rows[: outside[0] if len(outside) else None]] = False
+        if goal_covered:
+            avoidable[rows[outside[-1] + 1 if len(outside) else 0 :]] = False
+    return avoidable
 
 
 def clearing_duration(

@@ -18,11 +18,13 @@ class Motion:
     starts: Array
     """(R, 3) where the robot starts, metres."""
     goal: Array
-    """(3,) where the demonstrations end, metres."""
+    """(3,) where the motions end, metres."""
     index: Indices
     """(N,) which rollout a sample belongs to."""
     positions: Array
     """(N, 3) samples of the rollouts, metres."""
+    keeps_goal: bool = True
+    """Whether behaviours that do not mean to move the goal leave it where it is, or may move it after all."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,9 @@ class Built:
     """ψ, from the manifold with the behaviour to the one without."""
     duration: float
     """t of its flow."""
+    goal: Array
+    """(3,) where motions with the behaviour are to end, metres: `Motion.goal` if the behaviour respects it, else its
+    image under ψ⁻¹."""
     doubts: tuple[str, ...] = ()
     """Why its result is not to be trusted, in words."""
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dt_viz.avoidance import ObstacleAvoidance
 from dt_viz.behaviours import Behaviour, Built, Motion
-from dt_viz.diffeo import Chain, Diffeomorphism, Identity, Placed
+from dt_viz.diffeo import Chain, Diffeomorphism, Identity
 from dt_viz.fields import Array
 from dt_viz.fits import FitStore
 from dt_viz.health import Health, certified
@@ -20,7 +20,7 @@ from dt_viz.metrics import maximum_collision_distance
 from dt_viz.robot import JointPath, Robot, UnreachableError
 from dt_viz.rollouts import Bundle, Rays, evenly_sampled, refined
 from dt_viz.scenario import Scenario
-from dt_viz.systems import Attractor, DiffeomorphicSystem
+from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
 
 BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
@@ -28,15 +28,15 @@ BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
 
 NUM_SAMPLES = 200
 """Of each rollout before refinement."""
-MAX_ATTEMPTS = 5
+MAX_ATTEMPTS = 4
 """At a duration that clears the samples that refinement finds, too."""
 ARROW_SPACING = 0.030
 """Of the picture of the vector field, metres."""
+MAX_GOAL_MISS = 1e-3
+"""Metres by which motions may end beside the goal before it is said."""
 NUM_ARM_SAMPLES = 200
 MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
-MAX_GOAL_MISS = 3e-3
-"""Metres from the goal at which motions may end before it is said."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class Precision:
     """Of a step of the behaviours' flows."""
     spacing: float
     """Largest distance between neighbouring samples."""
-    start: float
-    """By which a rollout may miss its start before the motion below is worked out again from where it should begin."""
+    ends: float
+    """By which a rollout may miss its start and goal before the motion below is worked out again between others."""
 
 
-LIVE = Precision(tolerance=1e-5, spacing=0.012, start=1e-4)
+LIVE = Precision(tolerance=1e-5, spacing=0.012, ends=1e-4)
 """Nothing of this is seen at the size of a screen."""
-FINE = Precision(tolerance=1e-8, spacing=0.005, start=1e-7)
+FINE = Precision(tolerance=1e-8, spacing=0.005, ends=1e-7)
 
 
 class Stage(IntEnum):
@@ -121,8 +121,7 @@ class _Ground:
 
     task: Task
     imitation: Imitation
-    transform: Diffeomorphism
-    base: Attractor
+    system: DiffeomorphicSystem
     goal: Array
     rays: Rays
     bundle: Bundle
@@ -136,6 +135,11 @@ class _Solution:
     rays: Rays
     bundle: Bundle
     built: tuple[Built, ...]
+
+    @property
+    def system(self) -> DiffeomorphicSystem:
+        """The dynamical system whose motions these are."""
+        return DiffeomorphicSystem(self.transform, self.rays.base)
 
 
 class Engine:
@@ -172,14 +176,13 @@ class Engine:
         live = _solve(ground, scenario, LIVE)
         frame = _frame(ground, scenario, live)
         yield replace(frame, seconds=time.perf_counter() - began)
-        frame = self._with_field_and_arm(frame, DiffeomorphicSystem(live.transform, ground.base))
+        frame = self._with_field_and_arm(frame, live.system)
         yield replace(frame, stage=Stage.LIVE, seconds=time.perf_counter() - began)
 
         fine = _solve(ground, scenario, FINE)
-        system = DiffeomorphicSystem(fine.transform, ground.base)
-        frame = self._with_field_and_arm(_frame(ground, scenario, fine), system)
+        frame = self._with_field_and_arm(_frame(ground, scenario, fine), fine.system)
         yield replace(frame, stage=Stage.FINE, seconds=time.perf_counter() - began)
-        health = certified(frame.health, system, fine.bundle)
+        health = certified(frame.health, fine.system, fine.bundle)
         depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
         health = replace(health, clearance=-depth if depth > 0 else health.clearance)
         yield replace(frame, stage=Stage.CERTIFIED, health=health, seconds=time.perf_counter() - began)
@@ -189,15 +192,14 @@ class Engine:
         if key not in self._grounds:
             task = self.task(scenario.task)
             imitation = self._fits.get(task.demonstrations, progress=progress)
-            goal = task.to_world(imitation.goal)
-            base = imitation.base.placed(task.origin, task.axes[:, : imitation.base.dim], task.scale)
-            if scenario.imitation:
-                transform = Placed(imitation.transform, task.origin, task.axes, task.scale)
-            else:
-                transform, base = Identity(len(goal)), replace(base, goal=goal)
-            rays = Rays(transform.forward(task.starts), base)
-            bundle = evenly_sampled(lambda i, u: _climb(rays.at(i, u), [transform])[:, 1:], len(rays.z0), NUM_SAMPLES)
-            self._grounds[key] = _Ground(task, imitation, transform, base, goal, rays, bundle)
+            goal, system = task.to_world(imitation.goal), task.system(imitation)
+            if not scenario.imitation:
+                system = DiffeomorphicSystem(Identity(len(goal)), replace(system.base, goal=goal))
+            rays = Rays(system.transform.forward(task.starts), system.base)
+            bundle = evenly_sampled(
+                lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], len(rays.z0), NUM_SAMPLES
+            )
+            self._grounds[key] = _Ground(task, imitation, system, goal, rays, bundle)
         return self._grounds[key]
 
     def _with_field_and_arm(self, frame: Frame, system: DiffeomorphicSystem) -> Frame:
@@ -244,36 +246,60 @@ def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
 def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Solution:
     """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
 
-    A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and starts that
-    the behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not.
+    A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
+    behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not. Where
+    there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
     """
-    starts, rays, bundle = ground.task.starts, ground.rays, ground.bundle
-    durations = [0.0] * len(BEHAVIOURS)
-    for attempt in range(MAX_ATTEMPTS):
-        motion = Motion(scenario, starts, ground.goal, bundle.index, bundle.levels[:, 0])
-        built: list[tuple[Behaviour, Built]] = []
-        for k, behaviour in enumerate(BEHAVIOURS):
-            if built:
-                motion = replace(motion, positions=built[-1][1].transform.inverse(motion.positions))
-            made = behaviour.build(motion, precision.tolerance, durations[k])
-            if made is not None:
-                built.append((behaviour, made))
-                durations[k] = made.duration
-        outer = [made.transform for _, made in built]
+    solution = None
+    for keeps_goal in (True, False):
+        rays, bundle = ground.rays, ground.bundle
+        ends_below = np.concatenate([ground.task.starts, [ground.goal]])
+        durations = [0.0] * len(BEHAVIOURS)
+        for _ in range(MAX_ATTEMPTS):
+            lowest = Motion(scenario, ground.task.starts, ground.goal, bundle.index, bundle.levels[:, 0], keeps_goal)
+            built = _build(lowest, precision.tolerance, durations)
+            durations = [made.duration if made else 0.0 for _, made in built]
+            outer = [made.transform for _, made in built if made]
+            goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
 
-        moved = Chain(outer).forward(starts) if outer else starts
-        if np.abs(moved - starts).max() > precision.start:
-            rays = Rays(ground.transform.forward(moved), ground.base)
-            bundle = replace(bundle, levels=_climb(rays.at(bundle.index, bundle.fraction), [ground.transform])[:, 1:])
-        bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
-        stack = [ground.transform, *outer]
-        bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
+            ends = np.concatenate([ground.task.starts, [goal]])
+            below = Chain(outer).forward(ends) if outer else ends
+            if np.abs(below - ends_below).max() > precision.ends:
+                *z0, z_e = ground.system.transform.forward(below)
+                rays, ends_below = Rays(np.stack(z0), replace(ground.system.base, goal=z_e)), below
+                positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
+                bundle = replace(bundle, levels=positions[:, None])
+            bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
+            stack = [ground.system.transform, *outer]
+            bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
+            solution = _Solution(Chain(stack), rays, bundle, tuple(made for _, made in built if made))
+            if _satisfied(built, bundle):
+                return solution
+    assert solution is not None
+    return solution
 
-        levels = [replace(motion, index=bundle.index, positions=bundle.levels[:, 1 + k]) for k in range(len(built))]
-        fits = all(behaviour.satisfied(after) for (behaviour, _), after in zip(built, levels, strict=True))
-        if fits or attempt == MAX_ATTEMPTS - 1:
-            return _Solution(Chain(stack), rays, bundle, tuple(made for _, made in built))
-    raise AssertionError("unreachable")
+
+def _build(motion: Motion, tolerance: float, durations: Sequence[float]) -> list[tuple[Motion, Built | None]]:
+    """Each behaviour's transform, None where it is off, with the motion that it was made for."""
+    built = []
+    for k, behaviour in enumerate(BEHAVIOURS):
+        made = behaviour.build(motion, tolerance, durations[k])
+        built.append((motion, made))
+        if made and k < len(BEHAVIOURS) - 1:
+            motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
+    return built
+
+
+def _satisfied(built: Sequence[tuple[Motion, Built | None]], bundle: Bundle) -> bool:
+    """Whether each behaviour finds on its level of the bundle what it was made for."""
+    level = 0
+    for behaviour, (motion, made) in zip(BEHAVIOURS, built, strict=True):
+        if made:
+            level += 1
+            after = replace(motion, index=bundle.index, positions=bundle.levels[:, level])
+            if not behaviour.satisfied(after):
+                return False
+    return True
 
 
 def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
@@ -284,8 +310,8 @@ def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
     doubts = [*ground.imitation.warnings, *(doubt for made in solution.built for doubt in made.doubts)]
     if scenario.avoidance and clearance < 0 and not doubts:
         doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
-    if missed > MAX_GOAL_MISS:
-        doubts.append(f"the obstacle keeps the motions {1e3 * missed:.0f} mm from the goal")
+    if missed > MAX_GOAL_MISS and not doubts:
+        doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
     return Frame(
         scenario=scenario,
         task=ground.task,

@@ -11,7 +11,7 @@ from dt_viz.fields import Array, PlacedField
 from dt_viz.occupancy import AvoidanceField, Generator, OccupancyMap, fit_occupancy, sample_labels
 
 NUM_SAMPLES = 4000
-KERNEL_WIDTH = 0.75
+KERNEL_WIDTH = 0.9
 """Of the occupancy map, in radii of the obstacle."""
 REGULARISATION = 10.0
 
@@ -33,6 +33,13 @@ class Sphere:
     def signed_distance(self, s: Array) -> Array:
         """Distance of the points `s` (*B, 3) from the surface, (*B,), metres, negative inside."""
         return np.linalg.norm(s - np.asarray(self.position), axis=-1) - self.radius
+
+    def nearest_free(self, s: Array) -> Array:
+        """The points `s` (*B, 3), those inside moved to the nearest point of the surface, (*B, 3), metres."""
+        offset = s - np.asarray(self.position)
+        distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+        outward = np.where(distance > 0, offset / np.maximum(distance, 1e-300), np.array([0.0, 0.0, 1.0]))
+        return np.where(distance < self.radius, np.asarray(self.position) + self.radius * outward, s)
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
         """The generator whose reverse flow leaves the sphere, from an occupancy map learned once for all spheres."""

@@ -122,8 +122,9 @@ def sample_labels(
 class AvoidanceField:
     """Generator V whose reverse flow leaves the occupied region.
 
-    - "free-space" (default): V = ∇U with U = T·softplus(logit/T), which is −∇log(1 − p) at T = 1. The temperature T
-      widens the field: a smooth warp needs reach.
+    - "free-space" (default): V = ∇U with U'(logit) = σ(logit/T) − σ(b/T), not below 0, b the logit far away. Without
+      the second term and with T = 1 this is −∇log(1 − p). The temperature T widens the field, for a smooth warp needs
+      reach; the second term ends it where the map knows of nothing any more: what is far away stays where it is.
     - "probability": V = ∇p, the paper's. Where p saturates the field is dead, so what is deep inside never leaves.
 
     V is scaled by the squared kernel width, which makes the duration dimensionless and about 1.
@@ -163,4 +164,5 @@ class AvoidanceField:
             weight = p * (1 - p)
             return weight, weight * (1 - 2 * p)
         p = expit(logit / self.temperature)
-        return p, p * (1 - p) / self.temperature
+        far = expit(self.occupancy.bias / self.temperature)
+        return np.maximum(p - far, 0), np.where(p > far, p * (1 - p) / self.temperature, 0)

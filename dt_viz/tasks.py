@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.demos import Demonstration, lasa_files, load_demonstrations
+from dt_viz.diffeo import Placed
 from dt_viz.fields import Array
+from dt_viz.imitation import Imitation
 from dt_viz.metrics import resample_by_arc_length
+from dt_viz.systems import DiffeomorphicSystem
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 
@@ -67,6 +70,13 @@ class Task:
     def to_world(self, points: Array) -> Array:
         """World points (*B, 3) of points (*B, k) of the demonstrations."""
         return self.origin + self.scale * (points @ self.axes[:, : points.shape[-1]].T)
+
+    def system(self, imitation: Imitation) -> DiffeomorphicSystem:
+        """The motion learned from the demonstrations, as a system in the world, metres and seconds."""
+        return DiffeomorphicSystem(
+            Placed(imitation.transform, self.origin, self.axes, self.scale),
+            imitation.base.placed(self.origin, self.axes[:, : imitation.base.dim], self.scale),
+        )
 
     @property
     def paths(self) -> tuple[Array, ...]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import expit
 
 from dt_viz.integrate import integrate_adaptive
 from dt_viz.obstacles import Sphere, unit_sphere_map
@@ -66,7 +67,8 @@ def test_the_generator_is_the_gradient_of_its_potential(generator, temperature):
     def potential(points):
         if generator == "probability":
             return BALL.probability(points)
-        return temperature * np.logaddexp(0, BALL.logit(points) / temperature)
+        logit = np.maximum(BALL.logit(points), BALL.bias)  # constant where the map knows of nothing
+        return temperature * np.logaddexp(0, logit / temperature) - logit * expit(BALL.bias / temperature)
 
     np.testing.assert_allclose(V(s), width_squared * central_difference(potential, s), rtol=0, atol=1e-8)
     value, DV = V.with_jacobian(s)
@@ -75,11 +77,22 @@ def test_the_generator_is_the_gradient_of_its_potential(generator, temperature):
     np.testing.assert_allclose(DV, DV.transpose(0, 2, 1), rtol=0, atol=1e-12)
 
 
-def test_at_temperature_one_the_potential_is_the_papers_free_space():
+def test_the_free_space_generator_ends_and_leaves_what_is_far_away_where_it_is():
+    directions = in_ball(60, 1.0)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for temperature in (1.0, 6.0, 20.0):
+        V = AvoidanceField(BALL, temperature=temperature)
+        assert np.linalg.norm(V(5 * directions), axis=1).max() < 1e-4
+        assert np.linalg.norm(V(directions), axis=1).min() > 0.1
+
+
+def test_at_temperature_one_the_generator_is_free_space_but_for_the_chance_of_meeting_something_far_away():
     s = in_ball(40, 1.5)
     gradient = central_difference(lambda points: -np.log1p(-BALL.probability(points)), s)
     expected = 0.5 / BALL.grid.ell * gradient
-    np.testing.assert_allclose(AvoidanceField(BALL, temperature=1.0)(s), expected, rtol=0, atol=1e-6)
+    far = expit(BALL.bias) * 0.5 / BALL.grid.ell * BALL.logit_gradient(s)[1]
+    np.testing.assert_allclose(AvoidanceField(BALL, temperature=1.0)(s), expected - far, rtol=0, atol=1e-6)
+    assert expit(BALL.bias) < 1e-3
 
 
 def test_the_learned_boundary_is_near_the_true_one():

@@ -265,7 +265,8 @@ def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
     opened.settle()
     assert [scenario.obstacle.position[0] for scenario in opened.engine.asked[1:]] == [0.0, 7.0]
     stages = [frame.stage for frame in opened.page.frames if frame.scenario.obstacle == at(0.0)]
-    assert stages == [Stage.ROLLOUTS, Stage.LIVE]  # something is shown while dragging; refined is only what rests
+    # something is shown while dragging, field and arm unless they were drawn a moment ago; refined is only what rests
+    assert stages in ([Stage.ROLLOUTS], [Stage.ROLLOUTS, Stage.LIVE])
     assert opened.page.paces[-1].num_skipped == 6
 
 

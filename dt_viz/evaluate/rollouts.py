@@ -37,7 +37,6 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_json,
 )
-from dt_viz.evaluate.system import learned_system
 from dt_viz.fields import Array
 from dt_viz.fits import FitStore, default_cache_folder
 from dt_viz.obstacles import Sphere
@@ -92,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
     tasks, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, ".json")
     fits = FitStore(default_cache_folder())
-    learned = learned_system(task, fits.get(task.demonstrations))
+    learned = task.system(fits.get(task.demonstrations))
     scenario = Scenario(task.name, Sphere(options.obstacle or task.obstacle_position, options.diameter))
     frame = next(iter(Engine(tasks, fits, load_jaco()).frames(scenario)))
     field = scenario.obstacle.field(scenario.generator, scenario.temperature)

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to_write, whole_number
-from dt_viz.evaluate.system import learned_system
 from dt_viz.fits import FitStore, default_cache_folder
 
 AT_GOAL = 5e-5
@@ -37,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
     _, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, ".npz")
     imitation = FitStore(default_cache_folder()).get(task.demonstrations)
-    system, goal = learned_system(task, imitation), task.to_world(imitation.goal)
+    system, goal = task.system(imitation), task.to_world(imitation.goal)
     points = np.concatenate([d.positions for d in task.demonstrations])
     lower, upper = points.min(axis=0), points.max(axis=0)
     margin = (upper - lower) / 2

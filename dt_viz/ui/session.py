@@ -16,6 +16,8 @@ from dt_viz.ui.worker import LatestWorker
 GESTURE_PAUSE = 1.0
 """Seconds without an edit after which the next edit of the same control is a step of its own for undo."""
 MAX_UNDO = 200
+LIVE_PAUSE = 0.05
+"""Seconds between two drawings of field and arm while edits come so fast that something must be left out."""
 REST = 0.1
 """Seconds that a scenario must rest before it is refined: while a hand moves, edits come faster."""
 
@@ -177,5 +179,6 @@ class Session:
             self._display.draw(frame, Pace(self._latency, rate, self._worker.num_skipped))
             if frame.stage is Stage.LIVE:
                 self._worker.rest(REST)
-            if frame.stage >= Stage.LIVE and superseded():
+            lately = self._live_frames and now - self._live_frames[-1] < LIVE_PAUSE
+            if superseded() and (frame.stage >= Stage.LIVE or lately):
                 return
