@@ -42,7 +42,7 @@ class ImitationSettings:
     """What is fitted: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
     num_layers: int = 3
     """Stationary flows that ψ is composed of, at least; motions that turn far get more. The velocity objective
-    has one."""
+    has one, with the steps of all."""
     steps: int = 4
     """Euler steps of each flow."""
     sigma: float | None = None
@@ -66,7 +66,7 @@ class ImitationSettings:
 
 def paper_preset(objective: Literal["trajectory", "velocity"] = "velocity") -> ImitationSettings:
     """The paper's choices (sec. 5): m = 720 equally spaced states, ℓ = 0.005 with LASA in millimetres, Euler steps."""
-    return ImitationSettings(objective, steps=10 if objective == "velocity" else 4, ell=0.005e6, num_inducing=720)
+    return ImitationSettings(objective, ell=0.005e6, num_inducing=720)
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Pro
         grid = GaussianGrid.covering(x, sigma, spacing=settings.spacing, pad=settings.reach)
     else:
         grid = equally_spaced_grid(x, settings.num_inducing, 0.5 / sigma**2)
-    max_iterations = 10 * settings.max_iterations
+    max_iterations, steps = 10 * settings.max_iterations, settings.num_layers * settings.steps
 
     def report(iteration: int, cost: float) -> None:
         progress(0.05 + 0.85 * iteration / max_iterations, f"fitting velocities, mean square error {cost:.3g}")
@@ -253,13 +253,13 @@ def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Pro
             speed=length,
             smoothing=0.1 * length,
             regularisation=settings.regularisation * VELOCITY_REGULARISATION * 10.0**attempt,
-            steps=settings.steps,
+            steps=steps,
         )
         field = GridRBF(grid, problem.solve(max_iterations, report))
-        if min_step_determinant(field, 1.0 / settings.steps) > MIN_STEP_DETERMINANT:
-            return Chain(
-                [Flow(scaled_field(field, centre, scale), 1.0, settings.steps, euler, implicit_euler)]
-            ), _smoothed(attempt)
+        if min_step_determinant(field, 1.0 / steps) > MIN_STEP_DETERMINANT:
+            return Chain([Flow(scaled_field(field, centre, scale), 1.0, steps, euler, implicit_euler)]), _smoothed(
+                attempt
+            )
     raise ImitationError(NOT_INVERTIBLE)
 
 
