@@ -46,7 +46,7 @@ class ImitationSettings:
     steps: int = 4
     """Euler steps of each flow."""
     sigma: float | None = None
-    """Width of a Gaussian. None takes 1 in the plane and 0.55 in space, less for motions folded into little room; half
+    """Width of a Gaussian. None takes 1 in the plane and 0.6 in space, less for motions folded into little room; half
     of that for the velocity objective."""
     ell: float | None = None
     """ℓ of the Gaussians in 1/m², instead of `sigma`."""
@@ -270,7 +270,7 @@ def _width(motions: Motions, settings: ImitationSettings) -> float:
     if settings.sigma is not None:
         return settings.sigma
     length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / motions.spread
-    width = (1.0 if len(motions.goal) == 2 else 0.55) * min(1.0, 7.5 / length)
+    width = (1.0 if len(motions.goal) == 2 else 0.6) * min(1.0, 7.5 / length)
     return width if settings.objective == "trajectory" else 0.5 * width
 
 
