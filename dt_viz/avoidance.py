@@ -17,6 +17,8 @@ SNAPSHOT = 0.05
 off by micrometres; between the last two the duration is interpolated."""
 TOLERANCE = 1e-5
 """Of the integration up to the duration that is known to be needed, metres a step."""
+NUM_DEEPEST = 8
+"""Samples of each rollout that the duration is chosen for at first."""
 ROUNDING = 1e-6
 """Metres that do not count: a motion may end on the surface."""
 ACCEPTED_MARGIN = 0.9
@@ -38,8 +40,7 @@ class ObstacleAvoidance:
             doubts.append("the goal is inside the obstacle: motions end beside it")
         duration = scenario.duration
         if duration is None:
-            points = motion.positions[_avoidable(motion)]
-            duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
+            duration = clearing_duration(field, obstacle, _deepest(motion), _margin(motion), at_least=at_least)
         if duration is None:
             duration = MAX_DURATION
             doubts.append(
@@ -74,6 +75,15 @@ def _margin(motion: Motion) -> float:
         ends = np.concatenate([ends, _goal(motion)[None]])
     room = motion.scenario.obstacle.signed_distance(ends).min(initial=motion.scenario.margin)
     return max(0.0, float(room))
+
+
+def _deepest(motion: Motion) -> Array:
+    """(M, 3) the deepest few samples of each rollout that can be kept out: they leave last; all are looked at later."""
+    avoidable = _avoidable(motion)
+    depth = np.where(avoidable, motion.scenario.obstacle.signed_distance(motion.positions), np.inf)
+    order = np.lexsort([depth, motion.index])
+    rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
+    return motion.positions[order[(rank < NUM_DEEPEST) & avoidable[order]]]
 
 
 def _avoidable(motion: Motion) -> Mask:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 
@@ -32,6 +33,8 @@ MAX_ATTEMPTS = 4
 """At a duration that clears the samples that refinement finds, too."""
 ARROW_SPACING = 0.030
 """Of the picture of the vector field, metres."""
+MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
+"""Steps towards the images of moved ends, and metres by which they may miss."""
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
 NUM_ARM_SAMPLES = 200
@@ -51,7 +54,7 @@ class Precision:
     """By which a rollout may miss its start and goal before the motion below is worked out again between others."""
 
 
-LIVE = Precision(tolerance=1e-5, spacing=0.012, ends=1e-4)
+LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
 """Nothing of this is seen at the size of a screen."""
 FINE = Precision(tolerance=1e-8, spacing=0.005, ends=1e-7)
 
@@ -125,6 +128,26 @@ class _Ground:
     goal: Array
     rays: Rays
     bundle: Bundle
+
+    @cached_property
+    def ends(self) -> Array:
+        """(R + 1, 3) starts and goal, metres."""
+        return np.concatenate([self.task.starts, [self.goal]])
+
+    @cached_property
+    def _linearised(self) -> tuple[Array, Array]:
+        return self.system.transform.jacobian(self.ends)
+
+    def images(self, ends: Array) -> Array:
+        """ψ of points (R + 1, 3) not far from `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
+        images, J = self._linearised
+        error = ends - self.ends
+        for _ in range(MAX_CHORDS):
+            images = images + (J @ error[..., None])[..., 0]
+            error = ends - self.system.transform.inverse(images)
+            if np.abs(error).max() <= IMAGE_TOLERANCE:
+                return images
+        return self.system.transform.forward(ends)
 
 
 @dataclass(frozen=True)
@@ -253,7 +276,7 @@ def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Soluti
     solution = None
     for keeps_goal in (True, False):
         rays, bundle = ground.rays, ground.bundle
-        ends_below = np.concatenate([ground.task.starts, [ground.goal]])
+        ends_below = ground.ends
         durations = [0.0] * len(BEHAVIOURS)
         for _ in range(MAX_ATTEMPTS):
             lowest = Motion(scenario, ground.task.starts, ground.goal, bundle.index, bundle.levels[:, 0], keeps_goal)
@@ -265,7 +288,7 @@ def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Soluti
             ends = np.concatenate([ground.task.starts, [goal]])
             below = Chain(outer).forward(ends) if outer else ends
             if np.abs(below - ends_below).max() > precision.ends:
-                *z0, z_e = ground.system.transform.forward(below)
+                *z0, z_e = ground.images(below)
                 rays, ends_below = Rays(np.stack(z0), replace(ground.system.base, goal=z_e)), below
                 positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
                 bundle = replace(bundle, levels=positions[:, None])

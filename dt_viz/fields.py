@@ -66,7 +66,7 @@ class GaussianGrid:
         """Dimension d of the space."""
         return len(self.axes)
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         """Inducing points per axis."""
         return tuple(len(axis) for axis in self.axes)
@@ -88,6 +88,20 @@ class GaussianGrid:
         parts = tuple(slice(int(end) - n, int(end)) for n, end in zip(self.shape, ends, strict=True))
         return np.repeat(np.arange(self.dim), self.shape), np.concatenate(self.axes), parts
 
+    def _gaussians(self, s: Array, max_order: int) -> Array:
+        """1-D Gaussians of all axes and their derivatives, (K + 1, Σn_j, N): the batch last, for long inner loops."""
+        coordinate, entries, _ = self._flat_axes
+        offset = np.ascontiguousarray(s.T)[coordinate] - entries[:, None]
+        values = np.empty((max_order + 1, *offset.shape))
+        np.exp(-self.ell * (offset * offset), out=values[0])
+        # Hermite recursion: g⁽ⁿ⁺¹⁾ = −2ℓ (offset · g⁽ⁿ⁾ + n · g⁽ⁿ⁻¹⁾)
+        offset *= -2.0 * self.ell
+        for n in range(max_order):
+            np.multiply(offset, values[n], out=values[n + 1])
+            if n:
+                values[n + 1] -= 2.0 * self.ell * n * values[n - 1]
+        return values
+
     def factors(self, s: Array, max_order: int = 0) -> list[Array]:
         """1-D Gaussians of each axis and their derivatives.
 
@@ -98,17 +112,8 @@ class GaussianGrid:
         Returns:
             For each axis j an array (K + 1, N, n_j), the derivative's order first.
         """
-        coordinate, entries, parts = self._flat_axes
-        offset = s[:, coordinate] - entries
-        values = np.empty((len(s), max_order + 1, len(entries)))
-        values[:, 0] = np.exp(-self.ell * (offset * offset))
-        # Hermite recursion: g⁽ⁿ⁺¹⁾ = −2ℓ (offset · g⁽ⁿ⁾ + n · g⁽ⁿ⁻¹⁾)
-        offset *= -2.0 * self.ell
-        for n in range(max_order):
-            np.multiply(offset, values[:, n], out=values[:, n + 1])
-            if n:
-                values[:, n + 1] -= 2.0 * self.ell * n * values[:, n - 1]
-        return [values[:, :, part].swapaxes(0, 1) for part in parts]
+        values = self._gaussians(s, max_order)
+        return [np.ascontiguousarray(values[:, part].swapaxes(1, 2)) for part in self._flat_axes[2]]
 
     def contract(self, s: Array, weights: Array, orders: tuple[tuple[int, ...], ...]) -> list[Array]:
         """Partial derivatives of Σ_i w_i k(s, ŝ_i).
@@ -124,22 +129,18 @@ class GaussianGrid:
         num, k = len(s), weights.shape[1]
         if not num:  # an obstacle that covers the whole slice leaves no arrows to evaluate
             return [np.empty((0, k)) for _ in orders]
-        axes = [factor.swapaxes(0, 1) for factor in self.factors(s, max(map(max, orders)))]  # (N, K + 1, n_j)
-        partial: dict[tuple[int, ...], Array] = {(): weights.reshape(self.shape[0], -1)}
-        for j, plan in enumerate(_contraction_plan(orders)):
-            after: dict[tuple[int, ...], Array] = {}
-            for parent, highest in plan:
-                # all derivatives along this axis that continue the same beginning are one matrix product
-                factor = axes[j][:, : highest + 1]
-                if j:
-                    product = np.matmul(factor, partial[parent].reshape(num, self.shape[j], -1))
-                else:  # the weights are the same for all points
-                    rows = factor.reshape(-1, self.shape[0]) @ partial[parent]
-                    product = rows.reshape(num, highest + 1, -1)
-                for order in range(highest + 1):
-                    after[(*parent, order)] = product[:, order]
-            partial = after
-        return [partial[order].reshape(num, k) for order in orders]
+        values = self._gaussians(s, max(map(max, orders)))
+        first, *others = self._flat_axes[2]
+        rest = weights.reshape(self.shape[0], -1).T  # (n_2 ⋯ n_d k, n_1)
+        partial = {order: rest @ values[order[0], first] for order in _beginnings(orders, 1)}
+        for j, part in enumerate(others, start=1):
+            partial = {
+                order: np.einsum(
+                    "arn,an->rn", partial[order[:j]].reshape(self.shape[j], -1, num), values[order[j], part]
+                )
+                for order in _beginnings(orders, j + 1)
+            }
+        return [partial[order].T for order in orders]
 
     def features(self, s: Array) -> Array:
         """The dense matrix k(s, ŝ), (N, m): for fitting, not for evaluating."""
@@ -153,16 +154,10 @@ class GaussianGrid:
         return self.features(self.inducing_points)
 
 
-@lru_cache(maxsize=64)
-def _contraction_plan(orders: tuple[tuple[int, ...], ...]) -> list[list[tuple[tuple[int, ...], int]]]:
-    """For each axis the beginnings that multi-indices share, and the highest derivative that continues each."""
-    plan = []
-    for j in range(len(orders[0])):
-        highest: dict[tuple[int, ...], int] = {}
-        for order in orders:
-            highest[order[:j]] = max(highest.get(order[:j], 0), order[j])
-        plan.append(list(highest.items()))
-    return plan
+@lru_cache(maxsize=256)
+def _beginnings(orders: tuple[tuple[int, ...], ...], length: int) -> tuple[tuple[int, ...], ...]:
+    """The different beginnings of that length among multi-indices."""
+    return tuple(dict.fromkeys(order[:length] for order in orders))
 
 
 @lru_cache

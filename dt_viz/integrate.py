@@ -42,7 +42,7 @@ def implicit_euler(
     """
     identity = np.eye(field.dim)
     scale = 1.0 + np.abs(s).max(initial=0.0)
-    y = best = s
+    y = best = s + h * field(s)
     direction = np.zeros_like(s)
     smallest = np.full(len(s), np.inf)  # residual at `best`
     length = np.ones((len(s), 1))
@@ -59,7 +59,7 @@ def implicit_euler(
         direction = np.where(worse[:, None], direction, update)
         smallest = np.where(worse, smallest, size)
         y = best - length * direction
-        if not worse.any() and np.abs(update).max(initial=0.0) <= 1e-9 * scale:
+        if not worse.any() and np.abs(update).max(initial=0.0) <= 1e-8 * scale:
             break  # quadratic convergence: the next correction would be far below rounding
     if U is None:
         return y, None

@@ -182,7 +182,8 @@ def test_the_field_is_drawn_outside_the_obstacle_and_is_the_velocity_of_the_moti
     assert fine.field is not None
     np.testing.assert_array_equal(fine.field.points, frame.field.points)
     largest = np.linalg.norm(fine.field.velocities, axis=1).max()
-    assert np.abs(fine.field.velocities - frame.field.velocities).max() < 0.02 * largest
+    # the fastest arrows stand where the stack stretches most, and show the tolerance of the live stage most
+    assert np.abs(fine.field.velocities - frame.field.velocities).max() < 0.05 * largest
 
 
 AWKWARD = {

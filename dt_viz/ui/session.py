@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import numpy as np
+
 from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.scenario import Scenario
 from dt_viz.ui.worker import LatestWorker
@@ -17,7 +19,7 @@ GESTURE_PAUSE = 1.0
 """Seconds without an edit after which the next edit of the same control is a step of its own for undo."""
 MAX_UNDO = 200
 LIVE_PAUSE = 0.05
-"""Seconds between two drawings of field and arm while edits come so fast that something must be left out."""
+"""Seconds between two drawings of field and arm while edits come faster: rollouts are drawn for each that can be."""
 REST = 0.1
 """Seconds that a scenario must rest before it is refined: while a hand moves, edits come faster."""
 
@@ -179,6 +181,11 @@ class Session:
             self._display.draw(frame, Pace(self._latency, rate, self._worker.num_skipped))
             if frame.stage is Stage.LIVE:
                 self._worker.rest(REST)
-            lately = self._live_frames and now - self._live_frames[-1] < LIVE_PAUSE
-            if superseded() and (frame.stage >= Stage.LIVE or lately):
+            elif frame.stage is Stage.ROLLOUTS:
+                last = self._live_frames[-1] if self._live_frames else -np.inf
+                pause = last + LIVE_PAUSE - now
+                if pause <= 0:
+                    continue  # field and arm are due, whatever is waiting
+                self._worker.rest(pause)
+            if superseded():
                 return
