@@ -158,6 +158,8 @@ class _Solution:
     rays: Rays
     bundle: Bundle
     built: tuple[Built, ...]
+    satisfied: bool
+    """Whether every behaviour found what it was made for."""
 
     @property
     def system(self) -> DiffeomorphicSystem:
@@ -295,8 +297,9 @@ def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Soluti
             bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
             stack = [ground.system.transform, *outer]
             bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            solution = _Solution(Chain(stack), rays, bundle, tuple(made for _, made in built if made))
-            if _satisfied(built, bundle):
+            satisfied = _satisfied(built, bundle)
+            solution = _Solution(Chain(stack), rays, bundle, tuple(made for _, made in built if made), satisfied)
+            if satisfied:
                 return solution
     assert solution is not None
     return solution
@@ -333,6 +336,8 @@ def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
     doubts = [*ground.imitation.warnings, *(doubt for made in solution.built for doubt in made.doubts)]
     if scenario.avoidance and clearance < 0 and not doubts:
         doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
+    elif not solution.satisfied and not doubts:
+        doubts.append(f"a motion keeps only {1e3 * clearance:.1f} mm from the obstacle")
     if missed > MAX_GOAL_MISS and not doubts:
         doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
     return Frame(
