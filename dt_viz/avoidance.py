@@ -40,7 +40,9 @@ class ObstacleAvoidance:
             doubts.append("the goal is inside the obstacle: motions end beside it")
         duration = scenario.duration
         if duration is None:
-            duration = clearing_duration(field, obstacle, _deepest(motion), _margin(motion), at_least=at_least)
+            # the deepest samples leave last, or nearly so; where they did not tell the whole story, take all
+            points = motion.positions[_avoidable(motion)] if at_least else _deepest(motion)
+            duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
         if duration is None:
             duration = MAX_DURATION
             doubts.append(
@@ -78,7 +80,7 @@ def _margin(motion: Motion) -> float:
 
 
 def _deepest(motion: Motion) -> Array:
-    """(M, 3) the deepest few samples of each rollout that can be kept out: they leave last; all are looked at later."""
+    """(M, 3) the deepest few samples of each rollout that can be kept out."""
     avoidable = _avoidable(motion)
     depth = np.where(avoidable, motion.scenario.obstacle.signed_distance(motion.positions), np.inf)
     order = np.lexsort([depth, motion.index])

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,18 +20,96 @@ logger = logging.getLogger(__name__)
 FORMAT = 1
 """Raised whenever the fit or its file changes, so that older files are not taken for newer ones."""
 
+LONGEST_WITHOUT_REPORT = 0.2
+"""Seconds after which those who wait for a fit are told again how far it is."""
+
 
 def default_cache_folder() -> Path:
     """`$XDG_CACHE_HOME/dt-viz`, or `~/.cache/dt-viz`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dt-viz"
 
 
+class _AbandonedError(Exception):
+    """Nobody waits for a fit any more."""
+
+
+class _RunningFit:
+    """A fit on a thread of its own, for as long as somebody waits for it."""
+
+    def __init__(self, work: Callable[[Progress], Imitation]) -> None:
+        self._work = work
+        self._changed = threading.Condition()
+        self._num_waiting = 0
+        self._num_reports, self._report = 0, (0.0, "")
+        self._result: Imitation | None = None
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="fit", daemon=True)
+
+    def join(self) -> bool:
+        """Wait for it from now on; False if it has been abandoned."""
+        with self._changed:
+            if self._thread.ident is None:
+                self._thread.start()
+            elif not self._num_waiting:
+                return False
+            self._num_waiting += 1
+            return True
+
+    def wait(self, progress: Progress) -> Imitation:
+        """Its result. What `progress` raises is let through, and ends the fit if nobody else waits for it."""
+        seen = 0
+        try:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(
+                        lambda: self._ended or self._num_reports > seen, timeout=LONGEST_WITHOUT_REPORT
+                    )
+                    ended, fresh = self._ended, self._num_reports > seen
+                    seen, report = self._num_reports, self._report
+                if fresh or not ended:
+                    progress(*report)
+                if self._error is not None:
+                    raise self._error
+                if self._result is not None:
+                    return self._result
+        finally:
+            with self._changed:
+                self._num_waiting -= 1
+
+    @property
+    def _ended(self) -> bool:
+        return self._result is not None or self._error is not None
+
+    def _run(self) -> None:
+        result, failed = None, None
+        try:
+            result = self._work(self._tell)
+        except BaseException as error:  # noqa: BLE001 - it belongs to those who wait, whatever it is
+            failed = error
+        with self._changed:
+            self._result, self._error = result, failed
+            self._changed.notify_all()
+
+    def _tell(self, fraction: float, message: str) -> None:
+        with self._changed:
+            if not self._num_waiting:
+                raise _AbandonedError
+            self._num_reports += 1
+            self._report = (fraction, message)
+            self._changed.notify_all()
+
+
 class FitStore:
-    """Fits on demand, once for all visitors; a damaged file is fitted anew, never trusted."""
+    """Fits on demand, once for all visitors; a damaged file is fitted anew, never trusted.
+
+    Each fit has a thread of its own: who wants one that is known does not wait for another that is being made, and
+    who does not want to wait any more leaves it to the others.
+    """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self._memory: dict[str, Imitation] = {}
+        self._running: dict[str, _RunningFit] = {}
         self._lock = threading.Lock()
 
     def get(
@@ -44,29 +123,45 @@ class FitStore:
         Args:
             demonstrations: what to imitate.
             settings: of the fit; None takes the defaults.
-            progress: see `dt_viz.imitation.fit`; not called for a fit that is known.
+            progress: see `dt_viz.imitation.fit`; not called for a fit that is known. It is called again and again
+                while nothing is new, so that it can raise an exception to cancel: that is let through, and the fit
+                goes on only if somebody else waits for it.
 
         Raises:
             ImitationError: as `dt_viz.imitation.fit`.
         """
         settings = settings or ImitationSettings()
         key = _content_key(demonstrations, settings)
-        with self._lock:  # two visitors who open the same task fit it once
-            if key not in self._memory:
-                self._memory[key] = self._read(key) or self._fit(key, demonstrations, settings, progress)
-            return self._memory[key]
+        with self._lock:
+            known = self._memory.get(key)
+            if known is None:
+                running = self._running.get(key)
+                if running is None or not running.join():
+                    running = _RunningFit(lambda tell: self._read(key) or self._fit(key, demonstrations, settings, tell))
+                    running.join()
+                    self._running[key] = running
+        if known is not None:
+            return known
+        try:
+            result = running.wait(progress or (lambda _fraction, _message: None))
+            with self._lock:
+                return self._memory.setdefault(key, result)
+        finally:
+            with self._lock:
+                if self._running.get(key) is running and not running.is_waited_for:
+                    del self._running[key]
 
     def _fit(
         self,
         key: str,
         demonstrations: tuple[Demonstration, ...],
         settings: ImitationSettings,
-        progress: Progress | None,
+        progress: Progress,
     ) -> Imitation:
         imitation = fit(demonstrations, settings, progress)
         if self._folder is not None:
             path = self._folder / f"{key}.npz"
-            partial = path.with_suffix(f".{os.getpid()}.partial")
+            partial = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}.partial")
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
                 with partial.open("wb") as file:
