@@ -16,8 +16,9 @@ from dt_viz.diffeo import Chain, Diffeomorphism, Identity
 from dt_viz.fields import Array
 from dt_viz.fits import FitStore
 from dt_viz.health import Health, certified
-from dt_viz.imitation import Imitation, Progress
+from dt_viz.imitation import Imitation, ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
+from dt_viz.pictures import NO_PICTURES, Pictures, Sketchbook, in_frame
 from dt_viz.robot import JointPath, Robot, UnreachableError
 from dt_viz.rollouts import Bundle, Rays, evenly_sampled, refined
 from dt_viz.scenario import Scenario
@@ -114,6 +115,8 @@ class Frame:
     """None before stage LIVE."""
     arm: ArmMotion | None = None
     """None before stage LIVE, and where the arm cannot reach the start."""
+    pictures: Pictures = NO_PICTURES
+    """Of ψ itself, as far as the view shows them; empty before stage LIVE."""
     seconds: float = 0.0
     """From the start of the rebuild until this frame."""
 
@@ -133,6 +136,11 @@ class _Ground:
     def ends(self) -> Array:
         """(R + 1, 3) starts and goal, metres."""
         return np.concatenate([self.task.starts, [self.goal]])
+
+    @cached_property
+    def sketchbook(self) -> Sketchbook:
+        """Makes the pictures of ψ."""
+        return Sketchbook(self.task, in_frame(self.system.transform), self.system, self.rays)
 
     @cached_property
     def _linearised(self) -> tuple[Array, Array]:
@@ -175,7 +183,7 @@ class Engine:
         self._fits = fits
         self._robot = robot
         self._tasks: dict[str, Task] = {}
-        self._grounds: dict[tuple[str, bool], _Ground] = {}
+        self._grounds: dict[tuple[str, bool, str], _Ground] = {}
         self._arm_starts: dict[tuple[str, int], Array | UnreachableError] = {}
         self._arm_before: tuple[tuple[str, int], Array] | None = None
 
@@ -202,10 +210,12 @@ class Engine:
         frame = _frame(ground, scenario, live)
         yield replace(frame, seconds=time.perf_counter() - began)
         frame = self._with_field_and_arm(frame, live.system)
+        frame = replace(frame, pictures=_pictures(ground, scenario, live, coarse=True))
         yield replace(frame, stage=Stage.LIVE, seconds=time.perf_counter() - began)
 
         fine = _solve(ground, scenario, FINE)
         frame = self._with_field_and_arm(_frame(ground, scenario, fine), fine.system)
+        frame = replace(frame, pictures=_pictures(ground, scenario, fine, coarse=False))
         yield replace(frame, stage=Stage.FINE, seconds=time.perf_counter() - began)
         health = certified(frame.health, fine.system, fine.bundle)
         depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
@@ -213,10 +223,10 @@ class Engine:
         yield replace(frame, stage=Stage.CERTIFIED, health=health, seconds=time.perf_counter() - began)
 
     def _ground(self, scenario: Scenario, progress: Progress | None) -> _Ground:
-        key = (scenario.task, scenario.imitation)
+        key = (scenario.task, scenario.imitation, scenario.objective)
         if key not in self._grounds:
             task = self.task(scenario.task)
-            imitation = self._fits.get(task.demonstrations, progress=progress)
+            imitation = self._fits.get(task.demonstrations, ImitationSettings(scenario.objective), progress)
             goal, system = task.to_world(imitation.goal), task.system(imitation)
             if not scenario.imitation:
                 system = DiffeomorphicSystem(Identity(len(goal)), replace(system.base, goal=goal))
@@ -326,6 +336,16 @@ def _satisfied(built: Sequence[tuple[Motion, Built | None]], bundle: Bundle) -> 
             if not behaviour.satisfied(after):
                 return False
     return True
+
+
+def _pictures(ground: _Ground, scenario: Scenario, solution: _Solution, *, coarse: bool) -> Pictures:
+    """Those that the view shows."""
+    view, book = scenario.view, ground.sketchbook
+    return Pictures(
+        generator=book.generator(view.generator_layer) if view.generator else None,
+        grid=book.grid([made.transform for made in solution.built], coarse=coarse) if view.grid else None,
+        base=book.base(solution.rays) if view.base else None,
+    )
 
 
 def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:

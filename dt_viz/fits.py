@@ -37,23 +37,20 @@ class _RunningFit:
     """A fit on a thread of its own, for as long as somebody waits for it."""
 
     def __init__(self, work: Callable[[Progress], Imitation]) -> None:
+        """Begin; whoever makes it waits for it."""
         self._work = work
         self._changed = threading.Condition()
-        self._num_waiting = 0
-        self._num_reports, self._report = 0, (0.0, "")
+        self._num_waiting = 1
+        self._num_reports, self._report = 0, (0.0, "looking whether it is known")
         self._result: Imitation | None = None
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="fit", daemon=True)
+        self._error: Exception | None = None
+        threading.Thread(target=self._run, name="fit", daemon=True).start()
 
     def join(self) -> bool:
-        """Wait for it from now on; False if it has been abandoned."""
+        """Wait for it, too, from now on; False if it has been abandoned."""
         with self._changed:
-            if self._thread.ident is None:
-                self._thread.start()
-            elif not self._num_waiting:
-                return False
-            self._num_waiting += 1
-            return True
+            self._num_waiting += self._num_waiting > 0
+            return self._num_waiting > 0
 
     def wait(self, progress: Progress) -> Imitation:
         """Its result. What `progress` raises is let through, and ends the fit if nobody else waits for it."""
@@ -61,9 +58,8 @@ class _RunningFit:
         try:
             while True:
                 with self._changed:
-                    self._changed.wait_for(
-                        lambda: self._ended or self._num_reports > seen, timeout=LONGEST_WITHOUT_REPORT
-                    )
+                    if not self._ended and self._num_reports == seen:
+                        self._changed.wait(LONGEST_WITHOUT_REPORT)
                     ended, fresh = self._ended, self._num_reports > seen
                     seen, report = self._num_reports, self._report
                 if fresh or not ended:
@@ -84,7 +80,7 @@ class _RunningFit:
         result, failed = None, None
         try:
             result = self._work(self._tell)
-        except BaseException as error:  # noqa: BLE001 - it belongs to those who wait, whatever it is
+        except Exception as error:  # whatever it is, it belongs to those who wait
             failed = error
         with self._changed:
             self._result, self._error = result, failed
@@ -133,23 +129,28 @@ class FitStore:
         settings = settings or ImitationSettings()
         key = _content_key(demonstrations, settings)
         with self._lock:
-            known = self._memory.get(key)
-            if known is None:
-                running = self._running.get(key)
-                if running is None or not running.join():
-                    running = _RunningFit(lambda tell: self._read(key) or self._fit(key, demonstrations, settings, tell))
-                    running.join()
-                    self._running[key] = running
-        if known is not None:
-            return known
-        try:
-            result = running.wait(progress or (lambda _fraction, _message: None))
-            with self._lock:
-                return self._memory.setdefault(key, result)
-        finally:
-            with self._lock:
-                if self._running.get(key) is running and not running.is_waited_for:
-                    del self._running[key]
+            if key in self._memory:
+                return self._memory[key]
+            running = self._running.get(key)
+            if running is None or not running.join():
+                running = self._running[key] = self._begin(key, demonstrations, settings)
+        return running.wait(progress or (lambda _fraction, _message: None))
+
+    def _begin(self, key: str, demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> _RunningFit:
+        """Read or fit on another thread. Called with the lock held."""
+
+        def work(progress: Progress) -> Imitation:
+            try:
+                imitation = self._read(key) or self._fit(key, demonstrations, settings, progress)
+                with self._lock:
+                    return self._memory.setdefault(key, imitation)
+            finally:
+                with self._lock:
+                    if self._running.get(key) is running:
+                        del self._running[key]
+
+        running = _RunningFit(work)
+        return running
 
     def _fit(
         self,

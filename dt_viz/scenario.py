@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from dt_viz.obstacles import Sphere
 from dt_viz.occupancy import Generator
+
+Objective = Literal["trajectory", "velocity"]
+"""What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
+OBJECTIVES: tuple[Objective, ...] = ("trajectory", "velocity")
 
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
 """Metres."""
@@ -15,9 +20,13 @@ MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
 MAX_MANUAL_DURATION = 2.0
 
 
+COMPUTED_VIEWS = ("generator", "grid", "base")
+"""Fields of `View` whose pictures are computed only while they are shown."""
+
+
 @dataclass(frozen=True)
 class View:
-    """How a result is looked at; changing it computes nothing anew."""
+    """How a result is looked at; changing it moves nothing. Pictures that are computed are so only while shown."""
 
     demonstrations: bool = True
     rollouts: bool = True
@@ -27,6 +36,14 @@ class View:
     """Arrows of the vector field on a slice."""
     arm: bool = True
     table: bool = True
+    generator: bool = False
+    """Arrows of the learned generator, the vector field whose flow is ψ."""
+    generator_layer: int = 0
+    """Which of the flows that ψ is composed of; 1 is what ψ applies first, 0 their mean over time."""
+    grid: bool = False
+    """The warped grid: lines of base space seen through ψ⁻¹."""
+    base: bool = False
+    """The base attractor beside the learned system."""
     playing: bool = True
     """Whether the arm moves along its rollout."""
     speed: float = 1.0
@@ -41,6 +58,7 @@ class Scenario:
     obstacle: Sphere
     imitation: bool = True
     """Whether the learned transform is in the stack; without it motions are straight."""
+    objective: Objective = "trajectory"
     avoidance: bool = True
     """Whether the obstacle's transform is in the stack."""
     generator: Generator = "free-space"
@@ -57,3 +75,14 @@ class Scenario:
     def moves_like(self, other: Scenario) -> bool:
         """Whether both give the same motion, however it is looked at."""
         return replace(self, view=other.view) == other
+
+    def learns_like(self, other: Scenario) -> bool:
+        """Whether both need the same fit."""
+        return (self.task, self.objective) == (other.task, other.objective)
+
+    def computes_like(self, other: Scenario) -> bool:
+        """Whether a frame of `other` holds all that this needs."""
+        before, after = other.view, self.view
+        shows_no_more = all(getattr(before, name) or not getattr(after, name) for name in COMPUTED_VIEWS)
+        same_layer = not after.generator or after.generator_layer == before.generator_layer
+        return self.moves_like(other) and shows_no_more and same_layer

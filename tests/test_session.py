@@ -49,6 +49,7 @@ class Page:
 
     def __init__(self):
         self.frames, self.paces, self.adopted, self.errors = [], [], [], []
+        self.cancellations = []
 
     def draw(self, frame, pace):
         self.frames.append(frame)
@@ -62,6 +63,9 @@ class Page:
 
     def fail(self, error):
         self.errors.append(error)
+
+    def cancelled(self, task):
+        self.cancellations.append(task)
 
 
 def fresh(task):

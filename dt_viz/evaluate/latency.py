@@ -83,6 +83,9 @@ class Recorder:
         """See `Display`."""
         self.error = error
 
+    def cancelled(self, task: str) -> None:
+        """See `Display`."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""

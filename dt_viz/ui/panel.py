@@ -20,7 +20,9 @@ from dt_viz.scenario import (
     MAX_TEMPERATURE,
     MIN_DIAMETER,
     MIN_TEMPERATURE,
+    OBJECTIVES,
     Scenario,
+    View,
 )
 from dt_viz.ui.export import RESOLUTIONS
 from dt_viz.ui.session import Pace, Session
@@ -32,9 +34,14 @@ VIEW_LABELS: Mapping[str, str] = {
     "field": "Vector field",
     "arm": "Arm",
     "table": "Table",
+    "grid": "Warped grid ψ⁻¹(grid)",
+    "base": "Base attractor beside it",
+    "generator": "Learned generator",
 }
 GENERATOR_LABELS = {"free-space": "Free space (−∇log(1−p))", "probability": "Probability (∇p, the paper's)"}
 assert set(GENERATOR_LABELS) == set(GENERATORS)
+MAX_FLOWS = 3
+"""That ψ is composed of, for a start: each picture brings its own number."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +69,18 @@ class Panel:
         self._titles = dict(titles)
         self._controls: list[_Control] = []
         self._health = Health(clearance=float("nan"))
+        self._notice = gui.add_html("", visible=False)
+        self._noticed: Scenario | None = None
+        self._adopted: Scenario | None = None
         self._status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
+
+        @self._cancel.on_click
+        async def _(_event: viser.GuiEvent) -> None:
+            if self._session is not None:
+                self._session.cancel()
+
         self._build_task()
         self._build_obstacle()
         self._build_stack()
@@ -77,34 +94,59 @@ class Panel:
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
+        self._adopted = scenario
         for control in self._controls:
             value = control.read(scenario)
             if control.handle.value != value:
                 control.handle.value = value
         self._duration.disabled = scenario.duration is None
+        self._flow.visible = scenario.view.generator
         self._play.label = "Pause" if scenario.view.playing else "Play"
 
     def report(self, frame: Frame, pace: Pace) -> None:
         """Show how the rebuild went and how far its result is to be trusted."""
         if frame.stage is Stage.ROLLOUTS:
             return  # the next stage is a few milliseconds away
-        self._bar.visible = False
+        self._learned()
+        if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
+            self._notice.visible, self._noticed = False, None
         self._hint.content = f"<div style='{_SMALL}'>{html.escape(frame.task.hint)}</div>"
-        count = len(frame.rollouts)
-        if self._rollout.max != count:
-            self._rollout.max = count
+        _set_max(self._rollout, len(frame.rollouts))
+        if frame.pictures.generator is not None:
+            _set_max(self._flow, frame.pictures.generator.num_flows)
         self._status.content = status_html(frame, pace)
 
     def learning(self, fraction: float, message: str) -> None:
         """Show how far learning a task is."""
-        self._bar.visible = True
+        self._bar.visible = self._cancel.visible = True
         self._bar.value = 100 * fraction
         self._status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
-        self._bar.visible = False
-        self._status.content = _alarm(f"{type(error).__name__}: {error}", *_RED)
+        self._say(f"{type(error).__name__}: {error}", *_RED)
+
+    def cancelled(self, task: str) -> None:
+        """Show that learning a task was cancelled, and what is shown instead."""
+        shown = self._adopted.task if self._adopted is not None else task
+        instead = (
+            "Choose another task, or change anything to start again."
+            if shown == task
+            else f"This is “{self._titles[shown]}” as before."
+        )
+        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
+
+    def _say(self, text: str, colour: str, background: str) -> None:
+        """Say something that stays until the next scenario is shown."""
+        self._learned()
+        self._notice.content, self._notice.visible = _alarm(text, colour, background), True
+        self._noticed = self._adopted
+
+    def _learned(self) -> None:
+        """Nothing is being learned any more."""
+        if self._bar.visible:
+            self._bar.visible = self._cancel.visible = False
+            self._status.content = ""
 
     def _edit(self, gesture: str, **changes: Any) -> None:
         if self._session is not None:
@@ -176,6 +218,13 @@ class Panel:
                 lambda s: s.imitation,
                 lambda _s, value: {"imitation": value},
             )
+            self._bind(
+                gui.add_dropdown(
+                    "Learn", OBJECTIVES, hint="what is fitted to the demonstrations: the motions or eq. (3)"
+                ),
+                lambda s: s.objective,
+                lambda _s, value: {"objective": value},
+            )
             labels = GENERATOR_LABELS
             self._bind(
                 gui.add_dropdown("Generator", tuple(labels.values()), hint="the vector field whose flow avoids"),
@@ -236,10 +285,23 @@ class Panel:
         with self._gui.add_folder("Show", expand_by_default=False):
             for name, label in VIEW_LABELS.items():
                 self._bind(
-                    self._gui.add_checkbox(label, True),
+                    self._gui.add_checkbox(label, getattr(View(), name)),
                     lambda s, name=name: getattr(s.view, name),
                     lambda s, value, name=name: {"view": replace(s.view, **{name: value})},
                 )
+            self._flow = self._bind(
+                self._gui.add_slider(
+                    "Of flow",
+                    0,
+                    MAX_FLOWS,
+                    1,
+                    0,
+                    visible=False,
+                    hint="ψ is several flows, 1 is the first; 0: their mean",
+                ),
+                lambda s: s.view.generator_layer,
+                lambda s, value: {"view": replace(s.view, generator_layer=int(value))},
+            )
 
     def _build_export(self, save_png: Callable[[str, bool], None]) -> None:
         with self._gui.add_folder("Picture", expand_by_default=False):
@@ -254,6 +316,11 @@ class Panel:
                     save_png(resolution.value, transparent.value)
                 finally:
                     save.disabled = False
+
+
+def _set_max(slider: Any, value: int) -> None:
+    if slider.max != value:
+        slider.max = value
 
 
 _AMBER = ("#8a4b00", "#fff4e0")

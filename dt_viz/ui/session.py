@@ -7,11 +7,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
+from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.imitation import ImitationError
 from dt_viz.scenario import Scenario
 from dt_viz.ui.worker import LatestWorker
 
@@ -36,6 +39,10 @@ class Pace:
     """Edits that a newer one overtook, since the session began."""
 
 
+class _UnwantedError(Exception):
+    """Nobody wants any more what is being learned."""
+
+
 class Display(Protocol):
     """What a session shows its results on: a page, or a measurement."""
 
@@ -53,6 +60,10 @@ class Display(Protocol):
 
     def fail(self, error: Exception) -> None:
         """Show that the scenario could not be computed, and why."""
+        ...
+
+    def cancelled(self, task: str) -> None:
+        """Show that learning this task was cancelled. What is adopted was shown before."""
         ...
 
 
@@ -78,6 +89,8 @@ class Session:
         self._future: list[Scenario] = []
         self._gesture: tuple[str, float] = ("", 0.0)
         self._held = False
+        self._learning = self._stopped = self._closed = False
+        self._shown: Scenario | None = None
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
         self._worker = LatestWorker[tuple[Scenario, float]](self._compute, display.fail, name="session")
@@ -103,8 +116,9 @@ class Session:
                     self._past.append(self.scenario)
                 self._gesture = (gesture, now)
                 self._future.clear()
+            needs_frames = not edited.computes_like(self.scenario)
             self.scenario = edited
-            if moves:
+            if needs_frames:
                 self._submit()
         self._adopt()
 
@@ -143,12 +157,23 @@ class Session:
         """Do again what was undone last."""
         self._travel(self._future, self._past)
 
+    def cancel(self) -> None:
+        """Stop learning a task and go back to what was shown before. Nothing is done while nothing is learned."""
+        with self._lock:
+            abandoned = self.scenario
+            if not self._learning or (self._shown is not None and abandoned.learns_like(self._shown)):
+                return
+            self._stopped = not self._retreat(abandoned)
+        self._adopt()
+        self._display.cancelled(abandoned.task)
+
     def wait_idle(self, timeout: float | None = None) -> bool:
         """Wait until the newest scenario is computed to the end; False if that took longer than `timeout` seconds."""
         return self._worker.wait_idle(timeout)
 
     def close(self) -> None:
         """Stop computing and let go of everything."""
+        self._closed = True
         self._worker.close()
 
     def _travel(self, source: Any, target: Any) -> None:  # noqa: ANN401 - both kinds of history
@@ -166,12 +191,56 @@ class Session:
         with self._adopting:
             self._display.adopt(self.scenario)
 
+    def _retreat(self, abandoned: Scenario) -> bool:
+        """Go back from a scenario that has no picture to the one shown last, as if it had never been chosen.
+
+        Called with the lock held. False if there is none, or if `abandoned` is not what is wanted any more.
+        """
+        shown = self._shown
+        if shown is None or shown.learns_like(abandoned) or not self.scenario.learns_like(abandoned):
+            return False
+        while self._past and self._past[-1].learns_like(abandoned):
+            self._past.pop()  # edits of what was never seen
+        before = shown
+        for history in (self._past, self._future):
+            if history and history[-1].learns_like(shown):
+                before = history.pop()
+                break
+        self.scenario = replace(before, view=self.scenario.view)
+        self._gesture = ("", 0.0)
+        self._submit()
+        return True
+
     def _submit(self) -> None:
+        self._stopped = False
         self._worker.submit((self.scenario, time.perf_counter()))
 
     def _compute(self, job: tuple[Scenario, float], superseded: Callable[[], bool]) -> None:
+        try:
+            self._show_frames(job, superseded)
+        except _UnwantedError:
+            pass
+        except (DemonstrationError, ImitationError):
+            with self._lock:
+                returned = self._retreat(job[0])
+            if returned:
+                self._adopt()
+            raise
+        finally:
+            self._learning = False
+
+    def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
+        """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
+        with self._lock:
+            if self._stopped or self._closed or not self.scenario.learns_like(scenario):
+                raise _UnwantedError
+            self._learning = True
+        self._display.learning(fraction, message)
+
+    def _show_frames(self, job: tuple[Scenario, float], superseded: Callable[[], bool]) -> None:
         scenario, edited = job
-        for frame in self._engine.frames(scenario, self._display.learning):
+        for frame in self._engine.frames(scenario, partial(self._learn, scenario)):
+            self._learning, self._shown = False, scenario
             now = time.perf_counter()
             if frame.stage <= Stage.LIVE:
                 self._latency = now - edited

@@ -84,6 +84,10 @@ class Visitor:
         """See `Display`."""
         self._panel.fail(error)
 
+    def cancelled(self, task: str) -> None:
+        """See `Display`."""
+        self._panel.cancelled(task)
+
     def close(self) -> None:
         """The visitor has left: stop all threads."""
         self.session.close()

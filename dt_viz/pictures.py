@@ -1,0 +1,336 @@
+"""Pictures of ψ itself: the generator that was learned, the grid that ψ⁻¹ warps, and the base attractor beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dt_viz.diffeo import Chain, Diffeomorphism, Flow, Placed
+from dt_viz.fields import Array, Indices, Mask
+from dt_viz.rollouts import Bundle, Rays, refined
+from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.tasks import Task
+
+ARROW_SPACING = 0.027
+"""Of the generator's arrows, metres."""
+NEGLIGIBLE = 0.03
+"""Part of the largest arrow below which there is none to see."""
+LINE_SPACING = 0.035
+"""Between neighbouring lines of the grid in base space, metres."""
+TRIAL_STEP = 0.004
+"""Along a line of the grid, metres of base space: where it lies in the motion's space is looked at so closely."""
+SAMPLE_SPACING = 0.010
+"""Along a line of the grid, metres in the motion's space, before the behaviours bend it."""
+FINE_SPACING, COARSE_SPACING = 0.006, 0.030
+"""Metres between neighbouring samples of the drawn grid."""
+MAX_OFFSET = 0.12
+"""Metres by which a line of the grid may leave the slice before it is cut."""
+INSET_GAP = 0.06
+"""Between the slice and the inset, metres."""
+INSET_MARGIN = 0.18
+"""Around the rays in the inset, relative to their extent."""
+INSET_ARROWS = 13
+"""Along the longer side of the inset."""
+
+
+@dataclass(frozen=True)
+class GeneratorPicture:
+    """A generator V of ψ, ψ(s) = γ(t, s), on the slice: it straightens the motion."""
+
+    points: Array
+    """(N, 3), metres."""
+    displacements: Array
+    """(N, 3) t·V, metres: about how far the flow carries a point."""
+    motions: tuple[Array, ...]
+    """The demonstrations on the manifold that this flow acts on, (T_i, 3), metres; empty for the mean of all flows."""
+    num_flows: int
+    """That ψ is composed of."""
+
+
+@dataclass(frozen=True)
+class GridPicture:
+    """A regular lattice of lines of base space, seen through ψ⁻¹ of the whole stack."""
+
+    lines: tuple[Array, ...]
+    """(T_i, 3), metres."""
+
+
+@dataclass(frozen=True)
+class BasePicture:
+    """The base system in an inset beside the slice, smaller if need be."""
+
+    rays: tuple[Array, ...]
+    """(2, 3), from ψ(start) to ψ(goal), metres in the world, as all that follows."""
+    points: Array
+    """(N, 3) of the vector field's arrows."""
+    velocities: Array
+    """(N, 3) m/s in base space."""
+    grid: tuple[Array, ...]
+    """(2, 3) lines of the lattice whose image is the warped grid."""
+    border: Array
+    """(5, 3) the inset's closed outline."""
+    labels: tuple[Array, Array]
+    """(3,) above the inset and above the learned system."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Those that the view asks for; None is what it does not, or what is not worked out yet."""
+
+    generator: GeneratorPicture | None = None
+    grid: GridPicture | None = None
+    base: BasePicture | None = None
+
+
+NO_PICTURES = Pictures()
+
+
+@dataclass(frozen=True)
+class _Inset:
+    """Base space → world: z ↦ centre + scale·(z − middle)."""
+
+    middle: Array
+    centre: Array
+    scale: float
+    half: Array
+    """(2,) of the rectangle, metres in base space."""
+
+    def __call__(self, z: Array) -> Array:
+        return self.centre + self.scale * (z - self.middle)
+
+
+class Sketchbook:
+    """Makes pictures of one learned motion.
+
+    What does not depend on the obstacle is worked out when it is first shown.
+    """
+
+    def __init__(self, task: Task, flows: Chain | None, system: DiffeomorphicSystem, rays: Rays) -> None:
+        """Begin with no picture.
+
+        Args:
+            task: where the motion is.
+            flows: that ψ is composed of, in the demonstrations' own units; None where it is not in the stack.
+            system: the motion without any behaviour, in the world.
+            rays: from ψ(starts) to ψ(goal).
+        """
+        self._task, self._flows, self._system, self._rays = task, flows, system, rays
+        self._generators: dict[int, GeneratorPicture] = {}
+
+    def generator(self, number: int) -> GeneratorPicture | None:
+        """The generator of one of the flows: 1 is what ψ applies first, 0 stands for the mean over time of all."""
+        if self._flows is None:
+            return None
+        number = min(number, len(self._flows.parts))
+        if number not in self._generators:
+            self._generators[number] = self._generator(self._flows.parts[::-1], number)
+        return self._generators[number]
+
+    def _generator(self, flows: Sequence[Diffeomorphism], number: int) -> GeneratorPicture:
+        task, chosen = self._task, [flows[number - 1]] if number else flows
+        motions: list[Array] = []
+        if number:
+            for demonstration in task.demonstrations:
+                u = demonstration.positions
+                keep = np.unique(np.linspace(0, len(u) - 1, 150).round().astype(int))
+                u = u[keep]
+                for flow in flows[: number - 1]:
+                    u = flow.forward(u)
+                motions.append(task.to_world(u))
+        lower, upper = -np.array(task.slice.half_size), np.array(task.slice.half_size)
+        for motion in motions:
+            across = (motion - task.slice.centre) @ task.slice.axes
+            lower, upper = np.minimum(lower, across.min(axis=0)), np.maximum(upper, across.max(axis=0))
+        points = _on_slice(task, _lattice(lower, upper, ARROW_SPACING))
+        k = flows[0].dim
+        u = ((points - task.origin) @ task.axes / task.scale)[:, :k]
+        total = np.zeros_like(u)
+        for flow in chosen:
+            assert isinstance(flow, Flow)
+            total += flow.duration * flow.field(u)
+        displacements = task.scale * (total / len(chosen)) @ task.axes[:, :k].T
+        size = np.linalg.norm(displacements, axis=1)
+        seen = size > NEGLIGIBLE * size.max(initial=0.0)
+        return GeneratorPicture(points[seen], displacements[seen], tuple(motions), len(flows))
+
+    def grid(self, behaviours: Sequence[Diffeomorphism], *, coarse: bool) -> GridPicture:
+        """The warped grid.
+
+        Args:
+            behaviours: what is stacked on the imitation, from the inside out.
+            coarse: with fewer points, for a picture that is replaced at once.
+        """
+        start, end, index, fraction, positions = self._cut_lines
+
+        def lifted(positions: Array) -> Array:
+            for transform in behaviours:
+                positions = transform.inverse(positions)
+            return positions
+
+        def evaluate(index: Indices, fraction: Array) -> Array:
+            z = start[index] + fraction[:, None] * (end[index] - start[index])
+            return lifted(self._system.transform.inverse(z))[:, None]
+
+        if coarse:
+            keep = _every_other(index)
+            index, fraction, positions = index[keep], fraction[keep], positions[keep]
+        bundle = Bundle(index, fraction, lifted(positions)[:, None])
+        if not len(index):
+            return GridPicture(())
+        if not coarse:
+            bundle = refined(bundle, evaluate, FINE_SPACING, max_rounds=3)
+        # where ψ⁻¹ tears neighbours far apart a straight stroke would be a lie
+        limit = 3 * (COARSE_SPACING if coarse else FINE_SPACING)
+        return GridPicture(_runs(bundle.positions, bundle.index, limit))
+
+    @cached_property
+    def _lines(self) -> tuple[Array, Array]:
+        """Ends (M, 3) of the lattice's lines in base space: over all that ψ makes of the slice, through ψ(goal)."""
+        task, goal = self._task, self._system.base.goal
+        across = (self._system.transform.forward(task.slice.lattice(0.02)) - task.slice.centre) @ task.slice.axes
+        middle = (goal - task.slice.centre) @ task.slice.axes
+        offset = goal - _on_slice(task, middle[None])[0]
+        lower = middle + LINE_SPACING * np.floor((across.min(axis=0) - middle) / LINE_SPACING)
+        upper = middle + LINE_SPACING * np.ceil((across.max(axis=0) - middle) / LINE_SPACING)
+        start, end = _lattice_lines(lower, upper, LINE_SPACING)
+        return _on_slice(task, start) + offset, _on_slice(task, end) + offset
+
+    @cached_property
+    def _cut_lines(self) -> tuple[Array, Array, Indices, Array, Array]:
+        """The lines' pieces that lie over the slice before behaviours bend them.
+
+        Returns:
+            Of the M pieces the ends (M, 3) of their lines in base space; of the N samples the piece (N,) that they
+            belong to, where (N,) on its line they are, and their positions (N, 3) on the manifold of the imitation.
+        """
+        task, (start, end) = self._task, self._lines
+        normal = np.cross(*task.slice.axes.T)
+        indices, fractions, positions, starts, ends = [], [], [], [], []
+        for a, b in zip(start, end, strict=True):
+            u = np.linspace(0, 1, 2 + int(np.linalg.norm(b - a) / TRIAL_STEP))
+            x = self._system.transform.inverse(a + u[:, None] * (b - a))
+            across = (x - task.slice.centre) @ task.slice.axes
+            inside = (np.abs(across) <= task.slice.half_size).all(axis=1)
+            inside &= np.abs((x - task.slice.centre) @ normal) <= MAX_OFFSET
+            for piece in _true_runs(inside):
+                if len(piece) < 3:
+                    continue
+                along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(x[piece], axis=0), axis=1))])
+                even = np.linspace(0, along[-1], 2 + int(along[-1] / SAMPLE_SPACING))
+                chosen = piece[np.unique(np.searchsorted(along, even - 1e-12).clip(0, len(piece) - 1))]
+                indices.append(np.full(len(chosen), len(starts)))
+                fractions.append(u[chosen])
+                positions.append(x[chosen])
+                starts.append(a)
+                ends.append(b)
+        if not starts:
+            return np.empty((0, 3)), np.empty((0, 3)), np.empty(0, int), np.empty(0), np.empty((0, 3))
+        return (
+            np.stack(starts),
+            np.stack(ends),
+            np.concatenate(indices),
+            np.concatenate(fractions),
+            np.concatenate(positions),
+        )
+
+    def base(self, rays: Rays) -> BasePicture:
+        """The base system; `rays` are those of the whole stack."""
+        task, inset = self._task, self._inset
+        goal = rays.base.goal
+        spacing = 2 * inset.half.max() / INSET_ARROWS
+        corner = inset.half - spacing / 2
+        z = inset.middle + _lattice(-corner, corner, spacing) @ task.slice.axes.T
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * inset.half
+        above = inset.centre + inset.scale * (task.slice.axes @ np.array([0.0, inset.half[1]]))
+        return BasePicture(
+            rays=tuple(inset(np.stack([z0, goal])) for z0 in rays.z0),
+            points=inset(z),
+            velocities=rays.base.velocity(z),
+            grid=self._inset_grid,
+            border=inset(inset.middle + corners @ task.slice.axes.T),
+            labels=(above, task.slice.centre + task.slice.axes @ np.array([0.0, task.slice.half_size[1]])),
+        )
+
+    @cached_property
+    def _inset_grid(self) -> tuple[Array, ...]:
+        task, inset = self._task, self._inset
+        pieces = []
+        for a, b in zip(*self._lines, strict=True):
+            ends = (np.stack([a, b]) - inset.middle) @ task.slice.axes
+            cut = np.clip(ends, -inset.half, inset.half)
+            fixed = np.abs(ends[0] - ends[1]) < 1e-9  # the coordinate along which the line does not run
+            if (np.abs(ends[0] - cut[0])[fixed] < 1e-9).all():
+                pieces.append(inset(inset.middle + cut @ task.slice.axes.T))
+        return tuple(pieces)
+
+    @cached_property
+    def _inset(self) -> _Inset:
+        """Beside the slice, on the left of who looks from where the task puts the camera; no larger than the slice."""
+        task = self._task
+        plane = task.slice.axes
+        ends = np.concatenate([self._rays.z0, [self._rays.base.goal]])
+        across = (ends - task.slice.centre) @ plane
+        lower, upper = across.min(axis=0), across.max(axis=0)
+        half = (upper - lower) / 2
+        half = half + INSET_MARGIN * half.max()
+        half = np.maximum(half, 0.45 * half.max())
+        # the plane of the picture goes through the goal, where all rays meet
+        normal = np.cross(*plane.T)
+        offset = (self._rays.base.goal - task.slice.centre) @ normal
+        middle = _on_slice(task, ((lower + upper) / 2)[None])[0] + offset * normal
+        scale = min(1.0, float((np.array(task.slice.half_size) / half).min()))
+        eye, target = (np.array(point) for point in task.camera)
+        right = np.cross(target - eye, [0.0, 0.0, 1.0])
+        side = -np.sign(right @ plane[:, 0])
+        centre = task.slice.centre + side * (task.slice.half_size[0] + INSET_GAP + scale * half[0]) * plane[:, 0]
+        return _Inset(middle, centre, scale, half)
+
+
+def in_frame(transform: Diffeomorphism) -> Chain | None:
+    """The chain of flows inside a placed imitation; None of the identity."""
+    return transform.inner if isinstance(transform, Placed) and isinstance(transform.inner, Chain) else None
+
+
+def _on_slice(task: Task, across: Array) -> Array:
+    """World points (N, 3) of coordinates (N, 2) on the slice, metres."""
+    return task.slice.centre + across @ task.slice.axes.T
+
+
+def _lattice(lower: Array, upper: Array, spacing: float) -> Array:
+    """Points (N, 2) over a rectangle at about this spacing."""
+    axes = [np.linspace(a, b, max(2, round((b - a) / spacing) + 1)) for a, b in zip(lower, upper, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _lattice_lines(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
+    """Ends (M, 2) of the lines of a lattice over a rectangle, whose sides are multiples of the spacing."""
+    starts, ends = [], []
+    for axis in range(2):
+        for c in np.linspace(lower[axis], upper[axis], round((upper[axis] - lower[axis]) / spacing) + 1):
+            start, end = lower.copy(), upper.copy()
+            start[axis] = end[axis] = c
+            starts.append(start)
+            ends.append(end)
+    return np.stack(starts), np.stack(ends)
+
+
+def _true_runs(mask: Mask) -> list[Indices]:
+    """Indices of each run of neighbours that are true."""
+    return [run for run in np.split(np.arange(len(mask)), np.flatnonzero(np.diff(mask)) + 1) if mask[run[0]]]
+
+
+def _every_other(index: Indices) -> Indices:
+    """Every other sample of each piece, and its last."""
+    rank = np.arange(len(index)) - np.searchsorted(index, index)
+    last = np.append(np.diff(index) > 0, [True] * (len(index) > 0))
+    return np.flatnonzero((rank % 2 == 0) | last)
+
+
+def _runs(positions: Array, index: Indices, limit: float) -> tuple[Array, ...]:
+    """Polylines (T_i, 3) of samples of the same piece that lie within `limit` of their neighbours."""
+    far = np.linalg.norm(np.diff(positions, axis=0), axis=1) > limit
+    pieces = np.split(positions, np.flatnonzero(far | (np.diff(index) > 0)) + 1)
+    return tuple(piece for piece in pieces if len(piece) > 1)
