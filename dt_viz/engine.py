@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -175,6 +176,11 @@ class _Solution:
         return DiffeomorphicSystem(self.transform, self.rays.base)
 
 
+_turn = threading.Lock()
+"""Engines take turns. Small array operations of several threads would fight for the interpreter, and all would lose:
+four sessions that drag at once get twice as many frames this way."""
+
+
 class Engine:
     """Computes frames for one visitor. Not thread-safe: one worker thread calls it."""
 
@@ -206,18 +212,23 @@ class Engine:
         """
         began = time.perf_counter()
         ground = self._ground(scenario, progress)
-        live = _solve(ground, scenario, LIVE)
-        frame = _frame(ground, scenario, live)
+        with _turn:
+            live = _solve(ground, scenario, LIVE)
+            frame = _frame(ground, scenario, live)
         yield replace(frame, seconds=time.perf_counter() - began)
-        frame = self._with_field_and_arm(frame, live.system)
-        frame = replace(frame, pictures=_pictures(ground, scenario, live, coarse=True))
+        with _turn:
+            frame = self._with_field_and_arm(frame, live.system)
+            frame = replace(frame, pictures=_pictures(ground, scenario, live, coarse=True))
         yield replace(frame, stage=Stage.LIVE, seconds=time.perf_counter() - began)
 
-        fine = _solve(ground, scenario, FINE)
-        frame = self._with_field_and_arm(_frame(ground, scenario, fine), fine.system)
-        frame = replace(frame, pictures=_pictures(ground, scenario, fine, coarse=False))
+        with _turn:
+            fine = _solve(ground, scenario, FINE)
+        with _turn:
+            frame = self._with_field_and_arm(_frame(ground, scenario, fine), fine.system)
+            frame = replace(frame, pictures=_pictures(ground, scenario, fine, coarse=False))
         yield replace(frame, stage=Stage.FINE, seconds=time.perf_counter() - began)
-        health = certified(frame.health, fine.system, fine.bundle)
+        with _turn:
+            health = certified(frame.health, fine.system, fine.bundle)
         depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
         health = replace(health, clearance=-depth if depth > 0 else health.clearance)
         yield replace(frame, stage=Stage.CERTIFIED, health=health, seconds=time.perf_counter() - began)
