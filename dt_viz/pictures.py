@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from dt_viz.diffeo import Chain, Diffeomorphism, Flow, Placed
+from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Placed
 from dt_viz.fields import Array, Indices, Mask
 from dt_viz.rollouts import Bundle, Rays, refined
 from dt_viz.systems import DiffeomorphicSystem
@@ -26,6 +26,8 @@ SAMPLE_SPACING = 0.010
 """Along a line of the grid, metres in the motion's space, before the behaviours bend it."""
 FINE_SPACING, COARSE_SPACING = 0.006, 0.030
 """Metres between neighbouring samples of the drawn grid."""
+TOLERANCE = 1e-4
+"""Of the behaviours' flows where they bend the grid, metres: finer is not seen."""
 MAX_OFFSET = 0.12
 """Metres by which a line of the grid may leave the slice before it is cut."""
 INSET_GAP = 0.06
@@ -165,8 +167,10 @@ class Sketchbook:
         """
         start, end, index, fraction, positions = self._cut_lines
 
+        drawn = [replace(b, tolerance=TOLERANCE) if isinstance(b, AdaptiveFlow) else b for b in behaviours]
+
         def lifted(positions: Array) -> Array:
-            for transform in behaviours:
+            for transform in drawn:
                 positions = transform.inverse(positions)
             return positions
 

@@ -13,6 +13,12 @@ START = (213, 94, 0)
 OBSTACLE = (204, 121, 167)
 ARROW_SLOW = (198, 205, 216)
 ARROW_FAST = (64, 84, 120)
+GENERATOR_WEAK = (246, 214, 150)
+GENERATOR = (230, 159, 0)
+"""Of the flows that ψ is made of."""
+GRID = (0, 114, 178)
+"""Thinnest lines."""
+INSET = (120, 126, 136)
 TABLE = (226, 217, 204)
 ARM = (206, 210, 216)
 ARM_RING = (62, 66, 74)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.scenario import MAX_DIAMETER, Scenario
 from dt_viz.tasks import Slice, Task
 from dt_viz.ui import palette
-
-Colour = tuple[int, int, int]
+from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
+from dt_viz.ui.picture import Arrows, Lines, Picture
 
 ARROW_LENGTH = 0.024
 """Of the fastest arrow, metres."""
@@ -26,65 +24,6 @@ OPACITY = 0.8
 """Of the obstacle: the path that it blocks shines through."""
 MIN_SLOPE = 0.2
 """Of the line of sight to the slice, below which the slice counts as seen on edge."""
-
-
-class Picture(ABC):
-    """Something that is drawn from frames, under one node of the scene tree."""
-
-    def __init__(self, node: viser.SceneNodeHandle) -> None:
-        self._node = node
-
-    @abstractmethod
-    def draw(self, frame: Frame) -> None:
-        """Show what the frame says."""
-
-    @property
-    def visible(self) -> bool:
-        """Whether it is shown."""
-        return self._node.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        if visible != self._node.visible:
-            self._node.visible = visible
-
-
-class Lines:
-    """Polylines of one look, as one set of line segments."""
-
-    def __init__(self, scene: viser.SceneApi, name: str, colour: Colour, thickness: float, *, dash: float = 0) -> None:
-        """Make an empty set.
-
-        Args:
-            scene: of the visitor.
-            name: in the scene tree.
-            colour: of all lines.
-            thickness: metres.
-            dash: length of a dash and of the gap after it, metres; 0 draws through.
-        """
-        self._colour = colour
-        self._dash = dash
-        self.node = scene.add_line_segments(
-            name, np.zeros((1, 2, 3), np.float32), _rgb(colour, (1, 2, 3)), thickness=thickness
-        )
-
-    def show(self, paths: Sequence[Array], marked: int | None = None, mark: Colour = palette.CHOSEN_ROLLOUT) -> None:
-        """Show these polylines (T_i, 3), metres, the one with index `marked` in the colour `mark`."""
-        segments, colours = [], []
-        for index, path in enumerate(paths):
-            pieces = np.stack([path[:-1], path[1:]], axis=1)
-            if self._dash:
-                middle = np.cumsum(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1))
-                pieces = pieces[(middle / self._dash).astype(int) % 2 == 0]
-            segments.append(pieces)
-            colours.append(_rgb(mark if index == marked else self._colour, pieces.shape))
-        self.node.points = np.concatenate(segments).astype(np.float32)
-        self.node.colors = np.concatenate(colours)
-
-
-def _rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """One colour for an array of points of lines of that shape."""
-    return np.broadcast_to(np.array(palette.linear(colour), dtype=np.uint8), shape)
 
 
 class Demonstrations(Picture):
@@ -137,30 +76,13 @@ class FieldArrows(Picture):
     """The vector field on the task's slice: longer and darker is faster."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._arrows = scene.add_arrows(
-            "/field",
-            np.zeros((1, 2, 3), np.float32),
-            _rgb(palette.ARROW_SLOW, (1, 3)),
-            shaft_radius=0.0011,
-            head_radius=0.0034,
-            head_length=0.0085,
-        )
-        super().__init__(self._arrows)
+        self._arrows = Arrows(scene, "/field", palette.ARROW_SLOW, palette.ARROW_FAST, ARROW_LENGTH)
+        super().__init__(self._arrows.node)
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        if frame.field is None:
-            return
-        velocities = frame.field.velocities
-        speed = np.linalg.norm(velocities, axis=1, keepdims=True)
-        # the fastest arrows lie where ψ⁻¹ stretches most; a high quantile keeps the others readable
-        relative = np.minimum(speed / np.quantile(speed, 0.9), 1)
-        arrows = velocities / np.maximum(speed, 1e-12) * ARROW_LENGTH * (0.45 + 0.55 * relative)
-        slow, fast = np.array(palette.ARROW_SLOW), np.array(palette.ARROW_FAST)
-        self._arrows.points = np.stack(
-            [frame.field.points - arrows / 2, frame.field.points + arrows / 2], axis=1
-        ).astype(np.float32)
-        self._arrows.colors = (slow + relative * (fast - slow)).astype(np.uint8)
+        if frame.field is not None:
+            self._arrows.show(frame.field.points, frame.field.velocities)
 
 
 class Goal(Picture):
@@ -292,6 +214,9 @@ class ScenePictures:
             "ghost": Ghost(scene),
             "field": FieldArrows(scene),
             "table": Table(scene),
+            "generator": Generator(scene),
+            "grid": WarpedGrid(scene),
+            "base": BaseInset(scene),
         }
 
     def draw(self, frame: Frame) -> None:
