@@ -6,7 +6,7 @@ import numpy as np
 
 from dt_viz.behaviours import Built, Motion
 from dt_viz.diffeo import AdaptiveFlow
-from dt_viz.fields import Array, Mask, VectorField
+from dt_viz.fields import Array, Indices, Mask, VectorField
 from dt_viz.integrate import integrate_adaptive, rk4
 from dt_viz.obstacles import Sphere
 
@@ -35,7 +35,7 @@ class ObstacleAvoidance:
             return None
         obstacle = scenario.obstacle
         field = obstacle.field(scenario.generator, scenario.temperature)
-        doubts = [f"start {i + 1} is inside the obstacle" for i in np.flatnonzero(_blocked(motion))]
+        doubts = _inside(np.flatnonzero(_blocked(motion)) + 1)
         if obstacle.signed_distance(motion.goal) < 0:
             doubts.append("the goal is inside the obstacle: motions end beside it")
         duration = scenario.duration
@@ -58,6 +58,13 @@ class ObstacleAvoidance:
             return True
         distance = motion.scenario.obstacle.signed_distance(motion.positions[_avoidable(motion)])
         return bool((distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING).all())
+
+
+def _inside(starts: Indices) -> list[str]:
+    """What there is to say of starts, counted from 1, inside the obstacle."""
+    if len(starts) < 2:
+        return [f"start {start} is inside the obstacle" for start in starts]
+    return [f"starts {', '.join(map(str, starts))} are inside the obstacle"]
 
 
 def _goal(motion: Motion) -> Array:
@@ -94,7 +101,7 @@ def _avoidable(motion: Motion) -> Mask:
     Not the first ones of a motion that starts inside it, and not the last ones if it covers the goal.
     """
     obstacle = motion.scenario.obstacle
-    free = obstacle.signed_distance(motion.positions) >= 0
+    free = obstacle.signed_distance(motion.positions) >= -ROUNDING
     goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
     avoidable = np.ones(len(free), dtype=bool)
     for rollout, blocked in enumerate(_blocked(motion)):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.demos import Demonstration, lasa_files, load_demonstrations
+from dt_viz.demos import Demonstration, DemonstrationError, lasa_files, load_demonstrations
 from dt_viz.diffeo import Placed
 from dt_viz.fields import Array
 from dt_viz.imitation import Imitation
@@ -169,7 +169,11 @@ def lasa_tasks(folder: Path) -> dict[str, TaskEntry]:
 
 
 def _lasa_task(name: str, path: Path) -> Task:
-    return drawing_task(name, f"LASA {name}", "Drag the sphere through the letter.", load_demonstrations(path))
+    demonstrations = load_demonstrations(path)
+    if demonstrations[0].dimension != 2:
+        found = f"{demonstrations[0].dimension} coordinates"
+        raise DemonstrationError(path, "pos", found, "2: a drawing in the plane")
+    return drawing_task(name, f"LASA {name}", "Drag the sphere through the letter.", demonstrations)
 
 
 def _on_mean_path(

@@ -138,13 +138,15 @@ def test_an_obstacle_that_nearly_touches_the_goal_is_cleared_and_a_missed_goal_i
     assert missed < 1e-4 or any("beside" in doubt for doubt in frame.health.doubts), (missed, frame.health.doubts)
 
 
-def test_motions_to_a_covered_goal_end_at_the_nearest_free_place(engine, scenario):
+@pytest.mark.parametrize("offset", [(0.02, 0.0, 0.03), (-0.03, 0.01, -0.02), (0.0, 0.0, 0.07), (0.001, 0.0, 0.0)])
+def test_motions_to_a_covered_goal_stay_outside_and_end_beside_the_obstacle(engine, scenario, offset):
     goal = stage(engine, scenario, Stage.ROLLOUTS).goal
-    centre = goal + np.array([0.02, 0.0, 0.03])
-    frame = stage(engine, placed(scenario, centre, 0.15), Stage.FINE)
-    beside = centre + 0.075 * (goal - centre) / np.linalg.norm(goal - centre)
-    np.testing.assert_allclose(frame.reached, beside, rtol=0, atol=1e-4)
-    assert depth(frame) < 1e-5
+    centre = goal + np.array(offset)
+    for wanted in (Stage.LIVE, Stage.FINE):
+        frame = stage(engine, placed(scenario, centre, 0.15), wanted)
+        assert depth(frame) < 1e-5
+        assert np.linalg.norm(frame.reached - centre) < 0.075 + 0.03  # the margin, or the obstacle's own image of it
+        assert any("goal is inside" in doubt for doubt in frame.health.doubts)
 
 
 def test_without_avoidance_the_rollouts_are_the_ghost(engine, scenario):
@@ -188,7 +190,7 @@ def test_the_field_is_drawn_outside_the_obstacle_and_is_the_velocity_of_the_moti
 
 AWKWARD = {
     "on the goal": ("goal", 0.15, "goal is inside the obstacle"),
-    "on a start": ("start", 0.15, "start 1 is inside the obstacle"),
+    "on a start": ("start", 0.15, "inside the obstacle"),
     "around everything": ("middle", 2.0, "inside the obstacle"),
 }
 
