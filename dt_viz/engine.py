@@ -210,8 +210,8 @@ class Engine:
             DemonstrationError: the task's demonstrations cannot be read.
             ImitationError: nothing can be learned from them.
         """
-        began = time.perf_counter()
         ground = self._ground(scenario, progress)
+        began = time.perf_counter()
         with _turn:
             live = _solve(ground, scenario, LIVE)
             frame = _frame(ground, scenario, live)

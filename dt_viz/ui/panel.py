@@ -11,7 +11,7 @@ import viser
 
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Frame, Stage
-from dt_viz.health import Health
+from dt_viz.imitation import ImitationError
 from dt_viz.occupancy import GENERATORS
 from dt_viz.scenario import (
     MAX_DIAMETER,
@@ -68,7 +68,6 @@ class Panel:
         self._session: Session | None = None
         self._titles = dict(titles)
         self._controls: list[_Control] = []
-        self._health = Health(clearance=float("nan"))
         self._notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
         self._adopted: Scenario | None = None
@@ -114,6 +113,9 @@ class Panel:
         _set_max(self._rollout, len(frame.rollouts))
         if frame.pictures.generator is not None:
             _set_max(self._flow, frame.pictures.generator.num_flows)
+        if frame.scenario.duration is None and frame.health.duration is not None:
+            # what `auto` chose, to go on from by hand
+            self._duration.value = round(min(frame.health.duration, MAX_MANUAL_DURATION), 2)
         self._status.content = status_html(frame, pace)
 
     def learning(self, fraction: float, message: str) -> None:
@@ -124,7 +126,8 @@ class Panel:
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
-        self._say(f"{type(error).__name__}: {error}", *_RED)
+        expected = isinstance(error, DemonstrationError | ImitationError)
+        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
@@ -209,7 +212,7 @@ class Panel:
         gui = self._gui
         with gui.add_folder("Transforms"):
             self._bind(
-                gui.add_checkbox("Avoid the obstacle", True),
+                gui.add_checkbox("Avoid", True, hint="the obstacle's transform; off: the motion as learned"),
                 lambda s: s.avoidance,
                 lambda _s, value: {"avoidance": value},
             )
@@ -244,19 +247,15 @@ class Panel:
                 lambda _s, value: {"temperature": value},
             )
             self._bind(
-                gui.add_checkbox("Duration t: auto", True, hint="the shortest flow that clears the obstacle"),
+                gui.add_checkbox("Flow time: auto", True, hint="the shortest flow that clears the obstacle"),
                 lambda s: s.duration is None,
-                lambda _s, value: {"duration": None if value else self._auto_duration()},
+                lambda _s, value: {"duration": None if value else self._duration.value},
             )
             self._duration = self._bind(
-                gui.add_slider("Duration t", 0.0, MAX_MANUAL_DURATION, 0.01, 0.5, disabled=True),
+                gui.add_slider("Flow time t", 0.0, MAX_MANUAL_DURATION, 0.01, 0.5, disabled=True),
                 lambda s: self._duration.value if s.duration is None else round(s.duration, 2),
                 lambda s, value: {} if s.duration is None else {"duration": value},
             )
-
-    def _auto_duration(self) -> float:
-        """The duration that `auto` has chosen, to start from by hand."""
-        return round(min(self._health.duration or 0.5, MAX_MANUAL_DURATION), 2)
 
     def _build_arm(self) -> None:
         gui = self._gui
@@ -306,7 +305,7 @@ class Panel:
     def _build_export(self, save_png: Callable[[str, bool], None]) -> None:
         with self._gui.add_folder("Picture", expand_by_default=False):
             resolution = self._gui.add_dropdown("Resolution", tuple(RESOLUTIONS))
-            transparent = self._gui.add_checkbox("Transparent background", False)
+            transparent = self._gui.add_checkbox("Transparent", False)
             save = self._gui.add_button("Save PNG", icon=viser.Icon.CAMERA)
 
             @save.on_click
@@ -332,7 +331,7 @@ def status_html(frame: Frame, pace: Pace) -> str:
     """The status line: speed, clearance, certificates, and every reason for doubt."""
     health = frame.health
     rows = (
-        ("Rebuild", f"{1e3 * pace.latency:.0f} ms · {pace.rate:.0f} frames/s"),
+        ("Rebuild", f"{1e3 * pace.latency:.0f} ms" + (f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else "")),
         ("Skipped edits", f"{pace.num_skipped}"),
         ("Clearance", f"{1e3 * health.clearance:.1f} mm"),
         ("Flow time t", "off" if health.duration is None else f"{health.duration:.2f}"),

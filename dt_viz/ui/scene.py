@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import viser
 
-from dt_viz.engine import Frame
+from dt_viz.engine import MAX_GOAL_MISS, Frame
 from dt_viz.fields import Array
 from dt_viz.scenario import MAX_DIAMETER, Scenario
 from dt_viz.tasks import Slice, Task
@@ -86,17 +86,25 @@ class FieldArrows(Picture):
 
 
 class Goal(Picture):
-    """Where the motions end."""
+    """Where the motions should end, and a second ball where they do if something covers the goal."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._frame = scene.add_frame("/goal", show_axes=False)
-        super().__init__(self._frame)
+        self._goal = scene.add_frame("/goal", show_axes=False)
+        super().__init__(self._goal)
+        label = {"position": (0.0, 0.0, 0.02), "anchor": "bottom-center", "font_screen_scale": 0.8}
         scene.add_icosphere("/goal/ball", radius=0.012, color=palette.GOAL)
-        scene.add_label("/goal/label", "goal", position=(0.0, 0.0, 0.02), anchor="bottom-center", font_screen_scale=0.8)
+        scene.add_label("/goal/label", "goal", **label)
+        self._end = scene.add_frame("/end", show_axes=False, visible=False)
+        scene.add_icosphere("/end/ball", radius=0.009, color=palette.ROLLOUT)
+        scene.add_label("/end/label", "end", **label)
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        self._frame.position = frame.reached
+        self._goal.position = frame.goal
+        self._end.position = frame.reached
+        elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
+        if self._end.visible != elsewhere:
+            self._end.visible = elsewhere
 
 
 class Obstacle(Picture):
@@ -218,6 +226,10 @@ class ScenePictures:
             "grid": WarpedGrid(scene),
             "base": BaseInset(scene),
         }
+
+    def layer(self, view: str) -> Picture:
+        """The picture that this field of `View` shows or hides."""
+        return self._by_view[view]
 
     def draw(self, frame: Frame) -> None:
         """Assign fresh arrays to the handles."""

@@ -112,6 +112,8 @@ class Session:
             moves = not edited.moves_like(self.scenario)
             if moves:
                 name, when = self._gesture
+                # another control is moved, so whatever was held has been let go, even if nobody said so
+                self._held = self._held and name in {"", gesture}
                 if name != gesture or (now - when > GESTURE_PAUSE and not self._held):
                     self._past.append(self.scenario)
                 self._gesture = (gesture, now)
@@ -140,7 +142,12 @@ class Session:
         """
         if name != self.scenario.task:
             fresh = self._initial(name)
-            self.edit("task", task=name, obstacle=replace(fresh.obstacle, diameter=self.scenario.obstacle.diameter))
+            self.edit(
+                "task",
+                task=name,
+                arm_rollout=0,
+                obstacle=replace(fresh.obstacle, diameter=self.scenario.obstacle.diameter),
+            )
             self.end_gesture()
 
     def reset(self) -> None:
@@ -240,8 +247,10 @@ class Session:
     def _show_frames(self, job: tuple[Scenario, float], superseded: Callable[[], bool]) -> None:
         scenario, edited = job
         for frame in self._engine.frames(scenario, partial(self._learn, scenario)):
-            self._learning, self._shown = False, scenario
             now = time.perf_counter()
+            if self._learning:
+                edited = now - frame.seconds  # learning is no rebuild
+            self._learning, self._shown = False, scenario
             if frame.stage <= Stage.LIVE:
                 self._latency = now - edited
             if frame.stage is Stage.LIVE:
