@@ -26,12 +26,14 @@ SAMPLE_SPACING = 0.010
 """Along a line of the grid, metres in the motion's space, before the behaviours bend it."""
 FINE_SPACING, COARSE_SPACING = 0.006, 0.030
 """Metres between neighbouring samples of the drawn grid."""
-TOLERANCE = 1e-4
-"""Of the behaviours' flows where they bend the grid, metres: finer is not seen."""
+TOLERANCE = 1e-6
+"""Of the behaviours' flows where they bend the grid, metres: coarser is not faster, and lines would seem to cross."""
 MAX_OFFSET = 0.12
 """Metres by which a line of the grid may leave the slice before it is cut."""
 INSET_GAP = 0.06
 """Between the slice and the inset, metres."""
+INSET_HALF_WIDTH = 0.21
+"""At most, metres: all of it is seen from where the task puts the camera."""
 INSET_MARGIN = 0.18
 """Around the rays in the inset, relative to their extent."""
 INSET_ARROWS = 13
@@ -285,7 +287,7 @@ class Sketchbook:
         normal = np.cross(*plane.T)
         offset = (self._rays.base.goal - task.slice.centre) @ normal
         middle = _on_slice(task, ((lower + upper) / 2)[None])[0] + offset * normal
-        scale = min(1.0, float((np.array(task.slice.half_size) / half).min()))
+        scale = min(1.0, INSET_HALF_WIDTH / half[0], task.slice.half_size[1] / half[1])
         eye, target = (np.array(point) for point in task.camera)
         right = np.cross(target - eye, [0.0, 0.0, 1.0])
         side = -np.sign(right @ plane[:, 0])

@@ -263,6 +263,124 @@ def test_two_threads_that_want_the_same_fit_make_it_once(tmp_path, monkeypatch, 
     assert len(results) == 4 and all(result is learned for result in results)
 
 
+class Cancelled(Exception):
+    """What a visitor's progress raises."""
+
+
+@pytest.fixture
+def gated(monkeypatch, learned):
+    """Fits that report until they are let go on; one gate for each number of demonstrations."""
+    gates = {num: threading.Event() for num in (1, 2)}
+    noted = {"begun": threading.Semaphore(0), "ended": threading.Semaphore(0), "calls": []}
+
+    def slow(demonstrations, settings, progress):
+        noted["calls"].append(len(demonstrations))
+        noted["begun"].release()
+        try:
+            while not gates[len(demonstrations)].wait(0.01):
+                progress(0.5, "half")
+            return learned
+        finally:
+            noted["ended"].release()
+
+    monkeypatch.setattr(dt_viz.fits, "fit", slow)
+    yield gates, noted
+    for gate in gates.values():
+        gate.set()
+
+
+class Visitor:
+    """Waits for a fit on a thread of its own, and may give up."""
+
+    def __init__(self, store, num):
+        self.result = self.error = None
+        self.reports, self.gives_up = [], threading.Event()
+        self.reported = threading.Event()
+        self.thread = threading.Thread(target=self._run, args=(store, num))
+        self.thread.start()
+
+    def _run(self, store, num):
+        try:
+            self.result = store.get(arcs(num=num), SETTINGS, self._progress)
+        except Cancelled as error:
+            self.error = error
+
+    def _progress(self, fraction, message):
+        if self.gives_up.is_set():
+            raise Cancelled
+        self.reports.append((fraction, message))
+        if message == "half":
+            self.reported.set()
+
+    def join(self):
+        self.thread.join(30)
+        assert not self.thread.is_alive()
+
+
+def test_a_known_fit_does_not_wait_for_a_strangers_new_one(tmp_path, gated, learned):
+    gates, _ = gated
+    store = FitStore(tmp_path)
+    gates[2].set()
+    store.get(arcs(num=2), SETTINGS)
+    stranger = Visitor(store, 1)
+    assert stranger.reported.wait(30)
+    for known in (store, FitStore(tmp_path)):  # in memory, and in the folder
+        quick = Visitor(known, 2)
+        quick.join()
+        assert quick.result is not None
+    assert stranger.thread.is_alive()
+    gates[1].set()
+    stranger.join()
+    assert stranger.result is learned
+
+
+def test_a_cancelled_fit_ends_and_leaves_nothing_behind(tmp_path, gated, learned):
+    gates, noted = gated
+    store = FitStore(tmp_path)
+    visitor = Visitor(store, 2)
+    assert visitor.reported.wait(30)
+    visitor.gives_up.set()
+    visitor.join()
+    assert isinstance(visitor.error, Cancelled)
+    assert noted["ended"].acquire(timeout=30)  # it does not go on for nobody
+    assert list(tmp_path.iterdir()) == []
+    gates[2].set()
+    assert store.get(arcs(num=2), SETTINGS) is learned
+    assert noted["calls"] == [2, 2]
+
+
+def test_who_gives_up_does_not_take_the_fit_from_those_who_wait(tmp_path, gated, learned):
+    gates, noted = gated
+    store = FitStore(tmp_path)
+    first = Visitor(store, 2)
+    assert first.reported.wait(30)
+    second = Visitor(store, 2)
+    assert second.reported.wait(30)  # it is told how far the fit is that another began
+    first.gives_up.set()
+    first.join()
+    assert second.thread.is_alive()
+    gates[2].set()
+    second.join()
+    assert second.result is learned
+    assert first.error is not None
+    assert noted["calls"] == [2]
+
+
+def test_who_waits_can_give_up_although_the_fit_says_nothing(tmp_path, monkeypatch, learned):
+    release = threading.Event()
+
+    def silent(*_):
+        assert release.wait(30)
+        return learned
+
+    monkeypatch.setattr(dt_viz.fits, "fit", silent)
+    visitor = Visitor(FitStore(tmp_path), 2)
+    visitor.gives_up.set()
+    visitor.join()
+    assert isinstance(visitor.error, Cancelled)
+    release.set()
+
+
 def test_the_cache_folder_is_the_users(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_cache_folder() == tmp_path / "dt-viz"

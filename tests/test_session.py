@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import time
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -10,6 +11,7 @@ import pytest
 
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Stage
+from dt_viz.imitation import ImitationError
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Scenario, View
 from dt_viz.ui import session as session_module
@@ -32,12 +34,20 @@ class FakeEngine:
     def __init__(self):
         self.asked = []
         self.begun, self.gate = threading.Event(), None
+        self.unlearned, self.learning = set(), threading.Event()
 
     def frames(self, scenario, progress=None):
         self.asked.append(scenario)
         self.begun.set()
         if self.gate is not None:
             assert self.gate.wait(PATIENCE)
+        while scenario.task in self.unlearned:
+            assert progress is not None
+            progress(0.5, "half")
+            self.learning.set()
+            time.sleep(0.005)
+        if scenario.task == "hopeless":
+            raise ImitationError("they contradict each other")
         if scenario.temperature == 13.0:
             raise DemonstrationError("unlucky.csv", "file", "13", "another")
         for stage in Stage:
@@ -343,3 +353,123 @@ def test_a_closed_session_computes_nothing_more(opened):
     opened.session.edit("obstacle", obstacle=at(1.0))
     assert opened.session.wait_idle(1.0)
     assert len(opened.engine.asked) == asked
+
+
+def begin_learning(opened, task="lift_box"):
+    opened.engine.unlearned = {task}
+    opened.session.choose_task(task)
+    assert opened.engine.learning.wait(PATIENCE)
+
+
+def test_cancelling_goes_back_to_the_task_that_was_shown_and_says_so(opened):
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.settle()
+    before = opened.session.scenario
+    begin_learning(opened)
+    opened.session.cancel()
+    opened.settle()
+    assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == before
+    assert opened.page.cancellations == ["lift_box"]
+    assert opened.page.errors == []
+    opened.session.undo()  # as if the other task had never been chosen
+    assert opened.session.scenario == fresh("draw_s")
+
+
+def test_cancelling_keeps_the_view_and_forgets_what_was_edited_meanwhile(opened):
+    begin_learning(opened)
+    opened.session.edit("ghost", view=View(ghost=False))
+    opened.session.edit("obstacle", obstacle=at(2.0))
+    opened.session.cancel()
+    opened.settle()
+    assert opened.session.scenario == opened.shown == replace(fresh("draw_s"), view=View(ghost=False))
+    opened.session.undo()
+    assert opened.session.scenario.task == "draw_s"
+
+
+def test_what_was_cancelled_can_be_chosen_again(opened):
+    begin_learning(opened)
+    opened.session.cancel()
+    opened.settle()
+    opened.engine.unlearned = set()
+    opened.session.choose_task("lift_box")
+    opened.settle()
+    assert opened.shown.task == "lift_box"
+
+
+@pytest.mark.parametrize("how", ["another task", "undo"])
+def test_another_choice_supersedes_learning(opened, how):
+    begin_learning(opened)
+    if how == "another task":
+        opened.session.choose_task("pots")
+    else:
+        opened.session.undo()
+    opened.settle()
+    assert opened.shown == opened.session.scenario
+    assert opened.shown.task == {"another task": "pots", "undo": "draw_s"}[how]
+    assert opened.page.errors == opened.page.cancellations == []
+
+
+def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
+    begin_learning(opened)
+    for x in range(5):
+        opened.session.edit("obstacle", obstacle=at(float(x)))
+    opened.engine.learning.clear()
+    assert opened.engine.learning.wait(PATIENCE)
+    assert [scenario.task for scenario in opened.engine.asked].count("lift_box") == 1
+    opened.engine.unlearned = set()
+    opened.settle()
+    assert opened.shown.obstacle == at(4.0)
+
+
+def test_there_is_nothing_to_cancel_when_nothing_is_learned(opened):
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.settle()
+    opened.session.cancel()
+    opened.settle()
+    assert opened.session.scenario.obstacle == at(1.0)
+    assert opened.page.cancellations == []
+
+
+def test_the_first_task_can_be_cancelled_too_and_any_edit_begins_again():
+    engine, page = FakeEngine(), Page()
+    engine.unlearned = {"draw_s"}
+    session = Session(cast(Engine, engine), fresh, "draw_s", page)
+    try:
+        assert engine.learning.wait(PATIENCE)
+        session.cancel()
+        assert session.wait_idle(PATIENCE)
+        assert page.cancellations == ["draw_s"] and page.frames == []
+        engine.unlearned = set()
+        session.edit("obstacle", obstacle=at(1.0))
+        assert session.wait_idle(PATIENCE)
+        assert page.frames[-1].scenario.obstacle == at(1.0)
+    finally:
+        session.close()
+
+
+def test_closing_ends_learning(opened):
+    begin_learning(opened)
+    opened.session.close()
+    opened.settle()
+    assert opened.page.errors == []
+
+
+def test_a_task_that_cannot_be_learned_leaves_the_picture_and_the_choice_before_it(opened, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        opened.session.choose_task("hopeless")
+        opened.settle()
+    assert [str(error) for error in opened.page.errors] == ["they contradict each other"]
+    assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == fresh("draw_s")
+
+
+def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(opened):
+    asked = len(opened.engine.asked)
+    opened.session.edit("grid", view=View(grid=True))
+    opened.settle()
+    assert opened.shown.view.grid and len(opened.engine.asked) == asked + 1
+    opened.session.edit("grid", view=View())
+    opened.session.edit("flow", view=View(generator_layer=2))
+    opened.settle()
+    assert len(opened.engine.asked) == asked + 1
+    opened.session.undo()
+    assert opened.session.scenario == replace(fresh("draw_s"), view=View(generator_layer=2))

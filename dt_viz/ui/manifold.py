@@ -20,7 +20,12 @@ class Generator(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/generator", show_axes=False))
         self.arrows = Arrows(
-            scene, "/generator/arrows", palette.GENERATOR_WEAK, palette.GENERATOR, GENERATOR_LENGTH, thickness=1.25
+            scene,
+            "/generator/arrows",
+            palette.linear(palette.GENERATOR_WEAK),
+            palette.linear(palette.GENERATOR),
+            GENERATOR_LENGTH,
+            thickness=1.25,
         )
         self._motions = Lines(scene, "/generator/motions", palette.GENERATOR, 0.0026)
         self._shown: object = None
@@ -38,7 +43,7 @@ class WarpedGrid(Picture):
     """The grid of base space as ψ⁻¹ of the whole stack bends it."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self.lines = Lines(scene, "/grid", palette.GRID, 0.0013)
+        self.lines = Lines(scene, "/grid", palette.GRID, 0.0011)
         super().__init__(self.lines.node)
 
     def draw(self, frame: Frame) -> None:
@@ -54,7 +59,7 @@ class BaseInset(Picture):
         super().__init__(scene.add_frame("/base", show_axes=False))
         self._border = Lines(scene, "/base/border", palette.INSET, 0.0016)
         self._grid = Lines(scene, "/base/grid", palette.GRID, 0.0010)
-        self.arrows = Arrows(scene, "/base/field", palette.ARROW_SLOW, palette.ARROW_FAST, INSET_LENGTH)
+        self.arrows = Arrows(scene, "/base/field", palette.INSET, palette.ARROW_FAST, INSET_LENGTH)
         self.rays = Lines(scene, "/base/rays", palette.ROLLOUT, 0.0036)
         self._goal = scene.add_icosphere("/base/goal", radius=0.009, color=palette.GOAL)
         self._labels = tuple(
