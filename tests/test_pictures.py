@@ -1,0 +1,166 @@
+"""Pictures of ψ by what they promise: points of the warped grid are images of points of straight lines, and so on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.engine import FINE, LIVE, Stage, _solve
+from dt_viz.obstacles import Sphere
+from dt_viz.pictures import FINE_SPACING, LINE_SPACING
+from dt_viz.scenario import View
+
+TASK_NAMES = ["draw_s", "lift_box"]
+ALL = View(generator=True, grid=True, base=True)
+
+
+@pytest.fixture(params=TASK_NAMES, name="scenario")
+def _scenario(request, initial):
+    return replace(initial(request.param), view=ALL)
+
+
+def picture_at(engine, scenario, wanted=Stage.FINE):
+    frame = next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+    return frame, frame.pictures
+
+
+def on_slice(task, points):
+    """Coordinates (N, 3) in the slice and along its normal."""
+    axes = task.slice.axes
+    return (points - task.slice.centre) @ np.column_stack([axes, np.cross(*axes.T)])
+
+
+def straightness(lines):
+    """By how much points of lines leave the straight line along an axis of the slice."""
+    return max(np.ptp(line, axis=0)[:2].min() for line in lines)
+
+
+def test_pictures_are_worked_out_only_while_they_are_shown_and_never_before_the_rollouts(engine, scenario):
+    hidden = [frame.pictures for frame in engine.frames(replace(scenario, view=View()))]
+    assert all((p.generator, p.grid, p.base) == (None, None, None) for p in hidden)
+    for frame in engine.frames(scenario):
+        shown = (frame.pictures.generator, frame.pictures.grid, frame.pictures.base)
+        assert all((picture is not None) == (frame.stage >= Stage.LIVE) for picture in shown)
+
+
+@pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
+def test_the_warped_grid_of_the_identity_is_the_grid(engine, scenario, wanted):
+    frame, pictures = picture_at(engine, replace(scenario, imitation=False, avoidance=False), wanted)
+    lines = [on_slice(frame.task, line) for line in pictures.grid.lines]
+    assert straightness(lines) < 1e-9
+    for axis in range(2):
+        across = np.sort([line[0, axis] for line in lines if np.ptp(line[:, axis]) < 1e-9])
+        np.testing.assert_allclose(np.diff(across), LINE_SPACING, atol=1e-9)
+        half = frame.task.slice.half_size[axis]
+        assert across[0] < -half + LINE_SPACING and across[-1] > half - LINE_SPACING
+    assert pictures.generator is None  # nothing is learned that could be shown
+
+
+@pytest.mark.parametrize("avoidance", [False, True])
+@pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
+def test_the_warped_grid_is_made_of_images_of_points_of_straight_lines(engine, scenario, wanted, avoidance):
+    """ψ by another way, the forward side of the whole stack, makes the picture's lines straight again."""
+    scenario = replace(scenario, avoidance=avoidance)
+    frame, pictures = picture_at(engine, scenario, wanted)
+    stack = _solve(engine._ground(scenario, None), scenario, LIVE if wanted is Stage.LIVE else FINE)
+    middle, obstacle = [], scenario.obstacle
+    for line in pictures.grid.lines:
+        outside = line[obstacle.signed_distance(line) > 0.005]  # nearer, ψ magnifies what the picture rounds
+        if len(outside) > 1:
+            middle.append(on_slice(frame.task, stack.transform.forward(outside)))
+    assert len(middle) > 20
+    close = 2e-3 if wanted is Stage.LIVE else 5e-4  # ψ of the live stack itself is no more exact
+    assert straightness(middle) < close
+    assert max(np.ptp(line[:, 2]) for line in middle) < close
+
+
+def test_the_grid_lies_over_the_slice_and_is_smooth(engine, scenario):
+    frame, pictures = picture_at(engine, replace(scenario, avoidance=False))
+    points = on_slice(frame.task, np.concatenate(pictures.grid.lines))
+    assert (np.abs(points[:, :2]) <= np.array(frame.task.slice.half_size) + 1e-9).all()
+    # what the clipping leaves covers the slice: motions are everywhere among the lines
+    for axis in range(2):
+        assert np.ptp(points[:, axis]) > 1.8 * frame.task.slice.half_size[axis]
+    for line in pictures.grid.lines:
+        assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 3 * FINE_SPACING
+
+
+def test_the_grid_keeps_out_of_the_obstacle_as_the_motions_do(engine, scenario):
+    _, pictures = picture_at(engine, scenario)
+    points = np.concatenate(pictures.grid.lines)
+    inside = scenario.obstacle.signed_distance(points) < -0.01
+    assert inside.mean() < 0.01
+    bare = np.concatenate(picture_at(engine, replace(scenario, avoidance=False))[1].grid.lines)
+    assert (scenario.obstacle.signed_distance(bare) < -0.01).mean() > 0.03
+
+
+def test_far_from_the_obstacle_the_grid_does_not_move(engine, scenario):
+    away = replace(scenario, obstacle=Sphere((0.0, 3.0, 3.0)))
+    moved = picture_at(engine, away)[1].grid.lines
+    still = picture_at(engine, replace(away, avoidance=False))[1].grid.lines
+    for a, b in zip(moved, still, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_following_the_generators_one_after_the_other_straightens_the_demonstrations(engine, scenario):
+    """The motions that are shown with a flow's generator are bent less from flow to flow."""
+    bends = []
+    for number in range(1, 20):
+        frame, pictures = picture_at(engine, replace(scenario, view=replace(ALL, generator_layer=number)), Stage.LIVE)
+        if number > pictures.generator.num_flows:
+            break
+        bends.append(np.mean([turned(path) for path in pictures.generator.motions]))
+        if number == 1:
+            for motion, path in zip(pictures.generator.motions, frame.task.paths, strict=True):
+                np.testing.assert_allclose(motion[[0, -1]], path[[0, -1]], atol=1e-12)
+    assert len(bends) >= 2
+    assert (np.diff(bends) < 0).all()
+
+
+def turned(path):
+    """How much longer a path is than the way from its start to its end."""
+    return np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / np.linalg.norm(path[-1] - path[0])
+
+
+def test_the_mean_generator_is_the_mean_of_the_flows(engine, initial):
+    scenario = initial("draw_s")
+    imitation = engine._ground(scenario, None).imitation
+    _, pictures = picture_at(engine, replace(scenario, view=ALL), Stage.LIVE)
+    task, mean = engine.task("draw_s"), pictures.generator
+    u = ((mean.points - task.origin) @ task.axes / task.scale)[:, :2]
+    expected = np.mean([flow.duration * flow.field(u) for flow in imitation.transform.parts], axis=0)
+    np.testing.assert_allclose(mean.displacements @ task.axes[:, :2] / task.scale, expected, atol=1e-12)
+    assert mean.motions == ()
+
+
+def test_a_flow_that_there_is_not_is_the_last(engine, scenario):
+    """The slider may stand higher than another task has flows."""
+    many = picture_at(engine, replace(scenario, view=replace(ALL, generator_layer=99)), Stage.LIVE)[1].generator
+    last = replace(scenario, view=replace(ALL, generator_layer=many.num_flows))
+    assert picture_at(engine, last, Stage.LIVE)[1].generator is many
+
+
+def test_the_inset_shows_straight_rays_to_one_goal_beside_the_slice(engine, scenario):
+    frame, pictures = picture_at(engine, scenario)
+    base, task = pictures.base, frame.task
+    assert len(base.rays) == len(frame.rollouts)
+    goal = base.rays[0][1]
+    for ray in base.rays:
+        np.testing.assert_allclose(ray[1], goal, atol=1e-12)
+    for line in (*base.rays, base.border, base.points, *base.grid):
+        across = on_slice(task, np.asarray(line))
+        assert (np.abs(across[:, 0]) > task.slice.half_size[0]).all()  # nothing hides the learned system
+    # velocities point to the goal, as those of a base attractor do
+    to_goal = goal - base.points
+    cosine = (
+        (to_goal * base.velocities).sum(1) / np.linalg.norm(to_goal, axis=1) / np.linalg.norm(base.velocities, axis=1)
+    )
+    assert cosine.min() > 0.9
+
+
+def test_pictures_are_remembered_where_the_obstacle_does_not_matter(engine, scenario):
+    first = picture_at(engine, scenario, Stage.LIVE)[1]
+    x, y, z = scenario.obstacle.position
+    moved = picture_at(engine, replace(scenario, obstacle=Sphere((x, y, z + 0.02))), Stage.LIVE)[1]
+    assert moved.generator is first.generator
+    assert moved.base.grid is first.base.grid
