@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
+import dt_viz.fits
 from dt_viz.fits import FitStore
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.tasks import TASKS
@@ -206,3 +207,48 @@ def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
     page.get_by_role("option", name="Lift box").click()
     wait_until(lambda: visitor.shown is not None and visitor.shown.task.name == "lift_box", "the other task")
     assert len(visitor.shown.rollouts) == 8
+
+
+SHOWN = {  # the layer's label in the page, the picture's name, and its handles that hold points
+    "Warped grid ψ⁻¹(grid)": ("grid", lambda picture: [picture.lines.node]),
+    "Base attractor beside it": ("base", lambda picture: [picture.rays.node, picture.arrows.node]),
+    "Learned generator": ("generator", lambda picture: [picture.arrows.node]),
+}
+
+
+def test_each_layer_of_the_transform_is_drawn_once_it_is_switched_on(visit):
+    page, visitor = visit
+    page.get_by_role("button", name="Show").or_(page.get_by_text("Show", exact=True)).first.click()
+    for label, (name, handles) in SHOWN.items():
+        picture = visitor.pictures.layer(name)
+        assert not picture.visible
+
+        page.get_by_label(label).first.evaluate("box => box.click()")  # wherever the panel is scrolled to
+        wait_until(lambda name=name: getattr(visitor.session.scenario.view, name), f"the checkbox of {name}")
+        assert visitor.session.wait_idle(PATIENCE)
+        assert picture.visible
+        for handle in handles(picture):
+            assert np.isfinite(handle.points).all()
+            assert len(handle.points) >= len(visitor.shown.rollouts)
+            assert np.ptp(handle.points, axis=(0, 1)).max() > 0.1
+            assert len(handle.colors) == len(handle.points)
+
+
+def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
+    page, visitor = visit
+
+    def endless(_demonstrations, _settings, progress):
+        while True:
+            progress(0.5, "without end")
+            time.sleep(0.02)
+
+    monkeypatch.setattr(dt_viz.fits, "fit", endless)
+    page.get_by_role("textbox", name="Learn").or_(page.locator("input[value='trajectory']")).first.click()
+    page.get_by_role("option", name="velocity").click()
+    page.get_by_text("Learning the motion: without end").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_text("was cancelled").wait_for(timeout=1000 * PATIENCE)
+    assert visitor.session.wait_idle(PATIENCE)
+    assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
+    page.get_by_text("Smallest det J").wait_for(timeout=1000 * PATIENCE)
+    assert page.get_by_role("button", name="Cancel").count() == 0
