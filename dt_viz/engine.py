@@ -225,6 +225,7 @@ class Engine:
             fine = _solve(ground, scenario, FINE)
         with _turn:
             frame = self._with_field_and_arm(_frame(ground, scenario, fine), fine.system)
+        with _turn:
             frame = replace(frame, pictures=_pictures(ground, scenario, fine, coarse=False))
         yield replace(frame, stage=Stage.FINE, seconds=time.perf_counter() - began)
         with _turn:

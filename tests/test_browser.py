@@ -247,7 +247,7 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     page.get_by_role("option", name="velocity").click()
     page.get_by_text("Learning the motion: without end").wait_for(timeout=1000 * PATIENCE)
     page.get_by_role("button", name="Cancel").click()
-    page.get_by_text("was cancelled").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("was cancelled. This is “Draw S” as before.").wait_for(timeout=1000 * PATIENCE)
     assert visitor.session.wait_idle(PATIENCE)
     assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
     page.get_by_text("Smallest det J").wait_for(timeout=1000 * PATIENCE)

@@ -71,6 +71,7 @@ class Panel:
         self._notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
         self._adopted: Scenario | None = None
+        self._shows = False
         self._status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
@@ -106,6 +107,7 @@ class Panel:
         """Show how the rebuild went and how far its result is to be trusted."""
         if frame.stage is Stage.ROLLOUTS:
             return  # the next stage is a few milliseconds away
+        self._shows = True
         self._learned()
         if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
             self._notice.visible, self._noticed = False, None
@@ -131,12 +133,10 @@ class Panel:
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
-        shown = self._adopted.task if self._adopted is not None else task
-        instead = (
-            "Choose another task, or change anything to start again."
-            if shown == task
-            else f"This is “{self._titles[shown]}” as before."
-        )
+        if self._shows and self._adopted is not None:
+            instead = f"This is “{self._titles[self._adopted.task]}” as before."
+        else:
+            instead = "Choose another task, or move the obstacle to start again."
         self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
 
     def _say(self, text: str, colour: str, background: str) -> None:
