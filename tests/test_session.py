@@ -15,7 +15,7 @@ from dt_viz.imitation import ImitationError
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Scenario, View
 from dt_viz.ui import session as session_module
-from dt_viz.ui.session import MAX_UNDO, Session
+from dt_viz.ui.session import GESTURE_PAUSE, MAX_UNDO, Session
 
 PATIENCE = 30.0
 
@@ -255,6 +255,31 @@ def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
     opened.session.edit("obstacle", obstacle=at(1.0))
     opened.settle()
     assert opened.shown.obstacle == at(1.0)
+
+
+def test_a_drag_is_one_step_for_undo_however_slow(opened):
+    opened.session.begin_gesture()
+    for x in range(1, 5):
+        opened.session.edit("obstacle", obstacle=at(float(x)))
+        opened.clock[0] += 10 * GESTURE_PAUSE
+    opened.session.end_gesture()
+    opened.session.edit("obstacle", obstacle=at(9.0))
+    opened.session.undo()
+    assert opened.session.scenario.obstacle == at(4.0)
+    opened.session.undo()
+    assert opened.session.scenario == fresh("draw_s")
+
+
+def test_a_drag_whose_end_is_lost_ends_with_the_next_control(opened):
+    opened.session.begin_gesture()
+    opened.session.edit("obstacle", obstacle=at(1.0))
+    for margin in (0.02, 0.03):
+        opened.clock[0] += 2 * GESTURE_PAUSE
+        opened.session.edit("margin", margin=margin)
+    opened.session.undo()
+    assert opened.session.scenario.margin == 0.02
+    opened.session.undo()
+    assert opened.session.scenario == replace(fresh("draw_s"), obstacle=at(1.0))
 
 
 def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
