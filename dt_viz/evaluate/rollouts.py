@@ -42,7 +42,7 @@ from dt_viz.fits import FitStore, default_cache_folder
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Scenario
-from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.systems import Attractor, DiffeomorphicSystem
 
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 ARRIVED = 1e-4
@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--accuracy",
         type=positive_number("metres", 1),
-        default=1e-6,
+        default=1e-5,
         metavar="M",
         help="metres from the truth that both sides must keep to (default: %(default)s)",
     )
@@ -92,6 +92,9 @@ def run(options: argparse.Namespace) -> int:
     out = None if options.out is None else ready_to_write(options.out, ".json")
     fits = FitStore(default_cache_folder())
     learned = task.system(fits.get(task.demonstrations))
+    clock = learned.base
+    # the learned pace has kinks, which a stepping of high order would have to find: that would flatter the exact side
+    learned = replace(learned, base=Attractor(clock.goal, clock.speed, clock.smoothing))
     scenario = Scenario(task.name, Sphere(options.obstacle or task.obstacle_position, options.diameter))
     frame = next(iter(Engine(tasks, fits, load_jaco()).frames(scenario)))
     field = scenario.obstacle.field(scenario.generator, scenario.temperature)
@@ -107,6 +110,7 @@ def run(options: argparse.Namespace) -> int:
     scenes: dict[str, Systems] = {"no obstacle": lambda _: learned, "obstacle": with_obstacle}
     for scene, systems in scenes.items():
         exact, stepped = compare(systems, starts, options.accuracy, options.repeats)
+        print(f"{scene}: exact rollouts are {stepped.seconds / exact.seconds:.0f} × faster", flush=True)
         results[scene] = {"exact": vars(exact), "stepped": vars(stepped), "ratio": stepped.seconds / exact.seconds}
         for name, side in (("exact", exact), ("stepped", stepped)):
             accuracy = f"{side.error:.1e}" + ("" if side.accurate else " (too coarse)")
@@ -119,9 +123,6 @@ def run(options: argparse.Namespace) -> int:
         f"{task.name}, {NUM_ROLLOUTS} rollouts × {NUM_POINTS} points, both within {options.accuracy:g} m of the truth"
     )
     print_table(("", "ms", "error m", "setting"), rows)
-    print()
-    for scene, result in results.items():
-        print(f"{scene}: exact rollouts are {result['ratio']:.0f} × faster")
     return 0 if all(side["accurate"] for r in results.values() for side in (r["exact"], r["stepped"])) else 1
 
 
