@@ -43,6 +43,7 @@ class ObstacleAvoidance:
             # the deepest samples leave last, or nearly so; where they did not tell the whole story, take all
             points = motion.positions[_avoidable(motion)] if at_least else _deepest(motion)
             duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
+        hopeless = duration is None
         if duration is None:
             duration = MAX_DURATION
             doubts.append(
@@ -50,7 +51,8 @@ class ObstacleAvoidance:
                 + ("∇p is flat inside it" if scenario.generator == "probability" else "it runs through its dead centre")
             )
         flow = AdaptiveFlow(field, duration, tolerance)
-        return Built(flow, duration, _goal(motion) if motion.keeps_goal else flow.inverse(motion.goal), tuple(doubts))
+        goal = _goal(motion) if motion.keeps_goal else flow.inverse(motion.goal)
+        return Built(flow, duration, goal, hopeless, tuple(doubts))
 
     def satisfied(self, motion: Motion) -> bool:
         """Whether all that can be cleared keeps (almost) the margin, where that is to be seen to."""

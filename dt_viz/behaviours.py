@@ -38,6 +38,8 @@ class Built:
     goal: Array
     """(3,) where motions with the behaviour are to end, metres: `Motion.goal` if the behaviour respects it, else its
     image under ψ⁻¹."""
+    hopeless: bool = False
+    """Whether no duration does what is wanted, so that trying again is of no use."""
     doubts: tuple[str, ...] = ()
     """Why its result is not to be trusted, in words."""
 

@@ -110,7 +110,7 @@ class Frame:
     goal: Array
     """(3,) where the demonstrations end."""
     reached: Array
-    """(3,) where the motions end: elsewhere where the obstacle covers the goal or its field reaches it."""
+    """(3,) where the motions end: elsewhere where the obstacle covers the goal or leaves no way to it."""
     health: Health
     field: FieldPicture | None = None
     """None before stage LIVE."""
@@ -265,7 +265,7 @@ class Engine:
         key = (frame.task.name, chosen)
         if key not in self._arm_starts:
             try:
-                self._arm_starts[key] = self._robot.inverse_kinematics(path[0])
+                self._arm_starts[key] = self._robot.inverse_kinematics(frame.task.starts[chosen])
             except UnreachableError as error:
                 self._arm_starts[key] = error
         start = self._arm_starts[key]
@@ -321,7 +321,7 @@ def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Soluti
             bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
             satisfied = _satisfied(built, bundle)
             solution = _Solution(Chain(stack), rays, bundle, tuple(made for _, made in built if made), satisfied)
-            if satisfied:
+            if satisfied or any(made.hopeless for made in solution.built):
                 return solution
     assert solution is not None
     return solution
