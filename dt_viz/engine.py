@@ -20,11 +20,12 @@ from dt_viz.health import Health, certified
 from dt_viz.imitation import Imitation, ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.pictures import NO_PICTURES, Pictures, Sketchbook, in_frame
-from dt_viz.robot import JointPath, Robot, UnreachableError
+from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle, Rays, evenly_sampled, refined
 from dt_viz.scenario import Scenario
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
+from dt_viz.tracking import JointPath, UnreachableError, inverse_kinematics, track
 
 BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
 """What is stacked on the imitation, from the inside out."""
@@ -265,14 +266,14 @@ class Engine:
         key = (frame.task.name, chosen)
         if key not in self._arm_starts:
             try:
-                self._arm_starts[key] = self._robot.inverse_kinematics(frame.task.starts[chosen])
+                self._arm_starts[key] = inverse_kinematics(self._robot, frame.task.starts[chosen])
             except UnreachableError as error:
                 self._arm_starts[key] = error
         start = self._arm_starts[key]
         if isinstance(start, UnreachableError):
             return None, (f"the arm cannot reach the start of rollout {chosen + 1}: {start}",)
         warm = self._arm_before[1] if self._arm_before and self._arm_before[0] == key else None
-        joints = self._robot.track(path, start, warm)
+        joints = track(self._robot, path, start, warm)
         self._arm_before = (key, joints.q)
         doubts: tuple[str, ...] = ()
         worst = float(joints.error.max())
