@@ -19,6 +19,9 @@ DENSE = 2001  # points of a path before it is sampled in time
 LIFT_GOAL = np.array([0.0, -0.52, 0.45])  # metres, world frame
 LIFT_CORNER = np.array([0.0, -0.55, 0.10])
 LIFT_START = np.array([0.38, -0.30, 0.38])
+PUSH_START = np.array([0.34, -0.33, 0.38])
+PUSH_CONTACT = np.array([0.30, -0.47, 0.15])  # behind the box, where the hand is down
+PUSH_GOAL = np.array([-0.34, -0.42, 0.15])
 
 
 def draw_s(num_demonstrations: int = 7, seed: int = 41) -> tuple[Demonstration, ...]:
@@ -52,6 +55,21 @@ def lift_box(num_demonstrations: int = 8, seed: int = 48) -> tuple[Demonstration
     return tuple(demonstrations)
 
 
+def push_box(num_demonstrations: int = 7, seed: int = 54) -> tuple[Demonstration, ...]:
+    """Approach a box from one side, come down behind it, and push it along the table in a gently curved line.
+
+    Returns:
+        Demonstrations in metres, 3-D, in the world frame: origin at the arm's base on the table, front −y, z up.
+    """
+    rng = np.random.default_rng(seed)
+    demonstrations = []
+    for i in range(num_demonstrations):
+        path = _push_path(PUSH_CONTACT + rng.normal(0.0, [0.006, 0.005, 0.003]))
+        path = _vary(path, PUSH_GOAL, rng, start_spread=0.020, bow=0.005)
+        demonstrations.append(_perform(path, PUSH_GOAL, rng, f"push box {i}"))
+    return tuple(demonstrations)
+
+
 def _letter_s() -> np.ndarray:
     """Return the path of a slender S: one bend to the left, then the same bend to the right.
 
@@ -77,6 +95,18 @@ def _lift_path(corner: np.ndarray) -> np.ndarray:
     path = _equidistant(np.concatenate([reach, lift[1:]]))
     spacing = np.linalg.norm(path[1] - path[0])
     return gaussian_filter1d(path, 0.010 / spacing, axis=0, mode="nearest")
+
+
+def _push_path(contact: np.ndarray) -> np.ndarray:
+    """Return the way over and down to ``contact``, and the push from there in a wide arc, shape ``(DENSE, 3)``."""
+    u = np.linspace(0.0, 1.0, DENSE)[:, None]
+    over = PUSH_START + np.array([0.03, -0.04, -0.03])  # this and the next are Bézier control points
+    down = contact + np.array([0.08, 0.02, 0.08])
+    approach = (1 - u) ** 3 * PUSH_START + 3 * (1 - u) ** 2 * u * over + 3 * (1 - u) * u**2 * down + u**3 * contact
+    push = contact + u * (PUSH_GOAL - contact) + np.sin(np.pi * u) * [0.0, -0.11, 0.0]
+    path = _equidistant(np.concatenate([approach, push[1:]]))
+    spacing = np.linalg.norm(path[1] - path[0])
+    return gaussian_filter1d(path, 0.035 / spacing, axis=0, mode="nearest")
 
 
 def _vary(path: np.ndarray, goal: np.ndarray, rng: np.random.Generator, start_spread: float, bow: float) -> np.ndarray:
@@ -150,3 +180,4 @@ def _smooth_step(x: np.ndarray) -> np.ndarray:
 if __name__ == "__main__":
     save_demonstrations(FOLDER / "draw_s.npz", draw_s())
     save_demonstrations(FOLDER / "lift_box.npz", lift_box())
+    save_demonstrations(FOLDER / "push_box.npz", push_box())

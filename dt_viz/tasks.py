@@ -132,6 +132,27 @@ def lift_box() -> Task:
     )
 
 
+def push_box() -> Task:
+    """Come down behind a box and push it along the table (sec. 5)."""
+    demonstrations = load_demonstrations(ASSETS / "push_box.npz")
+    points = np.concatenate([d.positions for d in demonstrations])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    height = demonstrations[0].positions[-1, 2]  # of the push: the slice lies level in it
+    x, y, z = _on_mean_path(demonstrations, lambda u: u, 0.55)
+    return Task(
+        name="push_box",
+        title="Push box",
+        hint="Put the sphere where the box is pushed along the table.",
+        demonstrations=demonstrations,
+        origin=np.zeros(3),
+        axes=np.eye(3),
+        scale=1.0,
+        slice=Slice(np.array([middle[0], middle[1], height]), np.eye(3)[:, :2], (0.42, 0.20)),
+        camera=((0.70, -1.58, 0.95), (0.13, -0.32, 0.22)),
+        obstacle_position=(x, y, z - 0.02),  # a little low: the way over it is free, under it is the table
+    )
+
+
 def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonstration, ...]) -> Task:
     """A task from 2-D demonstrations, on the vertical plane before the robot.
 
@@ -188,5 +209,6 @@ def _on_mean_path(
 TASKS: Mapping[str, TaskEntry] = {
     "draw_s": TaskEntry("Draw S", draw_s),
     "lift_box": TaskEntry("Lift box", lift_box),
+    "push_box": TaskEntry("Push box", push_box),
 }
 """The tasks that ship with DT-Viz, by name."""

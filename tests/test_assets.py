@@ -10,7 +10,7 @@ from dt_viz.demos import load_demonstrations
 from dt_viz.metrics import arc_length, resample_by_arc_length, sharpest_turn
 
 ASSETS = Path(__file__).parents[1] / "assets"
-TASKS = ["draw_s", "lift_box"]
+TASKS = ["draw_s", "lift_box", "push_box"]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_the_script_makes_the_files_that_ship(script, task):
         np.testing.assert_allclose(ours.positions, theirs.positions, rtol=0, atol=2.1e-6)
 
 
-@pytest.mark.parametrize(("task", "number", "dimension"), [("draw_s", 7, 2), ("lift_box", 8, 3)])
+@pytest.mark.parametrize(("task", "number", "dimension"), [("draw_s", 7, 2), ("lift_box", 8, 3), ("push_box", 7, 3)])
 def test_number_and_dimension(task, number, dimension):
     assert [d.dimension for d in shipped(task)] == [dimension] * number
 
@@ -95,3 +95,25 @@ def test_the_lift_turns_sharply_in_the_box_and_slows_down_there():
         assert sharpest_turn(positions, 0.04) > 75
         inner = slice(len(positions) // 4, -len(positions) // 4)
         assert speeds(demonstration)[inner].min() < 0.6 * np.median(speeds(demonstration)[inner])
+
+
+def test_the_hand_comes_down_behind_the_box_then_pushes_it_level_in_a_gentle_arc():
+    for demonstration in shipped("push_box"):
+        path = resample_by_arc_length(demonstration.positions, 200)
+        down = int(np.argmax(path[:, 2] < 0.165))
+        assert path[0, 2] - path[down, 2] > 0.15
+        push = path[down:]
+        assert push[:, 2].min() > 0.12 and push[:, 2].max() < 0.17  # above the table, at the height of a box
+        assert arc_length(push)[-1] > 0.6
+        assert arc_length(push)[-1] < 1.2 * np.linalg.norm(push[-1] - push[0])
+        away = push[:, 1] - np.interp(-push[:, 0], -push[[0, -1], 0], push[[0, -1], 1])
+        assert -0.13 < away.min() < -0.07  # the arc lies outwards, as the arm turns
+        assert sharpest_turn(path, 0.015) < 30
+
+
+def test_a_sphere_in_the_middle_of_the_push_leaves_start_and_goal_free():
+    paths = [resample_by_arc_length(d.positions, 101) for d in shipped("push_box")]
+    ends = np.concatenate([[path[0], path[-1]] for path in paths])
+    farthest_shift = 0.05
+    distance = np.linalg.norm(ends - np.mean(paths, axis=0)[50], axis=1)
+    assert distance.min() - farthest_shift - 0.15 / 2 > 0.06

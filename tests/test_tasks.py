@@ -5,7 +5,10 @@ import pytest
 from scipy.io import savemat
 
 from dt_viz.demos import DemonstrationError
+from dt_viz.metrics import resample_by_arc_length
+from dt_viz.robot import load_jaco
 from dt_viz.tasks import DRAWING_SIZE, TASKS, lasa_tasks
+from dt_viz.tracking import inverse_kinematics, track
 
 
 def write_shape(path, dim):
@@ -39,3 +42,25 @@ def test_the_obstacle_first_stands_on_the_motion(name):
     task = TASKS[name]()
     distance = np.linalg.norm(np.concatenate(task.paths) - task.obstacle_position, axis=1)
     assert distance.min() < 0.03
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_slice_lies_in_the_motion(name):
+    task = TASKS[name]()
+    offset = np.concatenate(task.paths) - task.slice.centre
+    across = np.abs(offset @ np.cross(*task.slice.axes.T))
+    along = np.abs(offset @ task.slice.axes)
+    assert np.median(across) < 0.02
+    assert (along < task.slice.half_size).all(axis=1).mean() > 0.75
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_arm_follows_every_demonstration_with_its_hand_sloping_down(name):
+    task, robot = TASKS[name](), load_jaco()
+    paths = np.stack([resample_by_arc_length(path, 100) for path in task.paths])
+    starts = np.stack([inverse_kinematics(robot, start) for start in task.starts])
+    joints = track(robot, paths, starts)
+    assert joints.error.max() < 1e-4
+    assert not joints.limits_hit.any() and not joints.damped.any()
+    assert (robot.hand_direction(joints.q)[..., 2] < -0.2).all()
+    assert (robot.forward_kinematics(joints.q)[1][..., 1:, 2] > 0.05).all()  # no joint near the table
