@@ -181,6 +181,23 @@ class Robot:
         return KinematicChain(axes, origins, origins[-1] + hand, hand / np.linalg.norm(self.end_effector_offset))
 
 
+@dataclass(frozen=True, eq=False)
+class LinkMesh:
+    """The collision shape of a link; the fingers, which do not move, are links of the last joint.
+
+    Attributes:
+        name: of the link in the URDF.
+        joint: index of the joint that it moves with, -1 for the base.
+        vertices: (V, 3) metres, in the frame of that joint, the base's in the base frame.
+        faces: (F, 3) indices of vertices.
+    """
+
+    name: str
+    joint: int
+    vertices: Array
+    faces: NDArray[np.intp]
+
+
 def _cross(a: Array, b: Array) -> Array:
     """Cross products over the second last axis of a (*B, 3, N) and b (*B, 3, N)."""
     ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
@@ -251,6 +268,36 @@ def load_jaco() -> Robot:
         end_effector_offset=_constant(hand.translation),
         home=_constant(HOME),
     )
+
+
+@lru_cache(maxsize=1)
+def collision_meshes() -> tuple[LinkMesh, ...]:
+    """The collision meshes of the URDF, from the base to the finger tips, read once.
+
+    Raises:
+        FileNotFoundError: As `urdf_path`.
+    """
+    path = str(urdf_path())
+    model = pin.buildModelFromUrdf(path)  # pyright: ignore[reportAttributeAccessIssue]  # it has no stubs
+    kind = pin.GeometryType.COLLISION  # pyright: ignore[reportAttributeAccessIssue]
+    shapes = pin.buildGeomFromUrdf(  # pyright: ignore[reportAttributeAccessIssue]
+        model, path, kind, package_dirs=[str(package_folder())]
+    )
+    meshes = []
+    for shape in shapes.geometryObjects:
+        triangles = (shape.geometry.tri_indices(i) for i in range(shape.geometry.num_tris))
+        faces = np.array([[triangle[k] for k in range(3)] for triangle in triangles], dtype=np.intp)
+        faces.flags.writeable = False
+        vertices = shape.geometry.vertices() * shape.meshScale
+        meshes.append(
+            LinkMesh(
+                name=model.frames[shape.parentFrame].name,
+                joint=shape.parentJoint - 1,  # 0 is pinocchio's universe
+                vertices=_constant(vertices @ shape.placement.rotation.T + shape.placement.translation),
+                faces=faces,
+            )
+        )
+    return tuple(meshes)
 
 
 def _constant(values: ArrayLike) -> Array:

@@ -62,6 +62,10 @@ def test_only_the_robot_talks_to_pinocchio():
     assert importers("pinocchio") == {"robot.py"}
 
 
+def test_only_collision_truth_talks_to_coal():
+    assert importers("coal") == {"collision.py"}
+
+
 def test_computing_never_imports_the_ui():
     outside = {name for name in importers("dt_viz.ui") if not name.startswith("ui/")}
     assert not [name for name in outside if not name.startswith(MAY_IMPORT_UI)]

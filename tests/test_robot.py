@@ -18,6 +18,7 @@ from dt_viz.robot import (
     END_EFFECTOR_FRAME,
     NUM_JOINTS,
     Robot,
+    collision_meshes,
     load_jaco,
     package_folder,
     urdf_path,
@@ -136,3 +137,34 @@ class TestKinematics:
                 joint = urdf.joint_map[name]
                 expected = urdf.get_transform(joint.child, joint.parent)[:3, :3]
                 np.testing.assert_allclose(pin.Quaternion(*wxyz).matrix(), expected, atol=1e-9)
+
+
+class TestLinkMeshes:
+    def test_they_move_as_in_pinocchio(self, robot):
+        model, data = pinocchio_model()
+        shapes = pin.buildGeomFromUrdf(
+            model, str(urdf_path()), pin.GeometryType.COLLISION, package_dirs=[str(package_folder())]
+        )
+        placed = shapes.createData()
+        for q in random_configurations(robot, 2, 5):
+            pin.updateGeometryPlacements(model, data, shapes, placed, pinocchio_configuration(q))
+            rotations, origins = robot.forward_kinematics(q)
+            for mesh, shape, world in zip(collision_meshes(), shapes.geometryObjects, placed.oMg, strict=True):
+                expected = shape.geometry.vertices() @ world.rotation.T + world.translation
+                vertices = mesh.vertices
+                if mesh.joint >= 0:
+                    vertices = vertices @ rotations[mesh.joint].T + origins[mesh.joint]
+                np.testing.assert_allclose(vertices, expected, atol=1e-12)
+
+    def test_they_are_the_links_of_the_urdf(self):
+        root = ElementTree.parse(urdf_path()).getroot()
+        with_shape = {
+            link.get("name") for link in root.iter("link") if link.find("collision/geometry/mesh") is not None
+        }
+        assert {mesh.name for mesh in collision_meshes()} == with_shape
+        assert [mesh.joint for mesh in collision_meshes()] == [-1, 0, 1, 2, 3, 4, 5, 5, 5, 5, 5]
+
+    def test_faces_join_vertices_that_each_occur_once(self):
+        for mesh in collision_meshes():
+            assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
+            np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))

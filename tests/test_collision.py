@@ -1,0 +1,307 @@
+"""Collision truth against brute force, trimesh and pinocchio."""
+
+# pyright: reportAttributeAccessIssue=false
+# (pinocchio has no stubs)
+
+from functools import lru_cache
+
+import numpy as np
+import pinocchio as pin  # noqa: TID251, here it is the oracle
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from dt_viz.collision import (
+    SELF_REACH,
+    SELF_TOLERANCE,
+    TOLERANCE,
+    CollisionModel,
+    CollisionReport,
+    Nearest,
+    load_collision_model,
+)
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import LinkMesh, collision_meshes, package_folder, urdf_path
+from dt_viz.tracking import inverse_kinematics, track
+
+HAND = 6
+FOLDED = np.array([0.0, np.pi, 0.5, 0.0, 5.7, 0.0])  # the hand in the upper arm
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.fixture(scope="module")
+def model() -> CollisionModel:
+    return load_collision_model()
+
+
+@lru_cache(maxsize=1)
+def solids() -> tuple[trimesh.Trimesh, ...]:
+    return tuple(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False) for mesh in collision_meshes())
+
+
+def random_configurations(seed: int, num: int) -> np.ndarray:
+    robot = load_collision_model().robot
+    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, 2 * np.pi)
+    return np.random.default_rng(seed).uniform(lower, upper, (num, 6))
+
+
+def random_path(seed: int, num: int = 12) -> np.ndarray:
+    """Samples that lie up to 0.2 rad apart."""
+    start, end = random_configurations(seed, 2)
+    return start + np.linspace(0.0, 2.0 / np.abs(end - start).max(), num)[:, None] * (end - start)
+
+
+def finely(q: np.ndarray, num: int = 600) -> np.ndarray:
+    return np.stack([np.interp(np.linspace(0, len(q) - 1, num), np.arange(len(q)), angles) for angles in q.T], axis=1)
+
+
+def in_frame(mesh: LinkMesh, q: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """A point (3,) of the base frame, in the frame of the link's joint."""
+    if mesh.joint < 0:
+        return point
+    rotations, origins = load_collision_model().robot.forward_kinematics(q)
+    return rotations[mesh.joint].T @ (point - origins[mesh.joint])
+
+
+def placed_vertices(q: np.ndarray) -> list[np.ndarray]:
+    """Of each link, base frame, as pinocchio places them."""
+    pinocchio, data, shapes, shape_data = pinocchio_model()
+    pin.updateGeometryPlacements(pinocchio, data, shapes, shape_data, pinocchio_configuration(q))
+    pairs = zip(shapes.geometryObjects, shape_data.oMg, strict=True)
+    return [shape.geometry.vertices() @ place.rotation.T + place.translation for shape, place in pairs]
+
+
+@lru_cache(maxsize=1)
+def pinocchio_model() -> tuple:
+    path = str(urdf_path())
+    pinocchio = pin.buildModelFromUrdf(path)
+    shapes = pin.buildGeomFromUrdf(pinocchio, path, pin.GeometryType.COLLISION, package_dirs=[str(package_folder())])
+    for a, first in enumerate(shapes.geometryObjects):
+        for b, second in enumerate(shapes.geometryObjects):
+            if second.parentJoint - first.parentJoint > 1:
+                shapes.addCollisionPair(pin.CollisionPair(a, b))
+    return pinocchio, pinocchio.createData(), shapes, shapes.createData()
+
+
+def pinocchio_configuration(q: np.ndarray) -> np.ndarray:
+    joints = pinocchio_model()[0].joints
+    parts = [[np.cos(angle), np.sin(angle)] if joints[i + 1].nq == 2 else [angle] for i, angle in enumerate(q)]
+    return np.concatenate(parts)
+
+
+class TestObstacle:
+    @pytest.mark.parametrize("seed", range(4))
+    @pytest.mark.parametrize("diameter", [0.02, 0.15, 0.6])
+    def test_distances_are_those_of_the_nearest_triangle(self, model, seed, diameter):
+        """Also where the ball cuts a link, swallows one, or lies within one."""
+        rng = np.random.default_rng(seed)
+        q = random_configurations(seed, 6)
+        vertices = [rng.choice(np.concatenate(placed_vertices(one))) for one in q]
+        for one, vertex in zip(q, vertices, strict=True):
+            centre = vertex + rng.normal(scale=0.03, size=3)
+            local = [in_frame(mesh, one, centre) for mesh in collision_meshes()]
+            expected = []
+            for solid, point in zip(solids(), local, strict=True):
+                gap = trimesh.proximity.closest_point_naive(solid, point[None])[1][0]
+                inside = solid.ray.contains_points(point[None])[0]
+                expected.append((0.0 if inside else gap) - diameter / 2)
+            distance, nearest = model.obstacle_distance(one[None], Sphere(tuple(centre), diameter))
+            np.testing.assert_allclose(distance[0], min(expected), atol=1e-6)
+            np.testing.assert_allclose(expected[nearest[0]], min(expected), atol=1e-6)
+
+    def test_a_ball_that_just_misses_the_forearm(self, model, robot):
+        vertices = placed_vertices(robot.home)[3]
+        outermost = vertices[np.argmax(vertices[:, 0])]  # the ball touches the plane x = outermost there
+        for gap in (0.004, -0.004):
+            ball = Sphere(tuple(outermost + np.array([0.05 + gap, 0.0, 0.0])), 0.1)
+            distance, nearest = model.obstacle_distance(robot.home[None], ball)
+            np.testing.assert_allclose(distance[0], gap, atol=1e-9)
+            assert model.links[nearest[0]].name == "link 3"
+
+    def test_a_ball_that_swallows_the_hand(self, model, robot):
+        hand = np.concatenate(placed_vertices(robot.home)[HAND:])
+        centre = robot.end_effector(robot.home)
+        assert np.linalg.norm(hand - centre, axis=1).max() < 0.25
+        report = model.report(robot.home[None], Sphere(tuple(centre), 0.5))
+        local = [in_frame(mesh, robot.home, centre)[None] for mesh in collision_meshes()]
+        pairs = zip(solids(), local, strict=True)
+        nearest = min(trimesh.proximity.closest_point_naive(solid, point)[1][0] for solid, point in pairs)
+        np.testing.assert_allclose(report.depth, 0.25 - nearest, atol=1e-9)
+
+    def test_a_ball_within_a_link_is_as_deep_as_it_can_be(self, model, robot):
+        rotations, origins = robot.forward_kinematics(robot.home)
+        inside = origins[1] + rotations[1] @ model.links[2].centre
+        report = model.report(robot.home[None], Sphere(tuple(inside), 0.01))
+        assert report.obstacle == Nearest(-0.005, ("link 2",), 0.0)
+
+    def test_a_ball_far_away_is_clear(self, model, robot):
+        report = model.report(robot.home[None], Sphere((2.0, 0.0, 0.0)))
+        assert report.depth == 0.0
+        assert report.obstacle.distance > 1.0
+        assert report.problems == ()
+
+    def test_inside_of_the_links_is_told_from_outside(self, model):
+        for link, solid in zip(model.links, solids(), strict=True):
+            if not solid.is_watertight:
+                continue
+            picked = np.random.default_rng(0).choice(len(solid.faces), 20, replace=False)
+            middles, normals = solid.triangles_center[picked], solid.face_normals[picked]
+            assert all(link.contains(point) for point in middles - 1e-4 * normals)
+            assert not any(link.contains(point) for point in middles + 1e-4 * normals)
+
+    @settings(max_examples=20)
+    @given(seed=seeds, turn=st.floats(-3, 3))
+    def test_turning_the_arm_and_the_obstacle_changes_nothing(self, seed, turn):
+        model, q = load_collision_model(), random_configurations(seed, 3)
+        centre = model.robot.end_effector(q[0]) + np.array([0.05, 0.0, 0.1])
+        turned = Rotation.from_rotvec([0.0, 0.0, -turn]).apply(centre)  # the first axis points down
+        before, nearest = model.obstacle_distance(q, Sphere(tuple(centre)))
+        after, nearest_after = model.obstacle_distance(q + turn * np.eye(6)[0], Sphere(tuple(turned)))
+        moving = (nearest > 0) & (nearest_after > 0)  # the base does not turn along
+        np.testing.assert_allclose(after[moving], before[moving], atol=1e-9)
+
+
+class TestBetweenSamples:
+    def test_both_ends_are_clear_and_the_middle_collides(self, model, robot):
+        ball = Sphere(tuple(robot.end_effector(robot.home)))
+        ends = robot.home + np.array([[-0.8], [0.8]]) * np.eye(6)[0]
+        assert model.obstacle_distance(ends, ball)[0].min() > 0.05
+        found = model.nearest_to_obstacle(ends, ball)
+        at_home = model.obstacle_distance(robot.home[None], ball)[0][0]
+        assert found.distance <= at_home + TOLERANCE < -0.02
+        assert 0.0 < found.at < 1.0
+
+    @settings(max_examples=20)
+    @given(seed=seeds, diameter=st.floats(0.02, 0.4))
+    def test_nothing_nearer_is_found_by_fine_sampling(self, seed, diameter):
+        model, q = load_collision_model(), random_path(seed)
+        middle = model.robot.forward_kinematics(q[len(q) // 2])[1]
+        ball = Sphere(tuple(middle[seed % 6] + np.array([0.1, 0.0, 0.05])), diameter)
+        found = model.nearest_to_obstacle(q, ball)
+        fine = model.obstacle_distance(finely(q), ball)[0].min()
+        assert found.distance <= fine + TOLERANCE
+        assert found.distance >= fine - 0.01  # between two of the fine samples
+
+    @settings(max_examples=20)
+    @given(seed=seeds)
+    def test_what_is_found_is_there(self, seed):
+        model, q = load_collision_model(), random_path(seed)
+        ball = Sphere(tuple(model.robot.end_effector(q[5]) + np.array([0.1, 0.0, 0.1])))
+        found = model.nearest_to_obstacle(q, ball)
+        there = np.stack([np.interp([found.at], np.arange(len(q)), angles) for angles in q.T], axis=1)
+        distance, nearest = model.obstacle_distance(there, ball)
+        np.testing.assert_allclose(distance[0], found.distance, atol=1e-9)
+        assert found.links == (model.links[nearest[0]].name,)
+
+    @settings(max_examples=20)
+    @given(seed=seeds, growth=st.floats(0.001, 0.2))
+    def test_a_larger_ball_is_nearer_by_its_growth(self, seed, growth):
+        model, q = load_collision_model(), random_path(seed)
+        place = tuple(model.robot.end_effector(q[5]) + np.array([0.1, 0.0, 0.1]))
+        small, large = (model.nearest_to_obstacle(q, Sphere(place, d)).distance for d in (0.1, 0.1 + growth))
+        np.testing.assert_allclose(small - large, growth / 2, atol=2 * TOLERANCE)
+
+    def test_more_samples_on_the_path_change_nothing(self, model, robot):
+        ball = Sphere(tuple(robot.end_effector(robot.home) + np.array([0.0, 0.0, 0.12])))
+        ends = robot.home + np.array([[-0.8], [0.8]]) * np.eye(6)[0]
+        distances = [model.nearest_to_obstacle(finely(ends, num), ball).distance for num in (2, 3, 50, 333)]
+        np.testing.assert_allclose(distances, distances[0], atol=2 * TOLERANCE)
+
+    def test_reach_bounds_the_distance_from_the_axes(self, model):
+        largest = np.zeros_like(model.reach)
+        rotations, origins = model.robot.forward_kinematics(random_configurations(0, 300))
+        for k, link in enumerate(model.links):
+            for i in range(link.frame):
+                points = link.hull @ rotations[:, link.frame - 1].transpose(0, 2, 1) + origins[:, None, link.frame - 1]
+                across = np.cross(rotations[:, None, i, :, 2], points - origins[:, None, i])
+                largest[k, i] = np.linalg.norm(across, axis=-1).max()
+        assert (largest <= model.reach + 1e-12).all()
+        assert (largest >= 0.6 * model.reach).all()
+        assert (np.diff(model.reach, axis=1) <= 0).all()
+
+
+class TestItself:
+    @pytest.mark.parametrize("seed", range(15))
+    def test_distances_are_those_of_pinocchio(self, model, seed):
+        pinocchio, data, shapes, shape_data = pinocchio_model()
+        q = FOLDED + np.random.default_rng(seed).normal(scale=0.25, size=6)
+        pin.computeDistances(pinocchio, data, shapes, shape_data, pinocchio_configuration(q))
+        expected = max(0.0, min(result.min_distance for result in shape_data.distanceResults))
+        found = model.nearest_to_itself(q[None])
+        if expected >= SELF_REACH:
+            assert found is None
+        else:
+            np.testing.assert_allclose(found.distance, expected, atol=1e-9)
+
+    def test_folded_into_itself(self, model):
+        report = model.report(FOLDED[None], Sphere((2.0, 0.0, 0.0)))
+        assert report.itself == Nearest(0.0, ("link 2", "link 6"), 0.0)
+        assert report.problems == ("link 6 hits link 2",)
+
+    def test_found_between_samples(self, model):
+        folded = np.array([0.0, np.pi, 0.5, np.pi, 1.5, 0.0])
+        ends = folded + np.array([[-1.5], [1.5]]) * np.eye(6)[3]  # the wrist turns through the upper arm
+        for end in ends:
+            found = model.nearest_to_itself(end[None])
+            assert found is None or found.distance > 0.02
+        assert model.nearest_to_itself(ends).distance == 0.0
+
+    @settings(max_examples=15)
+    @given(seed=seeds)
+    def test_nothing_nearer_is_found_by_fine_sampling(self, seed):
+        model, q = load_collision_model(), random_path(seed)
+        found = model.nearest_to_itself(q)
+        for one in finely(q, 60):
+            alone = model.nearest_to_itself(one[None])
+            if alone:
+                assert found
+                assert found.distance <= alone.distance + SELF_TOLERANCE
+
+    def test_natural_postures_are_not_near_themselves(self, model, robot):
+        for target in np.random.default_rng(0).uniform([-0.4, -0.65, 0.05], [0.4, -0.3, 0.75], (20, 3)):
+            assert model.nearest_to_itself(inverse_kinematics(robot, target)[None]) is None
+
+
+class TestTable:
+    @settings(max_examples=20)
+    @given(seed=seeds)
+    def test_heights_are_those_of_the_vertices(self, seed):
+        q = random_configurations(seed, 1)
+        lowest = [vertices[:, 2].min() for vertices in placed_vertices(q[0])]
+        found = load_collision_model().nearest_to_table(q)
+        np.testing.assert_allclose(found.distance, min(lowest[2:]), atol=1e-9)
+
+    def test_a_hand_below_the_table_is_named(self, model, robot):
+        path = np.linspace([0.0, -0.5, 0.3], [0.0, -0.5, -0.05], 20)
+        q = track(robot, path, inverse_kinematics(robot, path[0])).q
+        report = model.report(q, Sphere((2.0, 0.0, 0.0)))
+        assert report.table.links[0].startswith("finger tip")
+        assert report.table.at == 19.0
+        assert report.table.distance < -0.04
+        assert report.problems == (f"{report.table.links[0]} is {-1e3 * report.table.distance:.0f} mm below the table",)
+
+    def test_what_stands_on_the_table_does_not_count(self, model, robot):
+        assert model.nearest_to_table(robot.home[None]).distance > 0.2
+
+    @settings(max_examples=10)
+    @given(seed=seeds)
+    def test_nothing_lower_is_found_by_fine_sampling(self, seed):
+        model, q = load_collision_model(), random_path(seed)
+        found = model.nearest_to_table(q).distance
+        assert found <= min(model.nearest_to_table(one[None]).distance for one in finely(q, 100)) + TOLERANCE
+
+
+def test_the_report_says_what_is_wrong():
+    bad = CollisionReport(
+        Nearest(-0.0124, ("link 3",), 1.0), Nearest(0.004, ("base", "link 5"), 0.0), Nearest(-0.03, ("link 6",), 2.5)
+    )
+    assert bad.depth == 0.0124
+    assert bad.problems == (
+        "link 3 enters the obstacle by 12 mm",
+        "link 5 comes within 4 mm of base",
+        "link 6 is 30 mm below the table",
+    )
+    good = CollisionReport(Nearest(0.02, ("link 3",), 1.0), Nearest(0.03, ("base", "link 5"), 0.0), bad.obstacle)
+    assert good.depth == 0.0
