@@ -37,7 +37,7 @@ SELF_REACH = 0.05
 """Links farther apart than this are not measured, metres: the wrist never has more than 7 cm between its ends."""
 SELF_MARGIN = 0.01
 """Links nearer to each other than this are reported, metres."""
-KNOT_STRIDE = 8
+KNOT_STRIDE = 4
 """Samples of a path between those that a search begins with."""
 
 
