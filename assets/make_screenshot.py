@@ -42,7 +42,7 @@ def main() -> None:
         session = visitor.session
         session.edit("screenshot", view=View(playing=False))
         assert visitor.shown is not None and visitor.shown.arm is not None
-        joints = visitor.shown.arm.path.q
+        joints = visitor.shown.arm.q
         visitor.arm.pose(joints[round(MOMENT * (len(joints) - 1))])
         time.sleep(10)  # software rendering is slow
         page.screenshot(path=PICTURE)

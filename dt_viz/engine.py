@@ -25,7 +25,7 @@ from dt_viz.rollouts import Bundle, Rays, evenly_sampled, refined
 from dt_viz.scenario import Scenario
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
-from dt_viz.tracking import JointPath, UnreachableError, inverse_kinematics, track
+from dt_viz.tracking import UnreachableError, inverse_kinematics, track
 
 BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
 """What is stacked on the imitation, from the inside out."""
@@ -91,8 +91,10 @@ class ArmMotion:
 
     times: Array
     """(T,) seconds."""
-    path: JointPath
-    """Joint angles at these times."""
+    q: Array
+    """(T, 6) joint angles at these times, rad; continuous joints unwrapped."""
+    without: Array
+    """(T, 6) the same at the same moments of the motion without avoidance."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,8 @@ class Frame:
     """(3,) where the demonstrations end."""
     reached: Array
     """(3,) where the motions end: elsewhere where the obstacle covers the goal or leaves no way to it."""
+    blocked: tuple[str, ...]
+    """Why there is no motion for this scenario, in words; what is shown then is the last one that there was."""
     health: Health
     field: FieldPicture | None = None
     """None before stage LIVE."""
@@ -280,7 +284,7 @@ class Engine:
         if worst > MAX_TRACKING_ERROR:
             because = ", a joint is at its limit" if joints.limits_hit.any() else ""
             doubts = (f"the arm misses the path of rollout {chosen + 1} by up to {1e3 * worst:.0f} mm{because}",)
-        return ArmMotion(times, joints), doubts
+        return ArmMotion(times, joints.q, joints.q), doubts
 
 
 def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
@@ -382,6 +386,7 @@ def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
         times=bundle.split(solution.rays.times(bundle.index, bundle.fraction)),
         goal=ground.goal,
         reached=bundle.positions[-1],
+        blocked=(),
         health=Health(
             clearance=clearance,
             duration=solution.built[0].duration if solution.built else None,

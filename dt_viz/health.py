@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.collision import CollisionReport
 from dt_viz.fields import Array, Indices
 from dt_viz.rollouts import Bundle
 from dt_viz.systems import DiffeomorphicSystem
@@ -21,7 +22,10 @@ class Health:
     """What is known about how far a result is to be trusted; None is what this stage does not compute."""
 
     clearance: float
-    """Smallest distance of a rollout from the obstacle, metres, negative inside."""
+    """Smallest distance from the obstacle of what avoids it, metres, negative inside: of the end effector, or of the
+    spheres that cover the arm."""
+    collision: CollisionReport | None = None
+    """What the arm's meshes come near to on the motion that it shows."""
     duration: float | None = None
     """t of the avoidance flow; None where it is off."""
     min_det_jacobian: float | None = None

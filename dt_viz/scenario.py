@@ -12,6 +12,10 @@ Objective = Literal["trajectory", "velocity"]
 """What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
 OBJECTIVES: tuple[Objective, ...] = ("trajectory", "velocity")
 
+Space = Literal["task", "cspace", "both"]
+"""What avoids the obstacle: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""
+SPACES: tuple[Space, ...] = ("task", "cspace", "both")
+
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
 """Metres."""
 MAX_MARGIN = 0.05
@@ -35,6 +39,14 @@ class View:
     field: bool = True
     """Arrows of the vector field on a slice."""
     arm: bool = True
+    ghost_arm: bool = False
+    """The arm where it would be without avoidance."""
+    onion: bool = False
+    """Several arms along the motion, fading."""
+    body_points: bool = False
+    """The spheres that cover the arm, and how far avoidance has moved each."""
+    joint_plots: bool = False
+    """Joint angles and speeds over time, with their limits."""
     table: bool = True
     generator: bool = False
     """Arrows of the learned generator, the vector field whose flow is ψ."""
@@ -60,7 +72,9 @@ class Scenario:
     """Whether the learned transform is in the stack; without it motions are straight."""
     objective: Objective = "trajectory"
     avoidance: bool = True
-    """Whether the obstacle's transform is in the stack."""
+    """Whether the obstacle's transforms are in the stack."""
+    space: Space = "task"
+    """Which of them."""
     generator: Generator = "free-space"
     temperature: float = 6.0
     """T of the occupancy potential: higher reaches farther and bends more gently."""

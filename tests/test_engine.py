@@ -54,7 +54,7 @@ def assert_finite(frame):
     if frame.field is not None:
         assert np.isfinite(frame.field.points).all() and np.isfinite(frame.field.velocities).all()
     if frame.arm is not None:
-        assert np.isfinite(frame.arm.path.q).all()
+        assert np.isfinite(frame.arm.q).all()
 
 
 def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(engine, scenario):
@@ -227,7 +227,7 @@ def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
     for chosen in (0, 3):
         frame = stage(engine, replace(scenario, arm_rollout=chosen), Stage.LIVE)
         assert frame.arm is not None
-        hand = robot.end_effector(frame.arm.path.q)
+        hand = robot.end_effector(frame.arm.q)
         path = frame.rollouts[chosen]
         nearest = np.linalg.norm(hand[:, None] - path, axis=-1).min(axis=1)
         said = any("arm misses" in doubt for doubt in frame.health.doubts)

@@ -98,5 +98,5 @@ def _arm_motion(frame: Frame, robot: Robot, rollout: int) -> tuple[Array, Array,
     if frame.arm is None:
         path = frame.rollouts[rollout]
         return frame.times[rollout], np.full((len(path), 6), np.nan), path
-    q = frame.arm.path.q
+    q = frame.arm.q
     return frame.arm.times, q, robot.end_effector(q)

@@ -52,6 +52,6 @@ class Playback:
             if motion is None or (shown is motion and not self._playing):
                 continue
             moment = min(self._clock % (motion.times[-1] + REST), motion.times[-1])
-            q = np.array([np.interp(moment, motion.times, angle) for angle in motion.path.q.T])
+            q = np.array([np.interp(moment, motion.times, angle) for angle in motion.q.T])
             self._pose(q)
             shown = motion
