@@ -1,0 +1,201 @@
+"""Retiming for joint velocity limits: the limits hold, nothing is hurried, and no slow-down sets in abruptly."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dt_viz.retiming import NEGLIGIBLE, RAMP, joint_velocities, used_fraction, within_velocity_limits
+from dt_viz.robot import NUM_JOINTS
+
+LIMITS = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 0.8])
+
+
+class Motion(NamedTuple):
+    times: np.ndarray
+    q: np.ndarray
+
+
+@st.composite
+def motions(draw, min_points=1):
+    """Any pace from standing still to jumps; also samples that coincide in time, in place or in both."""
+    num = draw(st.integers(min_points, 12))
+    intervals = st.sampled_from([0.0, 1e-12, 1e-3, 0.02]) | st.floats(0.0, 2.0, allow_subnormal=False)
+    steps = st.sampled_from([0.0, 1e-9, 1e3]) | st.floats(-0.2, 0.2, allow_subnormal=False)
+    start = draw(st.sampled_from([0.0, -3.7]))
+    times = start + np.cumsum(np.append(0.0, draw(arrays(np.float64, num - 1, elements=intervals))))
+    turns = draw(arrays(np.float64, (num - 1, NUM_JOINTS), elements=steps))
+    return Motion(times, np.cumsum(np.vstack([np.ones(NUM_JOINTS), turns]), axis=0))
+
+
+def rounding(*times):
+    """What an interval of these times may be off by, seconds."""
+    return 8 * np.finfo(float).eps * (1.0 + max(np.abs(t).max() for t in times))
+
+
+def least_intervals(motion):
+    return (np.abs(np.diff(motion.q, axis=0)) / LIMITS).max(axis=1)
+
+
+def burst(num=2001, speed_up=3.0, duration=0.1):
+    """Joint 2 at nine tenths of its limit for 4 s, and in the middle, from one sample to the next, much faster."""
+    times = np.linspace(0.0, 4.0, num)
+    fast = np.abs((times[1:] + times[:-1]) / 2 - 2.0) < duration / 2
+    speed = 0.9 * LIMITS[1] * np.where(fast, speed_up, 1.0)
+    q = np.zeros((num, NUM_JOINTS))
+    q[1:, 1] = np.cumsum(speed * np.diff(times))
+    return Motion(times, q)
+
+
+class TestRetiming:
+    @given(motions())
+    def test_no_segment_is_faster_than_the_limits(self, motion):
+        new = within_velocity_limits(motion.times, motion.q, LIMITS)
+        assert (np.diff(new) >= least_intervals(motion) * (1 - 1e-12) - rounding(new)).all()
+
+    @given(motions())
+    def test_no_segment_is_faster_than_before(self, motion):
+        new = within_velocity_limits(motion.times, motion.q, LIMITS)
+        assert new.shape == motion.times.shape
+        assert new[0] == motion.times[0]
+        assert (np.diff(new) >= np.diff(motion.times) - rounding(new)).all()
+        assert (np.diff(new) >= 0).all()
+
+    @given(motions(min_points=3))
+    def test_progress_speeds_up_and_slows_down_gradually(self, motion):
+        """Means, over neighbouring intervals, of a rate whose slope is at most 1/RAMP."""
+        new = within_velocity_limits(motion.times, motion.q, LIMITS)
+        late = least_intervals(motion) - np.diff(motion.times)
+        intervals, before = np.diff(new), np.diff(motion.times)
+        counts = ((late <= 0) | (late > NEGLIGIBLE)) & (intervals > 1e-6)  # of the others rounding is too large a part
+        rate = before[counts] / intervals[counts]
+        middle = ((new[1:] + new[:-1]) / 2)[counts]
+        error = rounding(new) / intervals[counts]
+        assert (np.abs(np.diff(rate)) <= np.diff(middle) / RAMP + error[1:] + error[:-1] + 1e-9).all()
+
+    @given(motions(), st.floats(1.0, 2.0))
+    def test_a_motion_within_the_limits_is_unchanged(self, motion, slack):
+        intervals = np.maximum(np.diff(motion.times), least_intervals(motion) * slack) * (1 + 1e-9)
+        times = np.cumsum(np.append(0.0, intervals))
+        assume((np.diff(times) >= least_intervals(motion)).all())  # a short one may be rounded below what it needs
+        np.testing.assert_array_equal(within_velocity_limits(times, motion.q, LIMITS), times)
+
+    @given(motions())
+    def test_a_second_time_changes_nothing_more(self, motion):
+        once = within_velocity_limits(motion.times, motion.q, LIMITS)
+        twice = within_velocity_limits(once, motion.q, LIMITS)
+        np.testing.assert_allclose(twice, once, rtol=1e-9, atol=1e-6)
+
+    def test_the_jacos_limits_are_those_of_its_joints(self, robot):
+        times = np.linspace(0, 1, 50)
+        for joint, limit in enumerate(robot.velocity_limits):
+            q = np.zeros((50, NUM_JOINTS))
+            q[:, joint] = 2 * limit * times
+            new = within_velocity_limits(times, q, robot.velocity_limits)
+            assert new[-1] == pytest.approx(2.0, abs=1e-12)
+
+    @pytest.mark.parametrize("speed_up", [1.3, 3.0, 30.0])
+    def test_a_short_burst_is_led_up_to(self, speed_up):
+        motion = burst(speed_up=speed_up)
+        new = within_velocity_limits(motion.times, motion.q, LIMITS)
+        stretch = np.diff(new) / np.diff(motion.times)
+        assert stretch.max() == pytest.approx(0.9 * speed_up, rel=1e-9)
+        # In 2 ms of the motion's own time, which the stretch makes longer: d(ln f)/dt = −dg/dt · f ≤ f²/RAMP.
+        assert (np.abs(np.diff(np.log(stretch))) <= 1.05 * stretch[1:] * stretch[:-1] * 0.002 / RAMP).all()
+        # Far from it nothing changes, and on both sides it is alike.
+        assert (stretch[:900] < 1 + 1e-12).all()
+        np.testing.assert_allclose(stretch, stretch[::-1], rtol=1e-6)
+
+    def test_a_burst_slows_each_side_for_no_longer_than_the_ramp(self):
+        motion = burst(speed_up=30.0)
+        new = within_velocity_limits(motion.times, motion.q, LIMITS)
+        needed = np.maximum(least_intervals(motion), np.diff(motion.times)).sum()
+        assert needed < new[-1] < needed + RAMP
+
+    def test_finer_samples_give_the_same_times(self):
+        coarse, fine = burst(2001), burst(8001)
+        new = within_velocity_limits(*coarse, LIMITS)
+        np.testing.assert_allclose(within_velocity_limits(*fine, LIMITS)[::4], new, atol=2e-3)
+
+    def test_a_jump_is_crossed_at_the_limit_after_coming_to_rest(self):
+        times = np.array([0.0, 1.0, 1.0, 2.0])
+        q = np.zeros((4, NUM_JOINTS))
+        q[2:] = 1.2
+        new = within_velocity_limits(times, q, LIMITS)
+        # A ramp that takes RAMP seconds covers RAMP/2 of the motion.
+        np.testing.assert_allclose(np.diff(new), [1.0 + RAMP / 2, 2.0, 1.0 + RAMP / 2], rtol=1e-12)
+
+    def test_between_two_jumps_the_motion_goes_on(self):
+        times = np.array([0.0, 0.0, 0.1, 0.1])
+        q = np.zeros((4, NUM_JOINTS))
+        q[1:] += 0.6
+        q[3:] += 0.6
+        new = within_velocity_limits(times, q, LIMITS)
+        np.testing.assert_allclose(np.diff(new), [1.0, 2 * np.sqrt(0.1 * RAMP), 1.0], rtol=1e-12)
+
+    def test_noise_of_samples_at_one_time_slows_nothing_down(self):
+        times, q = np.repeat(burst(101, 1.0).times, 2), np.repeat(burst(101, 1.0).q, 2, axis=0)
+        q[1::2] += 1e-9
+        new = within_velocity_limits(times, q, LIMITS)
+        assert used_fraction(times, q, LIMITS) == np.inf
+        assert used_fraction(new, q, LIMITS) < 1 + 1e-6
+        np.testing.assert_allclose(new, times, atol=1e-6)
+
+    def test_one_sample_and_two(self):
+        one = np.array([0.5])
+        np.testing.assert_array_equal(within_velocity_limits(one, np.zeros((1, NUM_JOINTS)), LIMITS), one)
+        q = np.zeros((2, NUM_JOINTS))
+        q[1, 5] = 1.6
+        for duration in (0.0, 1e-300, 0.5, 1.9):
+            new = within_velocity_limits(np.array([0.0, duration]), q, LIMITS)
+            np.testing.assert_allclose(new, [0.0, 2.0], rtol=1e-12)
+
+
+class TestVelocities:
+    @given(motions())
+    def test_they_stay_within_the_limits_after_retiming(self, motion):
+        new = within_velocity_limits(motion.times, motion.q, LIMITS)
+        velocities = joint_velocities(new, motion.q)
+        assert velocities.shape == motion.q.shape
+        assert np.isfinite(velocities).all()
+        # A distance of 1e3 rad and more has lost the digits of the small ones before it.
+        off = 1 + np.abs(motion.q).max()
+        span = np.diff(np.unique(new)).min(initial=np.inf)
+        assert (np.abs(velocities) <= LIMITS * (1 + 1e-9) + (rounding(new) + 1e-14 * off) / span).all()
+
+    @given(motions())
+    def test_samples_at_one_time_have_one_velocity(self, motion):
+        velocities = joint_velocities(motion.times, motion.q)
+        together = np.diff(motion.times) == 0
+        np.testing.assert_array_equal(velocities[1:][together], velocities[:-1][together])
+
+    def test_of_a_parabola_they_are_exact_inside(self):
+        times = np.linspace(0, 1, 11)
+        q = np.outer(times**2, np.arange(6.0))
+        np.testing.assert_allclose(
+            joint_velocities(times, q)[1:-1], np.outer(2 * times, np.arange(6))[1:-1], atol=1e-12
+        )
+
+    def test_repeated_samples_change_none(self):
+        rng = np.random.default_rng(0)
+        times, q = np.cumsum(rng.uniform(0.01, 0.1, 20)), rng.normal(size=(20, NUM_JOINTS))
+        again = np.sort(rng.integers(0, 20, 60))
+        again = np.sort(np.concatenate([np.arange(20), again]))
+        np.testing.assert_array_equal(joint_velocities(times[again], q[again]), joint_velocities(times, q)[again])
+
+    def test_without_any_time_they_are_zero(self):
+        q = np.ones((3, NUM_JOINTS))
+        np.testing.assert_array_equal(joint_velocities(np.zeros(3), q), np.zeros_like(q))
+        np.testing.assert_array_equal(joint_velocities(np.zeros(1), q[:1]), np.zeros((1, NUM_JOINTS)))
+
+    def test_used_fraction_is_of_the_most_demanding_joint_and_segment(self):
+        times, q = np.array([0.0, 1.0, 3.0, 3.0]), np.zeros((4, NUM_JOINTS))
+        q[1:, 4] = -0.2
+        q[2:, 0] = 0.6
+        assert used_fraction(times, q, LIMITS) == pytest.approx(0.5)
+        q[3, 2] = 1e-9
+        assert used_fraction(times, q, LIMITS) == np.inf
+        assert used_fraction(times[:1], q[:1], LIMITS) == 0.0
