@@ -47,7 +47,7 @@ class BodyPoints:
             if joint < 0:
                 positions[points] = offset[:, :, None]
             else:
-                turned = (offset @ chain.axes[joint].reshape(3, -1)).reshape(-1, 3, num)
+                turned = (offset @ chain.axes[joint].reshape(3, 3 * num)).reshape(len(offset), 3, num)
                 positions[points] = turned + chain.origins[joint]
         return positions
 

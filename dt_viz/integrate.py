@@ -155,9 +155,12 @@ def _still(field: VectorField, state: Array, rate: Array, alone: bool, duration:
         return still & (
             np.abs(rate[:, d:]).max(axis=1) * total <= RELATIVE_TOLERANCE * np.abs(state[:, d:]).max(axis=1)
         )
-    velocity = rate[still]
-    change = field(state[still] + duration * velocity) - velocity
-    still[still] = np.abs(change).max(axis=1, initial=0.0) <= 0.1 * np.abs(velocity).max(axis=1, initial=0.0)
+    slow = np.flatnonzero(still & rate.any(axis=1))
+    if not len(slow):
+        return still
+    velocity = rate[slow]
+    change = field(state[slow] + duration * velocity) - velocity
+    still[slow] = np.abs(change).max(axis=1, initial=0.0) <= 0.1 * np.abs(velocity).max(axis=1, initial=0.0)
     return still
 
 

@@ -31,8 +31,9 @@ class Sphere:
         return self.diameter / 2
 
     def signed_distance(self, s: Array) -> Array:
-        """Distance of the points `s` (*B, 3) from the surface, (*B,), metres, negative inside."""
-        return np.linalg.norm(s - np.asarray(self.position), axis=-1) - self.radius
+        """Distance of the points `s` (*B, 3) from the surface, (*B,), metres, negative inside; analytic in `s`."""
+        offset = s - np.asarray(self.position)
+        return np.sqrt((offset * offset).sum(axis=-1)) - self.radius
 
     def nearest_free(self, s: Array) -> Array:
         """The points `s` (*B, 3), those inside moved to the nearest point of the surface, (*B, 3), metres."""

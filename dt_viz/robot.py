@@ -45,17 +45,17 @@ class KinematicChain(NamedTuple):
 
     def position_jacobian(self) -> Array:
         """Velocity of the end effector for each joint turning, (6, 3, N), metres per rad."""
-        return _cross(self.axes[:, 2], self.position - self.origins)
+        return cross(self.axes[:, 2], self.position - self.origins)
 
     def direction_jacobian(self) -> Array:
         """Velocity of the hand's direction for each joint turning, (6, 3, N), per rad."""
-        return _cross(self.axes[:, 2], self.direction)
+        return cross(self.axes[:, 2], self.direction)
 
     def manipulability(self) -> Array:
         """Square root of det(J Jᵀ) of the position's Jacobian, (N,), m³."""
         J = self.position_jacobian()
         x, y, z = np.einsum("irn,isn->rsn", J, J)
-        return np.sqrt(np.maximum((x * _cross(y, z)).sum(axis=0), 0.0))
+        return np.sqrt(np.maximum((x * cross(y, z)).sum(axis=0), 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,8 +163,8 @@ class Robot:
     def chain(self, q: Array) -> KinematicChain:
         """Forward kinematics of q (6, N), rad, in the layout that is quickest to compute with."""
         num = q.shape[1]
-        axes = np.empty((NUM_JOINTS, 3, 3, num))
-        origins = np.empty((NUM_JOINTS, 3, num))
+        axes = np.empty((NUM_JOINTS, 3, 3, num), dtype=q.dtype)
+        origins = np.empty((NUM_JOINTS, 3, num), dtype=q.dtype)
         cos, sin = np.cos(q), np.sin(q)
         for i in range(NUM_JOINTS):
             if i == 0:
@@ -198,7 +198,7 @@ class LinkMesh:
     faces: NDArray[np.intp]
 
 
-def _cross(a: Array, b: Array) -> Array:
+def cross(a: Array, b: Array) -> Array:
     """Cross products over the second last axis of a (*B, 3, N) and b (*B, 3, N)."""
     ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
     bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]

@@ -1,0 +1,251 @@
+"""Whole-arm avoidance: diffeomorphisms of configuration space (sec. 4.5).
+
+A configuration is six joint angles, rad. `WholeArmField` is a generator V_q on R⁶ whose reverse flow carries the arm
+out of an obstacle; `JointLimits` bends R⁶ so that no flow leaves the joint limits. Derivatives are exact to rounding by
+complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference of near numbers, so h can be tiny.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dt_viz.body import BodyPoints
+from dt_viz.diffeo import Diffeomorphism
+from dt_viz.fields import Array, Indices
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import NUM_JOINTS, KinematicChain, Robot, cross
+
+COMPLEX_STEP = 1e-30
+
+REACH_PER_TEMPERATURE = 0.08 / 6
+"""Metres from an obstacle at which its field ends, for each unit of the temperature T."""
+CORE = 0.5
+"""Part of the distance from a covering sphere's touching to its sitting on the obstacle's middle, from which on the field
+has its full strength: deep inside it is flat, and nothing happens at the middle itself."""
+SHARPNESS = 3
+"""p of the smooth maximum over body points: contacts within about a third of the strongest count."""
+FAN = 4.0
+"""Distance behind the obstacle's middle, in its radii, of the point from which escaping points fan out."""
+DAMPING = 0.03
+"""λ of the contact's pseudo-inverse, metres per rad: a contact that joints can hardly move is not chased."""
+DIRECTION_WEIGHT = 1.5
+"""Of the hand's direction against joint angles, as in `dt_viz.tracking`."""
+HAND_WEIGHT = 30.0
+"""Of the end effector's motion, rad² per m²: a forearm in contact is moved by what leaves the hand where it is."""
+LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
+"""How far the hand moves when a joint turns, metres per rad, about: makes a distance of postures a length."""
+PIN = 0.03
+"""Size of the region around a pinned posture in which the field fades to nothing, metres of that distance."""
+
+SPEED = 0.2
+"""Metres that a contact at full strength escapes in a unit of flow time."""
+
+LIMIT_ZONE = 0.05
+"""Before a joint limit, in which joints are held back, rad."""
+NEAREST_TO_LIMIT = 0.9
+"""Part of that zone that a planned path may use."""
+
+
+@dataclass(frozen=True, eq=False)
+class WholeArmField:
+    """Generator V_q whose reverse flow takes the arm out of an obstacle along an escape direction.
+
+    A body point x_b with sphere radius r_b has the occupancy w_b = S(d(x_b) − r_b), d the distance from the obstacle's
+    surface and S a smooth step from 1 inside to 0 at `reach`. The arm's contact is the average of its body points with
+    weights ŵ_b = w_b^p / Σw^p, with the Jacobian J_c = Σ ŵ_b J_b, the direction n_c = Σ ŵ_b n_b and the strength
+    m = (Σ w_b^p)^(1/p). It escapes by the weighted pseudo-inverse
+
+        −V_q(q) = v · m · χ(q) · H⁻¹ J_cᵀ (J_c H⁻¹ J_cᵀ + λ²I)⁻¹ n_c,   H = I + w_d DᵀD + w_x JᵀJ,
+
+    which moves the contact along n_c with as little motion of the joints, the hand's direction (D) and the end effector
+    (J) as can be. χ vanishes at pinned postures, so start and goal stay where they are.
+
+    The plain gradient ∇_q ΣU(x_b) of the paper (`GradientField`) follows the joints' mobility instead: it sweeps along
+    the path with the first joint and turns sharply, see README "Departures".
+    """
+
+    robot: Robot
+    body: BodyPoints
+    """That can be carried away."""
+    obstacle: Sphere
+    direction: Array
+    """n, (3,) unit vector in which the arm escapes."""
+    pins: Array
+    """(K, 6) postures that stay, rad."""
+    reach: float = 6 * REACH_PER_TEMPERATURE
+    """Distance from the obstacle's surface at which the field ends, metres."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of configuration space."""
+        return NUM_JOINTS
+
+    @cached_property
+    def _source(self) -> Array:
+        middle = np.asarray(self.obstacle.position) - FAN * self.obstacle.radius * self.direction
+        return middle[:, None]
+
+    @cached_property
+    def _core(self) -> Array:
+        return -CORE * (self.obstacle.radius + self.body.radius)[:, None]
+
+    def __call__(self, q: Array) -> Array:
+        """V_q at configurations `q` (N, 6), as (N, 6)."""
+        chain = self.robot.chain(q.T)
+        points = self.body.of_chain(chain)
+        distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        powers = _fading((self.reach - distance) / (self.reach - self._core)) ** SHARPNESS  # (P, N)
+        total = powers.sum(axis=0)
+        velocity = np.zeros_like(q)
+        near = np.flatnonzero(total.real > 0)
+        if not len(near):
+            return velocity
+        if len(near) < len(q):
+            chain, points, powers, total = _take(chain, near), points[..., near], powers[:, near], total[near]
+        weights = powers / total
+        outward = points - self._source
+        outward = outward / np.sqrt((outward * outward).sum(axis=1, keepdims=True))
+        wanted = SPEED * total ** (1 / SHARPNESS) * (weights[:, None] * outward).sum(axis=0)  # (3, M)
+        stays = np.concatenate([np.sqrt(DIRECTION_WEIGHT) * chain.direction_jacobian(),
+                                np.sqrt(HAND_WEIGHT) * chain.position_jacobian()], axis=1).transpose(2, 1, 0)  # fmt: skip
+        H = np.eye(NUM_JOINTS) + stays.transpose(0, 2, 1) @ stays
+        J = self._contact_jacobian(chain, points, weights)  # (M, 3, 6)
+        mobile = np.linalg.solve(H, J.transpose(0, 2, 1))
+        pull = np.linalg.solve(J @ mobile + DAMPING**2 * np.eye(3), wanted.T[..., None])
+        velocity[near] = -(mobile @ pull)[..., 0] * self._freedom(q[near])[:, None]
+        return velocity
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        return by_complex_steps(self, q)
+
+    def _contact_jacobian(self, chain: KinematicChain, points: Array, weights: Array) -> Array:
+        """J_c = Σ ŵ_b J_b, (M, 3, 6): each joint turns what lies beyond it."""
+        columns: list[Array] = []
+        lever, weight = np.zeros_like(chain.position), np.zeros_like(chain.position[0])
+        beyond = dict(self.body.by_joint)
+        for joint in reversed(range(NUM_JOINTS)):
+            if joint in beyond:
+                part = beyond[joint]
+                lever = lever + (weights[part, None] * points[part]).sum(axis=0)
+                weight = weight + weights[part].sum(axis=0)
+            columns.insert(0, cross(chain.axes[joint, 2], lever - weight * chain.origins[joint]))
+        return np.stack(columns).transpose(2, 1, 0)
+
+    def _freedom(self, q: Array) -> Array:
+        """χ, (N,): 0 at the pins, 1 away from them."""
+        return np.prod(1 - np.exp(-squared_lengths(q, self.pins) / (2 * PIN**2)), axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class GradientField:
+    """The paper's generator V_q = ∇_q Σ_b U(x_b), here with U the occupancy w_b of `WholeArmField`, in metres.
+
+    It takes no care of start and goal, nor of how the hand moves.
+    """
+
+    robot: Robot
+    body: BodyPoints
+    """That can be carried away."""
+    obstacle: Sphere
+    reach: float = 6 * REACH_PER_TEMPERATURE
+    """Distance from the obstacle's surface at which the field ends, metres."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of configuration space."""
+        return NUM_JOINTS
+
+    def __call__(self, q: Array) -> Array:
+        """V_q at configurations `q` (N, 6), as (N, 6)."""
+        chain = self.robot.chain(q.T)
+        points = self.body.of_chain(chain)
+        outward = points - np.asarray(self.obstacle.position)[:, None]
+        outward = outward / np.sqrt((outward * outward).sum(axis=1, keepdims=True))
+        core = -CORE * (self.obstacle.radius + self.body.radius)[:, None]
+        distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        u = _unit_interval((self.reach - distance) / (self.reach - core))
+        force = -30 * (u * u * (1 - u) * (1 - u))[:, None] * outward  # the slope of `_fading`
+        torque = cross(points, force)
+        pull, moment, velocity = np.zeros_like(chain.position), np.zeros_like(chain.position), np.empty_like(q)
+        beyond = dict(self.body.by_joint)
+        for joint in reversed(range(NUM_JOINTS)):
+            if joint in beyond:
+                pull = pull + force[beyond[joint]].sum(axis=0)
+                moment = moment + torque[beyond[joint]].sum(axis=0)
+            velocity[:, joint] = (chain.axes[joint, 2] * (moment - cross(chain.origins[joint], pull))).sum(axis=0)
+        return velocity
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        return by_complex_steps(self, q)
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits(Diffeomorphism):
+    """From the configurations inside the joint limits onto all of R⁶: whatever flows there stays inside here.
+
+    With e the distance by which a joint is inside the zone of width m before its limit, ψ⁻¹ is the flow of ė = −e³
+    for the time 1/(2m²), which carries joints away from their limits:
+
+        ψ⁻¹(e) = e/√(1 + (e/m)²) < m,    ψ(e) = e/√(1 − (e/m)²).
+
+    Joints outside the zone, and continuous ones, stay as they are.
+    """
+
+    lower: Array
+    """(6,) rad, −inf for continuous joints."""
+    upper: Array
+    """(6,) rad, +inf for continuous joints."""
+    zone: float = LIMIT_ZONE
+    """m, rad."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of configuration space."""
+        return len(self.lower)
+
+    def inside(self, q: Array) -> Array:
+        """Configurations (*B, 6) kept a little away from the limits, where ψ is finite."""
+        slack = (1 - NEAREST_TO_LIMIT) * self.zone
+        return np.clip(q, self.lower + slack, self.upper - slack)
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        free = np.clip(s.real, self.lower + self.zone, self.upper - self.zone)
+        excess = s - free
+        squared = (excess / self.zone) ** 2 * (1 if inverse else -1)
+        stretch = 1 / np.sqrt(1 + squared)
+        mapped = np.where(excess == 0, s, free + excess * stretch)
+        return mapped, None if U is None else (stretch**3)[..., None] * U
+
+
+def by_complex_steps(field: WholeArmField | GradientField, q: Array) -> tuple[Array, Array]:
+    """A field (N, 6) and its derivative (N, 6, 6) at configurations `q` (N, 6)."""
+    num, d = q.shape
+    shifted = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)
+    values = field(shifted).reshape(d, num, d)
+    return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
+
+
+def squared_lengths(q: Array, pins: Array) -> Array:
+    """Squared distances (N, K), m², of the postures `q` (N, 6) from the postures `pins` (K, 6), by `LEVERS`."""
+    offset = (q[:, None] - pins) * LEVERS
+    return (offset * offset).sum(axis=2)
+
+
+def _unit_interval(u: Array) -> Array:
+    """u where it is between 0 and 1, else the nearer of them."""
+    return np.where(u.real <= 0, 0.0, np.where(u.real >= 1, 1.0, u))
+
+
+def _fading(u: Array) -> Array:
+    """A step from 0 at u = 0 to 1 at u = 1 with two derivatives of 0 at both ends."""
+    u = _unit_interval(u)
+    return u * u * u * (10 - 15 * u + 6 * u * u)
+
+
+def _take(chain: KinematicChain, columns: Indices) -> KinematicChain:
+    return KinematicChain(*(part[..., columns] for part in chain))

@@ -1,0 +1,266 @@
+"""From motions of the end effector to motions of the whole arm that clear an obstacle (sec. 4.5).
+
+The joints follow the end effector by the pseudo-inverse: q(t) = Q(x(t)) with one section Q for all rollouts of a task
+(`dt_viz.tracking.track` with a shared reference). It does not depend on the obstacle, so it is computed once; a drag
+costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from dt_viz.body import BodyPoints
+from dt_viz.cspace import LEVERS, REACH_PER_TEMPERATURE, GradientField, JointLimits, WholeArmField, squared_lengths
+from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Identity, Inverse
+from dt_viz.escape import escape_directions
+from dt_viz.fields import Array, Indices
+from dt_viz.integrate import rk4
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import NUM_JOINTS, Robot
+from dt_viz.rollouts import Bundle, refined
+from dt_viz.scenario import Scenario
+from dt_viz.tracking import JointPath, track
+
+NUM_CONFIGURATIONS = 100
+"""Of each rollout before refinement."""
+MAX_DURATION = 4.0
+"""Longest flow that is tried."""
+SNAPSHOT = 0.1
+"""Flow time between two looks at the clearance: contacts move by at most two centimetres in it."""
+NUM_DEEPEST = 5
+"""Samples of each rollout that the duration is chosen for at first."""
+MAX_ROUNDS = 4
+"""Of looking whether samples that refinement finds are clear, too, and going on if not."""
+SLOPE = 0.3
+"""Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
+OVERSHOOT = 7e-3
+"""Metres by which the covering spheres stick out of the arm, about: so much less of the margin is asked of them."""
+ROUNDING = 1e-3
+"""Metres of clearance that do not count."""
+RADIANS_PER_METRE = 3.0
+"""Of tolerances: the hand's error is that of the joints times half a metre or less."""
+NUM_COMPARED = 60
+"""Colliding samples that ways out are compared by."""
+
+Generator = WholeArmField | GradientField
+
+
+@dataclass(frozen=True, eq=False)
+class Lift:
+    """The joints along each rollout: q = Q(x), a smooth function of the fraction of its base ray."""
+
+    fractions: Array
+    """(R, T) increasing along each rollout."""
+    tracked: JointPath
+    """At these fractions; its q has shape (R, T, 6)."""
+
+    @cached_property
+    def _splines(self) -> tuple[CubicSpline, ...]:
+        return tuple(CubicSpline(u, q) for u, q in zip(self.fractions, self.tracked.q, strict=True))
+
+    def at(self, index: Indices, fraction: Array) -> Array:
+        """Configurations (N, 6), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
+        q = np.empty((len(index), NUM_JOINTS))
+        for rollout, spline in enumerate(self._splines):
+            rows = index == rollout
+            q[rows] = spline(fraction[rows])
+        return q
+
+    @cached_property
+    def pins(self) -> Array:
+        """(R + 1, 6) postures at the starts and at the goal, rad."""
+        return np.concatenate([self.tracked.q[:, 0], self.tracked.q[:1, -1]])
+
+
+def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:
+    """Follow rollouts with the joints.
+
+    Args:
+        robot: whose joints.
+        fractions: (R, T) where on their base rays the samples are.
+        paths: (R, T, 3) end effector there, metres.
+        reference: (6,) posture that the arm stays near to, rad.
+        initial: (R, T, 6) joints of nearby paths to begin from, rad.
+    """
+    start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
+    return Lift(fractions, track(robot, paths, start, initial, reference=start))
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSolution:
+    """Joint motions of all rollouts, one after the other."""
+
+    transform: Diffeomorphism
+    """ψ_q, from the configurations where the arm moves to those of the undisturbed motion."""
+    index: Indices
+    """(N,) which rollout a sample belongs to, not decreasing."""
+    fraction: Array
+    """(N,) where on its base ray it is."""
+    q: Array
+    """(N, 6) without avoidance, rad."""
+    p: Array
+    """(N, 6) the motion, rad."""
+    duration: float
+    """t of the avoidance flow."""
+    clearance: float
+    """Smallest distance of the covering spheres from the obstacle, metres."""
+    cleared: bool
+    """Whether all samples keep the clearance that is asked for."""
+
+
+class WholeArm:
+    """Makes the arm's motions clear an obstacle, by a diffeomorphism of configuration space."""
+
+    def __init__(self, robot: Robot, body: BodyPoints) -> None:
+        self.robot = robot
+        self.body = body.on_moving_links
+        self.limits = JointLimits(robot.lower, robot.upper)
+
+    def undisturbed(self, lifted: Lift, scenario: Scenario, spacing: float) -> ArmSolution:
+        """The motions as lifted, avoiding nothing."""
+        return _Solver(self, lifted, scenario, None, spacing, spacing).solution()
+
+    def avoiding(self, lifted: Lift, scenario: Scenario, tolerance: float, spacing: float) -> ArmSolution:
+        """The motions around the scenario's obstacle.
+
+        With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
+        scenario's margin, or what the start or goal beside it has. Of several ways out the first is taken that works.
+
+        Args:
+            lifted: the motions below.
+            scenario: with obstacle, margin, temperature and duration.
+            tolerance: of the flow's integration, metres at the hand, about.
+            spacing: largest distance between neighbouring samples, metres at the hand, about.
+        """
+        solution = None
+        for generator in self._generators(lifted, scenario):
+            solution = _Solver(self, lifted, scenario, generator, tolerance, spacing).solution()
+            if solution.cleared or scenario.duration is not None:
+                break
+        return solution or self.undisturbed(lifted, scenario, spacing)
+
+    def clearance(self, q: Array, obstacle: Sphere) -> Array:
+        """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
+        points = self.body.of_chain(self.robot.chain(q.T))
+        return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)
+
+    def _generators(self, lifted: Lift, scenario: Scenario) -> Iterator[Generator]:
+        """The fields to try, the most promising first; none where nothing comes too near the obstacle."""
+        obstacle, reach = scenario.obstacle, REACH_PER_TEMPERATURE * scenario.temperature
+        q = lifted.tracked.q
+        num_rollouts, num_samples, _ = q.shape
+        flat = q.reshape(-1, NUM_JOINTS)
+        points = self.body.of_chain(self.robot.chain(flat.T))
+        distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        collides = distance.min(axis=0) < scenario.margin
+        if not collides.any():
+            return
+        if scenario.generator == "probability":
+            yield GradientField(self.robot, self.body, obstacle, reach)
+            return
+        hand = self.robot.end_effector(q)
+        tangents = np.gradient(hand, axis=1).reshape(-1, 3)
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        some = np.flatnonzero(collides)
+        some = some[:: max(1, len(some) // NUM_COMPARED)]
+        for direction in escape_directions(points[:, :, some], self.body.radius, tangents[some], obstacle):
+            yield WholeArmField(self.robot, self.body, obstacle, direction, lifted.pins, reach)
+
+
+class _Solver:
+    """Finds the duration of one generator's flow, and the samples that show the motion."""
+
+    def __init__(
+        self,
+        arm: WholeArm,
+        lifted: Lift,
+        scenario: Scenario,
+        generator: Generator | None,
+        tolerance: float,
+        spacing: float,
+    ) -> None:
+        self._arm = arm
+        self._lifted = lifted
+        self._scenario = scenario
+        self._generator = generator
+        self._tolerance = RADIANS_PER_METRE * tolerance
+        self._spacing = spacing
+        self._room = arm.clearance(lifted.pins, scenario.obstacle)
+
+    def solution(self) -> ArmSolution:
+        """See `WholeArm.avoiding`."""
+        num_rollouts, num_samples = self._lifted.fractions.shape
+        index = np.repeat(np.arange(num_rollouts), num_samples)
+        duration = self._scenario.duration
+        if self._generator is None:
+            duration = 0.0
+        elif duration is None:
+            q = self._arm.limits.inside(self._lifted.tracked.q.reshape(-1, NUM_JOINTS))
+            lack = self._lack(q)
+            order = np.lexsort([-lack, index])
+            deepest = order[(np.arange(len(order)) % num_samples < NUM_DEEPEST) & (lack[order] > 0)]
+            duration = self._clearing_duration(q[deepest])
+        return self._with_duration(min(duration, MAX_DURATION), index)
+
+    def _with_duration(self, duration: float, index: Indices) -> ArmSolution:
+        transform = self._transform(duration)
+        fraction = self._lifted.fractions.ravel()
+        bundle = self._refined(Bundle(index, fraction, self._evaluate(transform, index, fraction)), transform)
+        p = bundle.positions / LEVERS
+        lack = self._lack(p)
+        for _ in range(MAX_ROUNDS):
+            if self._scenario.duration is not None or duration >= MAX_DURATION or not (lack > ROUNDING).any():
+                break
+            # the flow is a one-parameter group: go on from where the samples are
+            more = self._clearing_duration(p[lack > 0])
+            duration = min(duration + more, MAX_DURATION)
+            transform = self._transform(duration)
+            p = self._transform(more).inverse(p)
+            bundle = self._refined(replace(bundle, levels=(p * LEVERS)[:, None]), transform)
+            p = bundle.positions / LEVERS
+            lack = self._lack(p)
+        clearance = float(self._arm.clearance(p, self._scenario.obstacle).min())
+        q = self._lifted.at(bundle.index, bundle.fraction)
+        cleared = not (lack > ROUNDING).any()
+        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, cleared)
+
+    def _transform(self, duration: float) -> Diffeomorphism:
+        limits = self._arm.limits
+        if self._generator is None or duration == 0:
+            return Identity(NUM_JOINTS)
+        return Chain([Inverse(limits), AdaptiveFlow(self._generator, duration, self._tolerance), limits])
+
+    def _evaluate(self, transform: Diffeomorphism, index: Indices, fraction: Array) -> Array:
+        """Levels (N, 1, 6) of the samples: postures by their `LEVERS`, so that distances are metres."""
+        q = self._arm.limits.inside(self._lifted.at(index, fraction))
+        return (transform.inverse(q) * LEVERS)[:, None]
+
+    def _refined(self, bundle: Bundle, transform: Diffeomorphism) -> Bundle:
+        return refined(bundle, lambda i, u: self._evaluate(transform, i, u), self._spacing)
+
+    def _lack(self, p: Array) -> Array:
+        """(N,) metres by which configurations (N, 6) miss the clearance that is asked for."""
+        distance = np.sqrt(squared_lengths(p, self._lifted.pins))
+        margin = max(self._scenario.margin - OVERSHOOT, 2 * ROUNDING)
+        asked = np.minimum(margin, (self._room + SLOPE * distance).min(axis=1))
+        return asked - self._arm.clearance(p, self._scenario.obstacle)
+
+    def _clearing_duration(self, p: Array) -> float:
+        """The shortest duration after which the flow has carried configurations (N, 6) clear, or `MAX_DURATION`."""
+        assert self._generator is not None
+        limits, duration = self._arm.limits, 0.0
+        state, lack = limits.forward(p), self._lack(p)
+        while len(state):
+            if duration >= MAX_DURATION:
+                return MAX_DURATION
+            state, _ = rk4(self._generator, state, None, -SNAPSHOT)
+            before, lack = lack, self._lack(limits.inverse(state))
+            if (lack <= 0).all():
+                return duration + SNAPSHOT * float((before / np.maximum(before - lack, 1e-12)).clip(0, 1).max())
+            state, lack, duration = state[lack > 0], lack[lack > 0], duration + SNAPSHOT
+        return duration
