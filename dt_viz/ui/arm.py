@@ -2,91 +2,126 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
-
-import trimesh
 import viser
-import yourdfpy
 from viser import transforms
 
 from dt_viz.fields import Array
-from dt_viz.robot import Robot, package_folder, urdf_path
+from dt_viz.robot import Robot
 from dt_viz.ui import palette
+from dt_viz.ui.links import bodies, light_shells
+
+PEDESTAL = 2
+"""Bodies that no motion carries away from anything: the base, and link 1, which only turns on the spot."""
+STALE_OPACITY = 0.4
+"""Of the arm while it shows a motion that is not the scenario's."""
+GHOST_OPACITY = 0.5
+MIN_APART = 0.006
+"""Metres that avoidance must move a link for its ghost to be shown: two surfaces in one place flicker."""
 
 
-@dataclass(frozen=True)
-class _Body:
-    """What moves with one joint."""
+class ArmFrames:
+    """The frames of the base and the six links as a tree in the scene of one visitor."""
 
-    placement: Array
-    """(4, 4) pose in the parent link, that of the base in the world; all joint angles zero, metres."""
-    shell: trimesh.Trimesh
-    rings: trimesh.Trimesh | None
+    def __init__(self, scene: viser.SceneApi, robot: Robot, name: str) -> None:
+        self._robot = robot
+        self.frames: list[viser.FrameHandle] = []
+        for index, body in enumerate(bodies(robot.joint_names)):
+            name += f"/joint_{index}" if index else ""
+            pose = transforms.SE3.from_matrix(body.placement)
+            self.frames.append(
+                scene.add_frame(name, show_axes=False, wxyz=pose.rotation().wxyz, position=pose.translation())
+            )
 
-
-@lru_cache(maxsize=1)
-def _bodies(joint_names: tuple[str, ...]) -> tuple[_Body, ...]:
-    """The base and the six links with all that is fixed to them, read once for all visitors."""
-    urdf = yourdfpy.URDF.load(
-        str(urdf_path()), filename_handler=lambda fname: str(fname).replace("package://", f"{package_folder()}/")
-    )
-    scene = urdf.scene
-    assert scene is not None
-    moving = [urdf.joint_map[name] for name in joint_names]
-    links = [moving[0].parent, *(joint.child for joint in moving)]
-    parents = scene.graph.transforms.parents
-    shells: list[list[trimesh.Trimesh]] = [[] for _ in links]
-    rings: list[list[trimesh.Trimesh]] = [[] for _ in links]
-    for name, mesh in scene.geometry.items():
-        link = parents[name]
-        while link not in links:
-            link = parents[link]
-        placed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        placed.apply_transform(urdf.get_transform(name, link))
-        (rings if name.startswith("ring") else shells)[links.index(link)].append(placed)
-    bodies = []
-    for index, link in enumerate(links):
-        placement = urdf.get_transform(link, links[index - 1] if index else scene.graph.base_frame)
-        bodies.append(_Body(placement, _merged(shells[index]), _merged(rings[index]) if rings[index] else None))
-    return tuple(bodies)
-
-
-def _merged(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    merged = trimesh.util.concatenate(meshes)
-    assert isinstance(merged, trimesh.Trimesh)
-    merged.merge_vertices()
-    return merged
+    def pose(self, q: Array) -> None:
+        """Turn to the joint angles `q` (6,), rad."""
+        for frame, wxyz in zip(self.frames[1:], self._robot.joint_frames(q), strict=True):
+            frame.wxyz = wxyz
 
 
 class ArmPicture:
-    """The arm as a tree of frames, one for each joint, in the scene of one visitor."""
+    """The arm."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
-        self._robot = robot
-        self._frames: list[viser.FrameHandle] = []
-        name = ""
-        for index, body in enumerate(_bodies(robot.joint_names)):
-            name += f"/joint_{index}" if index else "/arm"
-            pose = transforms.SE3.from_matrix(body.placement)
-            self._frames.append(
-                scene.add_frame(name, show_axes=False, wxyz=pose.rotation().wxyz, position=pose.translation())
-            )
-            scene.add_mesh_simple(f"{name}/shell", body.shell.vertices, body.shell.faces, color=palette.ARM)
-            if body.rings is not None:
-                scene.add_mesh_simple(f"{name}/rings", body.rings.vertices, body.rings.faces, color=palette.ARM_RING)
+        self._tree = ArmFrames(scene, robot, "/arm")
+        self._meshes: list[viser.MeshHandle] = []
+        for frame, body in zip(self._tree.frames, bodies(robot.joint_names), strict=True):
+            for part, mesh, colour in (("shell", body.shell, palette.ARM), ("rings", body.rings, palette.ARM_RING)):
+                if mesh is not None:
+                    self._meshes.append(
+                        scene.add_mesh_simple(f"{frame.name}/{part}", mesh.vertices, mesh.faces, color=colour)
+                    )
+        self._note = scene.add_label(
+            f"{self._tree.frames[-1].name}/note",
+            "last good motion",
+            anchor="bottom-center",
+            font_screen_scale=0.8,
+            visible=False,
+        )
         self.pose(robot.home)
 
     def pose(self, q: Array) -> None:
         """Show the joint angles `q` (6,), rad."""
-        for frame, wxyz in zip(self._frames[1:], self._robot.joint_frames(q), strict=True):
-            frame.wxyz = wxyz
+        self._tree.pose(q)
+
+    def show(self, *, whole: bool, pedestal: bool) -> None:
+        """Show the whole arm, or only what stands under other pictures of it, or nothing."""
+        self._tree.frames[0].visible = whole or pedestal
+        self._tree.frames[PEDESTAL].visible = whole
 
     @property
     def visible(self) -> bool:
-        """Whether the arm is shown."""
-        return self._frames[0].visible
+        """Whether the whole arm is shown."""
+        return self._tree.frames[0].visible and self._tree.frames[PEDESTAL].visible
+
+    @property
+    def stale(self) -> bool:
+        """Whether what it shows is not the scenario's motion: then it is translucent and says so."""
+        return self._note.visible
+
+    @stale.setter
+    def stale(self, stale: bool) -> None:
+        if stale != self._note.visible:
+            self._note.visible = stale
+            for mesh in self._meshes:
+                mesh.opacity = STALE_OPACITY if stale else None
+
+
+class GhostArm:
+    """The arm where it would be without avoidance, translucent; links that coincide with the arm's are left out."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        self._tree = ArmFrames(scene, robot, "/ghost_arm")
+        self._tree.frames[0].visible = False
+        shells = zip(self._tree.frames, light_shells(robot.joint_names), strict=True)
+        self.links = tuple(
+            scene.add_mesh_simple(
+                f"{frame.name}/shell",
+                shell.vertices,
+                shell.faces,
+                color=palette.GHOST,
+                opacity=GHOST_OPACITY,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            for frame, shell in list(shells)[PEDESTAL:]
+        )
+
+    def pose(self, without: Array, moved: Array) -> None:
+        """Show the arm without avoidance.
+
+        Args:
+            without: (6,) its joint angles, rad.
+            moved: (5,) how far avoidance has moved each link from the second on, metres.
+        """
+        self._tree.pose(without)
+        for link, distance in zip(self.links, moved, strict=True):
+            link.visible = bool(distance > MIN_APART)
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self._tree.frames[0].visible
 
     @visible.setter
     def visible(self, visible: bool) -> None:
-        self._frames[0].visible = visible
+        self._tree.frames[0].visible = visible

@@ -8,6 +8,8 @@ CHOSEN_ROLLOUT = (150, 45, 0)
 """The one that the arm follows."""
 GHOST = (84, 88, 96)
 """Dashed lines."""
+STALE = (158, 163, 171)
+"""Rollouts that are not the scenario's."""
 GOAL = (0, 158, 115)
 START = (213, 94, 0)
 OBSTACLE = (204, 121, 167)
@@ -22,6 +24,13 @@ INSET = (120, 126, 136)
 TABLE = (226, 217, 204)
 ARM = (206, 210, 216)
 ARM_RING = (62, 66, 74)
+ONION = (70, 116, 168)
+"""Arms along the motion."""
+BODY_POINT = (170, 178, 190)
+BODY_POINT_MOVED = (0, 158, 115)
+BODY_PATH = (0, 92, 66)
+JOINTS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (0, 114, 178), (213, 94, 0), (204, 121, 167))
+"""Curves of the six joints, base to hand."""
 BRAND = (0, 114, 178)
 
 

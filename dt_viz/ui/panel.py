@@ -9,10 +9,12 @@ from typing import Any
 
 import viser
 
+from dt_viz.collision import SELF_REACH, CollisionReport
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Frame, Stage
 from dt_viz.imitation import ImitationError
 from dt_viz.occupancy import GENERATORS
+from dt_viz.robot import Robot
 from dt_viz.scenario import (
     MAX_DIAMETER,
     MAX_MANUAL_DURATION,
@@ -21,10 +23,13 @@ from dt_viz.scenario import (
     MIN_DIAMETER,
     MIN_TEMPERATURE,
     OBJECTIVES,
+    SPACES,
     Scenario,
     View,
 )
+from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.export import RESOLUTIONS
+from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.session import Pace, Session
 
 VIEW_LABELS: Mapping[str, str] = {
@@ -33,11 +38,23 @@ VIEW_LABELS: Mapping[str, str] = {
     "demonstrations": "Demonstrations",
     "field": "Vector field",
     "arm": "Arm",
+    "ghost_arm": "Arm without avoidance",
+    "onion": "Arms along the motion",
+    "body_points": "Body points",
+    "joint_plots": "Joint plots",
     "table": "Table",
     "grid": "Warped grid ψ⁻¹(grid)",
     "base": "Base attractor beside it",
     "generator": "Learned generator",
 }
+VIEW_HINTS: Mapping[str, str] = {
+    "ghost_arm": "where it would be at the same moment; left out where both are in one place",
+    "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
+    "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
+    "joint_plots": "angles and speeds over time, with their limits",
+}
+SPACE_LABELS: Mapping[str, str] = {"task": "End effector", "cspace": "Whole arm", "both": "Both"}
+assert set(SPACE_LABELS) == set(SPACES)
 GENERATOR_LABELS = {"free-space": "Free space (−∇log(1−p))", "probability": "Probability (∇p, the paper's)"}
 assert set(GENERATOR_LABELS) == set(GENERATORS)
 MAX_FLOWS = 3
@@ -56,12 +73,15 @@ class _Control:
 class Panel:
     """The control panel of one visitor."""
 
-    def __init__(self, gui: viser.GuiApi, titles: Mapping[str, str], save_png: Callable[[str, bool], None]) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, titles: Mapping[str, str], robot: Robot, save_png: Callable[[str, bool], None]
+    ) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
         Args:
             gui: of the visitor.
             titles: of the tasks, by name.
+            robot: whose joints are plotted.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
         """
         self._gui = gui
@@ -86,6 +106,7 @@ class Panel:
         self._build_stack()
         self._build_arm()
         self._build_view()
+        self.joints = JointPlots(gui, robot)
         self._build_export(save_png)
 
     def connect(self, session: Session) -> None:
@@ -101,6 +122,7 @@ class Panel:
                 control.handle.value = value
         self._duration.disabled = scenario.duration is None
         self._flow.visible = scenario.view.generator
+        self.joints.visible = scenario.view.joint_plots
         self._play.label = "Pause" if scenario.view.playing else "Play"
 
     def report(self, frame: Frame, pace: Pace) -> None:
@@ -112,6 +134,7 @@ class Panel:
         if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
             self._notice.visible, self._noticed = False, None
         self._hint.content = f"<div style='{_SMALL}'>{html.escape(frame.task.hint)}</div>"
+        self.joints.draw(frame.arm)
         _set_max(self._rollout, len(frame.rollouts))
         if frame.pictures.generator is not None:
             _set_max(self._flow, frame.pictures.generator.num_flows)
@@ -217,6 +240,15 @@ class Panel:
                 lambda _s, value: {"avoidance": value},
             )
             self._bind(
+                gui.add_dropdown(
+                    "Avoid with",
+                    tuple(SPACE_LABELS.values()),
+                    hint="what gives way: the hand's path, or the whole arm by a transform of its joint angles",
+                ),
+                lambda s: SPACE_LABELS[s.space],
+                lambda _s, value: {"space": next(name for name, label in SPACE_LABELS.items() if label == value)},
+            )
+            self._bind(
                 gui.add_checkbox("Imitate", True, hint="off: straight to the goal"),
                 lambda s: s.imitation,
                 lambda _s, value: {"imitation": value},
@@ -284,7 +316,7 @@ class Panel:
         with self._gui.add_folder("Show", expand_by_default=False):
             for name, label in VIEW_LABELS.items():
                 self._bind(
-                    self._gui.add_checkbox(label, getattr(View(), name)),
+                    self._gui.add_checkbox(label, getattr(View(), name), hint=VIEW_HINTS.get(name)),
                     lambda s, name=name: getattr(s.view, name),
                     lambda s, value, name=name: {"view": replace(s.view, **{name: value})},
                 )
@@ -334,6 +366,7 @@ def status_html(frame: Frame, pace: Pace) -> str:
         ("Rebuild", f"{1e3 * pace.latency:.0f} ms" + (f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else "")),
         ("Skipped edits", f"{pace.num_skipped}"),
         ("Clearance", f"{1e3 * health.clearance:.1f} mm"),
+        *_collision_rows(health.collision, certified=frame.stage is Stage.CERTIFIED),
         ("Flow time t", "off" if health.duration is None else f"{health.duration:.2f}"),
         ("Smallest det J", "…" if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
         ("There and back", "…" if health.round_trip_error is None else f"{1e3 * health.round_trip_error:.0e} mm"),
@@ -344,10 +377,37 @@ def status_html(frame: Frame, pace: Pace) -> str:
         f"<td style='font-weight:600;white-space:nowrap'>{html.escape(value)}</td></tr>"
         for name, value in rows
     )
-    doubts = "".join(_alarm(doubt, *_AMBER) for doubt in health.doubts)
-    if health.clearance < 0 and frame.scenario.avoidance and not doubts:
-        doubts = _alarm("the motions go through the obstacle at this flow time", *_AMBER)
-    return f"<table style='{_SMALL}'>{cells}</table>{doubts}"
+    warnings = list(health.doubts)
+    if health.clearance < 0 and frame.scenario.avoidance and not warnings:
+        warnings.append("the motions go through the obstacle at this flow time")
+    if health.collision is not None:
+        warnings += [problem for problem in health.collision.problems if not any(problem in w for w in warnings)]
+    blocked = ""
+    if frame.blocked:
+        blocked = _alarm(f"no motion: {'; '.join(frame.blocked)}. What is shown is the last good one.", *_RED)
+    return f"{blocked}<table style='{_SMALL}'>{cells}</table>{''.join(_alarm(w, *_AMBER) for w in warnings)}"
+
+
+def _collision_rows(report: CollisionReport | None, *, certified: bool) -> tuple[tuple[str, str], ...]:
+    """What the arm's meshes come near to."""
+    if report is None:
+        unknown = "–" if certified else "…"
+        obstacle = itself = table = unknown
+    else:
+        obstacle = _distance(report.obstacle.distance, "enters by", report.obstacle.links)
+        itself = f"over {1e3 * SELF_REACH:.0f} mm"
+        if report.itself is not None:
+            itself = _distance(report.itself.distance, "touches", report.itself.links)
+        table = _distance(report.table.distance, "below by", report.table.links)
+    return ("Arm to obstacle", obstacle), ("Arm to itself", itself), ("Arm to table", table)
+
+
+def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
+    """A distance in metres, and of which links; `otherwise` says what one below zero means."""
+    size = f"{1e3 * abs(distance):.0f} mm"
+    if distance <= 0:
+        size = f"{otherwise} {size}" if distance < 0 else otherwise
+    return f"{size}, {' – '.join(links)}"
 
 
 def _alarm(text: str, colour: str, background: str) -> str:

@@ -34,7 +34,12 @@ class Picture(ABC):
     @visible.setter
     def visible(self, visible: bool) -> None:
         if visible != self._node.visible:
-            self._node.visible = visible
+            self._node.visible = visible  # first: a frame drawn meanwhile is then drawn by one of the two
+            if visible:
+                self._catch_up()
+
+    def _catch_up(self) -> None:  # noqa: B027 - most pictures need none
+        """Draw what was left out while it was hidden."""
 
 
 class Lines:
@@ -56,8 +61,14 @@ class Lines:
             name, np.zeros((1, 2, 3), np.float32), rgb(colour, (1, 2, 3)), thickness=thickness
         )
 
-    def show(self, paths: Sequence[Array], marked: int | None = None, mark: Colour = palette.CHOSEN_ROLLOUT) -> None:
-        """Show these polylines (T_i, 3), metres, the one with index `marked` in the colour `mark`."""
+    def show(
+        self,
+        paths: Sequence[Array],
+        marked: int | None = None,
+        mark: Colour = palette.CHOSEN_ROLLOUT,
+        colour: Colour | None = None,
+    ) -> None:
+        """Show these polylines (T_i, 3), metres, the one with index `marked` in the colour `mark`, in this `colour`."""
         segments: list[Array] = [np.zeros((0, 2, 3))]
         colours: list[NDArray[np.uint8]] = [np.zeros((0, 2, 3), np.uint8)]
         for index, path in enumerate(paths):
@@ -66,7 +77,7 @@ class Lines:
                 middle = np.cumsum(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1))
                 pieces = pieces[(middle / self._dash).astype(int) % 2 == 0]
             segments.append(pieces)
-            colours.append(rgb(mark if index == marked else self._colour, pieces.shape))
+            colours.append(rgb(mark if index == marked else colour or self._colour, pieces.shape))
         self.node.points = np.concatenate(segments).astype(np.float32)
         self.node.colors = np.concatenate(colours)
 

@@ -16,10 +16,19 @@ REST = 0.8
 """Seconds at the goal before the motion begins again."""
 
 
-class Playback:
-    """Poses the arm along the newest motion. A new motion takes over at the same moment of the loop."""
+def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
+    """Joint angles (6,), rad, so many seconds after the start, with and without avoidance."""
+    place = float(np.interp(moment, motion.times, np.arange(len(motion.times))))
+    before = min(int(place), len(motion.times) - 2)
+    weight = place - before
+    q, without = ((1 - weight) * path[before] + weight * path[before + 1] for path in (motion.q, motion.without))
+    return q, without
 
-    def __init__(self, pose: Callable[[Array], None]) -> None:
+
+class Playback:
+    """Poses the arms along the newest motion. A new motion takes over at the same moment of the loop."""
+
+    def __init__(self, pose: Callable[[Array, Array], None]) -> None:
         self._pose = pose
         self._motion: ArmMotion | None = None
         self._playing = True
@@ -52,6 +61,5 @@ class Playback:
             if motion is None or (shown is motion and not self._playing):
                 continue
             moment = min(self._clock % (motion.times[-1] + REST), motion.times[-1])
-            q = np.array([np.interp(moment, motion.times, angle) for angle in motion.q.T])
-            self._pose(q)
+            self._pose(*at_moment(motion, moment))
             shown = motion

@@ -10,9 +10,11 @@ import viser
 
 from dt_viz.engine import MAX_GOAL_MISS, Frame
 from dt_viz.fields import Array
+from dt_viz.robot import Robot
 from dt_viz.scenario import MAX_DIAMETER, Scenario
 from dt_viz.tasks import Slice, Task
 from dt_viz.ui import palette
+from dt_viz.ui.arm_layers import Onion
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
 from dt_viz.ui.picture import Arrows, Lines, Picture
 
@@ -53,7 +55,11 @@ class Rollouts(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        self._lines.show(frame.rollouts, marked=frame.scenario.arm_rollout % len(frame.rollouts))
+        chosen = frame.scenario.arm_rollout % len(frame.rollouts)
+        if frame.blocked:
+            self._lines.show(frame.rollouts, chosen, mark=palette.GHOST, colour=palette.STALE)
+        else:
+            self._lines.show(frame.rollouts, chosen)
         self._starts.points = np.stack([path[0] for path in frame.rollouts]).astype(np.float32)
 
 
@@ -211,8 +217,8 @@ def set_lights(scene: viser.SceneApi) -> None:
 class ScenePictures:
     """Everything in the scene of one visitor that is drawn from frames."""
 
-    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, str], None]) -> None:
-        """Build the scene; `moved` is told where the user puts the obstacle, see `Obstacle`."""
+    def __init__(self, scene: viser.SceneApi, robot: Robot, moved: Callable[[Array, str], None]) -> None:
+        """Build the scene of this robot; `moved` is told where the user puts the obstacle, see `Obstacle`."""
         set_lights(scene)
         self.obstacle = Obstacle(scene, moved)
         self._always: tuple[Picture, ...] = (self.obstacle, Goal(scene))
@@ -225,6 +231,7 @@ class ScenePictures:
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
             "base": BaseInset(scene),
+            "onion": Onion(scene, robot),
         }
 
     def layer(self, view: str) -> Picture:

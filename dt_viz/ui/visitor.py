@@ -13,6 +13,7 @@ from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario
 from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
+from dt_viz.ui.arm_layers import Arms
 from dt_viz.ui.export import RESOLUTIONS, render_png
 from dt_viz.ui.panel import Panel
 from dt_viz.ui.playback import Playback
@@ -49,12 +50,17 @@ class Visitor:
         client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
-            self.pictures = ScenePictures(client.scene, self._obstacle_moved)
-            self.arm = ArmPicture(client.scene, robot)
+            self.pictures = ScenePictures(client.scene, robot, self._obstacle_moved)
+            self.arms = Arms(client.scene, robot)
         self._playback = Playback(self._pose)
-        self._panel = Panel(client.gui, titles, self._save_png)
+        self._panel = Panel(client.gui, titles, robot, self._save_png)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
+
+    @property
+    def arm(self) -> ArmPicture:
+        """The arm in the scene."""
+        return self.arms.arm
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         """See `Display`."""
@@ -63,6 +69,7 @@ class Visitor:
             self.client.camera.fov = FIELD_OF_VIEW
         with self.client.atomic():
             self.pictures.draw(frame)
+            self.arm.stale = bool(frame.blocked)
         if frame.stage is not Stage.ROLLOUTS:
             self._playback.follow(frame.arm)
             self._panel.report(frame, pace)
@@ -71,8 +78,9 @@ class Visitor:
 
     def adopt(self, scenario: Scenario) -> None:
         """See `Display`."""
-        self.pictures.adopt(scenario)
-        self.arm.visible = scenario.view.arm
+        with self.client.atomic():
+            self.pictures.adopt(scenario)
+            self.arms.show(scenario.view)
         self._playback.set_pace(scenario.view.playing, scenario.view.speed)
         self._panel.adopt(scenario)
 
@@ -101,9 +109,9 @@ class Visitor:
         if phase == "end":
             self.session.end_gesture()
 
-    def _pose(self, q: Array) -> None:
+    def _pose(self, q: Array, without: Array) -> None:
         with self.client.atomic():
-            self.arm.pose(q)
+            self.arms.pose(q, without)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.obstacle.without_gizmo():
