@@ -31,7 +31,7 @@ class ObstacleAvoidance:
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
         """See `Behaviour`. With `auto` the duration is the shortest that clears all that can be cleared."""
         scenario = motion.scenario
-        if not scenario.avoidance:
+        if not scenario.avoidance or scenario.space == "cspace":
             return None
         obstacle = scenario.obstacle
         field = obstacle.field(scenario.generator, scenario.temperature)

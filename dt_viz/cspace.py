@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -23,21 +24,21 @@ COMPLEX_STEP = 1e-30
 REACH_PER_TEMPERATURE = 0.08 / 6
 """Metres from an obstacle at which its field ends, for each unit of the temperature T."""
 CORE = 0.5
-"""Part of the distance from a covering sphere's touching to its sitting on the obstacle's middle, from which on the field
-has its full strength: deep inside it is flat, and nothing happens at the middle itself."""
-SHARPNESS = 3
-"""p of the smooth maximum over body points: contacts within about a third of the strongest count."""
+"""Where the field has its full strength: part of the way from touching the obstacle to sitting on its middle. Deeper
+inside it is flat, and nothing special happens at the middle itself."""
+SHARPNESS = 2
+"""p of the smooth maximum over body points: the stronger a contact, the more it counts."""
 FAN = 4.0
 """Distance behind the obstacle's middle, in its radii, of the point from which escaping points fan out."""
-DAMPING = 0.03
+DAMPING = 0.06
 """λ of the contact's pseudo-inverse, metres per rad: a contact that joints can hardly move is not chased."""
 DIRECTION_WEIGHT = 1.5
 """Of the hand's direction against joint angles, as in `dt_viz.tracking`."""
-HAND_WEIGHT = 30.0
+HAND_WEIGHT = 100.0
 """Of the end effector's motion, rad² per m²: a forearm in contact is moved by what leaves the hand where it is."""
 LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
 """How far the hand moves when a joint turns, metres per rad, about: makes a distance of postures a length."""
-PIN = 0.03
+PIN = 0.04
 """Size of the region around a pinned posture in which the field fades to nothing, metres of that distance."""
 
 SPEED = 0.2
@@ -109,9 +110,12 @@ class WholeArmField:
         outward = points - self._source
         outward = outward / np.sqrt((outward * outward).sum(axis=1, keepdims=True))
         wanted = SPEED * total ** (1 / SHARPNESS) * (weights[:, None] * outward).sum(axis=0)  # (3, M)
-        stays = np.concatenate([np.sqrt(DIRECTION_WEIGHT) * chain.direction_jacobian(),
-                                np.sqrt(HAND_WEIGHT) * chain.position_jacobian()], axis=1).transpose(2, 1, 0)  # fmt: skip
-        H = np.eye(NUM_JOINTS) + stays.transpose(0, 2, 1) @ stays
+        stays = [
+            np.sqrt(DIRECTION_WEIGHT) * chain.direction_jacobian(),
+            np.sqrt(HAND_WEIGHT) * chain.position_jacobian(),
+        ]
+        A = np.concatenate(stays, axis=1).transpose(2, 1, 0)  # (M, 6, 6)
+        H = np.eye(NUM_JOINTS) + A.transpose(0, 2, 1) @ A
         J = self._contact_jacobian(chain, points, weights)  # (M, 3, 6)
         mobile = np.linalg.solve(H, J.transpose(0, 2, 1))
         pull = np.linalg.solve(J @ mobile + DAMPING**2 * np.eye(3), wanted.T[..., None])
@@ -168,7 +172,7 @@ class GradientField:
         core = -CORE * (self.obstacle.radius + self.body.radius)[:, None]
         distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         u = _unit_interval((self.reach - distance) / (self.reach - core))
-        force = -30 * (u * u * (1 - u) * (1 - u))[:, None] * outward  # the slope of `_fading`
+        force: Array = -30 * (u * u * (1 - u) * (1 - u))[:, None] * outward  # the slope of `_fading`
         torque = cross(points, force)
         pull, moment, velocity = np.zeros_like(chain.position), np.zeros_like(chain.position), np.empty_like(q)
         beyond = dict(self.body.by_joint)
@@ -225,7 +229,7 @@ class JointLimits(Diffeomorphism):
 def by_complex_steps(field: WholeArmField | GradientField, q: Array) -> tuple[Array, Array]:
     """A field (N, 6) and its derivative (N, 6, 6) at configurations `q` (N, 6)."""
     num, d = q.shape
-    shifted = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)
+    shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # the field takes complex angles, too
     values = field(shifted).reshape(d, num, d)
     return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
 
@@ -237,7 +241,7 @@ def squared_lengths(q: Array, pins: Array) -> Array:
 
 
 def _unit_interval(u: Array) -> Array:
-    """u where it is between 0 and 1, else the nearer of them."""
+    """U where it is between 0 and 1, else the nearer of them."""
     return np.where(u.real <= 0, 0.0, np.where(u.real >= 1, 1.0, u))
 
 

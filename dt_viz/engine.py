@@ -4,62 +4,35 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance import ObstacleAvoidance
-from dt_viz.behaviours import Behaviour, Built, Motion
-from dt_viz.diffeo import Chain, Diffeomorphism, Identity
+from dt_viz.collision import load_collision_model
+from dt_viz.diffeo import Identity
 from dt_viz.fields import Array
 from dt_viz.fits import FitStore
-from dt_viz.health import Health, certified
-from dt_viz.imitation import Imitation, ImitationSettings, Progress
+from dt_viz.following import NUM_ARM_SAMPLES, Follower
+from dt_viz.health import Health, certified, certified_arm
+from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.pictures import NO_PICTURES, Pictures, Sketchbook, in_frame
+from dt_viz.pictures import NO_PICTURES, Pictures
+from dt_viz.retiming import within_velocity_limits
 from dt_viz.robot import Robot
-from dt_viz.rollouts import Bundle, Rays, evenly_sampled, refined
+from dt_viz.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.scenario import Scenario
+from dt_viz.solving import FINE, LIVE, NUM_SAMPLES, Ground, Precision, Solution, solve
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
-from dt_viz.tracking import UnreachableError, inverse_kinematics, track
+from dt_viz.tracking import UnreachableError
+from dt_viz.whole_arm import ArmSolution
 
-BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
-"""What is stacked on the imitation, from the inside out."""
-
-NUM_SAMPLES = 200
-"""Of each rollout before refinement."""
-MAX_ATTEMPTS = 4
-"""At a duration that clears the samples that refinement finds, too."""
 ARROW_SPACING = 0.030
 """Of the picture of the vector field, metres."""
-MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
-"""Steps towards the images of moved ends, and metres by which they may miss."""
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
-NUM_ARM_SAMPLES = 200
-MAX_TRACKING_ERROR = 1e-3
-"""Metres by which the hand may miss its path before it is said."""
-
-
-@dataclass(frozen=True)
-class Precision:
-    """How exactly a motion is worked out, all in metres."""
-
-    tolerance: float
-    """Of a step of the behaviours' flows."""
-    spacing: float
-    """Largest distance between neighbouring samples."""
-    ends: float
-    """By which a rollout may miss its start and goal before the motion below is worked out again between others."""
-
-
-LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
-"""Nothing of this is seen at the size of a screen."""
-FINE = Precision(tolerance=1e-8, spacing=0.005, ends=1e-7)
 
 
 class Stage(IntEnum):
@@ -90,7 +63,7 @@ class ArmMotion:
     """The joint motion along one rollout."""
 
     times: Array
-    """(T,) seconds."""
+    """(T,) seconds, later than the rollout's where the joints' velocity limits ask for it."""
     q: Array
     """(T, 6) joint angles at these times, rad; continuous joints unwrapped."""
     without: Array
@@ -128,57 +101,13 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class _Ground:
-    """What depends on the task and the imitation only: the undeformed motion."""
+class _Solved:
+    """What a scenario's motion is."""
 
-    task: Task
-    imitation: Imitation
-    system: DiffeomorphicSystem
-    goal: Array
-    rays: Rays
-    bundle: Bundle
-
-    @cached_property
-    def ends(self) -> Array:
-        """(R + 1, 3) starts and goal, metres."""
-        return np.concatenate([self.task.starts, [self.goal]])
-
-    @cached_property
-    def sketchbook(self) -> Sketchbook:
-        """Makes the pictures of ψ."""
-        return Sketchbook(self.task, in_frame(self.system.transform), self.system, self.rays)
-
-    @cached_property
-    def _linearised(self) -> tuple[Array, Array]:
-        return self.system.transform.jacobian(self.ends)
-
-    def images(self, ends: Array) -> Array:
-        """ψ of points (R + 1, 3) not far from `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
-        images, J = self._linearised
-        error = ends - self.ends
-        for _ in range(MAX_CHORDS):
-            images = images + (J @ error[..., None])[..., 0]
-            error = ends - self.system.transform.inverse(images)
-            if np.abs(error).max() <= IMAGE_TOLERANCE:
-                return images
-        return self.system.transform.forward(ends)
-
-
-@dataclass(frozen=True)
-class _Solution:
-    """The stack that a scenario asks for, and its rollouts from the task's starts."""
-
-    transform: Diffeomorphism
-    rays: Rays
-    bundle: Bundle
-    built: tuple[Built, ...]
-    satisfied: bool
-    """Whether every behaviour found what it was made for."""
-
-    @property
-    def system(self) -> DiffeomorphicSystem:
-        """The dynamical system whose motions these are."""
-        return DiffeomorphicSystem(self.transform, self.rays.base)
+    stack: Solution
+    """Of the end effector, before the whole arm avoids anything."""
+    arm: ArmSolution | None
+    """None where only the end effector avoids."""
 
 
 _turn = threading.Lock()
@@ -187,16 +116,20 @@ four sessions that drag at once get twice as many frames this way."""
 
 
 class Engine:
-    """Computes frames for one visitor. Not thread-safe: one worker thread calls it."""
+    """Computes frames for one visitor. Not thread-safe: one worker thread calls it.
+
+    The same scenario always gives the same frame, except where there is no motion for it: then the last one that there
+    was for the task is shown, marked by `Frame.blocked`.
+    """
 
     def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot) -> None:
         self._loaders = tasks
         self._fits = fits
         self._robot = robot
+        self._follower = Follower(robot)
         self._tasks: dict[str, Task] = {}
-        self._grounds: dict[tuple[str, bool, str], _Ground] = {}
-        self._arm_starts: dict[tuple[str, int], Array | UnreachableError] = {}
-        self._arm_before: tuple[tuple[str, int], Array] | None = None
+        self._grounds: dict[tuple[str, bool, str], Ground] = {}
+        self._good: dict[str, Frame] = {}
 
     def task(self, name: str) -> Task:
         """The task of that name, loaded on first use. Raises DemonstrationError if its file cannot be used."""
@@ -217,29 +150,56 @@ class Engine:
         """
         ground = self._ground(scenario, progress)
         began = time.perf_counter()
+        for frame in self._stages(ground, scenario):
+            yield replace(frame, seconds=time.perf_counter() - began)
+
+    def _stages(self, ground: Ground, scenario: Scenario) -> Iterator[Frame]:
+        if _uses_whole_arm(scenario):
+            with _turn:
+                blocked = self._follower.obstructions(ground, scenario.obstacle)
+            if blocked:
+                yield from self._stages_without_motion(ground, scenario, blocked)
+                return
         with _turn:
-            live = _solve(ground, scenario, LIVE)
-            frame = _frame(ground, scenario, live)
-        yield replace(frame, seconds=time.perf_counter() - began)
+            live = self._solved(ground, scenario, LIVE)
+            frame = self._frame(ground, scenario, live)
+        yield frame
         with _turn:
-            frame = self._with_field_and_arm(frame, live.system)
-            frame = replace(frame, pictures=_pictures(ground, scenario, live, coarse=True))
-        yield replace(frame, stage=Stage.LIVE, seconds=time.perf_counter() - began)
+            frame = self._with_field_and_arm(frame, ground, live)
+            frame = replace(frame, stage=Stage.LIVE, pictures=_pictures(ground, scenario, live.stack, coarse=True))
+            self._good[scenario.task] = frame
+        yield frame
 
         with _turn:
-            fine = _solve(ground, scenario, FINE)
+            fine = self._solved(ground, scenario, FINE)
         with _turn:
-            frame = self._with_field_and_arm(_frame(ground, scenario, fine), fine.system)
+            frame = self._with_field_and_arm(self._frame(ground, scenario, fine), ground, fine)
         with _turn:
-            frame = replace(frame, pictures=_pictures(ground, scenario, fine, coarse=False))
-        yield replace(frame, stage=Stage.FINE, seconds=time.perf_counter() - began)
+            frame = replace(frame, stage=Stage.FINE, pictures=_pictures(ground, scenario, fine.stack, coarse=False))
+            self._good[scenario.task] = frame
+        yield frame
         with _turn:
-            health = certified(frame.health, fine.system, fine.bundle)
-        depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
-        health = replace(health, clearance=-depth if depth > 0 else health.clearance)
-        yield replace(frame, stage=Stage.CERTIFIED, health=health, seconds=time.perf_counter() - began)
+            health = certified(frame.health, fine.stack.system, fine.stack.bundle)
+            if fine.arm is not None:
+                health = certified_arm(health, fine.stack.system, fine.arm, self._robot)
+        if fine.arm is None:
+            depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
+            health = replace(health, clearance=-depth if depth > 0 else health.clearance)
+        if frame.arm is not None:
+            health = replace(health, collision=load_collision_model().report(frame.arm.q, scenario.obstacle))
+        yield replace(frame, stage=Stage.CERTIFIED, health=health)
 
-    def _ground(self, scenario: Scenario, progress: Progress | None) -> _Ground:
+    def _stages_without_motion(self, ground: Ground, scenario: Scenario, blocked: tuple[str, ...]) -> Iterator[Frame]:
+        """The last good motion at every stage, or the undisturbed one if there is none."""
+        good = self._good.get(scenario.task)
+        if good is None:
+            *_, good = self._stages(ground, replace(scenario, avoidance=False))
+        clearance = float(self._follower.whole_arm.clearance(self._any_arm(good), scenario.obstacle).min())
+        health = Health(clearance=clearance)
+        for stage in Stage:
+            yield replace(good, scenario=scenario, stage=stage, blocked=blocked, health=health)
+
+    def _ground(self, scenario: Scenario, progress: Progress | None) -> Ground:
         key = (scenario.task, scenario.imitation, scenario.objective)
         if key not in self._grounds:
             task = self.task(scenario.task)
@@ -251,111 +211,82 @@ class Engine:
             bundle = evenly_sampled(
                 lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], len(rays.z0), NUM_SAMPLES
             )
-            self._grounds[key] = _Ground(task, imitation, system, goal, rays, bundle)
+            self._grounds[key] = Ground(task, imitation, system, goal, rays, bundle)
         return self._grounds[key]
 
-    def _with_field_and_arm(self, frame: Frame, system: DiffeomorphicSystem) -> Frame:
+    def _solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> _Solved:
+        stack = solve(ground, scenario, precision)
+        if not _uses_whole_arm(scenario):
+            return _Solved(stack, None)
+        follower = self._follower
+        lifted = follower.behaving(ground, stack) if scenario.space == "both" else follower.undisturbed(ground)
+        return _Solved(stack, follower.whole_arm.avoiding(lifted, scenario, precision.tolerance, precision.spacing))
+
+    def _frame(self, ground: Ground, scenario: Scenario, solved: _Solved) -> Frame:
+        """The frame of stage ROLLOUTS."""
+        stack, arm = solved.stack, solved.arm
+        if arm is None:
+            index, fraction, positions = stack.bundle.index, stack.bundle.fraction, stack.bundle.positions
+            clearance = float(scenario.obstacle.signed_distance(positions).min())
+        else:
+            index, fraction, positions = arm.index, arm.fraction, self._robot.end_effector(arm.p)
+            clearance = arm.clearance
+        shown = Bundle(index, fraction, positions[:, None])
+        reached = positions[-1]
+        doubts = _doubts(ground, scenario, solved, clearance, float(np.linalg.norm(reached - ground.goal)))
+        built = stack.built[0].duration if stack.built else None
+        return Frame(
+            scenario=scenario,
+            task=ground.task,
+            stage=Stage.ROLLOUTS,
+            ghost=ground.bundle.paths,
+            rollouts=shown.paths,
+            times=shown.split(stack.rays.times(index, fraction)),
+            goal=ground.goal,
+            reached=reached,
+            blocked=(),
+            health=Health(
+                clearance=clearance, duration=built, arm_duration=arm.duration if arm else None, doubts=doubts
+            ),
+        )
+
+    def _with_field_and_arm(self, frame: Frame, ground: Ground, solved: _Solved) -> Frame:
         lattice = frame.task.slice.lattice(ARROW_SPACING)
         lattice = lattice[frame.scenario.obstacle.signed_distance(lattice) > 0]
-        picture = FieldPicture(lattice, system.velocity(lattice))
-        arm, doubts = self._arm(frame)
+        picture = FieldPicture(lattice, solved.stack.system.velocity(lattice))
+        try:
+            arm, doubts = self._arm(frame, ground, solved)
+        except UnreachableError as error:
+            arm, doubts = None, (f"the arm cannot reach the starts: {error}",)
         return replace(frame, field=picture, arm=arm, health=frame.health.doubting(*doubts))
 
-    def _arm(self, frame: Frame) -> tuple[ArmMotion | None, tuple[str, ...]]:
+    def _arm(self, frame: Frame, ground: Ground, solved: _Solved) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along the chosen rollout, and what is wrong with it."""
         chosen = frame.scenario.arm_rollout % len(frame.rollouts)
-        path, times = frame.rollouts[chosen], frame.times[chosen]
-        keep = np.linspace(0, len(path) - 1, NUM_ARM_SAMPLES).round().astype(int)
-        path, times = path[keep], times[keep]
-        key = (frame.task.name, chosen)
-        if key not in self._arm_starts:
-            try:
-                self._arm_starts[key] = inverse_kinematics(self._robot, frame.task.starts[chosen])
-            except UnreachableError as error:
-                self._arm_starts[key] = error
-        start = self._arm_starts[key]
-        if isinstance(start, UnreachableError):
-            return None, (f"the arm cannot reach the start of rollout {chosen + 1}: {start}",)
-        warm = self._arm_before[1] if self._arm_before and self._arm_before[0] == key else None
-        joints = track(self._robot, path, start, warm)
-        self._arm_before = (key, joints.q)
-        doubts: tuple[str, ...] = ()
-        worst = float(joints.error.max())
-        if worst > MAX_TRACKING_ERROR:
-            because = ", a joint is at its limit" if joints.limits_hit.any() else ""
-            doubts = (f"the arm misses the path of rollout {chosen + 1} by up to {1e3 * worst:.0f} mm{because}",)
-        return ArmMotion(times, joints.q, joints.q), doubts
+        times, undisturbed = frame.times[chosen], self._follower.undisturbed(ground)
+        if solved.arm is not None:
+            rows = solved.arm.index == chosen
+            q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
+            doubts = self._follower.doubts(undisturbed.tracked, chosen)
+        else:
+            bundle = solved.stack.bundle
+            path, fraction = frame.rollouts[chosen], bundle.split(bundle.fraction)[chosen]
+            keep = np.linspace(0, len(path) - 1, NUM_ARM_SAMPLES).round().astype(int)
+            joints = self._follower.along(ground, chosen, path[keep])
+            q, times, fraction = joints.q, times[keep], fraction[keep]
+            doubts = self._follower.doubts(joints, chosen)
+        without = undisturbed.at(np.full(len(fraction), chosen), fraction)
+        return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), doubts
+
+    def _any_arm(self, frame: Frame) -> Array:
+        return self._robot.home[None] if frame.arm is None else frame.arm.q
 
 
-def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
-    """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
-    levels = [positions]
-    for transform in transforms:
-        levels.append(transform.inverse(levels[-1]))
-    return np.stack(levels, axis=1)
+def _uses_whole_arm(scenario: Scenario) -> bool:
+    return scenario.avoidance and scenario.space != "task"
 
 
-def _solve(ground: _Ground, scenario: Scenario, precision: Precision) -> _Solution:
-    """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
-
-    A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
-    behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not. Where
-    there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
-    """
-    solution = None
-    for keeps_goal in (True, False):
-        rays, bundle = ground.rays, ground.bundle
-        ends_below = ground.ends
-        durations = [0.0] * len(BEHAVIOURS)
-        for _ in range(MAX_ATTEMPTS):
-            lowest = Motion(scenario, ground.task.starts, ground.goal, bundle.index, bundle.levels[:, 0], keeps_goal)
-            built = _build(lowest, precision.tolerance, durations)
-            durations = [made.duration if made else 0.0 for _, made in built]
-            outer = [made.transform for _, made in built if made]
-            goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
-
-            ends = np.concatenate([ground.task.starts, [goal]])
-            below = Chain(outer).forward(ends) if outer else ends
-            if np.abs(below - ends_below).max() > precision.ends:
-                *z0, z_e = ground.images(below)
-                rays, ends_below = Rays(np.stack(z0), replace(ground.system.base, goal=z_e)), below
-                positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
-                bundle = replace(bundle, levels=positions[:, None])
-            bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
-            stack = [ground.system.transform, *outer]
-            bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            satisfied = _satisfied(built, bundle)
-            solution = _Solution(Chain(stack), rays, bundle, tuple(made for _, made in built if made), satisfied)
-            if satisfied or any(made.hopeless for made in solution.built):
-                return solution
-    assert solution is not None
-    return solution
-
-
-def _build(motion: Motion, tolerance: float, durations: Sequence[float]) -> list[tuple[Motion, Built | None]]:
-    """Each behaviour's transform, None where it is off, with the motion that it was made for."""
-    built = []
-    for k, behaviour in enumerate(BEHAVIOURS):
-        made = behaviour.build(motion, tolerance, durations[k])
-        built.append((motion, made))
-        if made and k < len(BEHAVIOURS) - 1:
-            motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
-    return built
-
-
-def _satisfied(built: Sequence[tuple[Motion, Built | None]], bundle: Bundle) -> bool:
-    """Whether each behaviour finds on its level of the bundle what it was made for."""
-    level = 0
-    for behaviour, (motion, made) in zip(BEHAVIOURS, built, strict=True):
-        if made:
-            level += 1
-            after = replace(motion, index=bundle.index, positions=bundle.levels[:, level])
-            if not behaviour.satisfied(after):
-                return False
-    return True
-
-
-def _pictures(ground: _Ground, scenario: Scenario, solution: _Solution, *, coarse: bool) -> Pictures:
+def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse: bool) -> Pictures:
     """Those that the view shows."""
     view, book = scenario.view, ground.sketchbook
     return Pictures(
@@ -365,31 +296,16 @@ def _pictures(ground: _Ground, scenario: Scenario, solution: _Solution, *, coars
     )
 
 
-def _frame(ground: _Ground, scenario: Scenario, solution: _Solution) -> Frame:
-    """The frame of stage ROLLOUTS."""
-    bundle = solution.bundle
-    clearance = float(scenario.obstacle.signed_distance(bundle.positions).min())
-    missed = float(np.linalg.norm(bundle.positions[-1] - ground.goal))
-    doubts = [*ground.imitation.warnings, *(doubt for made in solution.built for doubt in made.doubts)]
-    if scenario.avoidance and clearance < 0 and not doubts:
+def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: float, missed: float) -> tuple[str, ...]:
+    """Why the motion is not to be trusted, in words."""
+    doubts = [*ground.imitation.warnings, *(doubt for made in solved.stack.built for doubt in made.doubts)]
+    if solved.arm is not None:
+        if not solved.arm.cleared:
+            doubts.append("the arm finds no way around the obstacle: a motion comes too near to it")
+    elif scenario.avoidance and clearance < 0 and not doubts:
         doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
-    elif not solution.satisfied and not doubts:
+    elif not solved.stack.satisfied and not doubts:
         doubts.append(f"a motion keeps only {1e3 * clearance:.1f} mm from the obstacle")
     if missed > MAX_GOAL_MISS and not doubts:
         doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
-    return Frame(
-        scenario=scenario,
-        task=ground.task,
-        stage=Stage.ROLLOUTS,
-        ghost=ground.bundle.paths,
-        rollouts=bundle.paths,
-        times=bundle.split(solution.rays.times(bundle.index, bundle.fraction)),
-        goal=ground.goal,
-        reached=bundle.positions[-1],
-        blocked=(),
-        health=Health(
-            clearance=clearance,
-            duration=solution.built[0].duration if solution.built else None,
-            doubts=tuple(doubts),
-        ),
-    )
+    return tuple(doubts)

@@ -10,7 +10,7 @@ from dt_viz.fields import Array
 from dt_viz.obstacles import Sphere
 
 NUM_DIRECTIONS = 128
-SIDEWAYS = 1.0
+SIDEWAYS = 2.0
 """How much more a direction along the motion costs than one across it, relatively: it bends the path sharply."""
 TABLE_WEIGHT = 3.0
 """Cost of every metre that an escape would lead below the table, against a metre of detour."""
@@ -31,7 +31,7 @@ def escape_directions(points: Array, radius: Array, tangents: Array, obstacle: S
     Args:
         points: (P, 3, M) middles of the spheres that cover the arm, metres, at the M samples that collide.
         radius: (P,) of these spheres.
-        tangents: (M, 3) directions of the end effector's motion at these samples, unit vectors.
+        tangents: (K, 3) directions of the end effector's motion, unit vectors, wherever the escape bends it.
         obstacle: to escape from.
         num: directions to return, at most.
 

@@ -22,11 +22,11 @@ class VectorField(Protocol):
         """Dimension d of the space."""
         ...
 
-    def __call__(self, s: Array) -> Array:
+    def __call__(self, s: Array, /) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
         ...
 
-    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+    def with_jacobian(self, s: Array, /) -> tuple[Array, Array]:
         """V (N, d) and its derivative DV (N, d, d), DV[:, i, j] = ∂V_i/∂s_j, at the points `s` (N, d)."""
         ...
 

@@ -8,13 +8,17 @@ import numpy as np
 
 from dt_viz.collision import CollisionReport
 from dt_viz.fields import Array, Indices
+from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle
 from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.whole_arm import ArmSolution
 
 MAX_ROUND_TRIP = 1e-6
 """Metres; the workspace is about one metre wide."""
 NUM_CHECKED = 800
 """Samples on which the certificates are computed."""
+NUM_CHECKED_POSTURES = 200
+"""The same for the whole arm."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,9 @@ class Health:
     collision: CollisionReport | None = None
     """What the arm's meshes come near to on the motion that it shows."""
     duration: float | None = None
-    """t of the avoidance flow; None where it is off."""
+    """t of the end effector's avoidance flow; None where it is off."""
+    arm_duration: float | None = None
+    """t of the whole arm's avoidance flow; None where it is off."""
     min_det_jacobian: float | None = None
     """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism."""
     round_trip_error: float | None = None
@@ -49,14 +55,34 @@ def certified(health: Health, system: DiffeomorphicSystem, bundle: Bundle) -> He
     det = np.linalg.det(J)
     round_trip = float(np.linalg.norm(system.transform.inverse(z) - y, axis=1).max())
     falls = _falls(system.base.potential(z), bundle.index[keep])
-    health = replace(health, min_det_jacobian=float(det.min()), round_trip_error=round_trip, lyapunov_falls=falls)
-    if not det.min() > 0:
-        health = health.doubting(f"det J falls to {det.min():.2g}: the map folds, the stack is no diffeomorphism there")
+    return _judged(health, float(det.min()), round_trip, falls)
+
+
+def certified_arm(health: Health, system: DiffeomorphicSystem, arm: ArmSolution, robot: Robot) -> Health:
+    """Add the certificates of the whole arm's transform to those of the end effector's stack below it."""
+    keep = np.unique(np.linspace(0, len(arm.index) - 1, NUM_CHECKED_POSTURES).astype(int))
+    p, (q, J) = arm.p[keep], arm.transform.jacobian(arm.p[keep])
+    round_trip = float(
+        np.linalg.norm(robot.end_effector(arm.transform.inverse(q)) - robot.end_effector(p), axis=1).max()
+    )
+    falls = _falls(system.lyapunov(robot.end_effector(q)), arm.index[keep])
+    return _judged(health, float(np.linalg.det(J).min()), round_trip, falls)
+
+
+def _judged(health: Health, det: float, round_trip: float, falls: bool) -> Health:
+    """Health with certificates that may be worse than those it has, and a doubt for each new failure."""
+    if not det > 0:
+        health = health.doubting(f"det J falls to {det:.2g}: the map folds, the stack is no diffeomorphism there")
     if not round_trip <= MAX_ROUND_TRIP:
         health = health.doubting(f"there and back again misses by {1e3 * round_trip:.3g} mm: steps too coarse")
     if not falls:
         health = health.doubting("the Lyapunov value does not fall all the way")
-    return health
+    return replace(
+        health,
+        min_det_jacobian=min(det, np.inf if health.min_det_jacobian is None else health.min_det_jacobian),
+        round_trip_error=max(round_trip, health.round_trip_error or 0.0),
+        lyapunov_falls=falls and health.lyapunov_falls is not False,
+    )
 
 
 def _falls(potential: Array, index: Indices) -> bool:

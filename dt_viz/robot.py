@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    Array = NDArray[np.float64]
+    from dt_viz.fields import Array
 
 NUM_JOINTS = 6
 DISTRIBUTION = "example-robot-data"

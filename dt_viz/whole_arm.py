@@ -46,6 +46,8 @@ RADIANS_PER_METRE = 3.0
 """Of tolerances: the hand's error is that of the joints times half a metre or less."""
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
+BESIDE = 0.20
+"""Clearance up to which a sample is bent along with the colliding ones, metres."""
 
 Generator = WholeArmField | GradientField
 
@@ -58,6 +60,8 @@ class Lift:
     """(R, T) increasing along each rollout."""
     tracked: JointPath
     """At these fractions; its q has shape (R, T, 6)."""
+    reference: Array
+    """(6,) posture that the arm stays near to, rad."""
 
     @cached_property
     def _splines(self) -> tuple[CubicSpline, ...]:
@@ -88,7 +92,7 @@ def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial
         initial: (R, T, 6) joints of nearby paths to begin from, rad.
     """
     start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
-    return Lift(fractions, track(robot, paths, start, initial, reference=start))
+    return Lift(fractions, track(robot, paths, start, initial, reference=start), reference)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,9 +157,7 @@ class WholeArm:
         """The fields to try, the most promising first; none where nothing comes too near the obstacle."""
         obstacle, reach = scenario.obstacle, REACH_PER_TEMPERATURE * scenario.temperature
         q = lifted.tracked.q
-        num_rollouts, num_samples, _ = q.shape
-        flat = q.reshape(-1, NUM_JOINTS)
-        points = self.body.of_chain(self.robot.chain(flat.T))
+        points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
         distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         collides = distance.min(axis=0) < scenario.margin
         if not collides.any():
@@ -166,9 +168,11 @@ class WholeArm:
         hand = self.robot.end_effector(q)
         tangents = np.gradient(hand, axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        affected = np.flatnonzero(distance.min(axis=0) < BESIDE)
+        tangents = tangents[affected[:: max(1, len(affected) // NUM_COMPARED)]]
         some = np.flatnonzero(collides)
         some = some[:: max(1, len(some) // NUM_COMPARED)]
-        for direction in escape_directions(points[:, :, some], self.body.radius, tangents[some], obstacle):
+        for direction in escape_directions(points[:, :, some], self.body.radius, tangents, obstacle):
             yield WholeArmField(self.robot, self.body, obstacle, direction, lifted.pins, reach)
 
 

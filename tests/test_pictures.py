@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.engine import FINE, LIVE, Stage, _solve
+from dt_viz.engine import Stage
 from dt_viz.obstacles import Sphere
 from dt_viz.pictures import FINE_SPACING, LINE_SPACING
 from dt_viz.scenario import View
+from dt_viz.solving import FINE, LIVE, solve
 
 TASK_NAMES = ["draw_s", "lift_box"]
 ALL = View(generator=True, grid=True, base=True)
@@ -62,7 +63,7 @@ def test_the_warped_grid_is_made_of_images_of_points_of_straight_lines(engine, s
     """ψ by another way, the forward side of the whole stack, makes the picture's lines straight again."""
     scenario = replace(scenario, avoidance=avoidance)
     frame, pictures = picture_at(engine, scenario, wanted)
-    stack = _solve(engine._ground(scenario, None), scenario, LIVE if wanted is Stage.LIVE else FINE)
+    stack = solve(engine._ground(scenario, None), scenario, LIVE if wanted is Stage.LIVE else FINE)
     middle, obstacle = [], scenario.obstacle
     for line in pictures.grid.lines:
         outside = line[obstacle.signed_distance(line) > 0.005]  # nearer, ψ magnifies what the picture rounds

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.engine import NUM_SAMPLES, Engine, Frame, Stage
+from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
     add_space,
@@ -44,6 +44,7 @@ from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Scenario
+from dt_viz.solving import NUM_SAMPLES
 from dt_viz.tasks import Task
 from dt_viz.ui.session import Pace, Session
 

@@ -1,0 +1,126 @@
+"""The arm follows the motions of its end effector: which joints, what is out of reach, what is in the way."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dt_viz.body import load_body_points
+from dt_viz.collision import load_collision_model
+from dt_viz.fields import Array, Indices
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import Robot
+from dt_viz.solving import Ground, Solution
+from dt_viz.tracking import JointPath, UnreachableError, inverse_kinematics, track
+from dt_viz.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, lift
+
+MAX_TRACKING_ERROR = 1e-3
+"""Metres by which the hand may miss its path before it is said."""
+NUM_ARM_SAMPLES = 200
+"""Of the motion that the arm shows where it follows a path of the end effector."""
+
+
+class Follower:
+    """Lifts the motions of one visitor to the joints, and keeps what a drag leaves unchanged."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.body = load_body_points()
+        self.whole_arm = WholeArm(robot, self.body)
+        self._lifts: dict[Ground, Lift | UnreachableError] = {}
+        self._before: dict[tuple[Ground, int | None], Array] = {}
+
+    def undisturbed(self, ground: Ground) -> Lift:
+        """The joints along the motion without any behaviour.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        if ground not in self._lifts:
+            try:
+                self._lifts[ground] = self._lift_undisturbed(ground)
+            except UnreachableError as error:
+                self._lifts[ground] = error
+        lifted = self._lifts[ground]
+        if isinstance(lifted, UnreachableError):
+            raise lifted
+        return lifted
+
+    def behaving(self, ground: Ground, solution: Solution) -> Lift:
+        """The joints along the motion with the behaviours of the end effector."""
+        index, fraction = solution.bundle.index, []
+        for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
+            length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
+            fraction.append(np.interp(np.linspace(0, length[-1], NUM_CONFIGURATIONS), length, fractions))
+        index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
+        paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)
+        reference = self.undisturbed(ground).reference
+        lifted = lift(self.robot, np.stack(fraction), paths, reference, self._before.get((ground, None)))
+        self._before[ground, None] = lifted.tracked.q
+        return lifted
+
+    def along(self, ground: Ground, rollout: int, path: Array) -> JointPath:
+        """The joints along one path (T, 3) of the end effector, metres, T being `NUM_ARM_SAMPLES`."""
+        reference = self.undisturbed(ground).reference
+        joints = track(self.robot, path, reference, self._before.get((ground, rollout)))
+        self._before[ground, rollout] = joints.q
+        return joints
+
+    def obstructions(self, ground: Ground, obstacle: Sphere) -> tuple[str, ...]:
+        """Why the whole arm cannot move from the starts to the goal, in words; empty where nothing is in the way."""
+        try:
+            lifted = self.undisturbed(ground)
+        except UnreachableError as error:
+            return (f"the arm cannot reach the starts: {error}",)
+        missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
+        reasons = _named("start", np.flatnonzero(missed[:, 0]), "out of the arm's reach")
+        if missed[:, 1].any():
+            reasons.append("the goal is out of the arm's reach")
+        resting = lifted.pins[:1]
+        pedestal = self.body.on_pedestal
+        distance = obstacle.signed_distance(pedestal.positions(self.robot, resting[0])) - pedestal.radius
+        covered = self.whole_arm.clearance(lifted.pins, obstacle) < 0
+        if covered.any() or (distance < 0).any():
+            # the spheres are larger than the arm: ask the meshes
+            model = load_collision_model()
+            gaps, links = model.obstacle_distance(lifted.pins, obstacle)
+            if gaps[0] < 0 and model.links[int(links[0])].name in PEDESTAL:
+                return (
+                    *reasons,
+                    f"the obstacle touches the arm's {model.links[int(links[0])].name}, which cannot move away",
+                )
+            reasons += _named("start", np.flatnonzero(gaps[:-1] < 0), "inside the obstacle: the arm there touches it")
+            if gaps[-1] < 0:
+                reasons.append("the goal is inside the obstacle: the arm there touches it")
+        return tuple(reasons)
+
+    def doubts(self, joints: JointPath, rollout: int) -> tuple[str, ...]:
+        """Why the joints along a rollout, counted from 0, are not to be trusted."""
+        doubts = []
+        worst = float(joints.error.max())
+        if worst > MAX_TRACKING_ERROR:
+            because = ", a joint is at its limit" if joints.limits_hit.any() else ""
+            doubts.append(f"the arm misses the path of rollout {rollout + 1} by up to {1e3 * worst:.0f} mm{because}")
+        if joints.damped.any():
+            doubts.append("the arm is stretched out or folded on the way: its pseudo-inverse is damped there")
+        return tuple(doubts)
+
+    def _lift_undisturbed(self, ground: Ground) -> Lift:
+        bundle = ground.bundle
+        num_rollouts = len(ground.task.starts)
+        stride = np.linspace(0, len(bundle.index) // num_rollouts - 1, NUM_CONFIGURATIONS).round().astype(int)
+        fractions = bundle.fraction.reshape(num_rollouts, -1)[:, stride]
+        paths = bundle.positions.reshape(num_rollouts, -1, 3)[:, stride]
+        reference = inverse_kinematics(self.robot, ground.task.starts.mean(axis=0))
+        return lift(self.robot, fractions, paths, reference)
+
+
+PEDESTAL = ("base", "link 1")
+"""What no joint carries away from an obstacle."""
+
+
+def _named(what: str, which: Indices, how: str) -> list[str]:
+    """What there is to say of some things, counted from 0; empty if it is of none."""
+    if len(which) == 0:
+        return []
+    numbers = ", ".join(str(k + 1) for k in which)
+    return [f"{what} {numbers} is {how}" if len(which) == 1 else f"{what}s {numbers} are {how}"]

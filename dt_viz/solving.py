@@ -1,0 +1,173 @@
+"""The stack that a scenario asks for, built for its motion, and the exact rollouts of the whole stack."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from dt_viz.avoidance import ObstacleAvoidance
+from dt_viz.behaviours import Behaviour, Built, Motion
+from dt_viz.diffeo import Chain, Diffeomorphism
+from dt_viz.fields import Array, Indices
+from dt_viz.imitation import Imitation
+from dt_viz.pictures import Sketchbook, in_frame
+from dt_viz.rollouts import Bundle, Rays, refined
+from dt_viz.scenario import Scenario
+from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.tasks import Task
+
+BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
+"""What is stacked on the imitation, from the inside out."""
+
+NUM_SAMPLES = 200
+"""Of each rollout before refinement."""
+MAX_ATTEMPTS = 4
+"""At a duration that clears the samples that refinement finds, too."""
+MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
+"""Steps towards the images of moved ends, and metres by which they may miss."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How exactly a motion is worked out, all in metres."""
+
+    tolerance: float
+    """Of a step of the behaviours' flows."""
+    spacing: float
+    """Largest distance between neighbouring samples."""
+    ends: float
+    """By which a rollout may miss its start and goal before the motion below is worked out again between others."""
+
+
+LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
+"""Nothing of this is seen at the size of a screen."""
+FINE = Precision(tolerance=1e-8, spacing=0.005, ends=1e-7)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What depends on the task and the imitation only: the undisturbed motion."""
+
+    task: Task
+    imitation: Imitation
+    system: DiffeomorphicSystem
+    goal: Array
+    rays: Rays
+    bundle: Bundle
+
+    @cached_property
+    def ends(self) -> Array:
+        """(R + 1, 3) starts and goal, metres."""
+        return np.concatenate([self.task.starts, [self.goal]])
+
+    @cached_property
+    def sketchbook(self) -> Sketchbook:
+        """Makes the pictures of ψ."""
+        return Sketchbook(self.task, in_frame(self.system.transform), self.system, self.rays)
+
+    @cached_property
+    def _linearised(self) -> tuple[Array, Array]:
+        return self.system.transform.jacobian(self.ends)
+
+    def images(self, ends: Array) -> Array:
+        """ψ of points (R + 1, 3) not far from `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
+        images, J = self._linearised
+        error = ends - self.ends
+        for _ in range(MAX_CHORDS):
+            images = images + (J @ error[..., None])[..., 0]
+            error = ends - self.system.transform.inverse(images)
+            if np.abs(error).max() <= IMAGE_TOLERANCE:
+                return images
+        return self.system.transform.forward(ends)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The stack that a scenario asks for, and its rollouts from the task's starts."""
+
+    transform: Diffeomorphism
+    rays: Rays
+    bundle: Bundle
+    built: tuple[Built, ...]
+    satisfied: bool
+    """Whether every behaviour found what it was made for."""
+
+    @property
+    def system(self) -> DiffeomorphicSystem:
+        """The dynamical system whose motions these are."""
+        return DiffeomorphicSystem(self.transform, self.rays.base)
+
+    def positions_at(self, index: Indices, fraction: Array) -> Array:
+        """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
+        return self.transform.inverse(self.rays.at(index, fraction))
+
+
+def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
+    """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
+    levels = [positions]
+    for transform in transforms:
+        levels.append(transform.inverse(levels[-1]))
+    return np.stack(levels, axis=1)
+
+
+def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
+    """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
+
+    A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
+    behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not. Where
+    there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
+    """
+    solution = None
+    for keeps_goal in (True, False):
+        rays, bundle = ground.rays, ground.bundle
+        ends_below = ground.ends
+        durations = [0.0] * len(BEHAVIOURS)
+        for _ in range(MAX_ATTEMPTS):
+            lowest = Motion(scenario, ground.task.starts, ground.goal, bundle.index, bundle.levels[:, 0], keeps_goal)
+            built = _build(lowest, precision.tolerance, durations)
+            durations = [made.duration if made else 0.0 for _, made in built]
+            outer = [made.transform for _, made in built if made]
+            goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
+
+            ends = np.concatenate([ground.task.starts, [goal]])
+            below = Chain(outer).forward(ends) if outer else ends
+            if np.abs(below - ends_below).max() > precision.ends:
+                *z0, z_e = ground.images(below)
+                rays, ends_below = Rays(np.stack(z0), replace(ground.system.base, goal=z_e)), below
+                positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
+                bundle = replace(bundle, levels=positions[:, None])
+            bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
+            stack = [ground.system.transform, *outer]
+            bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
+            satisfied = _satisfied(built, bundle)
+            solution = Solution(Chain(stack), rays, bundle, tuple(made for _, made in built if made), satisfied)
+            if satisfied or any(made.hopeless for made in solution.built):
+                return solution
+    assert solution is not None
+    return solution
+
+
+def _build(motion: Motion, tolerance: float, durations: Sequence[float]) -> list[tuple[Motion, Built | None]]:
+    """Each behaviour's transform, None where it is off, with the motion that it was made for."""
+    built = []
+    for k, behaviour in enumerate(BEHAVIOURS):
+        made = behaviour.build(motion, tolerance, durations[k])
+        built.append((motion, made))
+        if made and k < len(BEHAVIOURS) - 1:
+            motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
+    return built
+
+
+def _satisfied(built: Sequence[tuple[Motion, Built | None]], bundle: Bundle) -> bool:
+    """Whether each behaviour finds on its level of the bundle what it was made for."""
+    level = 0
+    for behaviour, (motion, made) in zip(BEHAVIOURS, built, strict=True):
+        if made:
+            level += 1
+            after = replace(motion, index=bundle.index, positions=bundle.levels[:, level])
+            if not behaviour.satisfied(after):
+                return False
+    return True
