@@ -13,6 +13,7 @@ from playwright.sync_api import sync_playwright
 import dt_viz.fits
 from dt_viz.fits import FitStore
 from dt_viz.metrics import maximum_collision_distance
+from dt_viz.scenario import View
 from dt_viz.tasks import TASKS
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
@@ -232,6 +233,70 @@ def test_each_layer_of_the_transform_is_drawn_once_it_is_switched_on(visit):
             assert len(handle.points) >= len(visitor.shown.rollouts)
             assert np.ptp(handle.points, axis=(0, 1)).max() > 0.1
             assert len(handle.colors) == len(handle.points)
+
+
+def pixels(page):
+    """The scene without the panel, (H, W, 3)."""
+    image = Image.open(io.BytesIO(page.screenshot(clip={"x": 0, "y": 0, "width": WIDTH - 340, "height": HEIGHT})))
+    return np.asarray(image.convert("RGB")).astype(int)
+
+
+def bluish(image):
+    return (image[..., 2] - image[..., 0] > 25) & (np.ptp(image, axis=-1) < 120)
+
+
+def greenish(image):
+    return (image[..., 1] - image[..., 0] > 25) & (image[..., 1] > image[..., 2])
+
+
+def darker(image):
+    return (image.max(axis=-1) < 150) & (np.ptp(image, axis=-1) < 40)
+
+
+ARM_LAYERS = {  # the layer's label in the page, its field of View, and which pixels there are then more of
+    "Arm without avoidance": ("ghost_arm", darker),
+    "Arms along the motion": ("onion", bluish),
+    "Body points": ("body_points", greenish),
+}
+
+
+def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
+    page, visitor = visit
+    session, plain = visitor.session, View(playing=False, field=False, ghost=False)
+    session.edit("test", view=plain)
+    wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
+    time.sleep(0.2)  # for the playback to rest
+    q = visitor.shown.arm.q[50]
+    visitor.arms.pose(q, q + 0.6 * np.eye(6)[0])
+    page.get_by_role("button", name="Show").or_(page.get_by_text("Show", exact=True)).first.click()
+    time.sleep(1.0)
+    before = pixels(page)
+    for label, (name, coloured) in ARM_LAYERS.items():
+        box = page.get_by_label(label, exact=True).first
+        box.evaluate("box => box.click()")
+        wait_until(lambda name=name: getattr(session.scenario.view, name), f"the checkbox of {name}")
+        wait_until(
+            lambda coloured=coloured: coloured(pixels(page)).sum() > coloured(before).sum() + 1000, f"{name} to be seen"
+        )
+        session.edit("test", view=plain)
+
+    page.get_by_label("Joint plots").first.evaluate("box => box.click()")
+    drawn = """() => [...document.querySelectorAll('.uplot canvas')].filter(canvas => canvas.width).map(canvas => {
+        const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+        let coloured = 0;
+        for (let i = 0; i < data.length; i += 4)
+            coloured += data[i + 3] > 128 && Math.max(...data.slice(i, i + 3)) - Math.min(...data.slice(i, i + 3)) > 60;
+        return coloured;
+    })"""
+    wait_until(lambda: [count > 300 for count in page.evaluate(drawn)] == [True, True], "both plots to be drawn")
+
+
+def test_who_avoids_is_chosen_in_the_page(visit):
+    page, visitor = visit
+    page.get_by_role("textbox", name="Avoid with").or_(page.locator("input[value='End effector']")).first.click()
+    page.get_by_role("option", name="Whole arm").click()
+    wait_until(lambda: visitor.session.scenario.space == "cspace", "the choice to arrive")
+    wait_until(lambda: visitor.shown.scenario.space == "cspace", "its picture")
 
 
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+import trimesh
 import viser
 from viser import transforms
 
@@ -43,15 +45,16 @@ class ArmPicture:
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._tree = ArmFrames(scene, robot, "/arm")
-        self._meshes: list[viser.MeshHandle] = []
-        for frame, body in zip(self._tree.frames, bodies(robot.joint_names), strict=True):
+        self.frames = self._tree.frames
+        self.meshes: list[viser.MeshHandle] = []
+        for frame, body in zip(self.frames, bodies(robot.joint_names), strict=True):
             for part, mesh, colour in (("shell", body.shell, palette.ARM), ("rings", body.rings, palette.ARM_RING)):
                 if mesh is not None:
-                    self._meshes.append(
+                    self.meshes.append(
                         scene.add_mesh_simple(f"{frame.name}/{part}", mesh.vertices, mesh.faces, color=colour)
                     )
         self._note = scene.add_label(
-            f"{self._tree.frames[-1].name}/note",
+            f"{self.frames[-1].name}/note",
             "last good motion",
             anchor="bottom-center",
             font_screen_scale=0.8,
@@ -65,13 +68,13 @@ class ArmPicture:
 
     def show(self, *, whole: bool, pedestal: bool) -> None:
         """Show the whole arm, or only what stands under other pictures of it, or nothing."""
-        self._tree.frames[0].visible = whole or pedestal
-        self._tree.frames[PEDESTAL].visible = whole
+        self.frames[0].visible = whole or pedestal
+        self.frames[PEDESTAL].visible = whole
 
     @property
     def visible(self) -> bool:
         """Whether the whole arm is shown."""
-        return self._tree.frames[0].visible and self._tree.frames[PEDESTAL].visible
+        return self.frames[0].visible and self.frames[PEDESTAL].visible
 
     @property
     def stale(self) -> bool:
@@ -82,7 +85,7 @@ class ArmPicture:
     def stale(self, stale: bool) -> None:
         if stale != self._note.visible:
             self._note.visible = stale
-            for mesh in self._meshes:
+            for mesh in self.meshes:
                 mesh.opacity = STALE_OPACITY if stale else None
 
 
@@ -90,9 +93,11 @@ class GhostArm:
     """The arm where it would be without avoidance, translucent; links that coincide with the arm's are left out."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        self._robot = robot
         self._tree = ArmFrames(scene, robot, "/ghost_arm")
         self._tree.frames[0].visible = False
-        shells = zip(self._tree.frames, light_shells(robot.joint_names), strict=True)
+        shells = light_shells(robot.joint_names)[PEDESTAL:]
+        self._corners = np.stack([trimesh.bounds.corners(shell.bounds) for shell in shells])  # (5, 8, 3)
         self.links = tuple(
             scene.add_mesh_simple(
                 f"{frame.name}/shell",
@@ -103,17 +108,16 @@ class GhostArm:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            for frame, shell in list(shells)[PEDESTAL:]
+            for frame, shell in zip(self._tree.frames[PEDESTAL:], shells, strict=True)
         )
 
-    def pose(self, without: Array, moved: Array) -> None:
-        """Show the arm without avoidance.
-
-        Args:
-            without: (6,) its joint angles, rad.
-            moved: (5,) how far avoidance has moved each link from the second on, metres.
-        """
+    def pose(self, q: Array, without: Array) -> None:
+        """Show the joint angles `without` (6,), rad, beside an arm at `q` (6,), rad."""
         self._tree.pose(without)
+        rotations, origins = self._robot.forward_kinematics(np.stack([q, without]))
+        carried = slice(PEDESTAL - 1, None)
+        corners = self._corners @ rotations[:, carried].swapaxes(-1, -2) + origins[:, carried, None]  # (2, 5, 8, 3)
+        moved = np.linalg.norm(corners[1] - corners[0], axis=-1).max(axis=-1)
         for link, distance in zip(self.links, moved, strict=True):
             link.visible = bool(distance > MIN_APART)
 

@@ -10,7 +10,7 @@ from viser import transforms
 from dt_viz.body import load_body_points
 from dt_viz.engine import ArmMotion, Frame
 from dt_viz.fields import Array
-from dt_viz.robot import NUM_JOINTS, Robot
+from dt_viz.robot import Robot
 from dt_viz.scenario import View
 from dt_viz.ui import palette
 from dt_viz.ui.arm import PEDESTAL, ArmPicture, GhostArm
@@ -157,16 +157,8 @@ class Arms:
 
     def _pose_beside(self) -> None:
         """Pose what is shown beside the arm; what is hidden waits until it is shown."""
-        if not (self.ghost.visible or self.body.visible):
-            return
         q, without = self._now
-        positions, before = self._points.positions(self._robot, np.stack([q, without]))
-        if self.body.visible:
-            self.body.pose(positions, before)
         if self.ghost.visible:
-            moved = np.linalg.norm(positions - before, axis=1)
-            self.ghost.pose(without, np.array([moved[self._points.joint == j].max() for j in _CARRIED]))
-
-
-_CARRIED = range(PEDESTAL - 1, NUM_JOINTS)
-"""Joints of the links that the ghost shows."""
+            self.ghost.pose(q, without)
+        if self.body.visible:
+            self.body.pose(*self._points.positions(self._robot, np.stack([q, without])))

@@ -136,9 +136,10 @@ def _legend() -> str:
     return f"<div style='{_SMALL}'><span style='opacity:0.65;margin-right:0.8em'>Joint</span>{marks}</div>"
 
 
+_FONT = "11px sans-serif"
 _LOOK = {
     "scales": {"x": {"time": False}},
-    "axes": ({"size": 26, "space": 40}, {"size": 38, "space": 24}),
+    "axes": ({"size": 26, "space": 40, "font": _FONT}, {"size": 42, "space": 24, "font": _FONT}),
     "legend": {"show": False},
     "cursor": {"drag": {"x": False, "y": False}},
     "height": HEIGHT,

@@ -1,0 +1,303 @@
+"""What the page shows of the whole arm, without a browser: a scene takes handles also while nobody looks."""
+
+from dataclasses import fields, replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import trimesh
+import viser  # noqa: TID251 - a scene of its own
+from viser import transforms  # noqa: TID251
+
+from dt_viz.body import load_body_points
+from dt_viz.collision import CollisionReport, Nearest
+from dt_viz.engine import ArmMotion, Frame, Stage
+from dt_viz.health import Health
+from dt_viz.obstacles import Sphere
+from dt_viz.robot import load_jaco
+from dt_viz.scenario import Scenario, View
+from dt_viz.ui.arm import PEDESTAL
+from dt_viz.ui.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
+from dt_viz.ui.links import CELL, bodies, light_shells, simplified
+from dt_viz.ui.panel import VIEW_LABELS, status_html
+from dt_viz.ui.playback import at_moment
+from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
+from dt_viz.ui.session import Pace
+
+ROBOT = load_jaco()
+REACHING = np.array([0.9, 3.6, 1.6, 0.4, 2.9, -0.3])
+
+
+def motion(num=60, seconds=4.0, *, sway=0.0):
+    """From the ready pose to another, unevenly timed; without avoidance `sway` rad less of joint 1 in its middle."""
+    u = np.linspace(0, 1, num) ** 1.5
+    q = ROBOT.home + u[:, None] * (REACHING - ROBOT.home)
+    without = q - sway * np.sin(np.pi * u)[:, None] * np.eye(6)[0]
+    return ArmMotion(seconds * u, q, without)
+
+
+def frame(arm=None, *, blocked=(), health=None, stage=Stage.CERTIFIED, scenario=None):
+    nothing: Any = None
+    return Frame(
+        scenario=scenario or Scenario("draw_s", Sphere((0.0, -0.5, 0.4))),
+        task=nothing,
+        stage=stage,
+        ghost=(),
+        rollouts=(),
+        times=(),
+        goal=nothing,
+        reached=nothing,
+        blocked=blocked,
+        health=health or Health(0.01),
+        arm=arm,
+    )
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def scene(server):
+    yield server.scene
+    server.scene.reset()
+
+
+# --- Along the motion ---
+
+
+def test_places_are_evenly_apart_however_the_path_is_sampled():
+    s = np.linspace(0, 1, 4001) ** 3
+    path = np.stack([np.cos(3 * s), np.sin(3 * s), s], axis=1)
+    places = evenly_along(path, 7)
+    assert places[0] == 0 and places[-1] == len(path) - 1
+    points = path[places.round().astype(int)]
+    np.testing.assert_allclose(points[:, 2], np.linspace(0, 1, 7), atol=2e-3)
+
+
+def test_a_path_that_rests_has_places_too():
+    path = np.repeat([[0.0, 0.0], [1.0, 0.0]], 5, axis=0)
+    places = evenly_along(path, 3)
+    assert places[0] == 0 and 4 < places[1] < 5 and places[2] == 9
+    assert np.isfinite(evenly_along(np.zeros((4, 3)), 3)).all()
+
+
+def test_arms_go_from_start_to_goal_with_the_hand_in_equal_steps():
+    arm = motion(400)
+    q = arms_along(ROBOT, arm)
+    np.testing.assert_allclose(q[[0, -1]], arm.q[[0, -1]])
+    hand = ROBOT.end_effector(arm.q)
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(hand, axis=0), axis=1))])
+    nearest = np.linalg.norm(hand[:, None] - ROBOT.end_effector(q), axis=-1).argmin(axis=0)
+    np.testing.assert_allclose(along[nearest], np.linspace(0, along[-1], NUM_ARMS), atol=0.005)
+
+
+@pytest.mark.parametrize("moment", [0.0, 0.3, 1.7, 4.0, 9.0])
+def test_both_arms_are_shown_at_the_same_moment(moment):
+    arm = motion(sway=0.4)
+    q, without = at_moment(arm, moment)
+    for got, path in ((q, arm.q), (without, arm.without)):
+        np.testing.assert_allclose(got, [np.interp(moment, arm.times, angle) for angle in path.T], atol=1e-12)
+
+
+# --- Meshes ---
+
+
+def test_a_simplified_mesh_stays_within_a_cell_of_the_original():
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    light = simplified(ball, 0.1)
+    assert len(light.faces) < len(ball.faces) / 4
+    radii = np.linalg.norm(light.vertices, axis=1)
+    assert 1 - 0.1 * np.sqrt(3) < radii.min() and radii.max() <= 1 + 1e-12
+    assert (np.diff(np.sort(light.faces, axis=1), axis=1) > 0).all()
+    assert light.is_watertight
+
+
+def test_light_links_have_the_size_of_the_links():
+    for body, shell in zip(bodies(ROBOT.joint_names), light_shells(ROBOT.joint_names), strict=True):
+        assert len(shell.faces) < len(body.shell.faces) / 2
+        np.testing.assert_allclose(shell.bounds, body.shell.bounds, atol=CELL)
+
+
+# --- The scene ---
+
+
+def test_the_ghost_is_shown_only_where_avoidance_has_moved_a_link(scene):
+    arms = Arms(scene, ROBOT)
+    arms.show(View(ghost_arm=True))
+    assert arms.ghost.visible
+    arms.pose(REACHING, REACHING)
+    assert not any(link.visible for link in arms.ghost.links)
+    arms.pose(REACHING, REACHING + 0.3 * np.eye(6)[3])  # the wrist alone
+    assert [link.visible for link in arms.ghost.links] == [False, False, True, True, True]
+    arms.pose(REACHING, REACHING + 0.3 * np.eye(6)[0])
+    assert all(link.visible for link in arms.ghost.links)
+
+
+def world_pose(handles, index):
+    pose = transforms.SE3.identity()
+    for handle in handles[: index + 1]:
+        step = transforms.SE3.from_rotation_and_translation(transforms.SO3(np.array(handle.wxyz)), handle.position)
+        pose = pose @ step
+    return pose
+
+
+def test_arms_along_the_motion_stand_where_the_arm_would(scene):
+    """The arm is a tree of frames, those along the motion are placed in the world: both by the same kinematics."""
+    onion, arms, arm = Onion(scene, ROBOT), Arms(scene, ROBOT), motion()
+    onion.draw(frame(arm))
+    onion.visible = True  # drawn while hidden: it catches up
+    for which, q in enumerate(arms_along(ROBOT, arm)):
+        arms.pose(q, q)
+        for index, link in enumerate(onion.links, start=PEDESTAL):
+            pose = world_pose(arms.arm.frames, index)
+            np.testing.assert_allclose(link.position + link.batched_positions[which], pose.translation(), atol=1e-6)
+            turned = transforms.SO3(link.batched_wxyzs[which].astype(float)).as_matrix()
+            np.testing.assert_allclose(turned, pose.rotation().as_matrix(), atol=1e-6)
+
+
+def test_arms_along_the_motion_send_nothing_while_hidden_and_follow_while_shown(scene):
+    onion = Onion(scene, ROBOT)
+    before = onion.links[0].batched_positions.copy()
+    onion.draw(frame(motion()))
+    np.testing.assert_array_equal(onion.links[0].batched_positions, before)
+    onion.visible = True
+    shown = onion.links[0].batched_wxyzs.copy()
+    onion.draw(frame(replace(motion(), q=motion().q + 0.2)))
+    assert np.abs(onion.links[0].batched_wxyzs - shown).max() > 0.05
+    shown = onion.links[0].batched_wxyzs.copy()
+    onion.draw(frame(None))  # no motion: they stay
+    np.testing.assert_array_equal(onion.links[0].batched_wxyzs, shown)
+
+
+def test_body_points_move_with_the_arm_and_lines_say_from_where(scene):
+    arms, points = Arms(scene, ROBOT), load_body_points()
+    q, without = REACHING, REACHING - 0.2 * np.eye(6)[0]
+    arms.pose(q, without)
+    arms.show(View(body_points=True))  # posed while hidden: they catch up
+    body = arms.body
+    np.testing.assert_allclose(
+        body.spheres.position + body.spheres.batched_positions, points.positions(ROBOT, q), atol=1e-6
+    )
+    np.testing.assert_allclose(np.asarray(body.spheres.batched_scales), points.radius, atol=1e-7)
+    np.testing.assert_allclose(body.paths.points[:, 0], points.positions(ROBOT, without), atol=1e-6)
+    np.testing.assert_allclose(body.paths.points[:, 1], points.positions(ROBOT, q), atol=1e-6)
+    on_base, on_hand = body.spheres.batched_colors[points.joint < 0], body.spheres.batched_colors[points.joint == 5]
+    assert (on_base == on_base[0]).all() and (on_hand != on_base[0]).any(axis=1).all()
+
+
+def test_what_is_beside_the_arm_keeps_its_pedestal(scene):
+    arms = Arms(scene, ROBOT)
+    arms.show(View(arm=False))
+    assert not arms.arm.visible and not arms.arm.frames[0].visible
+    arms.show(View(arm=False, onion=True))
+    assert not arms.arm.visible and arms.arm.frames[0].visible
+    arms.show(View())
+    assert arms.arm.visible
+
+
+def test_a_stale_arm_is_translucent_says_so_and_recovers(scene):
+    arm = Arms(scene, ROBOT).arm
+    assert not arm.stale
+    arm.stale = True
+    assert arm.stale and all((mesh.opacity or 1) < 1 for mesh in arm.meshes)
+    arm.stale = False
+    assert not arm.stale and all(mesh.opacity is None for mesh in arm.meshes)
+
+
+# --- Joint plots ---
+
+
+def test_speeds_are_parts_of_each_joints_limit():
+    times = np.linspace(0, 3, 50)
+    q = ROBOT.home + times[:, None] * ROBOT.velocity_limits * [1, -1, 0.5, 0, 0.25, -0.5]
+    curves = joint_curves(ArmMotion(times, q, q), ROBOT)
+    np.testing.assert_allclose(curves.speeds, np.broadcast_to([100, 100, 50, 0, 25, 50], (NUM_SAMPLES, 6)), atol=1e-9)
+    np.testing.assert_allclose(curves.angles[[0, -1]], np.degrees(q[[0, -1]]))
+    assert (curves.times[0], curves.times[-1]) == (0, 3)
+
+
+@pytest.mark.parametrize("at", [3, 1234, 3990])
+def test_no_peak_of_a_speed_is_lost_between_the_samples_of_the_plot(at):
+    times = np.linspace(0, 3, 4000)
+    q = np.tile(ROBOT.home, (4000, 1))
+    q[at:, 2] += 0.01
+    curves = joint_curves(ArmMotion(times, q, q), ROBOT)
+    expected = 100 * 0.01 / (times[1] * ROBOT.velocity_limits[2])
+    assert curves.speeds[:, 2].max() == pytest.approx(expected)
+    assert abs(curves.times[curves.speeds[:, 2].argmax()] - times[at]) < 3 / NUM_SAMPLES
+
+
+def test_two_samples_at_one_time_give_a_finite_speed():
+    arm = ArmMotion(np.array([0.0, 1.0, 1.0, 2.0]), np.tile(ROBOT.home, (4, 1)), np.tile(ROBOT.home, (4, 1)))
+    assert np.isfinite(joint_curves(arm, ROBOT).speeds).all()
+
+
+def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(server):
+    plots = JointPlots(server.gui, ROBOT)
+    plots.draw(motion())
+    assert len(plots.angles.data[0]) != NUM_SAMPLES
+    plots.visible = True
+    assert all(len(column) == NUM_SAMPLES for plot in (plots.angles, plots.speeds) for column in plot.data)
+    for plot in (plots.angles, plots.speeds):
+        assert len(plot.data) == len(plot.series)
+    limits = sorted({column[0] for column in plots.angles.data[7:]})
+    finite = np.concatenate([limit[np.isfinite(limit)] for limit in (ROBOT.lower, ROBOT.upper)])
+    np.testing.assert_allclose(limits, np.sort(np.degrees(finite)))
+    assert (plots.speeds.data[7] == 100).all()
+    before = plots.angles.data
+    plots.draw(None)
+    assert plots.angles.data is before
+    plots.visible = False
+    plots.draw(motion(seconds=9.0))
+    assert plots.angles.data is before
+
+
+# --- Panel ---
+
+
+def test_every_layer_has_a_checkbox():
+    switches = {f.name for f in fields(View) if f.type == "bool"} - {"playing"}
+    assert set(VIEW_LABELS) == switches
+
+
+PACE = Pace(0.02, 10.0, 0)
+CLOSE = CollisionReport(
+    Nearest(-0.008, ("link 5",), 2.5), Nearest(0.004, ("link 2", "hand"), 3.0), Nearest(-0.012, ("finger tip 1",), 4.0)
+)
+FAR = CollisionReport(Nearest(0.012, ("link 5",), 2.5), None, Nearest(0.034, ("hand",), 4.0))
+
+
+def test_the_status_says_what_the_arm_comes_near_to():
+    far = status_html(frame(health=Health(0.01, collision=FAR)), PACE)
+    for text in ("12 mm, link 5", "over 50 mm", "34 mm, hand"):
+        assert text in far
+    close = status_html(frame(health=Health(0.01, collision=CLOSE)), PACE)
+    for text in ("enters by 8 mm, link 5", "4 mm, link 2 – hand", "below by 12 mm, finger tip 1"):
+        assert text in close
+    hit = replace(FAR, itself=Nearest(0.0, ("link 2", "hand"), 1.0))
+    assert "touches, link 2 – hand" in status_html(frame(health=Health(0.01, collision=hit)), PACE)
+
+
+def test_a_problem_is_said_once_also_if_it_is_a_doubt_already():
+    problem = CLOSE.problems[0]
+    said = status_html(frame(health=Health(0.01, collision=CLOSE, doubts=(f"rollout 2: {problem}",))), PACE)
+    assert said.lower().count(problem.lower()) == 1
+    assert all(other[1:] in said for other in CLOSE.problems)
+
+
+@pytest.mark.parametrize(("stage", "unknown"), [(Stage.LIVE, "…"), (Stage.CERTIFIED, "–")])
+def test_what_is_not_known_yet_and_what_will_not_be_known_differ(stage, unknown):
+    row = status_html(frame(stage=stage), PACE).split("Arm to obstacle")[1]
+    assert cast(str, row).split("</tr>")[0].count(unknown) == 1
+
+
+def test_a_scenario_without_motion_says_why_and_what_is_shown_instead():
+    reasons = ("start 3 is inside the obstacle", "the obstacle touches the <base>")
+    said = status_html(frame(blocked=reasons), PACE)
+    assert "start 3 is inside the obstacle; the obstacle touches the &lt;base&gt;" in said
+    assert "last good" in said
+    assert "last good" not in status_html(frame(), PACE)
