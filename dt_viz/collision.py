@@ -26,8 +26,8 @@ from dt_viz.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jac
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    Array = NDArray[np.float64]
-    Indices = NDArray[np.intp]
+    from dt_viz.fields import Array, Indices
+
 
 TOLERANCE = 1e-4
 """How much more than the smallest distance on a path may be reported, metres."""
@@ -176,12 +176,18 @@ def _rounded(obstacle: Sphere) -> _Rounded:
 class _Measure(Protocol):
     """Distances of several items (a link, or a pair of links), as a search needs them."""
 
-    bodies: Indices
-    """(I,) the link of each item."""
-    bases: Indices
-    """(I,) the frame that its motion counts against: what it is measured from moves with that frame."""
     lowest: float
     """No distance is smaller."""
+
+    @property
+    def bodies(self) -> Indices:
+        """(I,) the link of each item."""
+        ...
+
+    @property
+    def bases(self) -> Indices:
+        """(I,) the frame that its motion counts against: what it is measured from moves with that frame."""
+        ...
 
     def names(self, item: int) -> tuple[str, ...]:
         """Of the links of an item."""

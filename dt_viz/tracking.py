@@ -16,7 +16,8 @@ from dt_viz.robot import NUM_JOINTS, KinematicChain, Robot
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    Array = NDArray[np.float64]
+    from dt_viz.fields import Array
+
 
 HAND_PITCH = np.deg2rad(40.0)
 """Angle below horizontal at which the hand points when nobody says otherwise."""
