@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +51,18 @@ class BodyPoints:
                 positions[points] = turned + chain.origins[joint]
         return positions
 
-    @property
+    @cached_property
     def by_joint(self) -> list[tuple[int, slice]]:
         """Each joint index that has points, with the points that move with it."""
         bounds = np.searchsorted(self.joint, np.arange(-1, NUM_JOINTS + 1))
         return [(j, slice(a, b)) for j, a, b in zip(range(-1, NUM_JOINTS), bounds, bounds[1:], strict=False) if b > a]
+
+    def beyond(self, values: Array) -> Array:
+        """Sums (6, …) of `values` (P, …) of points on moving links: for each joint over the points that it turns."""
+        starts = [points.start for joint, points in self.by_joint if joint >= 0]
+        sums = np.cumsum(np.add.reduceat(values, starts, axis=0)[::-1], axis=0)[::-1]
+        first = np.searchsorted([joint for joint, _ in self.by_joint if joint >= 0], np.arange(NUM_JOINTS))
+        return sums[first]
 
     def positions(self, robot: Robot, q: Array) -> Array:
         """Positions (*B, P, 3), metres, at configurations q (*B, 6), rad."""

@@ -128,16 +128,8 @@ class WholeArmField:
 
     def _contact_jacobian(self, chain: KinematicChain, points: Array, weights: Array) -> Array:
         """J_c = Σ ŵ_b J_b, (M, 3, 6): each joint turns what lies beyond it."""
-        columns: list[Array] = []
-        lever, weight = np.zeros_like(chain.position), np.zeros_like(chain.position[0])
-        beyond = dict(self.body.by_joint)
-        for joint in reversed(range(NUM_JOINTS)):
-            if joint in beyond:
-                part = beyond[joint]
-                lever = lever + (weights[part, None] * points[part]).sum(axis=0)
-                weight = weight + weights[part].sum(axis=0)
-            columns.insert(0, cross(chain.axes[joint, 2], lever - weight * chain.origins[joint]))
-        return np.stack(columns).transpose(2, 1, 0)
+        lever = self.body.beyond(weights[:, None] * points) - self.body.beyond(weights)[:, None] * chain.origins
+        return cross(chain.axes[:, 2], lever).transpose(2, 1, 0)
 
     def _freedom(self, q: Array) -> Array:
         """χ, (N,): 0 at the pins, 1 away from them."""
@@ -173,15 +165,8 @@ class GradientField:
         distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         u = _unit_interval((self.reach - distance) / (self.reach - core))
         force: Array = -30 * (u * u * (1 - u) * (1 - u))[:, None] * outward  # the slope of `_fading`
-        torque = cross(points, force)
-        pull, moment, velocity = np.zeros_like(chain.position), np.zeros_like(chain.position), np.empty_like(q)
-        beyond = dict(self.body.by_joint)
-        for joint in reversed(range(NUM_JOINTS)):
-            if joint in beyond:
-                pull = pull + force[beyond[joint]].sum(axis=0)
-                moment = moment + torque[beyond[joint]].sum(axis=0)
-            velocity[:, joint] = (chain.axes[joint, 2] * (moment - cross(chain.origins[joint], pull))).sum(axis=0)
-        return velocity
+        moment = self.body.beyond(cross(points, force)) - cross(chain.origins, self.body.beyond(force))
+        return (chain.axes[:, 2] * moment).sum(axis=1).T
 
     def with_jacobian(self, q: Array) -> tuple[Array, Array]:
         """V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""

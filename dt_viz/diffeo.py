@@ -81,6 +81,8 @@ class Flow(Diffeomorphism):
     step: Step = rk4
     inverse_step: Step | None = None
     """Integrator for ψ⁻¹; None takes `step`. `implicit_euler` with `euler` gives an inverse exact to rounding."""
+    sparse: bool = False
+    """Whether the field vanishes on much of space: points where it does are not integrated, only found."""
 
     @property
     def dim(self) -> int:
@@ -88,6 +90,13 @@ class Flow(Diffeomorphism):
         return self.field.dim
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        if self.sparse and U is None:
+            s, moving = s.copy(), self.field(s).any(axis=1)
+            s[moving], _ = self._integrated(s[moving], None, inverse=inverse)
+            return s, None
+        return self._integrated(s, U, inverse=inverse)
+
+    def _integrated(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         if inverse:
             return integrate(self.inverse_step or self.step, self.field, s, U, -self.duration, self.steps)
         return integrate(self.step, self.field, s, U, self.duration, self.steps)

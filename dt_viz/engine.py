@@ -220,7 +220,8 @@ class Engine:
             return _Solved(stack, None)
         follower = self._follower
         lifted = follower.behaving(ground, stack) if scenario.space == "both" else follower.undisturbed(ground)
-        return _Solved(stack, follower.whole_arm.avoiding(lifted, scenario, precision.tolerance, precision.spacing))
+        arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, coarse=precision is LIVE)
+        return _Solved(stack, arm)
 
     def _frame(self, ground: Ground, scenario: Scenario, solved: _Solved) -> Frame:
         """The frame of stage ROLLOUTS."""

@@ -7,6 +7,7 @@ costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from dt_viz.body import BodyPoints
 from dt_viz.cspace import LEVERS, REACH_PER_TEMPERATURE, GradientField, JointLimits, WholeArmField, squared_lengths
-from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Identity, Inverse
+from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity, Inverse
 from dt_viz.escape import escape_directions
 from dt_viz.fields import Array, Indices
 from dt_viz.integrate import rk4
@@ -28,22 +29,24 @@ from dt_viz.tracking import JointPath, track
 
 NUM_CONFIGURATIONS = 100
 """Of each rollout before refinement."""
-MAX_DURATION = 4.0
-"""Longest flow that is tried."""
+MAX_DURATION = 2.0
+"""Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
 SNAPSHOT = 0.1
 """Flow time between two looks at the clearance: contacts move by at most two centimetres in it."""
 NUM_DEEPEST = 5
 """Samples of each rollout that the duration is chosen for at first."""
 MAX_ROUNDS = 4
 """Of looking whether samples that refinement finds are clear, too, and going on if not."""
-SLOPE = 0.3
+SLOPE = 0.1
 """Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
 OVERSHOOT = 7e-3
 """Metres by which the covering spheres stick out of the arm, about: so much less of the margin is asked of them."""
 ROUNDING = 1e-3
 """Metres of clearance that do not count."""
-RADIANS_PER_METRE = 3.0
-"""Of tolerances: the hand's error is that of the joints times half a metre or less."""
+COARSE_STEP = 0.2
+"""Of flow time. An RK4 step of this length is off by a tenth of a millimetre at the hand, about."""
+TOLERANCE = 3e-8
+"""Of the fine flow's steps, rad."""
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
 BESIDE = 0.20
@@ -127,9 +130,9 @@ class WholeArm:
 
     def undisturbed(self, lifted: Lift, scenario: Scenario, spacing: float) -> ArmSolution:
         """The motions as lifted, avoiding nothing."""
-        return _Solver(self, lifted, scenario, None, spacing, spacing).solution()
+        return _Solver(self, lifted, scenario, None, spacing, coarse=True).solution()
 
-    def avoiding(self, lifted: Lift, scenario: Scenario, tolerance: float, spacing: float) -> ArmSolution:
+    def avoiding(self, lifted: Lift, scenario: Scenario, spacing: float, *, coarse: bool) -> ArmSolution:
         """The motions around the scenario's obstacle.
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
@@ -138,12 +141,12 @@ class WholeArm:
         Args:
             lifted: the motions below.
             scenario: with obstacle, margin, temperature and duration.
-            tolerance: of the flow's integration, metres at the hand, about.
             spacing: largest distance between neighbouring samples, metres at the hand, about.
+            coarse: whether the flow is integrated for the eye only, in a few equal steps.
         """
         solution = None
         for generator in self._generators(lifted, scenario):
-            solution = _Solver(self, lifted, scenario, generator, tolerance, spacing).solution()
+            solution = _Solver(self, lifted, scenario, generator, spacing, coarse=coarse).solution()
             if solution.cleared or scenario.duration is not None:
                 break
         return solution or self.undisturbed(lifted, scenario, spacing)
@@ -185,16 +188,17 @@ class _Solver:
         lifted: Lift,
         scenario: Scenario,
         generator: Generator | None,
-        tolerance: float,
         spacing: float,
+        *,
+        coarse: bool,
     ) -> None:
         self._arm = arm
         self._lifted = lifted
         self._scenario = scenario
         self._generator = generator
-        self._tolerance = RADIANS_PER_METRE * tolerance
         self._spacing = spacing
-        self._room = arm.clearance(lifted.pins, scenario.obstacle)
+        self._coarse = coarse
+        self._room = arm.clearance(lifted.pins, scenario.obstacle) - ROUNDING
 
     def solution(self) -> ArmSolution:
         """See `WholeArm.avoiding`."""
@@ -237,7 +241,11 @@ class _Solver:
         limits = self._arm.limits
         if self._generator is None or duration == 0:
             return Identity(NUM_JOINTS)
-        return Chain([Inverse(limits), AdaptiveFlow(self._generator, duration, self._tolerance), limits])
+        if self._coarse:
+            flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP), sparse=True)
+        else:
+            flow = AdaptiveFlow(self._generator, duration, TOLERANCE)
+        return Chain([Inverse(limits), flow, limits])
 
     def _evaluate(self, transform: Diffeomorphism, index: Indices, fraction: Array) -> Array:
         """Levels (N, 1, 6) of the samples: postures by their `LEVERS`, so that distances are metres."""
