@@ -282,6 +282,23 @@ def test_the_status_says_what_the_arm_comes_near_to():
     assert "touches, link 2 – hand" in status_html(frame(health=Health(0.01, collision=hit)), PACE)
 
 
+@pytest.mark.parametrize(
+    ("hand", "arm", "said"),
+    [(0.85, None, ">0.85<"), (None, 0.5, ">0.50 arm<"), (0.85, 0.5, ">0.85 hand · 0.50 arm<"), (None, None, ">off<")],
+)
+def test_the_status_says_which_flow_runs_how_long(hand, arm, said):
+    assert said in status_html(frame(health=Health(0.01, duration=hand, arm_duration=arm)), PACE)
+
+
+@pytest.mark.parametrize(
+    ("space", "avoidance", "whose"),
+    [("task", True, "end effector"), ("cspace", True, "body points"), ("cspace", False, "end effector")],
+)
+def test_the_status_says_whose_clearance_it_is(space, avoidance, whose):
+    scenario = Scenario("draw_s", Sphere((0.0, -0.5, 0.4)), space=space, avoidance=avoidance)
+    assert f"10.0 mm, {whose}" in status_html(frame(scenario=scenario), PACE)
+
+
 def test_a_problem_is_said_once_also_if_it_is_a_doubt_already():
     problem = CLOSE.problems[0]
     said = status_html(frame(health=Health(0.01, collision=CLOSE, doubts=(f"rollout 2: {problem}",))), PACE)

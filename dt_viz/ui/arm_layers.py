@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import trimesh
 import viser
@@ -64,6 +66,7 @@ class Onion(Picture):
         )
         self._motion: ArmMotion | None = None
         self._drawn: ArmMotion | None = None
+        self._drawing = threading.Lock()  # whoever switches it on is not who computes
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
@@ -72,10 +75,13 @@ class Onion(Picture):
             self._catch_up()
 
     def _catch_up(self) -> None:
-        motion = self._motion
-        if motion is None or motion is self._drawn:
-            return
-        self._drawn = motion
+        with self._drawing:
+            motion = self._motion
+            if motion is not None and motion is not self._drawn:
+                self._drawn = motion
+                self._place(motion)
+
+    def _place(self, motion: ArmMotion) -> None:
         rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
         wxyzs = transforms.SO3.from_matrix(rotations).wxyz
         for joint, link in enumerate(self.links, start=PEDESTAL - 1):
@@ -142,18 +148,21 @@ class Arms:
         self.ghost = GhostArm(scene, robot)
         self.body = BodySpheres(scene, self._points.radius)
         self._now = (robot.home, robot.home)
+        self._posing = threading.Lock()  # the playback poses, whoever clicks shows and hides
 
     def pose(self, q: Array, without: Array) -> None:
         """Show the joint angles `q` (6,), rad, and where the arm would be `without` avoidance (6,), rad."""
-        self._now = (q, without)
-        self.arm.pose(q)
-        self._pose_beside()
+        with self._posing:
+            self._now = (q, without)
+            self.arm.pose(q)
+            self._pose_beside()
 
     def show(self, view: View) -> None:
         """Show and hide what the view says."""
-        self.arm.show(whole=view.arm, pedestal=view.ghost_arm or view.onion)
-        self.ghost.visible, self.body.visible = view.ghost_arm, view.body_points
-        self._pose_beside()
+        with self._posing:
+            self.arm.show(whole=view.arm, pedestal=view.ghost_arm or view.onion)
+            self.ghost.visible, self.body.visible = view.ghost_arm, view.body_points
+            self._pose_beside()
 
     def _pose_beside(self) -> None:
         """Pose what is shown beside the arm; what is hidden waits until it is shown."""

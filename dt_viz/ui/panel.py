@@ -138,9 +138,11 @@ class Panel:
         _set_max(self._rollout, len(frame.rollouts))
         if frame.pictures.generator is not None:
             _set_max(self._flow, frame.pictures.generator.num_flows)
-        if frame.scenario.duration is None and frame.health.duration is not None:
+        health = frame.health
+        chosen = health.arm_duration if health.duration is None else health.duration
+        if frame.scenario.duration is None and chosen is not None:
             # what `auto` chose, to go on from by hand
-            self._duration.value = round(min(frame.health.duration, MAX_MANUAL_DURATION), 2)
+            self._duration.value = round(min(chosen, MAX_MANUAL_DURATION), 2)
         self._status.content = status_html(frame, pace)
 
     def learning(self, fraction: float, message: str) -> None:
@@ -361,16 +363,23 @@ _SMALL = "font-size:0.8em;line-height:1.45;padding:0.1em 0.9em 0.35em;opacity:0.
 
 def status_html(frame: Frame, pace: Pace) -> str:
     """The status line: speed, clearance, certificates, and every reason for doubt."""
-    health = frame.health
+    health, scenario = frame.health, frame.scenario
+    # what is not known after the last stage never will be
+    unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
+    off = "–" if frame.blocked else "off"
+    of_spheres = scenario.avoidance and scenario.space != "task"
+    durations = {"": health.duration, " arm": health.arm_duration}
+    if None not in durations.values():
+        durations = {" hand": health.duration, " arm": health.arm_duration}
     rows = (
         ("Rebuild", f"{1e3 * pace.latency:.0f} ms" + (f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else "")),
         ("Skipped edits", f"{pace.num_skipped}"),
-        ("Clearance", f"{1e3 * health.clearance:.1f} mm"),
-        *_collision_rows(health.collision, certified=frame.stage is Stage.CERTIFIED),
-        ("Flow time t", "off" if health.duration is None else f"{health.duration:.2f}"),
-        ("Smallest det J", "…" if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
-        ("There and back", "…" if health.round_trip_error is None else f"{1e3 * health.round_trip_error:.0e} mm"),
-        ("Lyapunov value", {None: "…", True: "falls", False: "does not fall"}[health.lyapunov_falls]),
+        ("Clearance", f"{1e3 * health.clearance:.1f} mm, {'body points' if of_spheres else 'end effector'}"),
+        *_collision_rows(health.collision, unknown),
+        ("Flow time t", " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None) or off),
+        ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
+        ("There and back", unknown if health.round_trip_error is None else f"{1e3 * health.round_trip_error:.0e} mm"),
+        ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[health.lyapunov_falls]),
     )
     cells = "".join(
         f"<tr><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
@@ -378,7 +387,7 @@ def status_html(frame: Frame, pace: Pace) -> str:
         for name, value in rows
     )
     warnings = list(health.doubts)
-    if health.clearance < 0 and frame.scenario.avoidance and not warnings:
+    if health.clearance < 0 and scenario.avoidance and not (warnings or frame.blocked):
         warnings.append("the motions go through the obstacle at this flow time")
     if health.collision is not None:
         warnings += [problem for problem in health.collision.problems if not any(problem in w for w in warnings)]
@@ -388,10 +397,9 @@ def status_html(frame: Frame, pace: Pace) -> str:
     return f"{blocked}<table style='{_SMALL}'>{cells}</table>{''.join(_alarm(w, *_AMBER) for w in warnings)}"
 
 
-def _collision_rows(report: CollisionReport | None, *, certified: bool) -> tuple[tuple[str, str], ...]:
+def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:
     """What the arm's meshes come near to."""
     if report is None:
-        unknown = "–" if certified else "…"
         obstacle = itself = table = unknown
     else:
         obstacle = _distance(report.obstacle.distance, "enters by", report.obstacle.links)

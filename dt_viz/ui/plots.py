@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,6 +57,7 @@ class JointPlots:
         self._robot = robot
         self._motion: ArmMotion | None = None
         self._drawn: ArmMotion | None = None
+        self._drawing = threading.Lock()  # whoever switches them on is not who computes
         limited = [j for j in range(NUM_JOINTS) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
         bounded = [_css(palette.JOINTS[j]) for j in limited for _ in range(2)]
@@ -95,10 +97,13 @@ class JointPlots:
                 self._catch_up()
 
     def _catch_up(self) -> None:
-        if self._motion is None or self._motion is self._drawn:
-            return
-        self._drawn = self._motion
-        curves = joint_curves(self._motion, self._robot)
+        with self._drawing:
+            motion = self._motion
+            if motion is not None and motion is not self._drawn:
+                self._drawn = motion
+                self._plot(joint_curves(motion, self._robot))
+
+    def _plot(self, curves: JointCurves) -> None:
         limits = np.tile(self._limits, (NUM_SAMPLES, 1))
         self.angles.data = _columns(curves.times, curves.angles, limits)
         speeds, limit = np.minimum(curves.speeds, MAX_SPEED), np.full((NUM_SAMPLES, 1), 100.0)
