@@ -153,6 +153,28 @@ class Engine:
         for frame in self._stages(ground, scenario):
             yield replace(frame, seconds=time.perf_counter() - began)
 
+    def arm_motions(self, scenario: Scenario) -> tuple[Frame, tuple[ArmMotion, ...]]:
+        """The frame of stage FINE, without pictures, and the arm's motion along each rollout; none if it is blocked.
+
+        Raises:
+            DemonstrationError, ImitationError: as `frames`.
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        ground = self._ground(scenario, None)
+        if _uses_whole_arm(scenario):
+            blocked = self._follower.obstructions(ground, scenario.obstacle)
+            if blocked:
+                *_, frame = self._stages_without_motion(ground, scenario, blocked)
+                return frame, ()
+        fine = self._solved(ground, scenario, FINE)
+        frame = self._frame(ground, scenario, fine)
+        arms, health = [], frame.health
+        for rollout in range(len(frame.rollouts)):
+            arm, doubts = self._arm(frame, ground, fine, rollout)
+            arms.append(arm)
+            health = health.doubting(*doubts)
+        return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
+
     def _stages(self, ground: Ground, scenario: Scenario) -> Iterator[Frame]:
         if _uses_whole_arm(scenario):
             with _turn:
@@ -256,14 +278,13 @@ class Engine:
         lattice = lattice[frame.scenario.obstacle.signed_distance(lattice) > 0]
         picture = FieldPicture(lattice, solved.stack.system.velocity(lattice))
         try:
-            arm, doubts = self._arm(frame, ground, solved)
+            arm, doubts = self._arm(frame, ground, solved, frame.scenario.arm_rollout % len(frame.rollouts))
         except UnreachableError as error:
             arm, doubts = None, (f"the arm cannot reach the starts: {error}",)
         return replace(frame, field=picture, arm=arm, health=frame.health.doubting(*doubts))
 
-    def _arm(self, frame: Frame, ground: Ground, solved: _Solved) -> tuple[ArmMotion, tuple[str, ...]]:
-        """The joint motion along the chosen rollout, and what is wrong with it."""
-        chosen = frame.scenario.arm_rollout % len(frame.rollouts)
+    def _arm(self, frame: Frame, ground: Ground, solved: _Solved, chosen: int) -> tuple[ArmMotion, tuple[str, ...]]:
+        """The joint motion along a rollout, and what is wrong with it."""
         times, undisturbed = frame.times[chosen], self._follower.undisturbed(ground)
         if solved.arm is not None:
             rows = solved.arm.index == chosen

@@ -193,7 +193,7 @@ def test_avoidance_writes_angles_end_effector_and_demonstration_that_belong_toge
     assert min(clearances) > 0
     assert number_after(printed, "F.D. mean") == pytest.approx(1e3 * np.mean(distances), abs=0.06)
     assert number_after(printed, "; clearance") == pytest.approx(1e3 * min(clearances), abs=0.06)
-    assert number_after(printed, "\nM.C.D.") == 0
+    assert number_after(printed, "M.C.D. of the end effector") == 0
     assert "joint-limit violations: 0 " in printed
 
 
@@ -203,7 +203,7 @@ def test_without_avoidance_the_same_command_shows_the_collision(lasa, tmp_path, 
     deepest = max(0.05 - np.linalg.norm(arrays[f"x_{i}"] - middle, axis=1).min() for i in range(NUM_DEMONSTRATIONS))
     assert deepest > 0.03
     # sampled points may lie a little less deep than the line between them
-    assert number_after(printed, "\nM.C.D.") == pytest.approx(1e3 * deepest, abs=1.0)
+    assert number_after(printed, "M.C.D. of the end effector") == pytest.approx(1e3 * deepest, abs=1.0)
 
 
 def test_avoidance_says_what_is_not_to_be_trusted(lasa, tmp_path, capsys):
@@ -211,6 +211,48 @@ def test_avoidance_says_what_is_not_to_be_trusted(lasa, tmp_path, capsys):
     assert "doubt" not in capsys.readouterr().out
     run_avoidance(lasa, tmp_path / "a.npz", start)
     assert "doubt: start 1 is inside the obstacle" in capsys.readouterr().out
+
+
+def test_the_whole_arm_avoids_what_the_hand_alone_does_not(lasa, tmp_path, middle, robot, capsys):
+    depth = {}
+    for space in ("task", "cspace", "both"):
+        arrays = run_avoidance(lasa, tmp_path / "a.npz", middle, "--space", space)
+        printed = capsys.readouterr().out
+        depth[space] = number_after(printed, "M.C.D. of the whole arm")
+        assert number_after(printed, "goal missed by") < 1
+        assert "joint-limit violations: 0 " in printed
+        for i in range(NUM_DEMONSTRATIONS):
+            assert np.linalg.norm(arrays[f"x_{i}"] - middle, axis=1).min() > 0.05
+    assert depth["task"] > 20 and depth["cspace"] == depth["both"] == 0
+
+
+def test_avoidance_says_why_there_is_no_motion(lasa, tmp_path, capsys):
+    out = tmp_path / "a.npz"
+    start = run_avoidance(lasa, out, [0.5, -0.5, 0.9])["demo_0"][0]
+    out.unlink()
+    for where, reason in {
+        ",".join(map(str, start)): "start 1 is inside the obstacle",
+        "0,0,0.1": "the obstacle touches the arm's base",
+    }.items():
+        sphere = ["--obstacle", where, "--diameter", "0.15"]
+        arguments = ["--task", "Hook", "--lasa", str(lasa), *sphere, "--space", "cspace", "--out", str(out)]
+        assert main(["avoidance", *arguments]) == 1
+        assert f"no motion: {reason}" in capsys.readouterr().err
+        assert not out.exists()
+
+
+def test_places_are_measured_on_the_meshes(lasa, tmp_path, capsys):
+    out = tmp_path / "places.npz"
+    arguments = ["--task", "Hook", "--lasa", str(lasa), "--count", "2", "--diameter", "0.1", "--out", str(out)]
+    assert main(["places", *arguments]) == 0
+    printed = capsys.readouterr().out
+    with np.load(out) as arrays:
+        assert np.linalg.norm(arrays["places"] - arrays["places"][0], axis=1).max() <= 0.05
+        assert arrays["arm_depth"].shape == (3, NUM_DEMONSTRATIONS)
+        assert np.nanmax(arrays["arm_depth"]) == number_after(printed, "M.C.D. of the whole arm") == 0
+        assert np.nanmin(arrays["depth_without"]) > 0
+    assert main(["places", *arguments, "--no-avoidance"]) == 0
+    assert number_after(capsys.readouterr().out, "M.C.D. of the whole arm") > 30
 
 
 def test_values_may_begin_with_a_minus():
@@ -323,7 +365,10 @@ def test_what_cannot_be_used_is_named(lasa, tmp_path, monkeypatch, capsys, argum
         (["avoidance", *TASK, "--obstacle", "0,0", "--diameter", "1"], "argument --obstacle: found '0,0'; accepted: "),
         (["avoidance", *TASK, "--obstacle", "-0,inf,0", "--diameter", "1"], "argument --obstacle: found '-0,inf,0'"),
         (["avoidance", *TASK, "--obstacle", "0,0,0", "--diameter", "-1"], "argument --diameter: found '-1'; accepted"),
-        (["avoidance", *TASK, *SPHERE, "--space", "cspace"], "argument --space: found 'cspace'; accepted: task "),
+        (
+            ["avoidance", *TASK, *SPHERE, "--space", "joint"],
+            "argument --space: found 'joint'; accepted: task, cspace, both",
+        ),
         (["starts", *TASK, "--count", "many"], "argument --count: found 'many'; accepted: a whole number, 1 or more"),
         (["imitation", "Hook.mat"], "the following arguments are required: --out"),
         ([], "the following arguments are required: SUBCOMMAND"),

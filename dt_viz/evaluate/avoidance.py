@@ -1,25 +1,30 @@
-"""Put a sphere into a motion and measure what the arm's end effector does.
+"""Put a sphere into a motion and measure what the end effector and the whole arm do.
 
 The npz file holds for each rollout i, as the page shows it when it rests:
 
 ``q_i`` (T, 6), ``times_i`` (T,)
-    joint angles, rad, continuous joints unwrapped, and seconds. NaN where the arm cannot reach the rollout's start.
+    joint angles, rad, continuous joints unwrapped, and seconds.
 ``x_i`` (T, 3)
-    end effector, metres, from these angles; the rollout itself where there are none.
+    end effector, metres, from these angles.
 ``demo_i`` (T_i, 3)
     its demonstration, metres.
+
+The whole arm is judged by its collision meshes, also between the samples; the spheres that avoidance computes with play
+no part in that.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dt_viz.engine import Engine, Frame
+from dt_viz.collision import CollisionReport, load_collision_model
+from dt_viz.engine import ArmMotion, Engine
 from dt_viz.evaluate.options import (
     add_space,
     add_task,
@@ -31,15 +36,67 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.fields import Array
 from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.metrics import discrete_frechet, maximum_collision_distance, resample_by_arc_length
+from dt_viz.metrics import discrete_frechet, maximum_collision_distance, resample_by_arc_length, sharpest_turn
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import Robot, load_jaco
 from dt_viz.scenario import Scenario
+from dt_viz.tracking import UnreachableError
 
 NUM_COMPARED = 400
 """Points by arc length that a Fréchet distance is taken between."""
 LIMIT_TOLERANCE = 1e-9
 """Rad by which rounding may take a joint over its limit."""
+TURN_ARC = 0.2
+"""Length of the arc over which a turn is measured, in radii of the obstacle."""
+NO_MOTION = 1
+"""Exit status where the obstacle leaves no motion."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What there is to say of one rollout; lengths in metres."""
+
+    x: Array
+    """(T, 3) end effector."""
+    frechet: float
+    """Discrete Fréchet distance of the end effector to the demonstration."""
+    hand_depth: float
+    """How deep the end effector enters the obstacle."""
+    hand_clearance: float
+    """Its smallest distance from the obstacle, negative inside."""
+    arm: CollisionReport
+    """Of the whole arm."""
+    depth_without: float
+    """How deep the arm would enter the obstacle without avoidance."""
+    num_outside: int
+    """Configurations outside the joint limits."""
+    turn: float
+    """Sharpest turn of the end effector over `TURN_ARC`, degrees."""
+    turn_without: float
+    """The same without avoidance."""
+    goal_miss: float
+    """Distance of its last position from the demonstrations' goal."""
+
+
+def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Sphere, robot: Robot) -> Measured:
+    """Measure one rollout of the arm."""
+    model = load_collision_model()
+    x, arc = robot.end_effector(motion.q), TURN_ARC * obstacle.radius
+    a, b = (resample_by_arc_length(path, NUM_COMPARED) for path in (x, demonstration))
+    depth = maximum_collision_distance(x, obstacle.signed_distance) + 0.0  # never -0
+    outside = (motion.q < robot.lower - LIMIT_TOLERANCE) | (motion.q > robot.upper + LIMIT_TOLERANCE)
+    return Measured(
+        x=x,
+        frechet=float(discrete_frechet(a, b)),
+        hand_depth=depth,
+        hand_clearance=-depth if depth > 0 else float(obstacle.signed_distance(x).min()),
+        arm=model.report(motion.q, obstacle),
+        depth_without=max(0.0, -model.nearest_to_obstacle(motion.without, obstacle).distance),
+        num_outside=int(outside.any(axis=1).sum()),
+        turn=sharpest_turn(x, arc),
+        turn_without=sharpest_turn(robot.end_effector(motion.without), arc),
+        goal_miss=float(np.linalg.norm(x[-1] - goal)),
+    )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,55 +105,74 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--obstacle", type=point, required=True, metavar="X,Y,Z", help="centre of the sphere, metres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), required=True, metavar="D", help="metres")
     add_space(parser)
-    parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transform out")
+    parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand."""
+    """Run the subcommand; 1 if there is no motion to measure."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".npz")
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
     obstacle = Sphere(options.obstacle, options.diameter)
-    scenario = Scenario(task.name, obstacle, avoidance=not options.no_avoidance)
+    scenario = Scenario(task.name, obstacle, avoidance=not options.no_avoidance, space=options.space)
+    try:
+        frame, motions = engine.arm_motions(scenario)
+    except UnreachableError as error:
+        print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
+        return NO_MOTION
+    if frame.blocked:
+        for reason in frame.blocked:
+            print(f"no motion: {reason}", file=sys.stderr)
+        return NO_MOTION
+
     arrays: dict[str, Any] = {}
-    rows: list[tuple[str, ...]] = []
-    doubts: dict[str, None] = {}  # in the order they come, each once
-    depths, clearances, distances, violations = [], [], [], 0
-    for i, demonstration in enumerate(task.paths):
-        *_, frame = engine.frames(replace(scenario, arm_rollout=i))
-        doubts.update(dict.fromkeys(frame.health.doubts))
-        times, q, x = _arm_motion(frame, robot, i)
-        arrays |= {f"q_{i}": q, f"x_{i}": x, f"times_{i}": times, f"demo_{i}": demonstration}
-        a, b = (resample_by_arc_length(path, NUM_COMPARED) for path in (x, demonstration))
-        distances.append(float(discrete_frechet(a, b)))
-        depths.append(maximum_collision_distance(x, obstacle.signed_distance) + 0.0)  # never -0
-        clearances.append(-depths[-1] if depths[-1] > 0 else float(obstacle.signed_distance(x).min()))
-        outside = int(((q < robot.lower - LIMIT_TOLERANCE) | (q > robot.upper + LIMIT_TOLERANCE)).any(axis=1).sum())
-        violations += outside
-        within = "no arm" if np.isnan(q).any() else f"{outside} of {len(q)}"
-        figures = (f"{1e3 * value:.1f}" for value in (distances[-1], depths[-1], clearances[-1]))
-        rows.append((str(i), *figures, within))
+    measured = []
+    for i, (motion, demonstration) in enumerate(zip(motions, task.paths, strict=True)):
+        measured.append(measure(motion, demonstration, frame.goal, obstacle, robot))
+        arrays |= {f"q_{i}": motion.q, f"x_{i}": measured[-1].x, f"times_{i}": motion.times, f"demo_{i}": demonstration}
     with out.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
-
-    x, y, z = options.obstacle
-    avoidance = "without avoidance" if options.no_avoidance else f"avoidance in {options.space} space"
-    print(f"{task.name}, sphere of {options.diameter:g} m at ({x:g}, {y:g}, {z:g}) m, {avoidance}; end effector:")
-    print_table(("rollout", "F.D. mm", "M.C.D. mm", "clearance mm", "outside joint limits"), rows)
-    print(f"\nF.D. mean {1e3 * np.mean(distances):.1f} mm, largest {1e3 * max(distances):.1f} mm")
-    print(f"M.C.D. {1e3 * max(depths):.1f} mm; clearance {1e3 * min(clearances):.1f} mm")
-    print(f"joint-limit violations: {violations} configuration(s)")
-    for doubt in doubts:
+    _print(options, task.name, measured, motions)
+    for doubt in dict.fromkeys(frame.health.doubts):
         print(f"doubt: {doubt}")
     return 0
 
 
-def _arm_motion(frame: Frame, robot: Robot, rollout: int) -> tuple[Array, Array, Array]:
-    """Times (T,), joint angles (T, 6) and end effector (T, 3) of the arm on its rollout."""
-    if frame.arm is None:
-        path = frame.rollouts[rollout]
-        return frame.times[rollout], np.full((len(path), 6), np.nan), path
-    q = frame.arm.q
-    return frame.arm.times, q, robot.end_effector(q)
+def _print(options: argparse.Namespace, task: str, measured: list[Measured], motions: tuple[ArmMotion, ...]) -> None:
+    x, y, z = options.obstacle
+    who = {"task": "end effector", "cspace": "whole arm", "both": "end effector and whole arm"}[options.space]
+    avoidance = "without avoidance" if options.no_avoidance else f"avoidance by the {who}"
+    print(f"{task}, sphere of {options.diameter:g} m at ({x:g}, {y:g}, {z:g}) m, {avoidance}; lengths in mm")
+    rows = [
+        (
+            str(i),
+            *(f"{1e3 * value:.1f}" for value in (m.frechet, m.hand_depth, m.hand_clearance, m.arm.depth)),
+            f"{1e3 * m.arm.obstacle.distance:.1f}",
+            m.arm.obstacle.links[0],
+            f"{m.turn:.0f}° ({m.turn_without:.0f}°)",
+            f"{m.num_outside} of {len(motion.q)}",
+        )
+        for i, (m, motion) in enumerate(zip(measured, motions, strict=True))
+    ]
+    print_table(
+        (
+            "rollout", "F.D.", "M.C.D. hand", "clearance", "M.C.D. arm", "clearance", "nearest link",
+            "sharpest turn (without)", "outside joint limits",
+        ),
+        rows,
+    )  # fmt: skip
+    hand = max(m.hand_depth for m in measured), min(m.hand_clearance for m in measured)
+    arm = max(m.arm.depth for m in measured), min(m.arm.obstacle.distance for m in measured)
+    distances = [m.frechet for m in measured]
+    print(f"\nF.D. mean {1e3 * np.mean(distances):.1f} mm, largest {1e3 * max(distances):.1f} mm")
+    for name, (depth, clearance) in {"end effector": hand, "whole arm": arm}.items():
+        print(f"M.C.D. of the {name} {1e3 * depth:.1f} mm; clearance {1e3 * clearance:.1f} mm")
+    forced = max(m.depth_without for m in measured)
+    print(f"M.C.D. of the whole arm without avoidance {1e3 * forced:.1f} mm")
+    print(f"goal missed by {1e3 * max(m.goal_miss for m in measured):.3f} mm")
+    print(f"joint-limit violations: {sum(m.num_outside for m in measured)} configuration(s)")
+    itself = min((m.arm.itself.distance for m in measured if m.arm.itself), default=None)
+    near = "more than 50 mm" if itself is None else f"{1e3 * itself:.0f} mm"
+    print(f"links from each other {near}, from the table {1e3 * min(m.arm.table.distance for m in measured):.0f} mm")

@@ -47,6 +47,7 @@ from dt_viz.scenario import Scenario
 from dt_viz.solving import NUM_SAMPLES
 from dt_viz.tasks import Task
 from dt_viz.ui.session import Pace, Session
+from dt_viz.whole_arm import NUM_CONFIGURATIONS
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
@@ -103,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".json")
     fits = FitStore(default_cache_folder())
     fits.get(task.demonstrations)
-    scenario = Scenario(task.name, Sphere(task.obstacle_position))
+    scenario = Scenario(task.name, Sphere(task.obstacle_position), space=options.space)
     recorders = [Recorder() for _ in range(options.sessions)]
     robot = load_jaco()
     sessions = [Session(Engine(tasks, fits, robot), lambda _: scenario, task.name, shown) for shown in recorders]
@@ -145,7 +146,7 @@ def run(options: argparse.Namespace) -> int:
             "edits": num_edits,
             "edits_per_second": num_edits / options.sessions / elapsed,
             "rollouts": recorders[0].num_rollouts,
-            "points_a_rollout": NUM_SAMPLES,
+            "points_a_rollout": NUM_SAMPLES if options.space == "task" else NUM_CONFIGURATIONS,
             "diameter": scenario.obstacle.diameter,
             "cores": os.cpu_count(),
             "python": platform.python_version(),
@@ -153,7 +154,7 @@ def run(options: argparse.Namespace) -> int:
         },
     }
     write_json(out, figures)
-    print(f"{task.name}, {options.sessions} session(s), {recorders[0].num_rollouts} rollouts × {NUM_SAMPLES} points")
+    print(f"{task.name}, {options.sessions} session(s), {recorders[0].num_rollouts} rollouts")
     print_table(
         ("edit → frame ready", "median ms", "95 % ms"),
         [

@@ -9,10 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dt_viz.scenario import SPACES
 from dt_viz.tasks import TASKS, Task, TaskEntry, lasa_tasks
-
-SPACES = ("task",)
-"""Where avoidance can be computed."""
 
 
 class InputError(ValueError):
@@ -30,7 +28,12 @@ def add_task(parser: argparse.ArgumentParser) -> None:
 
 def add_space(parser: argparse.ArgumentParser) -> None:
     """Add `--space`."""
-    parser.add_argument("--space", type=_space, default="task", help="where avoidance acts (default: %(default)s)")
+    parser.add_argument(
+        "--space",
+        type=_space,
+        default="task",
+        help="what avoids: the end effector (task), the whole arm (cspace), or both",
+    )
 
 
 def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], Task]:
@@ -136,7 +139,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 def _space(text: str) -> str:
     if text not in SPACES:
         accepted = ", ".join(SPACES)
-        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted} (no other space is avoided in so far)")
+        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
     return text
 
 
