@@ -231,7 +231,7 @@ def test_avoidance_says_why_there_is_no_motion(lasa, tmp_path, capsys):
     start = run_avoidance(lasa, out, [0.5, -0.5, 0.9])["demo_0"][0]
     out.unlink()
     for where, reason in {
-        ",".join(map(str, start)): "start 1 is inside the obstacle",
+        ",".join(map(str, start)): "starts 1, 2 are inside the obstacle",
         "0,0,0.1": "the obstacle touches the arm's base",
     }.items():
         sphere = ["--obstacle", where, "--diameter", "0.15"]
