@@ -187,10 +187,11 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
 
 def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):
     _, first = visit
+    first.session.edit("test", view=View(playing=False))  # pages share one software renderer
     page, second = open_page(browser, server)
     third = browser.new_page()
     try:
-        second.session.edit("test", avoidance=False)
+        second.session.edit("test", avoidance=False, view=View(playing=False))
         assert second.session.wait_idle(PATIENCE)
         assert first.session.scenario.avoidance
         third.goto(f"http://127.0.0.1:{server.port}")

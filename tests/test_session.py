@@ -498,3 +498,21 @@ def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(open
     assert len(opened.engine.asked) == asked + 1
     opened.session.undo()
     assert opened.session.scenario == replace(fresh("draw_s"), view=View(generator_layer=2))
+
+
+@pytest.mark.parametrize("layer", ["ghost_arm", "onion", "body_points", "joint_plots"])
+def test_what_is_drawn_from_the_motion_itself_needs_no_new_frame(opened, layer):
+    asked = len(opened.engine.asked)
+    opened.session.edit(layer, view=View(**{layer: True}))
+    opened.settle()
+    assert len(opened.engine.asked) == asked
+    assert getattr(opened.page.adopted[-1].view, layer)
+
+
+def test_who_avoids_can_be_undone(opened):
+    opened.session.edit("Avoid with", space="both")
+    opened.settle()
+    assert opened.shown.space == "both"
+    opened.session.undo()
+    opened.settle()
+    assert opened.shown.space == "task"

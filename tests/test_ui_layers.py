@@ -22,6 +22,7 @@ from dt_viz.ui.links import CELL, bodies, light_shells, simplified
 from dt_viz.ui.panel import VIEW_LABELS, status_html
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
+from dt_viz.ui.scene import Rollouts
 from dt_viz.ui.session import Pace
 
 ROBOT = load_jaco()
@@ -206,6 +207,19 @@ def test_a_stale_arm_is_translucent_says_so_and_recovers(scene):
     assert arm.stale and all((mesh.opacity or 1) < 1 for mesh in arm.meshes)
     arm.stale = False
     assert not arm.stale and all(mesh.opacity is None for mesh in arm.meshes)
+
+
+def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
+    rollouts = Rollouts(scene)
+    paths = tuple(np.linspace([x, 0.0, 0.0], [x, 1.0, 0.0], 5) for x in (0.0, 0.1))
+
+    def colours(blocked):
+        rollouts.draw(replace(frame(blocked=blocked), rollouts=paths))
+        return rollouts.lines.node.colors.reshape(-1, 3).astype(int)
+
+    fresh, stale = colours(()), colours(("the obstacle touches the base",))
+    assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
+    np.testing.assert_array_equal(colours(()), fresh)
 
 
 # --- Joint plots ---

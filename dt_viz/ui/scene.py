@@ -47,8 +47,8 @@ class Rollouts(Picture):
     """What the robot will do, bold, with a dot at each start."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._lines = Lines(scene, "/rollouts", palette.ROLLOUT, 0.0048)
-        super().__init__(self._lines.node)
+        self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, 0.0048)
+        super().__init__(self.lines.node)
         self._starts = scene.add_point_cloud(
             "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
         )
@@ -57,9 +57,9 @@ class Rollouts(Picture):
         """See `Picture`."""
         chosen = frame.scenario.arm_rollout % len(frame.rollouts)
         if frame.blocked:
-            self._lines.show(frame.rollouts, chosen, mark=palette.GHOST, colour=palette.STALE)
+            self.lines.show(frame.rollouts, chosen, mark=palette.GHOST, colour=palette.STALE)
         else:
-            self._lines.show(frame.rollouts, chosen)
+            self.lines.show(frame.rollouts, chosen)
         self._starts.points = np.stack([path[0] for path in frame.rollouts]).astype(np.float32)
 
 
