@@ -257,7 +257,6 @@ class Engine:
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
         doubts = _doubts(ground, scenario, solved, clearance, float(np.linalg.norm(reached - ground.goal)))
-        built = stack.built[0].duration if stack.built else None
         return Frame(
             scenario=scenario,
             task=ground.task,
@@ -269,7 +268,10 @@ class Engine:
             reached=reached,
             blocked=(),
             health=Health(
-                clearance=clearance, duration=built, arm_duration=arm.duration if arm else None, doubts=doubts
+                clearance=clearance,
+                duration=stack.avoidance_duration,
+                arm_duration=arm.duration if arm else None,
+                doubts=doubts,
             ),
         )
 
@@ -313,14 +315,14 @@ def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse:
     view, book = scenario.view, ground.sketchbook
     return Pictures(
         generator=book.generator(view.generator_layer) if view.generator else None,
-        grid=book.grid([made.transform for made in solution.built], coarse=coarse) if view.grid else None,
+        grid=book.grid([made.transform for _, made in solution.built], coarse=coarse) if view.grid else None,
         base=book.base(solution.rays) if view.base else None,
     )
 
 
 def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: float, missed: float) -> tuple[str, ...]:
     """Why the motion is not to be trusted, in words."""
-    doubts = [*ground.imitation.warnings, *(doubt for made in solved.stack.built for doubt in made.doubts)]
+    doubts = [*ground.imitation.warnings, *solved.stack.doubts]
     if solved.arm is not None:
         if not solved.arm.cleared:
             doubts.append("the arm finds no way around the obstacle: a motion comes too near to it")

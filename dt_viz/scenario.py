@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from dt_viz.obstacles import Sphere
 from dt_viz.occupancy import Generator
+
+if TYPE_CHECKING:
+    from dt_viz.behaviours import Behaviour
 
 Objective = Literal["trajectory", "velocity"]
 """What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
@@ -82,6 +85,10 @@ class Scenario:
     """Clearance that `auto` keeps, metres."""
     duration: float | None = None
     """t of the avoidance flow; None is `auto`, the shortest that clears the obstacle by the margin."""
+    layers: tuple[Behaviour, ...] = ()
+    """What else the end effector's motion is to do, from the inside out."""
+    avoidance_level: int | None = None
+    """How many of these layers the end effector's avoidance is stacked on; None is all of them."""
     arm_rollout: int = 0
     """Which rollout the arm follows."""
     view: View = field(default_factory=View)

@@ -19,9 +19,6 @@ from dt_viz.scenario import Scenario
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task
 
-BEHAVIOURS: tuple[Behaviour, ...] = (ObstacleAvoidance(),)
-"""What is stacked on the imitation, from the inside out."""
-
 NUM_SAMPLES = 200
 """Of each rollout before refinement."""
 MAX_ATTEMPTS = 4
@@ -91,7 +88,8 @@ class Solution:
     transform: Diffeomorphism
     rays: Rays
     bundle: Bundle
-    built: tuple[Built, ...]
+    built: tuple[tuple[Behaviour, Built], ...]
+    """The behaviours that are on, from the inside out."""
     satisfied: bool
     """Whether every behaviour found what it was made for."""
 
@@ -99,6 +97,16 @@ class Solution:
     def system(self) -> DiffeomorphicSystem:
         """The dynamical system whose motions these are."""
         return DiffeomorphicSystem(self.transform, self.rays.base)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Of the behaviours, in words."""
+        return tuple(doubt for _, made in self.built for doubt in made.doubts)
+
+    @property
+    def avoidance_duration(self) -> float | None:
+        """T of the end effector's avoidance; None where it is off."""
+        return next((made.duration for layer, made in self.built if isinstance(layer, ObstacleAvoidance)), None)
 
     def positions_at(self, index: Indices, fraction: Array) -> Array:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
@@ -113,6 +121,13 @@ def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
     return np.stack(levels, axis=1)
 
 
+def behaviours(scenario: Scenario) -> tuple[Behaviour, ...]:
+    """What is stacked on the imitation, from the inside out."""
+    level = scenario.avoidance_level
+    below = scenario.layers if level is None else scenario.layers[:level]
+    return (*below, ObstacleAvoidance(), *scenario.layers[len(below) :])
+
+
 def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
     """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
 
@@ -120,14 +135,14 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
     behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not. Where
     there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
     """
-    solution = None
+    solution, layers = None, behaviours(scenario)
     for keeps_goal in (True, False):
         rays, bundle = ground.rays, ground.bundle
         ends_below = ground.ends
-        durations = [0.0] * len(BEHAVIOURS)
+        durations = [0.0] * len(layers)
         for _ in range(MAX_ATTEMPTS):
             lowest = Motion(scenario, ground.task.starts, ground.goal, bundle.index, bundle.levels[:, 0], keeps_goal)
-            built = _build(lowest, precision.tolerance, durations)
+            built = _build(layers, lowest, precision.tolerance, durations)
             durations = [made.duration if made else 0.0 for _, made in built]
             outer = [made.transform for _, made in built if made]
             goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
@@ -142,29 +157,32 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
             bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
             stack = [ground.system.transform, *outer]
             bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            satisfied = _satisfied(built, bundle)
-            solution = Solution(Chain(stack), rays, bundle, tuple(made for _, made in built if made), satisfied)
-            if satisfied or any(made.hopeless for made in solution.built):
+            satisfied = _satisfied(layers, built, bundle)
+            on = tuple((layer, made) for layer, (_, made) in zip(layers, built, strict=True) if made)
+            solution = Solution(Chain(stack), rays, bundle, on, satisfied)
+            if satisfied or any(made.hopeless for _, made in on):
                 return solution
     assert solution is not None
     return solution
 
 
-def _build(motion: Motion, tolerance: float, durations: Sequence[float]) -> list[tuple[Motion, Built | None]]:
+def _build(
+    layers: Sequence[Behaviour], motion: Motion, tolerance: float, durations: Sequence[float]
+) -> list[tuple[Motion, Built | None]]:
     """Each behaviour's transform, None where it is off, with the motion that it was made for."""
     built = []
-    for k, behaviour in enumerate(BEHAVIOURS):
+    for k, behaviour in enumerate(layers):
         made = behaviour.build(motion, tolerance, durations[k])
         built.append((motion, made))
-        if made and k < len(BEHAVIOURS) - 1:
+        if made and k < len(layers) - 1:
             motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
     return built
 
 
-def _satisfied(built: Sequence[tuple[Motion, Built | None]], bundle: Bundle) -> bool:
+def _satisfied(layers: Sequence[Behaviour], built: Sequence[tuple[Motion, Built | None]], bundle: Bundle) -> bool:
     """Whether each behaviour finds on its level of the bundle what it was made for."""
     level = 0
-    for behaviour, (motion, made) in zip(BEHAVIOURS, built, strict=True):
+    for behaviour, (motion, made) in zip(layers, built, strict=True):
         if made:
             level += 1
             after = replace(motion, index=bundle.index, positions=bundle.levels[:, level])
