@@ -30,6 +30,8 @@ SHARPNESS = 2
 """p of the smooth maximum over body points: the stronger a contact, the more it counts."""
 FAN = 4.0
 """Distance behind the obstacle's middle, in its radii, of the point from which escaping points fan out."""
+BEHIND = 1.25
+"""The same, at least, in distances at which the field ends: the point itself is no place to escape from."""
 DAMPING = 0.06
 """λ of the contact's pseudo-inverse, metres per rad: a contact that joints can hardly move is not chased."""
 DIRECTION_WEIGHT = 1.5
@@ -86,8 +88,9 @@ class WholeArmField:
 
     @cached_property
     def _source(self) -> Array:
-        middle = np.asarray(self.obstacle.position) - FAN * self.obstacle.radius * self.direction
-        return middle[:, None]
+        end = self.obstacle.radius + self.reach + self.body.radius.max()
+        behind = max(FAN * self.obstacle.radius, BEHIND * end)
+        return (np.asarray(self.obstacle.position) - behind * self.direction)[:, None]
 
     @cached_property
     def _core(self) -> Array:
@@ -138,7 +141,7 @@ class WholeArmField:
 
 @dataclass(frozen=True, eq=False)
 class GradientField:
-    """The paper's generator V_q = ∇_q Σ_b U(x_b), here with U the occupancy w_b of `WholeArmField`, in metres.
+    """The paper's generator V_q = ∇_q Σ_b U(x_b), U the occupancy w_b of `WholeArmField` times the depth it grows over.
 
     It takes no care of start and goal, nor of how the hand moves.
     """
@@ -160,7 +163,8 @@ class GradientField:
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
         outward = points - np.asarray(self.obstacle.position)[:, None]
-        outward = outward / np.sqrt((outward * outward).sum(axis=1, keepdims=True))
+        length = np.sqrt((outward * outward).sum(axis=1, keepdims=True))
+        outward = outward / np.where(length == 0, 1.0, length)  # there the slope is 0
         core = -CORE * (self.obstacle.radius + self.body.radius)[:, None]
         distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         u = _unit_interval((self.reach - distance) / (self.reach - core))

@@ -136,7 +136,8 @@ class WholeArm:
         """The motions around the scenario's obstacle.
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
-        scenario's margin, or what the start or goal beside it has. Of several ways out the first is taken that works.
+        scenario's margin, or what the start or goal beside it has. Of several ways out the first is taken that works,
+        or the one that comes nearest to it.
 
         Args:
             lifted: the motions below.
@@ -144,12 +145,14 @@ class WholeArm:
             spacing: largest distance between neighbouring samples, metres at the hand, about.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
         """
-        solution = None
+        best = None
         for generator in self._generators(lifted, scenario):
             solution = _Solver(self, lifted, scenario, generator, spacing, coarse=coarse).solution()
+            if best is None or solution.cleared or solution.clearance > best.clearance:
+                best = solution
             if solution.cleared or scenario.duration is not None:
                 break
-        return solution or self.undisturbed(lifted, scenario, spacing)
+        return best or self.undisturbed(lifted, scenario, spacing)
 
     def clearance(self, q: Array, obstacle: Sphere) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
@@ -175,8 +178,10 @@ class WholeArm:
         tangents = tangents[affected[:: max(1, len(affected) // NUM_COMPARED)]]
         some = np.flatnonzero(collides)
         some = some[:: max(1, len(some) // NUM_COMPARED)]
-        for direction in escape_directions(points[:, :, some], self.body.radius, tangents, obstacle):
-            yield WholeArmField(self.robot, self.body, obstacle, direction, lifted.pins, reach)
+        grown = replace(obstacle, diameter=obstacle.diameter + 2 * scenario.margin)
+        pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
+        for direction in escape_directions(points[:, :, some], self.body.radius, tangents, grown):
+            yield WholeArmField(self.robot, self.body, obstacle, direction, pins, reach)
 
 
 class _Solver:
@@ -221,12 +226,13 @@ class _Solver:
         bundle = self._refined(Bundle(index, fraction, self._evaluate(transform, index, fraction)), transform)
         p = bundle.positions / LEVERS
         lack = self._lack(p)
-        for _ in range(MAX_ROUNDS):
-            if self._scenario.duration is not None or duration >= MAX_DURATION or not (lack > ROUNDING).any():
+        chosen = self._generator is not None and self._scenario.duration is None
+        for _ in range(MAX_ROUNDS if chosen else 0):
+            if duration >= MAX_DURATION or not (lack > ROUNDING).any():
                 break
             # the flow is a one-parameter group: go on from where the samples are
-            more = self._clearing_duration(p[lack > 0])
-            duration = min(duration + more, MAX_DURATION)
+            more = min(self._clearing_duration(p[lack > 0]), MAX_DURATION - duration)
+            duration += more
             transform = self._transform(duration)
             p = self._transform(more).inverse(p)
             bundle = self._refined(replace(bundle, levels=(p * LEVERS)[:, None]), transform)
