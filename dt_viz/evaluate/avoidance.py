@@ -26,6 +26,7 @@ import numpy as np
 from dt_viz.collision import CollisionReport, load_collision_model
 from dt_viz.engine import ArmMotion, Engine
 from dt_viz.evaluate.options import (
+    add_generator,
     add_space,
     add_task,
     chosen_task,
@@ -105,6 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--obstacle", type=point, required=True, metavar="X,Y,Z", help="centre of the sphere, metres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), required=True, metavar="D", help="metres")
     add_space(parser)
+    add_generator(parser)
     parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
@@ -116,7 +118,9 @@ def run(options: argparse.Namespace) -> int:
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
     obstacle = Sphere(options.obstacle, options.diameter)
-    scenario = Scenario(task.name, obstacle, avoidance=not options.no_avoidance, space=options.space)
+    scenario = Scenario(
+        task.name, obstacle, avoidance=not options.no_avoidance, space=options.space, generator=options.generator
+    )
     try:
         frame, motions = engine.arm_motions(scenario)
     except UnreachableError as error:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dt_viz.occupancy import GENERATORS
 from dt_viz.scenario import SPACES
 from dt_viz.tasks import TASKS, Task, TaskEntry, lasa_tasks
 
@@ -33,6 +34,16 @@ def add_space(parser: argparse.ArgumentParser) -> None:
         type=_space,
         default="task",
         help="what avoids: the end effector (task), the whole arm (cspace), or both",
+    )
+
+
+def add_generator(parser: argparse.ArgumentParser) -> None:
+    """Add `--generator`."""
+    parser.add_argument(
+        "--generator",
+        choices=GENERATORS,
+        default=GENERATORS[0],
+        help="probability is the paper's (default: %(default)s)",
     )
 
 

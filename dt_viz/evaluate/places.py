@@ -16,6 +16,7 @@ import numpy as np
 from dt_viz.engine import Engine
 from dt_viz.evaluate.avoidance import Measured, measure
 from dt_viz.evaluate.options import (
+    add_generator,
     add_space,
     add_task,
     chosen_task,
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     add_space(parser)
     parser.set_defaults(space="cspace")
+    add_generator(parser)
     parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
@@ -59,7 +61,9 @@ def run(options: argparse.Namespace) -> int:
     rows = []
     for k, (x, y, z) in enumerate(places):
         obstacle = Sphere((x, y, z), options.diameter)
-        scenario = Scenario(task.name, obstacle, avoidance=not options.no_avoidance, space=options.space)
+        scenario = Scenario(
+            task.name, obstacle, avoidance=not options.no_avoidance, space=options.space, generator=options.generator
+        )
         frame, motions = engine.arm_motions(scenario)
         found.append(
             [
