@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
-from dt_viz.fields import Array, GaussianGrid, Mask, second_orders, unit_orders
+from dt_viz.fields import Array, GaussianGrid, Mask, VectorField, second_orders, unit_orders
 
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")
@@ -166,3 +167,34 @@ class AvoidanceField:
         p = expit(logit / self.temperature)
         far = expit(self.occupancy.bias / self.temperature)
         return np.maximum(p - far, 0), np.where(p > far, p * (1 - p) / self.temperature, 0)
+
+
+@dataclass(frozen=True)
+class StretchedField:
+    """A vector field under a linear map of space: V_out(s) = M·V(M⁻¹s).
+
+    Its flow is M γ(t, M⁻¹s): what leaves a shape there leaves the stretched shape here, in the same time. A flat
+    or long shape so gets a field that is as smooth, relative to each of its sizes, as that of a ball.
+    """
+
+    inner: VectorField
+    axes: Array
+    """M, (d, d), invertible."""
+
+    @cached_property
+    def _inverse(self) -> Array:
+        return np.linalg.inv(self.axes)
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.inner.dim
+
+    def __call__(self, s: Array) -> Array:
+        """V_out at the points `s` (N, d), as (N, d)."""
+        return self.inner(s @ self._inverse.T) @ self.axes.T
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V_out (N, d) and its derivative (N, d, d) at the points `s` (N, d)."""
+        v, DV = self.inner.with_jacobian(s @ self._inverse.T)
+        return v @ self.axes.T, self.axes @ DV @ self._inverse
