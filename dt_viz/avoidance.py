@@ -9,6 +9,7 @@ from dt_viz.diffeo import AdaptiveFlow
 from dt_viz.fields import Array, Indices, Mask, VectorField
 from dt_viz.integrate import integrate_adaptive, rk4
 from dt_viz.obstacles import Sphere
+from dt_viz.several import Several
 
 MAX_DURATION = 4.0
 """Longest flow that is tried to clear an obstacle: a motion that still collides runs through the flow's centre."""
@@ -31,7 +32,7 @@ class ObstacleAvoidance:
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
         """See `Behaviour`. With `auto` the duration is the shortest that clears all that can be cleared."""
         scenario = motion.scenario
-        if not scenario.avoidance or scenario.space == "cspace":
+        if not scenario.avoidance or scenario.space == "cspace" or not scenario.obstacle.parts:
             return None
         obstacle = scenario.obstacle
         field = obstacle.field(scenario.generator, scenario.temperature)
@@ -119,7 +120,7 @@ def _avoidable(motion: Motion) -> Mask:
 
 
 def clearing_duration(
-    field: VectorField, obstacle: Sphere, points: Array, margin: float, *, at_least: float = 0.0
+    field: VectorField, obstacle: Several | Sphere, points: Array, margin: float, *, at_least: float = 0.0
 ) -> float | None:
     """The shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
+from dt_viz.several import Several
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -56,12 +57,16 @@ class Nearest:
     at: float
 
 
+NOTHING = Nearest(np.inf, (), 0.0)
+"""Where there is nothing to come near to."""
+
+
 @dataclass(frozen=True)
 class CollisionReport:
     """What a joint path comes near to or collides with.
 
     Attributes:
-        obstacle: smallest signed distance of the arm from the obstacle; negative inside.
+        obstacle: smallest signed distance of the arm from an obstacle, negative inside; infinite if there is none.
         itself: smallest distance of two links that are not neighbours, 0 where they intersect; None beyond
             `SELF_REACH`.
         table: smallest signed height above the table of what does not stand on it.
@@ -470,11 +475,14 @@ class CollisionModel:
                     distances[row], nearest[row] = distance, item
         return distances, nearest
 
-    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Sphere) -> Nearest:
+    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Several | Sphere) -> Nearest:
         """The smallest signed distance of the arm from the obstacle on a path q (T, 6), rad, to `TOLERANCE`."""
-        found = self._search(_FromObstacle(self.links, obstacle), q, TOLERANCE)
-        assert found is not None  # without a ceiling there always is one
-        return found
+        nearest = NOTHING
+        for part in obstacle.parts if isinstance(obstacle, Several) else (obstacle,):
+            found = self._search(_FromObstacle(self.links, part), q, TOLERANCE)
+            assert found is not None  # without a ceiling there always is one
+            nearest = min(nearest, found, key=lambda near: near.distance)
+        return nearest
 
     def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:
         """The smallest distance of two links on a path q (T, 6), rad, to `SELF_TOLERANCE`; None beyond `SELF_REACH`.
@@ -492,7 +500,7 @@ class CollisionModel:
         assert found is not None
         return found
 
-    def report(self, q: ArrayLike, obstacle: Sphere) -> CollisionReport:
+    def report(self, q: ArrayLike, obstacle: Several | Sphere) -> CollisionReport:
         """All of it for one path q (T, 6), rad."""
         return CollisionReport(
             self.nearest_to_obstacle(q, obstacle), self.nearest_to_itself(q), self.nearest_to_table(q)

@@ -231,3 +231,24 @@ class PlacedField:
         """V (N, d) and DV (N, d, d) at the world points `s` (N, d)."""
         v, DV = self.inner.with_jacobian((s - self.origin) @ (self.axes / self.scale))
         return v @ (self.scale * self.axes.T), self.axes @ DV @ self.axes.T
+
+
+@dataclass(frozen=True)
+class Sum:
+    """Several fields of the same dimension, added up; at least one."""
+
+    parts: tuple[VectorField, ...]
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.parts[0].dim
+
+    def __call__(self, s: Array) -> Array:
+        """V at the points `s` (N, d), as (N, d)."""
+        return np.sum([part(s) for part in self.parts], axis=0)
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
+        values, derivatives = zip(*(part.with_jacobian(s) for part in self.parts), strict=True)
+        return np.sum(values, axis=0), np.sum(derivatives, axis=0)

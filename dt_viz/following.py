@@ -9,6 +9,7 @@ from dt_viz.collision import load_collision_model
 from dt_viz.fields import Array, Indices
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import Robot
+from dt_viz.several import Several
 from dt_viz.solving import Ground, Solution
 from dt_viz.tracking import JointPath, UnreachableError, inverse_kinematics, track
 from dt_viz.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, lift
@@ -65,7 +66,7 @@ class Follower:
         self._before[ground, rollout] = joints.q
         return joints
 
-    def obstructions(self, ground: Ground, obstacle: Sphere) -> tuple[str, ...]:
+    def obstructions(self, ground: Ground, obstacle: Several) -> tuple[str, ...]:
         """Why the whole arm cannot move from the starts to the goal, in words; empty where nothing is in the way."""
         try:
             lifted = self.undisturbed(ground)
@@ -75,23 +76,26 @@ class Follower:
         reasons = _named("start", np.flatnonzero(missed[:, 0]), "out of the arm's reach")
         if missed[:, 1].any():
             reasons.append("the goal is out of the arm's reach")
-        resting = lifted.pins[:1]
-        pedestal = self.body.on_pedestal
-        distance = obstacle.signed_distance(pedestal.positions(self.robot, resting[0])) - pedestal.radius
-        covered = self.whole_arm.clearance(lifted.pins, obstacle) < 0
-        if covered.any() or (distance < 0).any():
-            # the spheres are larger than the arm: ask the meshes
-            model = load_collision_model()
-            gaps, links = model.obstacle_distance(lifted.pins, obstacle)
-            if gaps[0] < 0 and model.links[int(links[0])].name in PEDESTAL:
-                return (
-                    *reasons,
-                    f"the obstacle touches the arm's {model.links[int(links[0])].name}, which cannot move away",
-                )
-            reasons += _named("start", np.flatnonzero(gaps[:-1] < 0), "inside the obstacle: the arm there touches it")
-            if gaps[-1] < 0:
-                reasons.append("the goal is inside the obstacle: the arm there touches it")
+        for part in obstacle.parts:
+            reasons += self._touching(lifted.pins, part)
         return tuple(reasons)
+
+    def _touching(self, pins: Array, obstacle: Sphere) -> list[str]:
+        """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6), in words."""
+        pedestal = self.body.on_pedestal
+        distance = obstacle.signed_distance(pedestal.positions(self.robot, pins[0])) - pedestal.radius
+        if (distance >= 0).all() and (self.whole_arm.clearance(pins, obstacle) >= 0).all():
+            return []
+        # the spheres are larger than the arm: ask the meshes
+        model = load_collision_model()
+        gaps, links = model.obstacle_distance(pins, obstacle)
+        name = model.links[int(links[0])].name
+        if gaps[0] < 0 and name in PEDESTAL:
+            return [f"the obstacle touches the arm's {name}, which cannot move away"]
+        reasons = _named("start", np.flatnonzero(gaps[:-1] < 0), "inside the obstacle: the arm there touches it")
+        if gaps[-1] < 0:
+            reasons.append("the goal is inside the obstacle: the arm there touches it")
+        return reasons
 
     def doubts(self, joints: JointPath, rollout: int) -> tuple[str, ...]:
         """Why the joints along a rollout, counted from 0, are not to be trusted."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dt_viz.obstacles import Sphere
 from dt_viz.occupancy import Generator
+from dt_viz.several import Several
 
 if TYPE_CHECKING:
     from dt_viz.behaviours import Behaviour
@@ -70,7 +71,8 @@ class Scenario:
     """All that a picture depends on: the same scenario always gives the same frame."""
 
     task: str
-    obstacle: Sphere
+    obstacles: tuple[Sphere, ...]
+    """All are avoided together; there may be none."""
     imitation: bool = True
     """Whether the learned transform is in the stack; without it motions are straight."""
     objective: Objective = "trajectory"
@@ -92,6 +94,11 @@ class Scenario:
     arm_rollout: int = 0
     """Which rollout the arm follows."""
     view: View = field(default_factory=View)
+
+    @property
+    def obstacle(self) -> Several:
+        """All obstacles as one."""
+        return Several(self.obstacles)
 
     def moves_like(self, other: Scenario) -> bool:
         """Whether both give the same motion, however it is looked at."""

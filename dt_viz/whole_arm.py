@@ -19,12 +19,13 @@ from dt_viz.body import BodyPoints
 from dt_viz.cspace import LEVERS, REACH_PER_TEMPERATURE, GradientField, JointLimits, WholeArmField, squared_lengths
 from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity, Inverse
 from dt_viz.escape import escape_directions
-from dt_viz.fields import Array, Indices
+from dt_viz.fields import Array, Indices, Sum, VectorField
 from dt_viz.integrate import rk4
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import NUM_JOINTS, Robot
 from dt_viz.rollouts import Bundle, refined
 from dt_viz.scenario import Scenario
+from dt_viz.several import Several
 from dt_viz.tracking import JointPath, track
 
 NUM_CONFIGURATIONS = 100
@@ -51,8 +52,6 @@ NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
 BESIDE = 0.20
 """Clearance up to which a sample is bent along with the colliding ones, metres."""
-
-Generator = WholeArmField | GradientField
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,34 +153,57 @@ class WholeArm:
                 break
         return best or self.undisturbed(lifted, scenario, spacing)
 
-    def clearance(self, q: Array, obstacle: Sphere) -> Array:
+    def clearance(self, q: Array, obstacle: Several | Sphere) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
         points = self.body.of_chain(self.robot.chain(q.T))
         return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)
 
-    def _generators(self, lifted: Lift, scenario: Scenario) -> Iterator[Generator]:
-        """The fields to try, the most promising first; none where nothing comes too near the obstacle."""
-        obstacle, reach = scenario.obstacle, REACH_PER_TEMPERATURE * scenario.temperature
+    def _generators(self, lifted: Lift, scenario: Scenario) -> Iterator[VectorField]:
+        """The fields to try, the most promising first; none where nothing comes too near an obstacle."""
+        reach = REACH_PER_TEMPERATURE * scenario.temperature
         q = lifted.tracked.q
         points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
-        distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        collides = distance.min(axis=0) < scenario.margin
-        if not collides.any():
+        tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        near = scenario.obstacle.parts
+        escapes = [self._escapes(points, tangents, obstacle, scenario.margin) for obstacle in near]
+        met = [(obstacle, found) for obstacle, found in zip(near, escapes, strict=True) if found]
+        if not met:
             return
         if scenario.generator == "probability":
-            yield GradientField(self.robot, self.body, obstacle, reach)
+            yield Sum(tuple(GradientField(self.robot, self.body, obstacle, reach) for obstacle, _ in met))
             return
-        hand = self.robot.end_effector(q)
-        tangents = np.gradient(hand, axis=1).reshape(-1, 3)
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-        affected = np.flatnonzero(distance.min(axis=0) < BESIDE)
-        tangents = tangents[affected[:: max(1, len(affected) // NUM_COMPARED)]]
-        some = np.flatnonzero(collides)
-        some = some[:: max(1, len(some) // NUM_COMPARED)]
-        grown = replace(obstacle, diameter=obstacle.diameter + 2 * scenario.margin)
         pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
-        for direction in escape_directions(points[:, :, some], self.body.radius, tangents, grown):
-            yield WholeArmField(self.robot, self.body, obstacle, direction, pins, reach)
+        for attempt in range(max(len(found) for _, found in met)):
+            yield Sum(
+                tuple(
+                    WholeArmField(self.robot, self.body, obstacle, found[min(attempt, len(found) - 1)], pins, reach)
+                    for obstacle, found in met
+                )
+            )
+
+    def _escapes(self, points: Array, tangents: Array, obstacle: Sphere, margin: float) -> list[Array]:
+        """Ways out of one obstacle, the best first; none where nothing comes too near it.
+
+        Args:
+            points: (P, 3, N) body points of all samples, metres.
+            tangents: (N, 3) directions of the end effector's motion there.
+            obstacle: to escape from.
+            margin: clearance below which a sample counts, metres.
+        """
+        distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        clearance = distance.min(axis=0)
+        collides = np.flatnonzero(clearance < margin)
+        if not len(collides):
+            return []
+        bent = np.flatnonzero(clearance < BESIDE)
+        grown = replace(obstacle, diameter=obstacle.diameter + 2 * margin)
+        return escape_directions(
+            points[:, :, collides[:: max(1, len(collides) // NUM_COMPARED)]],
+            self.body.radius,
+            tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
+            grown,
+        )
 
 
 class _Solver:
@@ -192,7 +214,7 @@ class _Solver:
         arm: WholeArm,
         lifted: Lift,
         scenario: Scenario,
-        generator: Generator | None,
+        generator: VectorField | None,
         spacing: float,
         *,
         coarse: bool,

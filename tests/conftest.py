@@ -49,4 +49,4 @@ def engine(new_engine) -> Engine:
 @pytest.fixture(scope="session")
 def initial(engine):
     """The scenario that a task begins with."""
-    return lambda task: Scenario(task, Sphere(engine.task(task).obstacle_position))
+    return lambda task: Scenario(task, (Sphere(engine.task(task).obstacle_position),))

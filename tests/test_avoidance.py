@@ -85,7 +85,7 @@ def test_a_moved_and_grown_obstacle_clears_its_points_in_the_same_time(seed, dia
 
 def motion(paths, **changes):
     index = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
-    scenario = Scenario("any", SPHERE, margin=MARGIN, **changes)
+    scenario = Scenario("any", (SPHERE,), margin=MARGIN, **changes)
     starts = np.stack([path[0] for path in paths])
     return Motion(scenario, starts, paths[0][-1], index, np.concatenate(paths))
 

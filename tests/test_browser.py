@@ -112,18 +112,19 @@ def assert_shows_the_obstacle_where_it_is(visitor: Visitor) -> None:
     session, frame = visitor.session, visitor.shown
     assert frame is not None
     assert frame.scenario.obstacle == session.scenario.obstacle
-    np.testing.assert_allclose(visitor.pictures.obstacle.gizmo.position, session.scenario.obstacle.position, atol=1e-9)
+    (obstacle,) = session.scenario.obstacles
+    np.testing.assert_allclose(visitor.pictures.obstacle.gizmo.position, obstacle.position, atol=1e-9)
 
 
 def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
     page, visitor = visit
     before = visitor.shown
-    centre = np.array(visitor.session.scenario.obstacle.position)
+    centre = np.array(visitor.session.scenario.obstacles[0].position)
     tip = centre + np.array([0, 0, 0.8 * visitor.pictures.obstacle.gizmo.scale])
     drag(page, project(visitor, tip), project(visitor, tip + np.array([0, 0, 0.06])))
-    wait_until(lambda: visitor.session.scenario.obstacle.position[2] > centre[2] + 0.03, "the drag to arrive")
+    wait_until(lambda: visitor.session.scenario.obstacles[0].position[2] > centre[2] + 0.03, "the drag to arrive")
     assert visitor.session.wait_idle(PATIENCE)
-    moved = np.array(visitor.session.scenario.obstacle.position) - centre
+    moved = np.array(visitor.session.scenario.obstacles[0].position) - centre
     np.testing.assert_allclose(moved[:2], 0, atol=1e-6)  # the arrow moves it upwards only
 
     assert_shows_the_obstacle_where_it_is(visitor)
@@ -139,7 +140,7 @@ def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
 
 def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_pose_is_shown(visit):
     page, visitor = visit
-    centre = np.array(visitor.session.scenario.obstacle.position)
+    centre = np.array(visitor.session.scenario.obstacles[0].position)
     x, y = project(visitor, centre)
     grabbed = (x - 18, y + 14)  # off the handles
     for target in ((x + 40, y - 30), (x - 60, y + 20), (x + 25, y + 35)):
@@ -148,7 +149,7 @@ def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_p
         grabbed = target
     assert visitor.session.wait_idle(PATIENCE)
     wait_until(lambda: visitor.session.wait_idle(0.3), "the last event")
-    shift = np.array(visitor.session.scenario.obstacle.position) - centre
+    shift = np.array(visitor.session.scenario.obstacles[0].position) - centre
     assert np.linalg.norm(shift) > 0.02
     assert abs(shift[1]) < 1e-6  # the drawing plane is y = const
     assert_shows_the_obstacle_where_it_is(visitor)

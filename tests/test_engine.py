@@ -28,7 +28,7 @@ def stage(engine, scenario, wanted):
 
 def placed(scenario, position, diameter=0.15, **changes):
     x, y, z = (float(c) for c in position)
-    return replace(scenario, obstacle=Sphere((x, y, z), diameter), **changes)
+    return replace(scenario, obstacles=(Sphere((x, y, z), diameter),), **changes)
 
 
 def mean_end(task):
@@ -119,7 +119,7 @@ def test_no_drawn_segment_crosses_the_obstacle_wherever_it_stands(engine, initia
 def beside_goal(engine, scenario, diameter, clearance):
     """The scenario with its obstacle so near the goal, on the side of where it first stands."""
     goal = stage(engine, scenario, Stage.ROLLOUTS).goal
-    away = np.array(scenario.obstacle.position) - goal
+    away = np.array(scenario.obstacles[0].position) - goal
     return placed(scenario, goal + (diameter / 2 + clearance) * away / np.linalg.norm(away), diameter)
 
 
@@ -201,7 +201,7 @@ AWKWARD = {
 def test_an_awkward_obstacle_is_said_in_words_and_everything_stays_finite(engine, scenario, case, imitation):
     where, diameter, words = AWKWARD[case]
     task = engine.task(scenario.task)
-    position = {"goal": mean_end(task), "start": task.starts[0], "middle": scenario.obstacle.position}[where]
+    position = {"goal": mean_end(task), "start": task.starts[0], "middle": scenario.obstacles[0].position}[where]
     for frame in engine.frames(placed(scenario, position, diameter, imitation=imitation)):
         assert_finite(frame)
         assert any(words in doubt for doubt in frame.health.doubts), frame.health.doubts
@@ -248,7 +248,7 @@ def random_edit(rng, scenario, initial):
         return replace(scenario, imitation=bool(rng.integers(2)), avoidance=bool(rng.integers(2)))
     if kind == 3:
         return replace(scenario, arm_rollout=int(rng.integers(7)), temperature=float(rng.uniform(1, 12)))
-    position = np.array(scenario.obstacle.position) + rng.normal(size=3) * 0.03
+    position = np.array(scenario.obstacles[0].position) + rng.normal(size=3) * 0.03
     return placed(scenario, position, float(rng.uniform(0.05, 0.2)))
 
 

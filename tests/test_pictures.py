@@ -96,7 +96,7 @@ def test_the_grid_keeps_out_of_the_obstacle_as_the_motions_do(engine, scenario):
 
 
 def test_far_from_the_obstacle_the_grid_does_not_move(engine, scenario):
-    away = replace(scenario, obstacle=Sphere((0.0, 3.0, 3.0)))
+    away = replace(scenario, obstacles=(Sphere((0.0, 3.0, 3.0)),))
     moved = picture_at(engine, away)[1].grid.lines
     still = picture_at(engine, replace(away, avoidance=False))[1].grid.lines
     for a, b in zip(moved, still, strict=True):
@@ -161,7 +161,7 @@ def test_the_inset_shows_straight_rays_to_one_goal_beside_the_slice(engine, scen
 
 def test_pictures_are_remembered_where_the_obstacle_does_not_matter(engine, scenario):
     first = picture_at(engine, scenario, Stage.LIVE)[1]
-    x, y, z = scenario.obstacle.position
-    moved = picture_at(engine, replace(scenario, obstacle=Sphere((x, y, z + 0.02))), Stage.LIVE)[1]
+    x, y, z = scenario.obstacles[0].position
+    moved = picture_at(engine, replace(scenario, obstacles=(Sphere((x, y, z + 0.02)),)), Stage.LIVE)[1]
     assert moved.generator is first.generator
     assert moved.base.grid is first.base.grid

@@ -81,7 +81,7 @@ class Page:
 def fresh(task):
     if task == "broken":
         raise DemonstrationError("broken.csv", "lines", "none", "two or more")
-    return Scenario(task, Sphere((0.1, 0.2, 0.3 if task == "draw_s" else 0.6)))
+    return Scenario(task, (Sphere((0.1, 0.2, 0.3 if task == "draw_s" else 0.6)),))
 
 
 @dataclass
@@ -125,16 +125,16 @@ def test_a_session_begins_with_its_task(opened):
 
 
 def test_an_edit_is_adopted_computed_and_shown(opened):
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
-    assert opened.session.scenario.obstacle == at(1.0)
+    assert opened.session.scenario.obstacles[0] == at(1.0)
     assert opened.page.adopted[-1] == opened.shown == opened.session.scenario
     assert opened.page.frames[-1].stage is max(Stage)
 
 
 def test_an_edit_that_changes_nothing_does_nothing(opened):
     before = (len(opened.engine.asked), len(opened.page.adopted))
-    opened.session.edit("obstacle", obstacle=opened.session.scenario.obstacle)
+    opened.session.edit("obstacle", obstacles=opened.session.scenario.obstacles)
     opened.settle()
     assert (len(opened.engine.asked), len(opened.page.adopted)) == before
     opened.session.undo()
@@ -150,7 +150,7 @@ def test_a_view_is_adopted_and_nothing_is_computed(opened):
 
 
 def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     opened.session.edit("ghost", view=View(ghost=False))
     opened.session.undo()
     assert opened.session.scenario == replace(fresh("draw_s"), view=View(ghost=False))
@@ -159,16 +159,16 @@ def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
 def test_one_gesture_is_one_step_of_undo(opened):
     for x in np.linspace(0, 1, 20):
         opened.clock[0] += 0.05
-        opened.session.edit("obstacle", obstacle=at(x))
+        opened.session.edit("obstacle", obstacles=(at(x),))
     opened.session.undo()
     assert opened.session.scenario == fresh("draw_s")
     opened.session.redo()
-    assert opened.session.scenario.obstacle == at(1.0)
+    assert opened.session.scenario.obstacles[0] == at(1.0)
 
 
 @pytest.mark.parametrize("ending", ["let go", "pause", "another control"])
 def test_the_next_gesture_is_a_step_of_its_own(opened, ending):
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     if ending == "let go":
         opened.session.end_gesture()
     if ending == "pause":
@@ -176,7 +176,7 @@ def test_the_next_gesture_is_a_step_of_its_own(opened, ending):
     if ending == "another control":
         opened.session.edit("temperature", temperature=2.0)
     middle = opened.session.scenario
-    opened.session.edit("obstacle", obstacle=at(2.0))
+    opened.session.edit("obstacle", obstacles=(at(2.0),))
     opened.session.undo()
     assert opened.session.scenario == middle
 
@@ -220,7 +220,7 @@ def test_history_does_not_grow_without_end(opened):
 
 def test_reset_goes_back_to_the_beginning_keeps_the_view_and_can_be_undone(opened):
     opened.session.edit("ghost", view=View(ghost=False))
-    opened.session.edit("a", temperature=2.0, obstacle=at(1.0), generator="probability")
+    opened.session.edit("a", temperature=2.0, obstacles=(at(1.0),), generator="probability")
     changed = opened.session.scenario
     opened.session.reset()
     opened.settle()
@@ -230,56 +230,56 @@ def test_reset_goes_back_to_the_beginning_keeps_the_view_and_can_be_undone(opene
 
 
 def test_another_task_brings_its_place_and_keeps_other_choices(opened):
-    opened.session.edit("size", obstacle=Sphere((0.0, 0.0, 0.0), 0.22), temperature=3.0)
+    opened.session.edit("size", obstacles=(Sphere((0.0, 0.0, 0.0), 0.22),), temperature=3.0)
     opened.session.choose_task("lift_box")
     opened.settle()
     scenario = opened.session.scenario
     assert (scenario.task, scenario.temperature) == ("lift_box", 3.0)
-    assert scenario.obstacle == Sphere(fresh("lift_box").obstacle.position, 0.22)
+    assert scenario.obstacles == (Sphere(fresh("lift_box").obstacles[0].position, 0.22),)
     assert opened.shown == scenario
     opened.session.undo()
     assert opened.session.scenario.task == "draw_s"
-    assert opened.session.scenario.obstacle == Sphere((0.0, 0.0, 0.0), 0.22)
+    assert opened.session.scenario.obstacles[0] == Sphere((0.0, 0.0, 0.0), 0.22)
 
 
 def test_choosing_the_same_task_changes_nothing(opened):
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     opened.session.choose_task("draw_s")
-    assert opened.session.scenario.obstacle == at(1.0)
+    assert opened.session.scenario.obstacles[0] == at(1.0)
 
 
 def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
     with pytest.raises(DemonstrationError, match=r"broken\.csv"):
         opened.session.choose_task("broken")
     assert opened.session.scenario == fresh("draw_s")
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
-    assert opened.shown.obstacle == at(1.0)
+    assert opened.shown.obstacles[0] == at(1.0)
 
 
 def test_a_drag_is_one_step_for_undo_however_slow(opened):
     opened.session.begin_gesture()
     for x in range(1, 5):
-        opened.session.edit("obstacle", obstacle=at(float(x)))
+        opened.session.edit("obstacle", obstacles=(at(float(x)),))
         opened.clock[0] += 10 * GESTURE_PAUSE
     opened.session.end_gesture()
-    opened.session.edit("obstacle", obstacle=at(9.0))
+    opened.session.edit("obstacle", obstacles=(at(9.0),))
     opened.session.undo()
-    assert opened.session.scenario.obstacle == at(4.0)
+    assert opened.session.scenario.obstacles[0] == at(4.0)
     opened.session.undo()
     assert opened.session.scenario == fresh("draw_s")
 
 
 def test_a_drag_whose_end_is_lost_ends_with_the_next_control(opened):
     opened.session.begin_gesture()
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     for margin in (0.02, 0.03):
         opened.clock[0] += 2 * GESTURE_PAUSE
         opened.session.edit("margin", margin=margin)
     opened.session.undo()
     assert opened.session.scenario.margin == 0.02
     opened.session.undo()
-    assert opened.session.scenario == replace(fresh("draw_s"), obstacle=at(1.0))
+    assert opened.session.scenario == replace(fresh("draw_s"), obstacles=(at(1.0),))
 
 
 def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
@@ -296,14 +296,14 @@ def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
 def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
     opened.engine.begun.clear()
     opened.engine.gate = threading.Event()
-    opened.session.edit("obstacle", obstacle=at(0.0))
+    opened.session.edit("obstacle", obstacles=(at(0.0),))
     assert opened.engine.begun.wait(PATIENCE)
     for x in range(1, 8):
-        opened.session.edit("obstacle", obstacle=at(float(x)))
+        opened.session.edit("obstacle", obstacles=(at(float(x)),))
     opened.engine.gate.set()
     opened.settle()
-    assert [scenario.obstacle.position[0] for scenario in opened.engine.asked[1:]] == [0.0, 7.0]
-    stages = [frame.stage for frame in opened.page.frames if frame.scenario.obstacle == at(0.0)]
+    assert [scenario.obstacles[0].position[0] for scenario in opened.engine.asked[1:]] == [0.0, 7.0]
+    stages = [frame.stage for frame in opened.page.frames if frame.scenario.obstacles[0] == at(0.0)]
     # something is shown while dragging, field and arm unless they were drawn a moment ago; refined is only what rests
     assert stages in ([Stage.ROLLOUTS], [Stage.ROLLOUTS, Stage.LIVE])
     assert opened.page.paces[-1].num_skipped == 6
@@ -324,7 +324,7 @@ def test_after_a_storm_from_several_threads_the_last_picture_is_that_of_the_last
         for _ in range(150):
             what = rng.integers(0, 7)
             if what <= 2:
-                opened.session.edit("obstacle", obstacle=at(float(rng.normal())))
+                opened.session.edit("obstacle", obstacles=(at(float(rng.normal())),))
             elif what == 3:
                 opened.session.edit("temperature", temperature=float(rng.uniform(1, 12)))
             elif what == 4:
@@ -354,16 +354,16 @@ def test_what_the_controls_show_last_is_the_last_scenario_also_from_several_thre
     original = opened.page.adopt
 
     def slow_first(scenario):
-        if scenario.obstacle == at(1.0):
+        if scenario.obstacles[0] == at(1.0):
             inside.set()
             release.wait(1.0)
         original(scenario)
 
     opened.page.adopt = slow_first
-    thread = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacle": at(1.0)})
+    thread = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacles": (at(1.0),)})
     thread.start()
     assert inside.wait(PATIENCE)
-    second = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacle": at(2.0)})
+    second = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacles": (at(2.0),)})
     second.start()
     second.join(0.2)
     release.set()
@@ -375,7 +375,7 @@ def test_what_the_controls_show_last_is_the_last_scenario_also_from_several_thre
 def test_a_closed_session_computes_nothing_more(opened):
     opened.session.close()
     asked = len(opened.engine.asked)
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     assert opened.session.wait_idle(1.0)
     assert len(opened.engine.asked) == asked
 
@@ -387,7 +387,7 @@ def begin_learning(opened, task="lift_box"):
 
 
 def test_cancelling_goes_back_to_the_task_that_was_shown_and_says_so(opened):
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     before = opened.session.scenario
     begin_learning(opened)
@@ -403,7 +403,7 @@ def test_cancelling_goes_back_to_the_task_that_was_shown_and_says_so(opened):
 def test_cancelling_keeps_the_view_and_forgets_what_was_edited_meanwhile(opened):
     begin_learning(opened)
     opened.session.edit("ghost", view=View(ghost=False))
-    opened.session.edit("obstacle", obstacle=at(2.0))
+    opened.session.edit("obstacle", obstacles=(at(2.0),))
     opened.session.cancel()
     opened.settle()
     assert opened.session.scenario == opened.shown == replace(fresh("draw_s"), view=View(ghost=False))
@@ -437,21 +437,21 @@ def test_another_choice_supersedes_learning(opened, how):
 def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
     begin_learning(opened)
     for x in range(5):
-        opened.session.edit("obstacle", obstacle=at(float(x)))
+        opened.session.edit("obstacle", obstacles=(at(float(x)),))
     opened.engine.learning.clear()
     assert opened.engine.learning.wait(PATIENCE)
     assert [scenario.task for scenario in opened.engine.asked].count("lift_box") == 1
     opened.engine.unlearned = set()
     opened.settle()
-    assert opened.shown.obstacle == at(4.0)
+    assert opened.shown.obstacles[0] == at(4.0)
 
 
 def test_there_is_nothing_to_cancel_when_nothing_is_learned(opened):
-    opened.session.edit("obstacle", obstacle=at(1.0))
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     opened.session.cancel()
     opened.settle()
-    assert opened.session.scenario.obstacle == at(1.0)
+    assert opened.session.scenario.obstacles[0] == at(1.0)
     assert opened.page.cancellations == []
 
 
@@ -465,9 +465,9 @@ def test_the_first_task_can_be_cancelled_too_and_any_edit_begins_again():
         assert session.wait_idle(PATIENCE)
         assert page.cancellations == ["draw_s"] and page.frames == []
         engine.unlearned = set()
-        session.edit("obstacle", obstacle=at(1.0))
+        session.edit("obstacle", obstacles=(at(1.0),))
         assert session.wait_idle(PATIENCE)
-        assert page.frames[-1].scenario.obstacle == at(1.0)
+        assert page.frames[-1].scenario.obstacles[0] == at(1.0)
     finally:
         session.close()
 

@@ -40,7 +40,7 @@ def motion(num=60, seconds=4.0, *, sway=0.0):
 def frame(arm=None, *, blocked=(), health=None, stage=Stage.CERTIFIED, scenario=None):
     nothing: Any = None
     return Frame(
-        scenario=scenario or Scenario("draw_s", Sphere((0.0, -0.5, 0.4))),
+        scenario=scenario or Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),)),
         task=nothing,
         stage=stage,
         ghost=(),
@@ -309,7 +309,7 @@ def test_the_status_says_which_flow_runs_how_long(hand, arm, said):
     [("task", True, "end effector"), ("cspace", True, "body points"), ("cspace", False, "end effector")],
 )
 def test_the_status_says_whose_clearance_it_is(space, avoidance, whose):
-    scenario = Scenario("draw_s", Sphere((0.0, -0.5, 0.4)), space=space, avoidance=avoidance)
+    scenario = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space, avoidance=avoidance)
     assert f"10.0 mm, {whose}" in status_html(frame(scenario=scenario), PACE)
 
 

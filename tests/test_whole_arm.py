@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from dt_viz.collision import load_collision_model
-from dt_viz.diffeo import Identity
+from dt_viz.cspace import LEVERS, GradientField
+from dt_viz.diffeo import Identity, min_det_jacobian
 from dt_viz.following import Follower
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Scenario
 from dt_viz.solving import FINE, LIVE
 from dt_viz.tasks import TASKS
-from dt_viz.whole_arm import ROUNDING, ArmSolution, Lift, WholeArm
+from dt_viz.tracking import track
+from dt_viz.whole_arm import MAX_DURATION, ROUNDING, ArmSolution, Lift, WholeArm
 
 ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)
 """In the way of the forearm that pushes the box, far from where the hand goes."""
@@ -26,7 +28,7 @@ class Case:
         mean = np.mean([resample_by_arc_length(path, 101) for path in engine.task(task).paths], axis=0)
         x, y, z = mean[50]
         self.robot = robot
-        self.scenario = Scenario(task, Sphere((float(x), float(y), float(z)), 0.15), space="cspace")
+        self.scenario = Scenario(task, (Sphere((float(x), float(y), float(z)), 0.15),), space="cspace")
         self.ground = engine._ground(self.scenario, None)
         self.follower = Follower(robot)
         self.arm: WholeArm = self.follower.whole_arm
@@ -47,7 +49,7 @@ class Case:
 
     def beside(self, clearance, diameter=0.1) -> Sphere:
         """An obstacle that the arm passes at this distance."""
-        x, y, z = self.scenario.obstacle.position
+        x, y, z = self.scenario.obstacles[0].position
         q = self.lifted.tracked.q.reshape(-1, 6)
         low, high = 0.0, 1.0
         for _ in range(25):
@@ -77,11 +79,178 @@ def split(solution, values):
     return np.split(values, np.flatnonzero(np.diff(solution.index)) + 1)
 
 
+class TestLift:
+    def test_it_is_the_section_that_tracking_computes_also_between_its_samples(self, case):
+        fractions = case.lifted.fractions
+        between = np.sort(np.concatenate([fractions, (fractions[:, :-1] + fractions[:, 1:]) / 2], axis=1))
+        index = np.repeat(np.arange(len(between)), between.shape[1])
+        paths = case.ground.system.transform.inverse(case.ground.rays.at(index, between.ravel()))
+        start = np.broadcast_to(case.lifted.reference, (len(between), 6))
+        direct = track(case.robot, paths.reshape(*between.shape, 3), start, reference=start).q.reshape(-1, 6)
+        q = case.lifted.at(index, between.ravel())
+        # tracking itself stops within 5e-4 rad of the best posture, and with the hand in place
+        assert np.abs(q - direct).max() < 5e-4
+        assert np.median(np.abs(q - direct).max(axis=1)) < 1e-5
+        assert np.linalg.norm(case.robot.end_effector(q) - paths, axis=1).max() < 2e-5
+
+    def test_all_rollouts_end_in_one_posture_and_are_pinned_there(self, case):
+        last = case.lifted.tracked.q[:, -1]
+        np.testing.assert_allclose(last, np.broadcast_to(last[0], last.shape), rtol=0, atol=1e-4)
+        np.testing.assert_array_equal(case.lifted.pins[-1], last[0])
+        np.testing.assert_array_equal(case.lifted.pins[:-1], case.lifted.tracked.q[:, 0])
+        np.testing.assert_allclose(case.robot.end_effector(case.lifted.pins), case.ground.ends, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("coarse", [True, False])
+class TestAroundTheMiddle:
+    """A ball of 15 cm at the middle of the mean demonstration."""
+
+    def test_every_motion_is_cleared_and_so_are_the_meshes(self, case, coarse):
+        solution = case.avoiding(coarse=coarse)
+        assert solution.cleared
+        assert solution.clearance > 0
+        assert solution.clearance == pytest.approx(case.arm.clearance(solution.p, case.scenario.obstacle).min())
+        assert case.truth(split(solution, solution.p), case.scenario.obstacle) > 0
+        assert case.truth(case.lifted.tracked.q, case.scenario.obstacle) < -0.05  # so there was something to do
+
+    def test_start_and_goal_stay(self, case, coarse):
+        solution = case.avoiding(coarse=coarse)
+        np.testing.assert_allclose(solution.p[ends(solution)], solution.q[ends(solution)], rtol=0, atol=1e-6)
+        hand = case.robot.end_effector(solution.p[ends(solution)]).reshape(-1, 2, 3)
+        np.testing.assert_allclose(hand[:, 0], case.ground.task.starts, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(hand[:, 1], np.broadcast_to(case.ground.goal, hand[:, 1].shape), rtol=0, atol=1e-5)
+
+    def test_joint_limits_are_kept(self, case, coarse):
+        p = case.avoiding(coarse=coarse).p
+        assert (p > case.robot.lower).all() and (p < case.robot.upper).all()
+
+    def test_neighbouring_samples_are_near(self, case, coarse):
+        solution = case.avoiding(coarse=coarse)
+        spacing = LIVE.spacing if coarse else FINE.spacing
+        for p, fraction in zip(split(solution, solution.p), split(solution, solution.fraction), strict=True):
+            assert np.linalg.norm(np.diff(p * LEVERS, axis=0), axis=1).max() <= spacing
+            assert (np.diff(fraction) > 0).all() and fraction[0] == 0 and fraction[-1] == 1
+            hand = case.robot.end_effector(p)
+            assert np.linalg.norm(np.diff(hand, axis=0), axis=1).max() < 2 * spacing
+
+    def test_the_motion_is_the_image_of_the_lifted_one(self, case, coarse):
+        solution = case.avoiding(coarse=coarse)
+        q = case.arm.limits.inside(solution.q)
+        error = np.abs(solution.transform.inverse(q) - solution.p).max()
+        # a drag's flow is continued in steps of other lengths where new samples ask for more of it
+        assert error < (5e-3 if coarse else 1e-5)
+
+    def test_the_duration_is_the_shortest(self, case, coarse):
+        solution = case.avoiding(coarse=coarse)
+        less = case.avoiding(coarse=coarse, duration=0.9 * solution.duration)
+        assert not less.cleared
+        same = case.avoiding(coarse=coarse, duration=solution.duration)
+        assert same.cleared
+
+
+def test_orientation_is_kept_along_the_motions(case):
+    solution = case.avoiding()
+    assert min_det_jacobian(solution.transform.jacobian, solution.p[::10]) > 0
+    back = solution.transform.inverse(solution.transform.forward(solution.p[::10]))
+    np.testing.assert_allclose(back, solution.p[::10], rtol=0, atol=1e-5)
+
+
+def test_a_manual_duration_is_taken_as_it_is(case):
+    still = case.avoiding(duration=0.0)
+    np.testing.assert_allclose(still.p, still.q, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(still.p, case.lifted.at(still.index, still.fraction), rtol=0, atol=1e-14)
+    assert not still.cleared and still.clearance < -0.05
+    little = case.avoiding(duration=0.1)
+    assert little.duration == 0.1 and not little.cleared
+    assert still.clearance < little.clearance < case.avoiding().clearance
+
+
+def test_with_nothing_near_the_arm_moves_undisturbed(case):
+    far = case.avoiding(obstacles=(Sphere((3.0, 3.0, 3.0)),))
+    assert far.cleared and far.duration == 0 and isinstance(far.transform, Identity)
+    np.testing.assert_allclose(far.p, far.q, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("duration", [None, 0.05])
+def test_the_gradient_of_the_paper_is_there_to_be_compared(case, duration):
+    solution = case.avoiding(generator="probability", coarse=True, duration=duration)
+    fields = [field for part in solution.transform.parts if hasattr(part, "field") for field in part.field.parts]
+    assert fields and all(isinstance(field, GradientField) for field in fields)
+    assert np.isfinite(solution.p).all()
+    assert (solution.p > case.robot.lower).all() and (solution.p < case.robot.upper).all()
+    assert solution.clearance > case.avoiding(duration=0.0).clearance
+
+
+@pytest.mark.parametrize("diameter", [0.04, 0.30])
+@pytest.mark.parametrize("temperature", [1.0, 20.0])
+def test_any_size_and_temperature_is_cleared_or_that_is_said(case, diameter, temperature):
+    obstacle = replace(case.scenario.obstacles[0], diameter=diameter)
+    solution = case.avoiding(coarse=True, obstacles=(obstacle,), temperature=temperature)
+    assert np.isfinite(solution.p).all()
+    touched_at_rest = case.arm.clearance(case.lifted.pins, obstacle).min() < 0
+    assert touched_at_rest or solution.cleared == (solution.clearance > 0)
+
+
+class TestElbow:
+    def test_the_forearm_clears_what_the_hand_never_comes_near(self, push):
+        hand = push.robot.end_effector(push.lifted.tracked.q)
+        assert ELBOW.signed_distance(hand).min() > 0.2
+        assert push.truth(push.lifted.tracked.q, ELBOW) < -0.03
+        solution = push.avoiding(obstacles=(ELBOW,))
+        assert solution.cleared
+        assert push.truth(split(solution, solution.p), ELBOW) > 0
+
+    def test_the_hand_still_gets_to_the_goal_and_hardly_leaves_its_path(self, push):
+        solution = push.avoiding(obstacles=(ELBOW,))
+        hand, before = push.robot.end_effector(solution.p), push.robot.end_effector(solution.q)
+        np.testing.assert_allclose(
+            hand[ends(solution)][1::2], np.broadcast_to(push.ground.goal, (7, 3)), rtol=0, atol=1e-4
+        )
+        assert np.linalg.norm(hand - before, axis=1).max() < 0.04
+        assert np.abs(solution.p - solution.q).max() > 0.05
+
+
+class TestNearJointLimits:
+    """A posture that is pinned beside a limit is met by the flow where the map of the limits puts it."""
+
+    @pytest.fixture(name="bent")
+    def _bent(self, push):
+        """The push with a lower limit just below where the arm begins and ends."""
+        joint = 2
+        lower = push.robot.lower.copy()
+        lower[joint] = push.lifted.pins[:, joint].min() - 0.01
+        arm = WholeArm(replace(push.robot, lower=lower), push.follower.body)
+        return arm, lower
+
+    def test_start_and_goal_stay(self, push, bent):
+        arm, lower = bent
+        solution = arm.avoiding(push.lifted, push.scenario, LIVE.spacing, coarse=True)
+        np.testing.assert_allclose(solution.p[ends(solution)], solution.q[ends(solution)], rtol=0, atol=1e-6)
+        assert (solution.p > lower).all()
+
+    def test_postures_beyond_the_limit_are_put_inside(self, push, bent):
+        arm, lower = bent
+        solution = arm.avoiding(push.lifted, push.scenario, LIVE.spacing, coarse=True)
+        assert np.isfinite(solution.p).all()
+        assert (arm.limits.inside(solution.q) >= lower).all()
+
+
+class TestNoWay:
+    def test_what_cannot_be_cleared_is_said_and_its_certificates_fit(self, push):
+        """The duration that is reported is the one of the motion, also where the search ends."""
+        obstacle = Sphere((0.03, -0.13, 0.4), 0.14)
+        solution = push.avoiding(obstacles=(obstacle,))
+        assert not solution.cleared
+        assert solution.duration <= MAX_DURATION
+        image = solution.transform.inverse(push.arm.limits.inside(solution.q))
+        np.testing.assert_allclose(image, solution.p, rtol=0, atol=1e-5)
+
+
 class TestNearMisses:
     @pytest.mark.parametrize("margin", [0.0, 0.01])
     @pytest.mark.parametrize("clearance", [0.0005, 0.002, 0.008])
     def test_what_comes_too_near_without_touching_is_taken_farther_away_or_left(self, case, margin, clearance):
-        solution = case.avoiding(obstacle=case.beside(clearance), margin=margin, coarse=True)
+        solution = case.avoiding(obstacles=(case.beside(clearance),), margin=margin, coarse=True)
         assert np.isfinite(solution.p).all()
         assert solution.clearance > min(clearance, 0.002) - ROUNDING
 

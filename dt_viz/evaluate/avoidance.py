@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
     obstacle = Sphere(options.obstacle, options.diameter)
     scenario = Scenario(
-        task.name, obstacle, avoidance=not options.no_avoidance, space=options.space, generator=options.generator
+        task.name, (obstacle,), avoidance=not options.no_avoidance, space=options.space, generator=options.generator
     )
     try:
         frame, motions = engine.arm_motions(scenario)

@@ -104,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".json")
     fits = FitStore(default_cache_folder())
     fits.get(task.demonstrations)
-    scenario = Scenario(task.name, Sphere(task.obstacle_position), space=options.space)
+    scenario = Scenario(task.name, (Sphere(task.obstacle_position),), space=options.space)
     recorders = [Recorder() for _ in range(options.sessions)]
     robot = load_jaco()
     sessions = [Session(Engine(tasks, fits, robot), lambda _: scenario, task.name, shown) for shown in recorders]
@@ -147,7 +147,7 @@ def run(options: argparse.Namespace) -> int:
             "edits_per_second": num_edits / options.sessions / elapsed,
             "rollouts": recorders[0].num_rollouts,
             "points_a_rollout": NUM_SAMPLES if options.space == "task" else NUM_CONFIGURATIONS,
-            "diameter": scenario.obstacle.diameter,
+            "diameter": scenario.obstacles[0].diameter,
             "cores": os.cpu_count(),
             "python": platform.python_version(),
             "numpy": np.__version__,
@@ -193,7 +193,8 @@ def _drag(
         time.sleep(max(0.0, began + tick / EDITS_PER_SECOND - time.perf_counter()))
         for k, session in enumerate(sessions):
             place = position(tick / EDITS_PER_SECOND + 1.7 * k)
-            session.edit("obstacle", obstacle=replace(session.scenario.obstacle, position=place))
+            (obstacle,) = session.scenario.obstacles
+            session.edit("obstacle", obstacles=(replace(obstacle, position=place),))
     return ticks * len(sessions), time.perf_counter() - began
 
 

@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     for k, (x, y, z) in enumerate(places):
         obstacle = Sphere((x, y, z), options.diameter)
         scenario = Scenario(
-            task.name, obstacle, avoidance=not options.no_avoidance, space=options.space, generator=options.generator
+            task.name, (obstacle,), avoidance=not options.no_avoidance, space=options.space, generator=options.generator
         )
         frame, motions = engine.arm_motions(scenario)
         found.append(

@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
     clock = learned.base
     # the learned pace has kinks, which a stepping of high order would have to find: that would flatter the exact side
     learned = replace(learned, base=Attractor(clock.goal, clock.speed, clock.smoothing))
-    scenario = Scenario(task.name, Sphere(options.obstacle or task.obstacle_position, options.diameter))
+    scenario = Scenario(task.name, (Sphere(options.obstacle or task.obstacle_position, options.diameter),))
     frame = next(iter(Engine(tasks, fits, load_jaco()).frames(scenario)))
     field = scenario.obstacle.field(scenario.generator, scenario.temperature)
     duration = frame.health.duration or 0.0
@@ -117,7 +117,7 @@ def run(options: argparse.Namespace) -> int:
             rows.append((f"{scene}, {name}", f"{1e3 * side.seconds:.1f}", accuracy, side.setting))
     if out is not None:
         settings = {"task": task.name, "accuracy": options.accuracy, "repeats": options.repeats}
-        settings |= {"obstacle": scenario.obstacle.position, "diameter": options.diameter, "duration": duration}
+        settings |= {"obstacle": scenario.obstacles[0].position, "diameter": options.diameter, "duration": duration}
         write_json(out, {**results, "settings": settings})
     print(
         f"{task.name}, {NUM_ROLLOUTS} rollouts × {NUM_POINTS} points, both within {options.accuracy:g} m of the truth"

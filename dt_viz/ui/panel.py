@@ -224,8 +224,8 @@ class Panel:
         with gui.add_folder("Obstacle"):
             self._bind(
                 gui.add_slider("Diameter [cm]", 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0),
-                lambda s: round(100 * s.obstacle.diameter, 3),
-                lambda s, value: {"obstacle": replace(s.obstacle, diameter=value / 100)},
+                lambda s: round(100 * s.obstacles[0].diameter, 3),
+                lambda s, value: {"obstacles": (replace(s.obstacles[0], diameter=value / 100), *s.obstacles[1:])},
             )
             self._bind(
                 gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),

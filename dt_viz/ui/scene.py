@@ -165,7 +165,7 @@ class Obstacle(Picture):
 
     def adopt(self, scenario: Scenario) -> None:
         """Stand where the scenario says, unless that is where the browser has put it already."""
-        obstacle = scenario.obstacle
+        obstacle = scenario.obstacles[0]
         if np.abs(self.gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
             self.gizmo.position = obstacle.position
         if self._ball.scale != obstacle.radius:

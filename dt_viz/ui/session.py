@@ -142,11 +142,12 @@ class Session:
         """
         if name != self.scenario.task:
             fresh = self._initial(name)
+            kept = zip(fresh.obstacles, self.scenario.obstacles, strict=False)
             self.edit(
                 "task",
                 task=name,
                 arm_rollout=0,
-                obstacle=replace(fresh.obstacle, diameter=self.scenario.obstacle.diameter),
+                obstacles=tuple(replace(there, diameter=had.diameter) for there, had in kept),
             )
             self.end_gesture()
 

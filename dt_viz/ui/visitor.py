@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import viser
 
@@ -26,7 +27,7 @@ FIELD_OF_VIEW = 0.75
 
 def initial_scenario(engine: Engine, task: str) -> Scenario:
     """The scenario that a task begins with. Raises what `Engine.task` raises."""
-    return Scenario(task, Sphere(engine.task(task).obstacle_position))
+    return Scenario(task, (Sphere(engine.task(task).obstacle_position),))
 
 
 class Visitor:
@@ -105,7 +106,8 @@ class Visitor:
         if phase == "start":
             self.session.begin_gesture()
         x, y, z = (float(c) for c in centre)
-        self.session.edit("obstacle", obstacle=Sphere((x, y, z), self.session.scenario.obstacle.diameter))
+        first, *others = self.session.scenario.obstacles
+        self.session.edit("obstacle", obstacles=(replace(first, position=(x, y, z)), *others))
         if phase == "end":
             self.session.end_gesture()
 
