@@ -22,6 +22,8 @@ LIFT_START = np.array([0.38, -0.30, 0.38])
 PUSH_START = np.array([0.34, -0.33, 0.38])
 PUSH_CONTACT = np.array([0.30, -0.47, 0.15])  # behind the box, where the hand is down
 PUSH_GOAL = np.array([-0.34, -0.42, 0.15])
+DROP_START = np.array([0.0, -0.28, 0.42])
+DROP_GOAL = np.array([0.0, -0.52, 0.26])  # above the centre pot, `dt_viz.tasks.POTS`
 
 
 def draw_s(num_demonstrations: int = 7, seed: int = 41) -> tuple[Demonstration, ...]:
@@ -70,6 +72,36 @@ def push_box(num_demonstrations: int = 7, seed: int = 54) -> tuple[Demonstration
     return tuple(demonstrations)
 
 
+def draw_j(num_demonstrations: int = 7, seed: int = 103) -> tuple[Demonstration, ...]:
+    """Draw the letter J on a plane: down its stem, then through its bow to the upper left.
+
+    Returns:
+        Demonstrations in metres, 2-D, origin in the middle of the letter (about 0.24 wide and 0.40 high),
+        u to the right and v up.
+    """
+    rng = np.random.default_rng(seed)
+    letter = _letter_j()
+    goal = letter[-1].round(6)
+    return tuple(
+        _perform(_vary(letter, goal, rng, start_spread=0.013, bow=0.006), goal, rng, f"draw J {i}")
+        for i in range(num_demonstrations)
+    )
+
+
+def drop_pots(num_demonstrations: int = 8, seed: int = 98) -> tuple[Demonstration, ...]:
+    """Carry an object forward over the centre one of three pots in a row, and stop above it.
+
+    Returns:
+        Demonstrations in metres, 3-D, in the world frame: origin at the arm's base on the table, front −y, z up.
+    """
+    rng = np.random.default_rng(seed)
+    demonstrations = []
+    for i in range(num_demonstrations):
+        path = _vary(_drop_path(), DROP_GOAL, rng, start_spread=0.020, bow=0.005)
+        demonstrations.append(_perform(path, DROP_GOAL, rng, f"drop pots {i}"))
+    return tuple(demonstrations)
+
+
 def _letter_s() -> np.ndarray:
     """Return the path of a slender S: one bend to the left, then the same bend to the right.
 
@@ -83,6 +115,18 @@ def _letter_s() -> np.ndarray:
     path = cumulative_trapezoid(np.stack([np.cos(heading), np.sin(heading)], axis=1), s, axis=0, initial=0.0)
     path = path - (path[0] + path[-1]) / 2
     return path * np.array([0.30, 0.40]) / np.ptp(path, axis=0)
+
+
+def _letter_j() -> np.ndarray:
+    """Return the path of a J: its tangent angle falls, soft at both ends, from straight down to up and left.
+
+    Scaled to the letter's height and width and centred, shape ``(DENSE, 2)``.
+    """
+    s = np.linspace(0.0, 1.0, DENSE)
+    heading = np.deg2rad(-88.0 - 160.0 * _smooth_step((s - 0.38) / 0.58))
+    path = cumulative_trapezoid(np.stack([np.cos(heading), np.sin(heading)], axis=1), s, axis=0, initial=0.0)
+    path = path * np.array([0.24, 0.40]) / np.ptp(path, axis=0)
+    return path - (path.min(axis=0) + path.max(axis=0)) / 2
 
 
 def _lift_path(corner: np.ndarray) -> np.ndarray:
@@ -107,6 +151,15 @@ def _push_path(contact: np.ndarray) -> np.ndarray:
     path = _equidistant(np.concatenate([approach, push[1:]]))
     spacing = np.linalg.norm(path[1] - path[0])
     return gaussian_filter1d(path, 0.035 / spacing, axis=0, mode="nearest")
+
+
+def _drop_path() -> np.ndarray:
+    """Return the way up and forward, then down towards the pot, shape ``(DENSE, 3)``."""
+    u = np.linspace(0.0, 1.0, DENSE)[:, None]
+    over = DROP_START + np.array([0.0, -0.08, 0.02])  # this and the next are Bézier control points
+    above = DROP_GOAL + np.array([0.0, 0.0, 0.12])
+    path = (1 - u) ** 3 * DROP_START + 3 * (1 - u) ** 2 * u * over + 3 * (1 - u) * u**2 * above + u**3 * DROP_GOAL
+    return _equidistant(path)
 
 
 def _vary(path: np.ndarray, goal: np.ndarray, rng: np.random.Generator, start_spread: float, bow: float) -> np.ndarray:
@@ -181,3 +234,5 @@ if __name__ == "__main__":
     save_demonstrations(FOLDER / "draw_s.npz", draw_s())
     save_demonstrations(FOLDER / "lift_box.npz", lift_box())
     save_demonstrations(FOLDER / "push_box.npz", push_box())
+    save_demonstrations(FOLDER / "draw_j.npz", draw_j())
+    save_demonstrations(FOLDER / "drop_pots.npz", drop_pots())

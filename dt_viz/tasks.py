@@ -27,6 +27,33 @@ DRAWING_SIZE = 0.40
 
 
 @dataclass(frozen=True)
+class Pot:
+    """An open pot on the table."""
+
+    x: float
+    """Of its axis, metres."""
+    y: float
+    radius: float = 0.055
+    """Of its opening, metres."""
+    height: float = 0.10
+    """Of its rim above the table, metres."""
+
+    @property
+    def opening(self) -> tuple[float, float, float]:
+        """Middle of the opening, metres."""
+        return self.x, self.y, self.height
+
+    def catches(self, position: Array) -> bool:
+        """Whether what is let go at `position` (3,), metres, falls into it."""
+        x, y, z = (float(c) for c in position)
+        return z > self.height and float(np.hypot(x - self.x, y - self.y)) < self.radius
+
+
+POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
+"""Of `drop_pots`: left, centre and right for whoever faces the robot."""
+
+
+@dataclass(frozen=True)
 class Slice:
     """The rectangle on which a picture of the vector field is drawn."""
 
@@ -153,6 +180,34 @@ def push_box() -> Task:
     )
 
 
+def draw_j() -> Task:
+    """Draw the letter J in a vertical plane before the robot, to be biased towards points beside it (fig. 4)."""
+    return drawing_task(
+        "draw_j", "Draw J", "Bias the letter to points beside it.", load_demonstrations(ASSETS / "draw_j.npz")
+    )
+
+
+def drop_pots() -> Task:
+    """Carry an object over the centre pot, to be biased towards the left or the right one (fig. 8)."""
+    demonstrations = load_demonstrations(ASSETS / "drop_pots.npz")
+    paths = np.stack([resample_by_arc_length(d.positions, 101) for d in demonstrations])
+    # the slice is tilted: from the mean start down to the goals above all three pots
+    down = paths[:, -1].mean(axis=0) - paths[:, 0].mean(axis=0)
+    down = np.array([0.0, down[1], down[2]]) / np.hypot(down[1], down[2])
+    return Task(
+        name="drop_pots",
+        title="Drop in pots",
+        hint="Bias the motion to the left or the right pot, its goal along with it.",
+        demonstrations=demonstrations,
+        origin=np.zeros(3),
+        axes=np.eye(3),
+        scale=1.0,
+        slice=Slice(paths.mean(axis=(0, 1)), np.stack([[1.0, 0.0, 0.0], down], axis=1), (0.30, 0.24)),
+        camera=((0.62, -1.58, 0.90), (0.06, -0.38, 0.24)),
+        obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.5),
+    )
+
+
 def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonstration, ...]) -> Task:
     """A task from 2-D demonstrations, on the vertical plane before the robot.
 
@@ -210,5 +265,7 @@ TASKS: Mapping[str, TaskEntry] = {
     "draw_s": TaskEntry("Draw S", draw_s),
     "lift_box": TaskEntry("Lift box", lift_box),
     "push_box": TaskEntry("Push box", push_box),
+    "draw_j": TaskEntry("Draw J", draw_j),
+    "drop_pots": TaskEntry("Drop in pots", drop_pots),
 }
 """The tasks that ship with DT-Viz, by name."""

@@ -8,9 +8,10 @@ import pytest
 
 from dt_viz.demos import load_demonstrations
 from dt_viz.metrics import arc_length, resample_by_arc_length, sharpest_turn
+from dt_viz.tasks import POTS
 
 ASSETS = Path(__file__).parents[1] / "assets"
-TASKS = ["draw_s", "lift_box", "push_box"]
+TASKS = ["draw_s", "lift_box", "push_box", "draw_j", "drop_pots"]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,10 @@ def test_the_script_makes_the_files_that_ship(script, task):
         np.testing.assert_allclose(ours.positions, theirs.positions, rtol=0, atol=2.1e-6)
 
 
-@pytest.mark.parametrize(("task", "number", "dimension"), [("draw_s", 7, 2), ("lift_box", 8, 3), ("push_box", 7, 3)])
+@pytest.mark.parametrize(
+    ("task", "number", "dimension"),
+    [("draw_s", 7, 2), ("lift_box", 8, 3), ("push_box", 7, 3), ("draw_j", 7, 2), ("drop_pots", 8, 3)],
+)
 def test_number_and_dimension(task, number, dimension):
     assert [d.dimension for d in shipped(task)] == [dimension] * number
 
@@ -117,3 +121,26 @@ def test_a_sphere_in_the_middle_of_the_push_leaves_start_and_goal_free():
     farthest_shift = 0.05
     distance = np.linalg.norm(ends - np.mean(paths, axis=0)[50], axis=1)
     assert distance.min() - farthest_shift - 0.15 / 2 > 0.06
+
+
+def test_the_letter_j_is_centred_and_drawn_down_its_stem_and_up_its_bow():
+    paths = [resample_by_arc_length(d.positions, 100) for d in shipped("draw_j")]
+    mean = np.mean(paths, axis=0)
+    np.testing.assert_allclose(np.ptp(mean, axis=0), [0.24, 0.40], atol=0.02)
+    np.testing.assert_allclose((mean.min(axis=0) + mean.max(axis=0)) / 2, 0, atol=0.01)
+    lowest = mean[mean[:, 1].argmin()]
+    assert mean[0, 1] == mean[:, 1].max() and mean[0, 0] > 0.08  # from the top of the stem
+    assert mean[-1, 0] == mean[:, 0].min() and mean[-1, 1] > lowest[1] + 0.08  # to the upper left end of the bow
+
+
+def test_the_object_is_carried_over_the_centre_pot_and_stops_above_it():
+    left, centre, right = POTS
+    assert left.x == -right.x and 0.15 <= right.x - centre.x <= 0.17 and left.y == centre.y == right.y
+    for demonstration in shipped("drop_pots"):
+        path = demonstration.positions
+        assert (path[:, 2] > centre.height + 0.10).all()
+        assert centre.catches(path[-1])
+        assert not left.catches(path[-1]) and not right.catches(path[-1])
+        np.testing.assert_allclose(path[-1, :2], centre.opening[:2], atol=1e-6)
+        down = path[-1] - path[-len(path) // 4]
+        assert -down[2] > np.linalg.norm(down[:2])  # the last quarter of the time leads down

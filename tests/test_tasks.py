@@ -7,7 +7,7 @@ from scipy.io import savemat
 from dt_viz.demos import DemonstrationError
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.robot import load_jaco
-from dt_viz.tasks import DRAWING_SIZE, TASKS, lasa_tasks
+from dt_viz.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
 from dt_viz.tracking import inverse_kinematics, track
 
 
@@ -64,3 +64,19 @@ def test_the_arm_follows_every_demonstration_with_its_hand_sloping_down(name):
     assert not joints.limits_hit.any() and not joints.damped.any()
     assert (robot.hand_direction(joints.q)[..., 2] < -0.2).all()
     assert (robot.forward_kinematics(joints.q)[1][..., 1:, 2] > 0.05).all()  # no joint near the table
+
+
+def test_the_arm_reaches_above_and_into_every_pot():
+    robot, height = load_jaco(), TASKS["drop_pots"]().paths[0][-1, 2]
+    for pot in POTS:
+        for z in (pot.height + 0.05, height):
+            q = inverse_kinematics(robot, np.array([pot.x, pot.y, z]))
+            assert robot.hand_direction(q)[2] < -0.2
+
+
+def test_a_pot_catches_what_is_let_go_over_its_opening_only():
+    pot = POTS[0]
+    over = np.array(pot.opening) + np.array([0.9 * pot.radius, 0.0, 0.1])
+    assert pot.catches(over)
+    assert not pot.catches(over + np.array([0.2 * pot.radius, 0.0, 0.0]))
+    assert not pot.catches(over - np.array([0.0, 0.0, 0.11]))
