@@ -8,7 +8,7 @@ from dt_viz.behaviours import Built, Motion
 from dt_viz.diffeo import AdaptiveFlow
 from dt_viz.fields import Array, Indices, Mask, VectorField
 from dt_viz.integrate import integrate_adaptive, rk4
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Obstacle
 from dt_viz.several import Several
 
 MAX_DURATION = 4.0
@@ -120,7 +120,7 @@ def _avoidable(motion: Motion) -> Mask:
 
 
 def clearing_duration(
-    field: VectorField, obstacle: Several | Sphere, points: Array, margin: float, *, at_least: float = 0.0
+    field: VectorField, obstacle: Several | Obstacle, points: Array, margin: float, *, at_least: float = 0.0
 ) -> float | None:
     """The shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
 

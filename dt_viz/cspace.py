@@ -16,7 +16,7 @@ import numpy as np
 from dt_viz.body import BodyPoints
 from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array, Indices
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Obstacle
 from dt_viz.robot import NUM_JOINTS, KinematicChain, Robot, cross
 
 COMPLEX_STEP = 1e-30
@@ -73,7 +73,7 @@ class WholeArmField:
     robot: Robot
     body: BodyPoints
     """That can be carried away."""
-    obstacle: Sphere
+    obstacle: Obstacle
     direction: Array
     """n, (3,) unit vector in which the arm escapes."""
     pins: Array
@@ -94,7 +94,7 @@ class WholeArmField:
 
     @cached_property
     def _core(self) -> Array:
-        return -CORE * (self.obstacle.radius + self.body.radius)[:, None]
+        return -CORE * (self.obstacle.depth + self.body.radius)[:, None]
 
     def __call__(self, q: Array) -> Array:
         """V_q at configurations `q` (N, 6), as (N, 6)."""
@@ -149,7 +149,7 @@ class GradientField:
     robot: Robot
     body: BodyPoints
     """That can be carried away."""
-    obstacle: Sphere
+    obstacle: Obstacle
     reach: float = 6 * REACH_PER_TEMPERATURE
     """Distance from the obstacle's surface at which the field ends, metres."""
 
@@ -165,7 +165,7 @@ class GradientField:
         outward = points - np.asarray(self.obstacle.position)[:, None]
         length = np.sqrt((outward * outward).sum(axis=1, keepdims=True))
         outward = outward / np.where(length == 0, 1.0, length)  # there the slope is 0
-        core = -CORE * (self.obstacle.radius + self.body.radius)[:, None]
+        core = -CORE * (self.obstacle.depth + self.body.radius)[:, None]
         distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         u = _unit_interval((self.reach - distance) / (self.reach - core))
         force: Array = -30 * (u * u * (1 - u) * (1 - u))[:, None] * outward  # the slope of `_fading`

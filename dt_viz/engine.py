@@ -83,6 +83,8 @@ class Frame:
     """(T_i, 3), metres."""
     times: tuple[Array, ...]
     """(T_i,) seconds of the samples of each rollout."""
+    levels: tuple[tuple[Array, ...], ...]
+    """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3)."""
     goal: Array
     """(3,) where the demonstrations end."""
     reached: Array
@@ -264,12 +266,14 @@ class Engine:
             ghost=ground.bundle.paths,
             rollouts=shown.paths,
             times=shown.split(stack.rays.times(index, fraction)),
+            levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
             goal=ground.goal,
             reached=reached,
             blocked=(),
             health=Health(
                 clearance=clearance,
                 duration=stack.avoidance_duration,
+                layer_durations=tuple(stack.duration_of(layer.behaviour) for layer in scenario.layers),
                 arm_duration=arm.duration if arm else None,
                 doubts=doubts,
             ),

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from dt_viz.fields import Array
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Obstacle
 
 NUM_DIRECTIONS = 128
 SIDEWAYS = 2.0
@@ -22,29 +22,33 @@ SELECTIVITY = 0.03
 """Relative difference in cost that a variant's share in the escape falls by: it turns smoothly while one drags."""
 
 
-def escape_directions(points: Array, radius: Array, tangents: Array, obstacle: Sphere, num: int = 3) -> list[Array]:
+def escape_directions(
+    points: Array, radius: Array, tangents: Array, obstacle: Obstacle, margin: float = 0.0, *, num: int = 3
+) -> list[Array]:
     """Directions in which the arm can escape, the one with the least detour first.
 
     For each direction the detour is how far the arm would have to be shifted, all of it alike, until every sphere that
-    covers it is clear of the obstacle at each sample.
+    covers it is clear of every ball that covers the obstacle, at each sample.
 
     Args:
         points: (P, 3, M) middles of the spheres that cover the arm, metres, at the M samples that collide.
         radius: (P,) of these spheres.
         tangents: (K, 3) directions of the end effector's motion, unit vectors, wherever the escape bends it.
         obstacle: to escape from.
+        margin: clearance that is wanted, metres.
         num: directions to return, at most.
 
     Returns:
         Unit vectors (3,), none an alike of another.
     """
     directions = _directions()
-    offset = points - np.asarray(obstacle.position)[:, None]
-    excess = (offset**2).sum(axis=1) - (obstacle.radius + radius)[:, None] ** 2  # (P, M)
-    near = (offset**2).sum(axis=1) < (obstacle.radius + radius[:, None] + 2 * ON_THE_WAY) ** 2
-    point, sample = np.nonzero(near)
-    along = directions @ offset[point, :, sample].T  # (K, pairs)
-    under_root = along**2 - excess[point, sample]
+    centres, radii = obstacle.cover()
+    offset = points - centres[:, None, :, None]  # (B, P, 3, M)
+    squared, sum_of_radii = (offset**2).sum(axis=2), (radii[:, None] + margin + radius)[:, :, None]
+    ball, point, sample = np.nonzero(squared < (sum_of_radii + 2 * ON_THE_WAY) ** 2)
+    excess = (squared - sum_of_radii**2)[ball, point, sample]
+    along = directions @ offset[ball, point, :, sample].T  # (D, pairs)
+    under_root = along**2 - excess
     root = np.sqrt(np.maximum(under_root, 0))
     hit = (under_root > 0) & (root - along > 0) & (-along - root < ON_THE_WAY)
     shift = np.where(hit, root - along, 0)

@@ -7,7 +7,7 @@ import numpy as np
 from dt_viz.body import load_body_points
 from dt_viz.collision import load_collision_model
 from dt_viz.fields import Array, Indices
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Obstacle
 from dt_viz.robot import Robot
 from dt_viz.several import Several
 from dt_viz.solving import Ground, Solution
@@ -80,7 +80,7 @@ class Follower:
             reasons += self._touching(lifted.pins, part)
         return tuple(reasons)
 
-    def _touching(self, pins: Array, obstacle: Sphere) -> list[str]:
+    def _touching(self, pins: Array, obstacle: Obstacle) -> list[str]:
         """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6), in words."""
         pedestal = self.body.on_pedestal
         distance = obstacle.signed_distance(pedestal.positions(self.robot, pins[0])) - pedestal.radius

@@ -32,6 +32,8 @@ class Health:
     """What the arm's meshes come near to on the motion that it shows."""
     duration: float | None = None
     """t of the end effector's avoidance flow; None where it is off."""
+    layer_durations: tuple[float | None, ...] = ()
+    """t of each layer's flow, in the order of `Scenario.layers`; None for those that are off."""
     arm_duration: float | None = None
     """t of the whole arm's avoidance flow; None where it is off."""
     min_det_jacobian: float | None = None

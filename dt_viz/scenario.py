@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Obstacle
 from dt_viz.occupancy import Generator
 from dt_viz.several import Several
 
@@ -67,11 +67,22 @@ class View:
 
 
 @dataclass(frozen=True)
+class Layer:
+    """A behaviour in the stack."""
+
+    behaviour: Behaviour
+    """A value: compared by what it is made of."""
+    on: bool = True
+    name: str = ""
+    """As the page calls it."""
+
+
+@dataclass(frozen=True)
 class Scenario:
     """All that a picture depends on: the same scenario always gives the same frame."""
 
     task: str
-    obstacles: tuple[Sphere, ...]
+    obstacles: tuple[Obstacle, ...]
     """All are avoided together; there may be none."""
     imitation: bool = True
     """Whether the learned transform is in the stack; without it motions are straight."""
@@ -87,7 +98,7 @@ class Scenario:
     """Clearance that `auto` keeps, metres."""
     duration: float | None = None
     """t of the avoidance flow; None is `auto`, the shortest that clears the obstacle by the margin."""
-    layers: tuple[Behaviour, ...] = ()
+    layers: tuple[Layer, ...] = ()
     """What else the end effector's motion is to do, from the inside out."""
     avoidance_level: int | None = None
     """How many of these layers the end effector's avoidance is stacked on; None is all of them."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.fields import Array, Sum
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Obstacle
 from dt_viz.occupancy import Generator
 
 ROUNDS = 3
@@ -18,7 +18,7 @@ ROUNDS = 3
 class Several:
     """The union of any number of obstacles, also none: what is inside one of them is inside."""
 
-    parts: tuple[Sphere, ...] = ()
+    parts: tuple[Obstacle, ...] = ()
 
     def signed_distance(self, s: Array) -> Array:
         """Distance of the points `s` (*B, 3) from the nearest surface, (*B,), metres, negative inside; analytic in `s`.

@@ -108,6 +108,10 @@ class Solution:
         """T of the end effector's avoidance; None where it is off."""
         return next((made.duration for layer, made in self.built if isinstance(layer, ObstacleAvoidance)), None)
 
+    def duration_of(self, behaviour: Behaviour) -> float | None:
+        """T of the flow of a behaviour; None where it is off."""
+        return next((made.duration for layer, made in self.built if layer == behaviour), None)
+
     def positions_at(self, index: Indices, fraction: Array) -> Array:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
         return self.transform.inverse(self.rays.at(index, fraction))
@@ -122,10 +126,15 @@ def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
 
 
 def behaviours(scenario: Scenario) -> tuple[Behaviour, ...]:
-    """What is stacked on the imitation, from the inside out."""
+    """What is stacked on the imitation, from the inside out, without the layers that are off."""
     level = scenario.avoidance_level
     below = scenario.layers if level is None else scenario.layers[:level]
-    return (*below, ObstacleAvoidance(), *scenario.layers[len(below) :])
+    above = scenario.layers[len(below) :]
+    return (
+        *(layer.behaviour for layer in below if layer.on),
+        ObstacleAvoidance(),
+        *(layer.behaviour for layer in above if layer.on),
+    )
 
 
 def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:

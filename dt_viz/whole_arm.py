@@ -21,7 +21,7 @@ from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity, I
 from dt_viz.escape import escape_directions
 from dt_viz.fields import Array, Indices, Sum, VectorField
 from dt_viz.integrate import rk4
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Obstacle
 from dt_viz.robot import NUM_JOINTS, Robot
 from dt_viz.rollouts import Bundle, refined
 from dt_viz.scenario import Scenario
@@ -153,7 +153,7 @@ class WholeArm:
                 break
         return best or self.undisturbed(lifted, scenario, spacing)
 
-    def clearance(self, q: Array, obstacle: Several | Sphere) -> Array:
+    def clearance(self, q: Array, obstacle: Several | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
         points = self.body.of_chain(self.robot.chain(q.T))
         return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)
@@ -182,7 +182,7 @@ class WholeArm:
                 )
             )
 
-    def _escapes(self, points: Array, tangents: Array, obstacle: Sphere, margin: float) -> list[Array]:
+    def _escapes(self, points: Array, tangents: Array, obstacle: Obstacle, margin: float) -> list[Array]:
         """Ways out of one obstacle, the best first; none where nothing comes too near it.
 
         Args:
@@ -197,12 +197,12 @@ class WholeArm:
         if not len(collides):
             return []
         bent = np.flatnonzero(clearance < BESIDE)
-        grown = replace(obstacle, diameter=obstacle.diameter + 2 * margin)
         return escape_directions(
             points[:, :, collides[:: max(1, len(collides) // NUM_COMPARED)]],
             self.body.radius,
             tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
-            grown,
+            obstacle,
+            margin,
         )
 
 

@@ -47,6 +47,7 @@ def frame(arm=None, *, blocked=(), health=None, stage=Stage.CERTIFIED, scenario=
         rollouts=(),
         times=(),
         goal=nothing,
+        levels=(),
         reached=nothing,
         blocked=blocked,
         health=health or Health(0.01),

@@ -22,7 +22,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +147,7 @@ def run(options: argparse.Namespace) -> int:
             "edits_per_second": num_edits / options.sessions / elapsed,
             "rollouts": recorders[0].num_rollouts,
             "points_a_rollout": NUM_SAMPLES if options.space == "task" else NUM_CONFIGURATIONS,
-            "diameter": scenario.obstacles[0].diameter,
+            "diameter": 2 * scenario.obstacles[0].radius,
             "cores": os.cpu_count(),
             "python": platform.python_version(),
             "numpy": np.__version__,
@@ -194,7 +194,7 @@ def _drag(
         for k, session in enumerate(sessions):
             place = position(tick / EDITS_PER_SECOND + 1.7 * k)
             (obstacle,) = session.scenario.obstacles
-            session.edit("obstacle", obstacles=(replace(obstacle, position=place),))
+            session.edit("obstacle", obstacles=(obstacle.moved(place),))
     return ticks * len(sessions), time.perf_counter() - began
 
 

@@ -13,6 +13,7 @@ from dt_viz.collision import SELF_REACH, CollisionReport
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Frame, Stage
 from dt_viz.imitation import ImitationError
+from dt_viz.obstacles import Sphere
 from dt_viz.occupancy import GENERATORS
 from dt_viz.robot import Robot
 from dt_viz.scenario import (
@@ -224,8 +225,8 @@ class Panel:
         with gui.add_folder("Obstacle"):
             self._bind(
                 gui.add_slider("Diameter [cm]", 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0),
-                lambda s: round(100 * s.obstacles[0].diameter, 3),
-                lambda s, value: {"obstacles": (replace(s.obstacles[0], diameter=value / 100), *s.obstacles[1:])},
+                lambda s: round(200 * s.obstacles[0].radius, 3),
+                lambda s, value: {"obstacles": (Sphere(s.obstacles[0].position, value / 100), *s.obstacles[1:])},
             )
             self._bind(
                 gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),

@@ -147,7 +147,7 @@ class Session:
                 "task",
                 task=name,
                 arm_rollout=0,
-                obstacles=tuple(replace(there, diameter=had.diameter) for there, had in kept),
+                obstacles=tuple(had.moved(there.position) for there, had in kept),
             )
             self.end_gesture()
 

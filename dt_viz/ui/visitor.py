@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import viser
 
@@ -107,7 +106,7 @@ class Visitor:
             self.session.begin_gesture()
         x, y, z = (float(c) for c in centre)
         first, *others = self.session.scenario.obstacles
-        self.session.edit("obstacle", obstacles=(replace(first, position=(x, y, z)), *others))
+        self.session.edit("obstacle", obstacles=(first.moved((x, y, z), first.wxyz), *others))
         if phase == "end":
             self.session.end_gesture()
 
