@@ -1,0 +1,163 @@
+"""What the joints follow, what is in the arm's way, and what is shown meanwhile."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.engine import Engine, Stage
+from dt_viz.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
+from dt_viz.obstacles import Sphere
+from dt_viz.several import Several
+from dt_viz.solving import LIVE, solve
+from dt_viz.tasks import TASKS
+from dt_viz.tracking import UnreachableError
+from dt_viz.whole_arm import NUM_CONFIGURATIONS
+
+FAR = Sphere((3.0, 3.0, 3.0))
+
+
+def around(point, diameter=0.15):
+    x, y, z = (float(c) for c in point)
+    return Sphere((x, y, z), diameter)
+
+
+def placed(scenario, *obstacles, **changes):
+    return replace(scenario, obstacles=obstacles, space="cspace", **changes)
+
+
+@pytest.fixture(scope="module", name="ground")
+def _ground(engine, initial):
+    return engine._ground(initial("push_box"), None)
+
+
+@pytest.fixture(scope="module", name="follower")
+def _follower(robot):
+    return Follower(robot)
+
+
+@pytest.fixture(scope="module", name="too_far")
+def _too_far(fits, robot):
+    """An engine whose push lies two metres away."""
+
+    def shifted():
+        task = TASKS["push_box"]()
+        return replace(task, origin=task.origin + np.array([2.0, 0.0, 0.0]))
+
+    return Engine({"push_box": replace(TASKS["push_box"], load=shifted)}, fits, robot)
+
+
+class TestObstructions:
+    def reasons(self, follower, ground, obstacle):
+        return follower.obstructions(ground, Several((obstacle,)))
+
+    def test_nothing_is_in_the_way_of_what_has_to_be_avoided(self, follower, ground, initial):
+        assert follower.obstructions(ground, initial("push_box").obstacle) == ()
+        assert self.reasons(follower, ground, FAR) == ()
+        assert follower.obstructions(ground, Several()) == ()
+
+    def test_a_covered_start_is_named(self, follower, ground):
+        away = np.linalg.norm(ground.task.starts - ground.task.starts[2], axis=1)
+        (reason,) = self.reasons(follower, ground, around(ground.task.starts[2], 0.12))
+        assert reason.startswith("start") and "3" in reason and "inside the obstacle" in reason
+        assert (away[[k for k in range(7) if str(k + 1) in reason]] < 0.15).all()
+
+    def test_a_covered_goal_is_named(self, follower, ground):
+        assert self.reasons(follower, ground, around(ground.goal, 0.15)) == (
+            "the goal is inside the obstacle: the arm there touches it",
+        )
+
+    def test_what_fits_between_the_fingers_does_not_cover_the_goal(self, follower, ground):
+        assert self.reasons(follower, ground, around(ground.goal, 0.04)) == ()
+
+    @pytest.mark.parametrize(("height", "name"), [(0.05, "base"), (0.2, "link 1")])
+    def test_what_touches_the_pedestal_is_said_to(self, follower, ground, height, name):
+        (reason,) = self.reasons(follower, ground, around((0.0, 0.08, height), 0.1))
+        assert name in reason and "cannot move away" in reason
+
+    def test_the_spheres_that_cover_the_arm_are_no_reason_while_its_meshes_are_free(self, follower, ground):
+        """An obstacle between the sphere and the mesh of a hand at rest."""
+        pins = follower.undisturbed(ground).pins
+        clear_of_meshes = 0
+        for dy in np.linspace(0.0, 0.2, 41):
+            obstacle = around(ground.goal + np.array([0.0, -dy, 0.0]), 0.1)
+            covered = follower.whole_arm.clearance(pins, obstacle).min() < 0
+            if covered and not self.reasons(follower, ground, obstacle):
+                clear_of_meshes += 1
+        assert clear_of_meshes >= 1
+
+    def test_demonstrations_out_of_reach_are_named(self, too_far, initial, robot):
+        ground = too_far._ground(initial("push_box"), None)
+        follower = Follower(robot)
+        (reason,) = follower.obstructions(ground, Several((FAR,)))
+        assert "cannot reach the starts" in reason and "no configuration reaches" in reason
+        for _ in range(2):  # the second answer is the remembered one
+            with pytest.raises(UnreachableError):
+                follower.undisturbed(ground)
+
+
+class TestFollowing:
+    def test_the_undisturbed_motion_is_lifted_once(self, follower, ground):
+        assert follower.undisturbed(ground) is follower.undisturbed(ground)
+        assert follower.undisturbed(ground).tracked.error.max() < MAX_TRACKING_ERROR
+
+    def test_behaviours_of_the_hand_are_followed(self, follower, ground, initial, robot):
+        solution = solve(ground, replace(initial("push_box"), space="both"), LIVE)
+        lifted = follower.behaving(ground, solution)
+        assert lifted.fractions.shape == (7, NUM_CONFIGURATIONS)
+        assert (np.diff(lifted.fractions, axis=1) > 0).all()
+        index = np.repeat(np.arange(7), 60)
+        fraction = np.tile(np.linspace(0, 1, 60), 7)
+        miss = robot.end_effector(lifted.at(index, fraction)) - solution.positions_at(index, fraction)
+        assert np.linalg.norm(miss, axis=1).max() < 1e-3
+
+    def test_what_was_followed_before_changes_nothing_that_is_seen(self, follower, ground, initial, robot):
+        wanted = solve(ground, replace(initial("push_box"), space="both"), LIVE)
+        x, y, z = initial("push_box").obstacles[0].position
+        other = replace(initial("push_box"), space="both", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
+        follower.behaving(ground, solve(ground, other, LIVE))
+        again = follower.behaving(ground, wanted).tracked.q
+        fresh = Follower(robot).behaving(ground, wanted).tracked.q
+        np.testing.assert_allclose(again, fresh, rtol=0, atol=2e-3)
+
+    def test_doubts_say_what_misses_its_path(self, follower, ground):
+        path = np.linspace([0.0, -0.5, 0.2], [0.0, -1.2, 0.2], NUM_ARM_SAMPLES)
+        joints = follower.along(ground, 0, path)
+        doubts = follower.doubts(joints, 4)
+        assert any("misses the path of rollout 5" in doubt for doubt in doubts)
+        assert any("stretched out" in doubt for doubt in doubts)
+        assert follower.doubts(follower.undisturbed(ground).tracked, 0) == ()
+
+
+class TestBlocked:
+    def last(self, engine, scenario, wanted=Stage.LIVE):
+        return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+
+    def test_the_last_good_motion_is_shown_marked_until_the_obstacle_moves_away(self, new_engine, initial):
+        engine, free = new_engine(), placed(initial("push_box"), *initial("push_box").obstacles)
+        good = self.last(engine, free)
+        assert good.blocked == ()
+        covered = placed(initial("push_box"), around(good.goal))
+        frames = list(engine.frames(covered))
+        assert [frame.stage for frame in frames] == list(Stage)
+        for frame in frames:
+            assert frame.scenario == covered
+            assert any("goal is inside" in reason for reason in frame.blocked)
+            assert frame.arm is good.arm and frame.rollouts is good.rollouts
+            assert frame.health.clearance < 0  # of the motion that is shown, from the obstacle where it is now
+            assert frame.health.min_det_jacobian is None  # certificates of another scenario certify nothing
+        recovered = self.last(engine, free)
+        assert recovered.blocked == ()
+        for a, b in zip(recovered.rollouts, good.rollouts, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+    def test_without_a_motion_before_it_is_the_undisturbed_one(self, new_engine, initial):
+        frame = self.last(new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3)))
+        assert any("cannot move away" in reason for reason in frame.blocked)
+        for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
+            assert np.linalg.norm(path[:, None] - ghost, axis=-1).min(axis=0).max() < 1e-12
+
+    def test_demonstrations_out_of_reach_are_shown_without_an_arm(self, too_far, initial):
+        for frame in too_far.frames(placed(initial("push_box"), *initial("push_box").obstacles)):
+            assert any("cannot reach the starts" in reason for reason in frame.blocked)
+            assert frame.arm is None and np.isfinite(frame.health.clearance)
