@@ -11,7 +11,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from dt_viz.behaviours import Built, Motion
 from dt_viz.diffeo import AdaptiveFlow
-from dt_viz.fields import Array, GaussianGrid, GridRBF, PlacedField, VectorField
+from dt_viz.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
 from dt_viz.integrate import integrate_adaptive, rk4
 
 Vector = tuple[float, float, float]
@@ -40,6 +40,11 @@ LARGE, SMALL = 2.5, 1.5
 goal outside. On a straight path, these turn the motion by up to 30° and 90° on two centimetres."""
 MIN_RADIUS = 0.10
 """Metres, of the `auto` radius."""
+SMALLER = 1.25
+"""Of the distance: where starts or goal do lie in the region, the motion below ends farther away the larger it is, and
+the radius may not grow with that."""
+OVERSHOOT = 2.0
+"""Times the longer duration that another attempt needs."""
 FINENESS = 0.1
 """Part of the tolerance that a step of the flow may be off by: what contracts on the way there expands on the way back,
 and the estimate of a long first step may be small by chance."""
@@ -151,85 +156,114 @@ def unit_field(dim: int) -> RegionField:
 
 @dataclass(frozen=True)
 class Biasing:
-    """Motions are pulled towards a bias point."""
+    """Motions are pulled towards a bias point.
+
+    With the goal where it is, every motion passes the target on its way. If the goal moves, it does so to the target.
+    """
 
     point: BiasPoint
+    below: tuple[Vector, ...] = ()
+    """Targets of the bias points below this one in the stack: what passes them is not to be pulled away again."""
 
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built:
         """See `Behaviour`. With `auto` the duration is the shortest that brings every motion to the target."""
         point = self.point
-        nearest = closest_points(point, motion)
-        distance = np.linalg.norm(point.offsets(nearest), axis=1)
-        radius = self._auto_radius(motion, float(distance.max())) if point.radius is None else point.radius
-        field = point.field(radius)
-        doubts = [*_misplaced(point, motion)]
-        duration = point.strength
-        hopeless = False
+        nearest, at_end = closest_points(point, motion)
+        if point.moves_goal:
+            nearest = motion.goal[None]
+        distance = float(np.linalg.norm(point.offsets(nearest), axis=1).max())
+        radius = point.radius or self._auto_radius(motion, (SMALL if at_least == 0 else SMALLER) * distance, distance)
+        field, duration = point.field(radius), point.strength
+        doubts = self._misplaced(motion, nearest, radius)
         if duration is None:
             duration = pulling_duration(field, point, nearest, at_least=at_least)
-            hopeless = duration is None
+            if duration is not None and at_least > 0:
+                # starts and goal in the region move the motion below the farther, the longer the flow: converge sooner
+                duration = min(at_least + OVERSHOOT * (duration - at_least), MAX_DURATION)
+        hopeless = duration is None
         if duration is None:
             duration = MAX_DURATION
-            outside = int((distance >= radius).sum())
-            doubts.append(
-                f"the bias region of {100 * radius:.0f} cm is too small: "
-                f"{outside} of {len(distance)} motions pass it by, up to {100 * distance.max():.0f} cm from the target"
-                if outside
-                else f"the bias region of {100 * radius:.0f} cm is hardly larger than the distance of the motions, "
-                f"{100 * distance.max():.0f} cm: it ends too softly to pull them all the way"
-            )
+            doubts.append(_too_small(radius, distance))
+        elif point.strength is None and at_least > 0 and at_end.any() and not point.moves_goal:
+            hopeless = True  # what does not move is nearest, also to the motion between the moved ends
+            doubts.append("a motion has its start or goal nearer to the bias point than its way: it is not led there")
         flow = AdaptiveFlow(field, duration, FINENESS * tolerance)
         goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
         return Built(flow, duration, goal, hopeless, tuple(doubts))
-
-    def _auto_radius(self, motion: Motion, distance: float) -> float:
-        """Large for gentle turns, but such that starts and goal stay outside where that is possible."""
-        ends = motion.starts if self.point.moves_goal else np.concatenate([motion.starts, motion.goal[None]])
-        room = float(np.linalg.norm(self.point.offsets(ends), axis=1).min())
-        return max(MIN_RADIUS, min(LARGE * distance, max(SMALL * distance, room)))
 
     def satisfied(self, motion: Motion) -> bool:
         """Whether every motion passes close to the target, where that is to be seen to."""
         if self.point.strength is not None:
             return True
-        return bool((closest_distances(self.point, motion) <= ACCEPTED).all())
+        if self.point.moves_goal:
+            last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
+            distances = np.linalg.norm(self.point.offsets(motion.positions[last]), axis=1)
+        else:
+            distances = closest_distances(self.point, motion)
+        return bool((distances <= ACCEPTED).all())
+
+    def _auto_radius(self, motion: Motion, least: float, distance: float) -> float:
+        """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""
+        kept = [motion.starts, np.asarray(self.below).reshape(-1, 3)]
+        if not self.point.moves_goal:
+            kept.append(motion.goal[None])
+        room = float(np.linalg.norm(self.point.offsets(np.concatenate(kept)), axis=1).min())
+        return max(MIN_RADIUS, min(LARGE * distance, max(least, room)))
+
+    def _misplaced(self, motion: Motion, nearest: Array, radius: float) -> list[str]:
+        """What there is to say of the place of the bias point."""
+        point, doubts = self.point, []
+        position = np.asarray(point.position)
+        if np.linalg.norm(point.offsets(motion.goal)) < ACCEPTED:
+            doubts.append("the bias point is on the goal: the motions end there anyway")
+        if (np.linalg.norm(point.offsets(motion.starts), axis=1) < ACCEPTED).any():
+            doubts.append("the bias point is on a start: the motion is there anyway")
+        if position[2] < 0:
+            doubts.append("the bias point is below the table")
+        away = float(np.linalg.norm(position - SHOULDER))
+        if away > REACH:
+            doubts.append(f"the bias point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m")
+        depth = float(np.abs((nearest - position) @ point.axes()[:, 2]).max()) if point.plane else 0.0
+        if depth > ACCEPTED:
+            doubts.append(
+                f"the bias point lies {100 * depth:.0f} cm before or behind the plane: motions are not led to it"
+            )
+        if any(np.linalg.norm(point.offsets(np.asarray(other))) < 0.9 * radius for other in self.below):
+            doubts.append("a bias region covers the target of another one below: motions are pulled away from that")
+        return doubts
 
 
-def _misplaced(point: BiasPoint, motion: Motion) -> list[str]:
-    """What there is to say of the place of a bias point."""
-    doubts = []
-    position = np.asarray(point.position)
-    if np.linalg.norm(point.offsets(motion.goal)) < ACCEPTED:
-        doubts.append("the bias point is on the goal: the motions end there anyway")
-    if position[2] < 0:
-        doubts.append("the bias point is below the table")
-    away = float(np.linalg.norm(position - SHOULDER))
-    if away > REACH:
-        doubts.append(f"the bias point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m")
-    return doubts
+def _too_small(radius: float, distance: float) -> str:
+    """What there is to say of a region from which not all motions arrive."""
+    sizes = (
+        f"the bias region of {100 * radius:.0f} cm is too small: a motion is {100 * distance:.0f} cm from the target"
+    )
+    return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
 
 
-def closest_points(point: BiasPoint, motion: Motion) -> Array:
-    """(R, 3) metres: where each rollout, as a polyline, comes closest to the target."""
+def closest_points(point: BiasPoint, motion: Motion) -> tuple[Array, Mask]:
+    """Where each rollout, as a polyline, comes closest to the target.
+
+    Returns:
+        (R, 3) these places, metres, and (R,) whether they are the rollout's start or goal.
+    """
     offset = point.offsets(motion.positions)
     start, step = offset[:-1], np.diff(offset, axis=0)
     squared = (step * step).sum(axis=1)
     same = np.diff(motion.index) == 0
     along = np.clip(-(start * step).sum(axis=1) / np.maximum(squared, 1e-300), 0, 1) * same
     miss = start + along[:, None] * step
-    miss = (miss * miss).sum(axis=1)
+    miss = np.where(same, (miss * miss).sum(axis=1), np.inf)
     first = np.flatnonzero(np.r_[True, ~same])
-    nearest = []
-    for low, high in zip(first, [*first[1:], len(offset)], strict=True):
-        k = low + int(np.argmin(miss[low : max(high - 1, low + 1)]))
-        before, after = motion.positions[k], motion.positions[min(k + 1, high - 1)]
-        nearest.append(before + along[min(k, len(along) - 1)] * (after - before))
-    return np.stack(nearest)
+    last = np.r_[first[1:], len(offset)] - 1
+    k = np.array([low + np.argmin(miss[low:high]) for low, high in zip(first, last, strict=True)])
+    nearest = motion.positions[k] + along[k, None] * (motion.positions[k + 1] - motion.positions[k])
+    return nearest, ((k == first) & (along[k] == 0)) | ((k + 1 == last) & (along[k] == 1))
 
 
 def closest_distances(point: BiasPoint, motion: Motion) -> Array:
     """(R,) metres: how close each rollout comes to the target, in the plane if the bias acts in one."""
-    return np.linalg.norm(point.offsets(closest_points(point, motion)), axis=1)
+    return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)
 
 
 def pulling_duration(field: VectorField, point: BiasPoint, points: Array, *, at_least: float = 0.0) -> float | None:
