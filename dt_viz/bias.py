@@ -31,6 +31,8 @@ ACCEPTED = 0.010
 """Metres by which they may pass, between the samples that the duration was chosen for."""
 MAX_DURATION = 4.0
 """Longest flow that is tried: what has not arrived after it hardly lies in the region."""
+LONG = 1.5
+"""Flow after which a motion that has not arrived, and whose start or goal is still its nearest place, never does."""
 SNAPSHOT = 0.1
 """Flow time between two looks at the distance: less than half of what a point at the target takes to halve it."""
 TOLERANCE = 1e-5
@@ -184,8 +186,8 @@ class Biasing:
         if duration is None:
             duration = MAX_DURATION
             doubts.append(_too_small(radius, distance))
-        elif point.strength is None and at_least > 0 and at_end.any() and not point.moves_goal:
-            hopeless = True  # what does not move is nearest, also to the motion between the moved ends
+        elif point.strength is None and at_least > LONG and at_end.any() and not point.moves_goal:
+            hopeless = True  # its ends stay where they are, and no other place of it will be nearer
             doubts.append("a motion has its start or goal nearer to the bias point than its way: it is not led there")
         flow = AdaptiveFlow(field, duration, FINENESS * tolerance)
         goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal

@@ -1,0 +1,355 @@
+"""Bias points: the field that pulls, motions that pass their targets, and what is said of targets out of reach."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dt_viz.avoidance import ACCEPTED_MARGIN
+from dt_viz.behaviours import Motion
+from dt_viz.bias import (
+    ACCEPTED,
+    AIM,
+    MAX_DURATION,
+    Biasing,
+    BiasPoint,
+    Vector,
+    closest_distances,
+    closest_points,
+    unit_field,
+)
+from dt_viz.diffeo import AdaptiveFlow, round_trip_error
+from dt_viz.metrics import resample_by_arc_length, sharpest_turn
+from dt_viz.obstacles import Sphere
+from dt_viz.scenario import Layer, Scenario
+from dt_viz.solving import FINE, LIVE, Ground, Solution, solve
+from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.tasks import DRAWING_AXES, POTS
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def vector(v) -> Vector:
+    x, y, z = (float(c) for c in v)
+    return x, y, z
+
+
+PLANE = vector(DRAWING_AXES[:, 0]), vector(DRAWING_AXES[:, 1])
+MAX_OFF = 0.15
+
+
+def plane_of(task):
+    return PLANE if task.startswith("draw") else None
+
+
+@pytest.fixture(scope="session")
+def ground(fits, engine):
+    """The undisturbed motion of a task."""
+    made = {}
+
+    def ground(task) -> Ground:
+        if task not in made:
+            made[task] = engine._ground(Scenario(task, ()), None)
+        return made[task]
+
+    return ground
+
+
+def biased(ground, *behaviours, precision=FINE, **changes) -> Solution:
+    changes = {"avoidance": False, **changes}
+    scenario = Scenario(ground.task.name, changes.pop("obstacles", ()), layers=tuple(map(Layer, behaviours)), **changes)
+    return solve(ground, scenario, precision)
+
+
+def motion_of(ground, solution) -> Motion:
+    scenario = Scenario(ground.task.name, ())
+    return Motion(scenario, ground.task.starts, ground.goal, solution.bundle.index, solution.bundle.positions)
+
+
+def missed(ground, solution, point) -> float:
+    return float(closest_distances(point, motion_of(ground, solution)).max())
+
+
+def beside(ground, rng, plane=None):
+    """A target up to 15 cm off a place in the middle three quarters of a rollout, above the table."""
+    path = resample_by_arc_length(ground.bundle.paths[rng.integers(len(ground.bundle.paths))], 201)
+    k = int(rng.integers(25, 175))
+    tangent, aside = path[k + 1] - path[k - 1], rng.normal(size=3)
+    if plane is not None:
+        aside = np.array(plane).T @ (np.array(plane) @ aside)
+    aside = aside - (aside @ tangent) / (tangent @ tangent) * tangent
+    x, y, z = path[k] + rng.uniform(0.0, MAX_OFF) * aside / np.linalg.norm(aside)
+    if z < 0:
+        return beside(ground, rng, plane)
+    return float(x), float(y), float(z)
+
+
+def assert_sound(ground, solution, goal=None):
+    """Ends kept, a diffeomorphism along the rollouts, there and back again exact."""
+    paths, y = solution.bundle.paths, solution.bundle.positions
+    np.testing.assert_allclose([path[0] for path in paths], ground.task.starts, atol=1e-6)
+    np.testing.assert_allclose(
+        [path[-1] for path in paths], [ground.goal if goal is None else goal] * len(paths), atol=1e-6
+    )
+    assert np.linalg.det(solution.transform.jacobian(y)[1]).min() > 0
+    assert round_trip_error(solution.transform, y) < 1e-6
+
+
+# the field
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_field_leads_away_from_the_centre_nearly_alike_everywhere_outside_its_core(dim):
+    away = np.random.default_rng(dim).normal(size=(200, dim))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    for radius in (0.3, 0.4, 0.5):
+        V = unit_field(dim)(np.pad(radius * away, ((0, 0), (0, 3 - dim))))[:, :dim]
+        outward = (V * away).sum(axis=1)
+        assert outward.min() > 0.75 and outward.max() < 1.15
+        assert np.linalg.norm(V - outward[:, None] * away, axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_field_is_at_rest_at_the_centre_and_outside_its_region(dim):
+    field = unit_field(dim)
+    assert np.abs(field(np.zeros((1, 3)))).max() < 1e-12
+    outside = np.random.default_rng(0).normal(size=(100, 3))
+    outside *= 1.001 / np.linalg.norm(outside[:, :dim], axis=1, keepdims=True)
+    V, DV = field.with_jacobian(outside)
+    assert not V.any() and not DV.any() and not field(outside).any()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_field_ends_smoothly(dim):
+    """Value and derivative fade out together: near the border both are small, however near."""
+    direction = np.array([0.6, 0.8, 0.0])
+    for gap, bound in ((1e-2, 1e-3), (1e-3, 1e-6)):
+        V, DV = unit_field(dim).with_jacobian((1 - gap) * direction[None])
+        assert 0 < np.abs(V).max() < bound
+        assert np.abs(DV).max() < 10 * bound / gap
+
+
+@given(seeds, st.sampled_from([None, PLANE]))
+def test_the_derivative_of_a_placed_field_is_that_of_its_values(seed, plane):
+    rng = np.random.default_rng(seed)
+    field = BiasPoint((0.1, -0.4, 0.3), plane=plane).field(0.25)
+    s = np.array([0.1, -0.4, 0.3]) + rng.uniform(-0.2, 0.2, (40, 3))
+    V, DV = field.with_jacobian(s)
+    np.testing.assert_allclose(V, field(s), atol=1e-15)
+    h = 1e-5
+    for j, step in enumerate(h * np.eye(3)):
+        np.testing.assert_allclose(DV[:, :, j], (field(s + step) - field(s - step)) / (2 * h), atol=1e-6)
+
+
+def test_a_dragged_or_resized_bias_point_learns_nothing_again():
+    fields = [BiasPoint(place).field(radius) for place in ((0.0, -0.4, 0.3), (0.1, -0.5, 0.2)) for radius in (0.1, 0.3)]
+    assert len({id(field.inner) for field in fields}) == 1
+
+
+@given(seeds)
+def test_in_a_plane_nothing_moves_out_of_it(seed):
+    rng = np.random.default_rng(seed)
+    s = np.array([0.0, -0.5, 0.4]) + rng.uniform(-0.3, 0.3, (50, 3))
+    V = BiasPoint((0.0, -0.5, 0.4), plane=PLANE).field(0.3)(s)
+    assert V.any() and np.abs(V @ DRAWING_AXES[:, 2]).max() < 1e-15
+
+
+# motions
+
+
+@pytest.mark.parametrize("task", ["draw_s", "lift_box", "push_box"])
+def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(ground, task):
+    g, rng, off, turns = ground(task), np.random.default_rng(7), [], []
+    for number in range(30):
+        point = BiasPoint(beside(g, rng, plane_of(task)), plane=plane_of(task))
+        solution = biased(g, Biasing(point), precision=FINE if number % 3 == 0 else LIVE)
+        assert solution.satisfied and solution.doubts == ()
+        assert missed(g, solution, point) <= ACCEPTED
+        off.append(closest_distances(point, motion_of(g, solution=replace(solution, bundle=g.bundle))).max())
+        turns.append(max(sharpest_turn(path, 0.02) for path in solution.bundle.paths))
+        if number % 3 == 0:
+            assert_sound(g, solution)
+    assert max(off) > 0.12  # the targets were not all on the path
+    before = max(sharpest_turn(path, 0.02) for path in g.bundle.paths)
+    assert np.median(turns) < before + 65  # on two centimetres, degrees
+
+
+def test_a_drawing_stays_in_its_plane(ground):
+    g = ground("draw_s")
+    solution = biased(g, Biasing(BiasPoint(beside(g, np.random.default_rng(1), PLANE), plane=PLANE)))
+    assert np.ptp(solution.bundle.positions[:, 1]) < 1e-12
+
+
+def test_a_biased_motion_is_still_the_motion_of_a_stable_system(ground):
+    g = ground("lift_box")
+    solution = biased(g, Biasing(BiasPoint(beside(g, np.random.default_rng(2)))))
+    system: DiffeomorphicSystem = solution.system
+    for path in solution.bundle.paths:
+        assert (np.diff(system.lyapunov(path)) < 0).all()
+
+
+def straight(distance, num=401):
+    """A straight motion that passes the origin at this distance."""
+    path = np.stack([np.linspace(-0.6, 0.6, num), np.full(num, distance), np.zeros(num)], axis=1)
+    return Motion(Scenario("any", ()), path[:1], path[-1], np.zeros(num, dtype=int), path)
+
+
+@given(st.floats(0.02, 0.15), st.sampled_from([None, 0.3]))
+def test_the_auto_duration_is_the_shortest(distance, radius):
+    motion, point = straight(distance), BiasPoint((0.0, 0.0, 0.0), radius)
+    built = Biasing(point).build(motion, 1e-8, 0.0)
+    assert isinstance(built.transform, AdaptiveFlow)
+    field = built.transform.field
+
+    def after(duration):
+        return float(closest_distances(point, replace(motion, positions=flow(duration).inverse(motion.positions)))[0])
+
+    def flow(duration):
+        return AdaptiveFlow(field, duration)
+
+    assert after(built.duration) == pytest.approx(AIM, rel=0.03)
+    assert after(0.97 * built.duration) > AIM
+    assert Biasing(point).satisfied(replace(motion, positions=built.transform.inverse(motion.positions)))
+    assert not Biasing(point).satisfied(motion)
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.10, 0.15])
+def test_with_room_around_it_a_straight_motion_turns_gently(distance):
+    motion = straight(distance, 2001)
+    built = Biasing(BiasPoint((0.0, 0.0, 0.0))).build(motion, 1e-6, 0.0)
+    assert sharpest_turn(built.transform.inverse(motion.positions), 0.02) < 40
+
+
+@given(seeds)
+def test_the_closest_point_is_that_of_the_polyline(seed):
+    rng = np.random.default_rng(seed)
+    lengths = rng.integers(2, 30, 4)
+    paths = [np.cumsum(rng.normal(0, 0.05, (n, 3)), axis=0) for n in lengths]
+    index = np.repeat(np.arange(4), lengths)
+    motion = Motion(Scenario("any", ()), np.stack([p[0] for p in paths]), paths[0][-1], index, np.concatenate(paths))
+    point = BiasPoint((0.05, 0.0, 0.02))
+    fine = [resample_by_arc_length(path, 20000) for path in paths]
+    expected = [np.linalg.norm(path - point.position, axis=1).min() for path in fine]
+    np.testing.assert_allclose(closest_distances(point, motion), expected, atol=1e-4)
+    nearest, at_end = closest_points(point, motion)
+    for path, place, end in zip(paths, nearest, at_end, strict=True):
+        assert end == (np.abs(path[[0, -1]] - place).max(axis=1) < 1e-12).any()
+
+
+def test_a_chosen_strength_is_taken_as_it_is():
+    motion, point = straight(0.1), BiasPoint((0.0, 0.0, 0.0), 0.3, strength=0.2)
+    built = Biasing(point).build(motion, 1e-8, 0.7)
+    assert built.duration == 0.2 and built.goal is motion.goal and not built.hopeless
+    assert Biasing(point).satisfied(motion)  # nobody asked for more
+
+
+# several
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("task", ["draw_s", "draw_j", "lift_box", "push_box"])
+def test_two_bias_points_in_either_order(ground, task, order):
+    g, plane = ground(task), plane_of(task)
+    path = resample_by_arc_length(g.bundle.paths[0], 101)
+    aside = 0.06 * np.array([1.0, 0.0, 0.0])
+    points = [BiasPoint(vector(path[k] + aside), plane=plane) for k in (35, 75)][::order]
+    solution = biased(g, Biasing(points[0]), Biasing(points[1], below=(points[0].position,)))
+    assert solution.satisfied
+    for point in points:
+        assert missed(g, solution, point) <= ACCEPTED
+    assert_sound(g, solution)
+
+
+def test_fig_4_a_letter_biased_to_two_points(ground):
+    g = ground("draw_j")
+    path = resample_by_arc_length(np.mean([resample_by_arc_length(p, 201) for p in g.bundle.paths], axis=0), 101)
+    first = vector(path[30] + [-0.10, 0.0, 0.0])  # into the letter
+    second = vector(path[70] + [0.0, 0.0, -0.08])  # below its bow
+    points = [BiasPoint(first, plane=PLANE), BiasPoint(second, plane=PLANE)]
+    solution = biased(g, Biasing(points[0]), Biasing(points[1], below=(first,)))
+    assert [missed(g, solution, point) <= ACCEPTED for point in points] == [True, True]
+    assert_sound(g, solution)
+
+
+@pytest.mark.parametrize("pot", POTS[::2])
+def test_fig_8_the_object_falls_into_the_chosen_pot(ground, pot):
+    g = ground("drop_pots")
+    assert POTS[1].catches(g.goal) and not pot.catches(g.goal)
+    point = BiasPoint((pot.x, pot.y, float(g.goal[2])), moves_goal=True)
+    solution = biased(g, Biasing(point))
+    (_, built), *_ = solution.built
+    assert solution.satisfied and pot.catches(built.goal)
+    assert np.linalg.norm(built.goal - point.position) <= ACCEPTED
+    assert_sound(g, solution, goal=built.goal)
+    assert (solution.bundle.positions[:, 2] > pot.height + 0.10).all()  # carried above the rims
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_bias_and_avoidance_in_either_order(ground, level):
+    g = ground("draw_s")
+    path = resample_by_arc_length(g.bundle.paths[0], 101)
+    point, sphere = BiasPoint(vector(path[75] + [0.0, 0.0, -0.06]), plane=PLANE), Sphere(vector(path[35]), 0.10)
+    solution = biased(g, Biasing(point), obstacles=(sphere,), avoidance=True, avoidance_level=level)
+    assert solution.satisfied
+    assert missed(g, solution, point) <= ACCEPTED
+    assert sphere.signed_distance(solution.bundle.positions).min() > ACCEPTED_MARGIN * 0.01
+    assert_sound(g, solution)
+
+
+# what cannot be
+
+
+def test_a_region_that_does_not_reach_the_motion_is_said_to_be_too_small():
+    built = Biasing(BiasPoint((0.0, 0.0, 0.0), radius=0.08)).build(straight(0.12), 1e-8, 0.0)
+    assert built.hopeless and built.duration == MAX_DURATION
+    assert built.doubts == ("the bias region of 8 cm is too small: a motion is 12 cm from the target",)
+
+
+def test_a_region_that_hardly_reaches_the_motion_is_said_to_fade_out():
+    built = Biasing(BiasPoint((0.0, 0.0, 0.0), radius=0.123)).build(straight(0.12), 1e-8, 0.0)
+    assert built.hopeless and "fades out" in built.doubts[0]
+
+
+@pytest.mark.parametrize(
+    ("place", "doubt"),
+    [
+        ((0.6, 0.1, 0.0), "on the goal"),
+        ((-0.6, 0.1, 0.0), "on a start"),
+        ((0.0, 0.1, -0.02), "below the table"),
+        ((0.0, 0.1, 1.30), "1.02 m from the arm's shoulder, which reaches 0.95 m"),
+    ],
+)
+def test_a_misplaced_bias_point_is_doubted(place, doubt):
+    built = Biasing(BiasPoint(place, radius=0.2)).build(straight(0.1), 1e-6, 0.0)
+    assert any(doubt in said for said in built.doubts)
+
+
+def test_a_target_off_the_plane_of_a_drawing_is_doubted(ground):
+    g = ground("draw_s")
+    x, _, z = g.bundle.positions[100]
+    point = BiasPoint((float(x), -0.45, float(z)), plane=PLANE)
+    solution = biased(g, Biasing(point), precision=LIVE)
+    assert any("5 cm before or behind the plane" in doubt for doubt in solution.doubts)
+
+
+def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(ground):
+    g = ground("drop_pots")
+    point = BiasPoint((0.0, -0.52, 0.14))
+    solution = biased(g, Biasing(point), precision=LIVE)
+    assert not solution.satisfied
+    assert any("its start or goal nearer to the bias point" in doubt for doubt in solution.doubts)
+    for path in solution.bundle.paths:
+        np.testing.assert_allclose(path[-1], g.goal, atol=1e-3)
+
+
+def test_a_region_over_another_target_is_doubted():
+    point = BiasPoint((0.0, 0.0, 0.0), radius=0.3)
+    built = Biasing(point, below=((0.1, 0.1, 0.0),)).build(straight(0.1), 1e-6, 0.0)
+    assert any("covers the target of another" in doubt for doubt in built.doubts)
+
+
+def test_equal_bias_points_are_equal_layers():
+    point = BiasPoint((0.0, -0.4, 0.3), plane=PLANE)
+    assert Biasing(point) == Biasing(replace(point)) and hash(Biasing(point)) == hash(Biasing(replace(point)))
