@@ -11,7 +11,7 @@ from dt_viz.integrate import integrate_adaptive, rk4
 from dt_viz.obstacles import Obstacle
 from dt_viz.several import Several
 
-MAX_DURATION = 4.0
+MAX_DURATION = 2.5
 """Longest flow that is tried to clear an obstacle: a motion that still collides runs through the flow's centre."""
 SNAPSHOT = 0.05
 """Flow time between two looks at the clearance. The field turns points around in about ten of them, so one RK4 step is

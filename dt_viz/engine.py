@@ -10,9 +10,11 @@ from enum import IntEnum
 
 import numpy as np
 
+from dt_viz.avoidance import ObstacleAvoidance
+from dt_viz.behaviours import Behaviour
 from dt_viz.collision import load_collision_model
-from dt_viz.diffeo import Identity
-from dt_viz.fields import Array
+from dt_viz.diffeo import AdaptiveFlow, Identity
+from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
 from dt_viz.following import NUM_ARM_SAMPLES, Follower
 from dt_viz.health import Health, certified, certified_arm
@@ -23,7 +25,7 @@ from dt_viz.retiming import within_velocity_limits
 from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.scenario import Scenario
-from dt_viz.solving import FINE, LIVE, NUM_SAMPLES, Ground, Precision, Solution, solve
+from dt_viz.solving import FINE, LIVE, NUM_SAMPLES, Checkpoint, Ground, Precision, Solution, solve
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
@@ -92,6 +94,9 @@ class Frame:
     blocked: tuple[str, ...]
     """Why there is no motion for this scenario, in words; what is shown then is the last one that there was."""
     health: Health
+    layer_radii: tuple[float | None, ...] = ()
+    """Radius of the region that each layer acts in, in the order of `Scenario.layers`, metres; None where it is off or
+    acts everywhere."""
     field: FieldPicture | None = None
     """None before stage LIVE."""
     arm: ArmMotion | None = None
@@ -139,12 +144,15 @@ class Engine:
             self._tasks[name] = self._loaders[name]()
         return self._tasks[name]
 
-    def frames(self, scenario: Scenario, progress: Progress | None = None) -> Iterator[Frame]:
+    def frames(
+        self, scenario: Scenario, progress: Progress | None = None, checkpoint: Checkpoint = lambda: None
+    ) -> Iterator[Frame]:
         """Frames for a scenario, one for each stage; stop iterating to skip what is not wanted any more.
 
         Args:
             scenario: what to show.
             progress: called while a task is fitted for the first time; see `dt_viz.imitation.fit`.
+            checkpoint: called now and then after stage LIVE; what it raises ends the computation.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be read.
@@ -152,7 +160,7 @@ class Engine:
         """
         ground = self._ground(scenario, progress)
         began = time.perf_counter()
-        for frame in self._stages(ground, scenario):
+        for frame in self._stages(ground, scenario, checkpoint):
             yield replace(frame, seconds=time.perf_counter() - began)
 
     def arm_motions(self, scenario: Scenario) -> tuple[Frame, tuple[ArmMotion, ...]]:
@@ -177,7 +185,7 @@ class Engine:
             health = health.doubting(*doubts)
         return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
 
-    def _stages(self, ground: Ground, scenario: Scenario) -> Iterator[Frame]:
+    def _stages(self, ground: Ground, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
         if _uses_whole_arm(scenario):
             with _turn:
                 blocked = self._follower.obstructions(ground, scenario.obstacle)
@@ -195,7 +203,7 @@ class Engine:
         yield frame
 
         with _turn:
-            fine = self._solved(ground, scenario, FINE)
+            fine = self._solved(ground, scenario, FINE, checkpoint)
         with _turn:
             frame = self._with_field_and_arm(self._frame(ground, scenario, fine), ground, fine)
         with _turn:
@@ -238,12 +246,14 @@ class Engine:
             self._grounds[key] = Ground(task, imitation, system, goal, rays, bundle)
         return self._grounds[key]
 
-    def _solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> _Solved:
-        stack = solve(ground, scenario, precision)
+    def _solved(
+        self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint = lambda: None
+    ) -> _Solved:
+        stack = solve(ground, scenario, precision, checkpoint)
         if not _uses_whole_arm(scenario):
             return _Solved(stack, None)
         follower = self._follower
-        lifted = follower.behaving(ground, stack) if scenario.space == "both" else follower.undisturbed(ground)
+        lifted = follower.behaving(ground, stack) if stack.built else follower.undisturbed(ground)
         arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, coarse=precision is LIVE)
         return _Solved(stack, arm)
 
@@ -277,6 +287,7 @@ class Engine:
                 arm_duration=arm.duration if arm else None,
                 doubts=doubts,
             ),
+            layer_radii=tuple(_region_radius(stack, layer.behaviour) for layer in scenario.layers),
         )
 
     def _with_field_and_arm(self, frame: Frame, ground: Ground, solved: _Solved) -> Frame:
@@ -314,6 +325,19 @@ def _uses_whole_arm(scenario: Scenario) -> bool:
     return scenario.avoidance and scenario.space != "task"
 
 
+def _region_radius(stack: Solution, behaviour: Behaviour) -> float | None:
+    """Radius of the region that a behaviour acts in, if it is on and has one."""
+    flow = next((made.transform for layer, made in stack.built if layer == behaviour), None)
+    return flow.field.scale if isinstance(flow, AdaptiveFlow) and isinstance(flow.field, PlacedField) else None
+
+
+def _moves_goal(ground: Ground, stack: Solution) -> bool:
+    """Whether some behaviour other than avoidance means to end elsewhere."""
+    goals = [ground.goal, *(made.goal for _, made in stack.built)]
+    moves = (bool(np.any(a != b)) for a, b in zip(goals, goals[1:], strict=False))
+    return any(m and not isinstance(layer, ObstacleAvoidance) for m, (layer, _) in zip(moves, stack.built, strict=True))
+
+
 def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse: bool) -> Pictures:
     """Those that the view shows."""
     view, book = scenario.view, ground.sketchbook
@@ -334,6 +358,6 @@ def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: floa
         doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
     elif not solved.stack.satisfied and not doubts:
         doubts.append(f"a motion keeps only {1e3 * clearance:.1f} mm from the obstacle")
-    if missed > MAX_GOAL_MISS and not doubts:
+    if missed > MAX_GOAL_MISS and not doubts and not _moves_goal(ground, solved.stack):
         doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
     return tuple(doubts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -41,7 +41,7 @@ class Precision:
 
 LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
 """Nothing of this is seen at the size of a screen."""
-FINE = Precision(tolerance=1e-8, spacing=0.005, ends=1e-7)
+FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,11 @@ def behaviours(scenario: Scenario) -> tuple[Behaviour, ...]:
     )
 
 
-def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
+Checkpoint = Callable[[], None]
+"""Called now and then in long computations; raises what is to end them."""
+
+
+def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint = lambda: None) -> Solution:
     """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
 
     A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
@@ -151,7 +155,9 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
         durations = [0.0] * len(layers)
         for _ in range(MAX_ATTEMPTS):
             lowest = Motion(scenario, ground.task.starts, ground.goal, bundle.index, bundle.levels[:, 0], keeps_goal)
+            checkpoint()
             built = _build(layers, lowest, precision.tolerance, durations)
+            checkpoint()
             durations = [made.duration if made else 0.0 for _, made in built]
             outer = [made.transform for _, made in built if made]
             goal = next((made.goal for _, made in reversed(built) if made), ground.goal)

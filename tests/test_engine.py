@@ -238,6 +238,20 @@ def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
         assert used_fraction(frame.arm.times, frame.arm.q, robot.velocity_limits) <= 1 + 1e-9
 
 
+def test_refining_ends_where_a_checkpoint_says_so(engine, scenario):
+    class UnwantedError(Exception):
+        pass
+
+    def refuse():
+        raise UnwantedError
+
+    frames = engine.frames(scenario, checkpoint=refuse)
+    assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
+    with pytest.raises(UnwantedError):
+        next(frames)
+    assert stage(engine, scenario, Stage.CERTIFIED).health.lyapunov_falls  # nothing is left locked
+
+
 def random_edit(rng, scenario, initial):
     kind = rng.integers(0, 6)
     if kind == 0:

@@ -36,7 +36,7 @@ class FakeEngine:
         self.begun, self.gate = threading.Event(), None
         self.unlearned, self.learning = set(), threading.Event()
 
-    def frames(self, scenario, progress=None):
+    def frames(self, scenario, progress=None, checkpoint=None):
         self.asked.append(scenario)
         self.begun.set()
         if self.gate is not None:

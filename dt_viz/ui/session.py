@@ -16,6 +16,7 @@ from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.imitation import ImitationError
 from dt_viz.scenario import Scenario
+from dt_viz.tasks import Task
 from dt_viz.ui.worker import LatestWorker
 
 GESTURE_PAUSE = 1.0
@@ -40,7 +41,12 @@ class Pace:
 
 
 class _UnwantedError(Exception):
-    """Nobody wants any more what is being learned."""
+    """Nobody wants any more what is being learned, or refined."""
+
+
+def _end_if(superseded: Callable[[], bool]) -> None:
+    if superseded():
+        raise _UnwantedError
 
 
 class Display(Protocol):
@@ -97,6 +103,11 @@ class Session:
         display.adopt(self.scenario)
         self._submit()
 
+    @property
+    def task(self) -> Task:
+        """The scenario's task. Raises what `Engine.task` raises."""
+        return self._engine.task(self.scenario.task)
+
     def edit(self, gesture: str, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
         """Replace some values of the scenario and have it computed anew.
 
@@ -147,7 +158,7 @@ class Session:
                 "task",
                 task=name,
                 arm_rollout=0,
-                obstacles=tuple(had.moved(there.position) for there, had in kept),
+                obstacles=tuple(had.moved(there.position, had.wxyz) for there, had in kept),
             )
             self.end_gesture()
 
@@ -247,7 +258,8 @@ class Session:
 
     def _show_frames(self, job: tuple[Scenario, float], superseded: Callable[[], bool]) -> None:
         scenario, edited = job
-        for frame in self._engine.frames(scenario, partial(self._learn, scenario)):
+        wanted = partial(_end_if, superseded)
+        for frame in self._engine.frames(scenario, partial(self._learn, scenario), wanted):
             now = time.perf_counter()
             if self._learning:
                 edited = now - frame.seconds  # learning is no rebuild
