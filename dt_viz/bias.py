@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -10,9 +11,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from dt_viz.behaviours import Built, Motion
-from dt_viz.diffeo import AdaptiveFlow
+from dt_viz.diffeo import Flow
 from dt_viz.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
-from dt_viz.integrate import integrate_adaptive, rk4
+from dt_viz.integrate import integrate, rk4
 
 Vector = tuple[float, float, float]
 
@@ -35,8 +36,6 @@ LONG = 1.5
 """Flow after which a motion that has not arrived, and whose start or goal is still its nearest place, never does."""
 SNAPSHOT = 0.1
 """Flow time between two looks at the distance: less than half of what a point at the target takes to halve it."""
-TOLERANCE = 1e-5
-"""Of the integration up to the duration that is known to be needed, metres a step."""
 LARGE, SMALL = 2.5, 1.5
 """Of the distance of the farthest motion: the `auto` radius, and the one down to which it shrinks to leave starts and
 goal outside. On a straight path, these turn the motion by up to 30° and 90° on two centimetres."""
@@ -47,9 +46,9 @@ SMALLER = 1.25
 the radius may not grow with that."""
 OVERSHOOT = 2.0
 """Times the longer duration that another attempt needs."""
-FINENESS = 0.1
-"""Part of the tolerance that a step of the flow may be off by: what contracts on the way there expands on the way back,
-and the estimate of a long first step may be small by chance."""
+STEP = 2.2
+"""Flow time of a step of the flow, for each fourth root of a metre of tolerance. The field is mild everywhere, so RK4
+with equal steps is quicker here than steps of each point's own length, and there and back it errs less."""
 SHOULDER = (0.0, 0.0, 0.28)
 """Of the arm, metres."""
 REACH = 0.95
@@ -189,7 +188,7 @@ class Biasing:
         elif point.strength is None and at_least > LONG and at_end.any() and not point.moves_goal:
             hopeless = True  # its ends stay where they are, and no other place of it will be nearer
             doubts.append("a motion has its start or goal nearer to the bias point than its way: it is not led there")
-        flow = AdaptiveFlow(field, duration, FINENESS * tolerance)
+        flow = Flow(field, duration, max(1, math.ceil(duration / (STEP * tolerance**0.25))), sparse=True)
         goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
         return Built(flow, duration, goal, hopeless, tuple(doubts))
 
@@ -279,7 +278,7 @@ def pulling_duration(field: VectorField, point: BiasPoint, points: Array, *, at_
     """
     duration = at_least
     if duration > 0:
-        points, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
+        points, _ = integrate(rk4, field, points, None, -duration, math.ceil(duration / SNAPSHOT))
     distance = np.linalg.norm(point.offsets(points), axis=1)
     away = distance > AIM
     points, distance = points[away], distance[away]

@@ -20,7 +20,7 @@ from dt_viz.bias import (
     closest_points,
     unit_field,
 )
-from dt_viz.diffeo import AdaptiveFlow, round_trip_error
+from dt_viz.diffeo import Flow, round_trip_error
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Layer, Scenario
@@ -200,14 +200,14 @@ def straight(distance, num=401):
 def test_the_auto_duration_is_the_shortest(distance, radius):
     motion, point = straight(distance), BiasPoint((0.0, 0.0, 0.0), radius)
     built = Biasing(point).build(motion, 1e-8, 0.0)
-    assert isinstance(built.transform, AdaptiveFlow)
+    assert isinstance(built.transform, Flow)
     field = built.transform.field
 
     def after(duration):
         return float(closest_distances(point, replace(motion, positions=flow(duration).inverse(motion.positions)))[0])
 
     def flow(duration):
-        return AdaptiveFlow(field, duration)
+        return Flow(field, duration, 60)
 
     assert after(built.duration) == pytest.approx(AIM, rel=0.03)
     assert after(0.97 * built.duration) > AIM
