@@ -18,6 +18,7 @@ from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array, Indices
 from dt_viz.obstacles import Obstacle
 from dt_viz.robot import NUM_JOINTS, KinematicChain, Robot, cross
+from dt_viz.tracking import DIRECTION_WEIGHT
 
 COMPLEX_STEP = 1e-30
 
@@ -34,8 +35,6 @@ BEHIND = 1.25
 """The same, at least, in distances at which the field ends: the point itself is no place to escape from."""
 DAMPING = 0.06
 """λ of the contact's pseudo-inverse, metres per rad: a contact that joints can hardly move is not chased."""
-DIRECTION_WEIGHT = 1.5
-"""Of the hand's direction against joint angles, as in `dt_viz.tracking`."""
 HAND_WEIGHT = 100.0
 """Of the end effector's motion, rad² per m²: a forearm in contact is moved by what leaves the hand where it is."""
 LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])

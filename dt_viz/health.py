@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.collision import CollisionReport
+from dt_viz.cspace import LEVERS
 from dt_viz.fields import Array, Indices
 from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle
@@ -64,9 +65,7 @@ def certified_arm(health: Health, system: DiffeomorphicSystem, arm: ArmSolution,
     """Add the certificates of the whole arm's transform to those of the end effector's stack below it."""
     keep = np.unique(np.linspace(0, len(arm.index) - 1, NUM_CHECKED_POSTURES).astype(int))
     p, (q, J) = arm.p[keep], arm.transform.jacobian(arm.p[keep])
-    round_trip = float(
-        np.linalg.norm(robot.end_effector(arm.transform.inverse(q)) - robot.end_effector(p), axis=1).max()
-    )
+    round_trip = float(np.linalg.norm((arm.transform.inverse(q) - p) * LEVERS, axis=1).max())
     falls = _falls(system.lyapunov(robot.end_effector(q)), arm.index[keep])
     return _judged(health, float(np.linalg.det(J).min()), round_trip, falls)
 

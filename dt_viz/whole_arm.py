@@ -8,7 +8,7 @@ costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -46,7 +46,7 @@ ROUNDING = 1e-3
 """Metres of clearance that do not count."""
 COARSE_STEP = 0.2
 """Of flow time. An RK4 step of this length is off by a tenth of a millimetre at the hand, about."""
-TOLERANCE = 3e-8
+TOLERANCE = 3e-9
 """Of the fine flow's steps, rad."""
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
@@ -131,7 +131,15 @@ class WholeArm:
         """The motions as lifted, avoiding nothing."""
         return _Solver(self, lifted, scenario, None, spacing, coarse=True).solution()
 
-    def avoiding(self, lifted: Lift, scenario: Scenario, spacing: float, *, coarse: bool) -> ArmSolution:
+    def avoiding(
+        self,
+        lifted: Lift,
+        scenario: Scenario,
+        spacing: float,
+        checkpoint: Callable[[], None] = lambda: None,
+        *,
+        coarse: bool,
+    ) -> ArmSolution:
         """The motions around the scenario's obstacle.
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
@@ -142,10 +150,12 @@ class WholeArm:
             lifted: the motions below.
             scenario: with obstacle, margin, temperature and duration.
             spacing: largest distance between neighbouring samples, metres at the hand, about.
+            checkpoint: called now and then; raises what is to end the computation.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
         """
         best = None
         for generator in self._generators(lifted, scenario):
+            checkpoint()
             solution = _Solver(self, lifted, scenario, generator, spacing, coarse=coarse).solution()
             if best is None or solution.cleared or solution.clearance > best.clearance:
                 best = solution
