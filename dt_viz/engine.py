@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from itertools import pairwise
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from dt_viz.solving import FINE, LIVE, NUM_SAMPLES, Checkpoint, Ground, Precisio
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
-from dt_viz.whole_arm import ArmSolution
+from dt_viz.whole_arm import ArmSolution, Lift
 
 ARROW_SPACING = 0.030
 """Of the picture of the vector field, metres."""
@@ -115,6 +116,8 @@ class _Solved:
     """Of the end effector, before the whole arm avoids anything."""
     arm: ArmSolution | None
     """None where only the end effector avoids."""
+    lifted: Lift | None
+    """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
 
 
 _turn = threading.Lock()
@@ -251,11 +254,12 @@ class Engine:
     ) -> _Solved:
         stack = solve(ground, scenario, precision, checkpoint)
         if not _uses_whole_arm(scenario):
-            return _Solved(stack, None)
+            return _Solved(stack, None, None)
         follower = self._follower
         lifted = follower.behaving(ground, stack) if stack.built else follower.undisturbed(ground)
-        arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, coarse=precision is LIVE)
-        return _Solved(stack, arm)
+        checkpoint()
+        arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, checkpoint, coarse=precision is LIVE)
+        return _Solved(stack, arm, lifted)
 
     def _frame(self, ground: Ground, scenario: Scenario, solved: _Solved) -> Frame:
         """The frame of stage ROLLOUTS."""
@@ -303,10 +307,10 @@ class Engine:
     def _arm(self, frame: Frame, ground: Ground, solved: _Solved, chosen: int) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
         times, undisturbed = frame.times[chosen], self._follower.undisturbed(ground)
-        if solved.arm is not None:
+        if solved.arm is not None and solved.lifted is not None:
             rows = solved.arm.index == chosen
             q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
-            doubts = self._follower.doubts(undisturbed.tracked, chosen)
+            doubts = self._follower.doubts(solved.lifted.tracked, chosen)
         else:
             bundle = solved.stack.bundle
             path, fraction = frame.rollouts[chosen], bundle.split(bundle.fraction)[chosen]
@@ -334,7 +338,7 @@ def _region_radius(stack: Solution, behaviour: Behaviour) -> float | None:
 def _moves_goal(ground: Ground, stack: Solution) -> bool:
     """Whether some behaviour other than avoidance means to end elsewhere."""
     goals = [ground.goal, *(made.goal for _, made in stack.built)]
-    moves = (bool(np.any(a != b)) for a, b in zip(goals, goals[1:], strict=False))
+    moves = (bool(np.any(a != b)) for a, b in pairwise(goals))
     return any(m and not isinstance(layer, ObstacleAvoidance) for m, (layer, _) in zip(moves, stack.built, strict=True))
 
 
@@ -353,7 +357,11 @@ def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: floa
     doubts = [*ground.imitation.warnings, *solved.stack.doubts]
     if solved.arm is not None:
         if not solved.arm.cleared:
-            doubts.append("the arm finds no way around the obstacle: a motion comes too near to it")
+            doubts.append(
+                "the arm finds no way around the obstacle: a motion comes too near to it"
+                if scenario.duration is None
+                else "a motion of the arm comes too near to the obstacle at this flow time"
+            )
     elif scenario.avoidance and clearance < 0 and not doubts:
         doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
     elif not solved.stack.satisfied and not doubts:
