@@ -22,6 +22,8 @@ SPACES: tuple[Space, ...] = ("task", "cspace", "both")
 
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
 """Metres."""
+MAX_OBSTACLES = 5
+"""In the page: each costs time while a hand moves."""
 MAX_MARGIN = 0.05
 """Metres."""
 MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
@@ -52,6 +54,8 @@ class View:
     joint_plots: bool = False
     """Joint angles and speeds over time, with their limits."""
     table: bool = True
+    selected: int = 0
+    """The obstacle that has handles; the last one if there are fewer."""
     generator: bool = False
     """Arrows of the learned generator, the vector field whose flow is ψ."""
     generator_layer: int = 0
@@ -110,6 +114,11 @@ class Scenario:
     def obstacle(self) -> Several:
         """All obstacles as one."""
         return Several(self.obstacles)
+
+    @property
+    def selected(self) -> int | None:
+        """Which obstacle has handles; None if there is no obstacle."""
+        return min(self.view.selected, len(self.obstacles) - 1) if self.obstacles else None
 
     def moves_like(self, other: Scenario) -> bool:
         """Whether both give the same motion, however it is looked at."""

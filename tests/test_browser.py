@@ -113,14 +113,14 @@ def assert_shows_the_obstacle_where_it_is(visitor: Visitor) -> None:
     assert frame is not None
     assert frame.scenario.obstacle == session.scenario.obstacle
     (obstacle,) = session.scenario.obstacles
-    np.testing.assert_allclose(visitor.pictures.obstacle.gizmo.position, obstacle.position, atol=1e-9)
+    np.testing.assert_allclose(visitor.pictures.obstacles.items[0].gizmo.position, obstacle.position, atol=1e-9)
 
 
 def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
     page, visitor = visit
     before = visitor.shown
     centre = np.array(visitor.session.scenario.obstacles[0].position)
-    tip = centre + np.array([0, 0, 0.8 * visitor.pictures.obstacle.gizmo.scale])
+    tip = centre + np.array([0, 0, 0.8 * visitor.pictures.obstacles.items[0].gizmo.scale])
     drag(page, project(visitor, tip), project(visitor, tip + np.array([0, 0, 0.06])))
     wait_until(lambda: visitor.session.scenario.obstacles[0].position[2] > centre[2] + 0.03, "the drag to arrive")
     assert visitor.session.wait_idle(PATIENCE)
@@ -158,7 +158,7 @@ def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_p
 def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
     page, visitor = visit
     first = visitor.session.scenario
-    x, y = project(visitor, first.obstacle.position)
+    x, y = project(visitor, first.obstacles[0].position)
     drag(page, (x - 18, y + 14), (x + 30, y - 20))
     wait_until(lambda: visitor.session.scenario != first and visitor.session.wait_idle(0.5), "the drag")
     second = visitor.session.scenario

@@ -13,15 +13,11 @@ from dt_viz.collision import SELF_REACH, CollisionReport
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Frame, Stage
 from dt_viz.imitation import ImitationError
-from dt_viz.obstacles import Sphere
 from dt_viz.occupancy import GENERATORS
 from dt_viz.robot import Robot
 from dt_viz.scenario import (
-    MAX_DIAMETER,
     MAX_MANUAL_DURATION,
-    MAX_MARGIN,
     MAX_TEMPERATURE,
-    MIN_DIAMETER,
     MIN_TEMPERATURE,
     OBJECTIVES,
     SPACES,
@@ -30,6 +26,7 @@ from dt_viz.scenario import (
 )
 from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.export import RESOLUTIONS
+from dt_viz.ui.obstacle_panel import ObstaclePanel
 from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.session import Pace, Session
 
@@ -103,7 +100,7 @@ class Panel:
                 self._session.cancel()
 
         self._build_task()
-        self._build_obstacle()
+        self._obstacles = ObstaclePanel(gui, self._bind)
         self._build_stack()
         self._build_arm()
         self._build_view()
@@ -113,10 +110,12 @@ class Panel:
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
         self._session = session
+        self._obstacles.connect(session)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
         self._adopted = scenario
+        self._obstacles.adopt(scenario)
         for control in self._controls:
             value = control.read(scenario)
             if control.handle.value != value:
@@ -219,20 +218,6 @@ class Panel:
         async def _(_event: viser.GuiEvent) -> None:
             if self._session is not None:
                 {"Undo": self._session.undo, "Redo": self._session.redo, "Reset": self._session.reset}[history.value]()
-
-    def _build_obstacle(self) -> None:
-        gui = self._gui
-        with gui.add_folder("Obstacle"):
-            self._bind(
-                gui.add_slider("Diameter [cm]", 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0),
-                lambda s: round(200 * s.obstacles[0].radius, 3),
-                lambda s, value: {"obstacles": (Sphere(s.obstacles[0].position, value / 100), *s.obstacles[1:])},
-            )
-            self._bind(
-                gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
-                lambda s: round(100 * s.margin, 3),
-                lambda _s, value: {"margin": value / 100},
-            )
 
     def _build_stack(self) -> None:
         gui = self._gui
@@ -375,7 +360,7 @@ def status_html(frame: Frame, pace: Pace) -> str:
     rows = (
         ("Rebuild", f"{1e3 * pace.latency:.0f} ms" + (f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else "")),
         ("Skipped edits", f"{pace.num_skipped}"),
-        ("Clearance", f"{1e3 * health.clearance:.1f} mm, {'body points' if of_spheres else 'end effector'}"),
+        ("Clearance", _clearance(health.clearance, "body points" if of_spheres else "end effector")),
         *_collision_rows(health.collision, unknown),
         ("Flow time t", " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None) or off),
         ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
@@ -398,12 +383,18 @@ def status_html(frame: Frame, pace: Pace) -> str:
     return f"{blocked}<table style='{_SMALL}'>{cells}</table>{''.join(_alarm(w, *_AMBER) for w in warnings)}"
 
 
+def _clearance(clearance: float, whose: str) -> str:
+    return "no obstacle" if clearance == float("inf") else f"{1e3 * clearance:.1f} mm, {whose}"
+
+
 def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:
     """What the arm's meshes come near to."""
     if report is None:
         obstacle = itself = table = unknown
     else:
-        obstacle = _distance(report.obstacle.distance, "enters by", report.obstacle.links)
+        obstacle = "no obstacle"
+        if report.obstacle.links:
+            obstacle = _distance(report.obstacle.distance, "enters by", report.obstacle.links)
         itself = f"over {1e3 * SELF_REACH:.0f} mm"
         if report.itself is not None:
             itself = _distance(report.itself.distance, "touches", report.itself.links)

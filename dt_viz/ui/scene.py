@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 import viser
 
 from dt_viz.engine import MAX_GOAL_MISS, Frame
-from dt_viz.fields import Array
 from dt_viz.robot import Robot
-from dt_viz.scenario import MAX_DIAMETER, Scenario
-from dt_viz.tasks import Slice, Task
+from dt_viz.scenario import Scenario
+from dt_viz.tasks import Task
 from dt_viz.ui import palette
 from dt_viz.ui.arm_layers import Onion
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
+from dt_viz.ui.obstacles import Moved, Obstacles
 from dt_viz.ui.picture import Arrows, Lines, Picture
 
 ARROW_LENGTH = 0.024
 """Of the fastest arrow, metres."""
-GIZMO_SCALE = 0.2
-"""Metres that the handles stick out, about."""
-OPACITY = 0.8
-"""Of the obstacle: the path that it blocks shines through."""
-MIN_SLOPE = 0.2
-"""Of the line of sight to the slice, below which the slice counts as seen on edge."""
 
 
 class Demonstrations(Picture):
@@ -113,80 +106,6 @@ class Goal(Picture):
             self._end.visible = elsewhere
 
 
-class Obstacle(Picture):
-    """The sphere, which can be dragged itself, and the gizmo that moves it along the axes of the world.
-
-    The browser moves gizmo and sphere together, without asking the server.
-    """
-
-    def __init__(self, scene: viser.SceneApi, moved: Callable[[Array, str], None]) -> None:
-        """Draw the obstacle.
-
-        Args:
-            scene: of the visitor.
-            moved: told of a new centre (3,), metres, and the phase of the drag: "start", "update" or "end".
-        """
-        self._slice: Slice | None = None
-        self.gizmo = scene.add_transform_controls(
-            "/obstacle", scale=0.16, line_width=3.0, disable_rotations=True, depth_test=False
-        )
-        super().__init__(self.gizmo)
-        self._ball = scene.add_icosphere(
-            "/obstacle/ball", radius=1.0, subdivisions=4, color=palette.OBSTACLE, opacity=OPACITY
-        )
-
-        @self.gizmo.on_update
-        async def _(event: viser.TransformControlsEvent) -> None:
-            moved(event.target.position.copy(), event.phase)
-
-        @self._ball.on_drag
-        async def _(event: viser.SceneNodeDragEvent) -> None:
-            camera = np.asarray(event.client.camera.position)
-            centre = self.gizmo.position + self._in_slice(camera, event.start_position, event.end_position)
-            self.gizmo.position = centre
-            moved(centre, event.phase)
-
-    def _in_slice(self, camera: Array, grabbed: Sequence[float], pointer: Sequence[float]) -> Array:
-        """How far (3,) the grabbed point must move, parallel to the slice, to lie under the pointer."""
-        shift = np.asarray(pointer) - np.asarray(grabbed)
-        if self._slice is None:
-            return shift
-        normal = np.cross(*self._slice.axes.T)
-        sight = np.asarray(pointer) - camera
-        sight /= np.linalg.norm(sight)
-        slope = float(sight @ normal)
-        if abs(slope) < MIN_SLOPE:
-            return shift  # the slice is seen on edge: move across the line of sight instead
-        return shift - sight * float(shift @ normal) / slope
-
-    def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers the slice to be dragged in."""
-        self._slice = frame.task.slice
-
-    def adopt(self, scenario: Scenario) -> None:
-        """Stand where the scenario says, unless that is where the browser has put it already."""
-        obstacle = scenario.obstacles[0]
-        if np.abs(self.gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
-            self.gizmo.position = obstacle.position
-        if self._ball.scale != obstacle.radius:
-            self._ball.scale = obstacle.radius
-            self.gizmo.scale = GIZMO_SCALE * (0.5 + obstacle.radius / MAX_DIAMETER)
-        opacity = OPACITY if scenario.avoidance else 0.3
-        if self._ball.opacity != opacity:
-            self._ball.opacity = opacity
-
-    @contextmanager
-    def without_gizmo(self) -> Iterator[None]:
-        """Hide the handles, not the sphere, for as long as a picture takes."""
-        # hiding the gizmo itself would hide the sphere that hangs on it
-        scale, opacity = self.gizmo.scale, self.gizmo.opacity
-        self.gizmo.scale, self.gizmo.opacity = 1e-6, 0.0
-        try:
-            yield
-        finally:
-            self.gizmo.scale, self.gizmo.opacity = scale, opacity
-
-
 class Table(Picture):
     """The work table under the arm."""
 
@@ -217,11 +136,11 @@ def set_lights(scene: viser.SceneApi) -> None:
 class ScenePictures:
     """Everything in the scene of one visitor that is drawn from frames."""
 
-    def __init__(self, scene: viser.SceneApi, robot: Robot, moved: Callable[[Array, str], None]) -> None:
-        """Build the scene of this robot; `moved` is told where the user puts the obstacle, see `Obstacle`."""
+    def __init__(self, scene: viser.SceneApi, robot: Robot, moved: Moved, selected: Callable[[int], None]) -> None:
+        """Build the scene of this robot; `moved` and `selected` are told what the user does, see `Obstacles`."""
         set_lights(scene)
-        self.obstacle = Obstacle(scene, moved)
-        self._always: tuple[Picture, ...] = (self.obstacle, Goal(scene))
+        self.obstacles = Obstacles(scene, moved, selected)
+        self._always: tuple[Picture, ...] = (self.obstacles, Goal(scene))
         self._by_view: dict[str, Picture] = {
             "demonstrations": Demonstrations(scene),
             "rollouts": Rollouts(scene),
@@ -244,7 +163,7 @@ class ScenePictures:
             picture.draw(frame)
 
     def adopt(self, scenario: Scenario) -> None:
-        """Show and hide what the scenario's view says, and move the obstacle to where it stands."""
-        self.obstacle.adopt(scenario)
+        """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
+        self.obstacles.adopt(scenario)
         for name, picture in self._by_view.items():
             picture.visible = getattr(scenario.view, name)

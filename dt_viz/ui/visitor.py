@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import viser
 
@@ -50,7 +51,7 @@ class Visitor:
         client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
-            self.pictures = ScenePictures(client.scene, robot, self._obstacle_moved)
+            self.pictures = ScenePictures(client.scene, robot, self._obstacle_moved, self._obstacle_selected)
             self.arms = Arms(client.scene, robot)
         self._playback = Playback(self._pose)
         self._panel = Panel(client.gui, titles, robot, self._save_png)
@@ -101,21 +102,27 @@ class Visitor:
         self.session.close()
         self._playback.close()
 
-    def _obstacle_moved(self, centre: Array, phase: str) -> None:
+    def _obstacle_moved(self, index: int, position: Array, wxyz: Array, phase: str) -> None:
         if phase == "start":
             self.session.begin_gesture()
-        x, y, z = (float(c) for c in centre)
-        first, *others = self.session.scenario.obstacles
-        self.session.edit("obstacle", obstacles=(first.moved((x, y, z), first.wxyz), *others))
+        x, y, z = (float(c) for c in position)
+        w, i, j, k = (float(c) for c in wxyz)
+        obstacles = list(self.session.scenario.obstacles)
+        if index < len(obstacles):  # or it was deleted a moment ago
+            obstacles[index] = obstacles[index].moved((x, y, z), (w, i, j, k))
+            self.session.edit(f"obstacle {index}", obstacles=tuple(obstacles))
         if phase == "end":
             self.session.end_gesture()
+
+    def _obstacle_selected(self, index: int) -> None:
+        self.session.edit("select", view=replace(self.session.scenario.view, selected=index))
 
     def _pose(self, q: Array, without: Array) -> None:
         with self.client.atomic():
             self.arms.pose(q, without)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
-        with self.pictures.obstacle.without_gizmo():
+        with self.pictures.obstacles.without_handles():
             content = render_png(self.client, RESOLUTIONS[resolution], transparent=transparent)
         name = f"dt-viz-{self.session.scenario.task}.png"
         self.client.send_file_download(name, content, save_immediately=True)

@@ -1,0 +1,174 @@
+"""Controls of the obstacles: which there are, how large they are, and which one has handles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import viser
+
+from dt_viz.metrics import resample_by_arc_length
+from dt_viz.obstacles import Box, Cylinder, Obstacle, Point, Sphere
+from dt_viz.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
+from dt_viz.several import Several
+from dt_viz.tasks import Task
+from dt_viz.ui.session import Session
+
+ORIGIN: Point = (0.0, 0.0, 0.0)
+SHAPES: Mapping[str, Obstacle] = {
+    "Sphere": Sphere(ORIGIN, 0.10),
+    "Cylinder": Cylinder(ORIGIN, 0.08, 0.16),
+    "Cube (fig. 3a)": Box(ORIGIN, (0.12, 0.12, 0.12)),
+    "Box": Box(ORIGIN, (0.16, 0.10, 0.06)),
+}
+"""What can be added, by its button."""
+ASIDE = 0.4
+"""Of its inner radius, by which a new obstacle stands beside the motion: dead ahead no side is the shorter one."""
+MIN_SIZE, MAX_SIZE = 0.03, 0.40
+"""Of a box along one axis, and of a cylinder's height, metres."""
+NONE: str = "none"
+
+Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Any]
+"""Ties a control to the scenario; see `Panel`."""
+
+
+class ObstaclePanel:
+    """The folder "Obstacles" of one visitor's panel."""
+
+    def __init__(self, gui: viser.GuiApi, bind: Bind) -> None:
+        """Build the controls; they act once `connect` has given them a session."""
+        self._gui = gui
+        self._bind = bind
+        self._session: Session | None = None
+        self._sizes: list[tuple[Any, type[Obstacle]]] = []
+        with gui.add_folder("Obstacles"):
+            self._choice = gui.add_dropdown("Selected", (NONE,), hint="the one with handles; or click it in the scene")
+            self._add = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
+            self._change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected one")
+            diameters = 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0
+            self._size(gui.add_slider("Diameter [cm]", *diameters), Sphere, "diameter")
+            self._size(gui.add_slider("Diameter [cm]", *diameters), Cylinder, "diameter")
+            lengths = 100 * MIN_SIZE, 100 * MAX_SIZE, 0.5, 15.0
+            self._size(gui.add_slider("Height [cm]", *lengths), Cylinder, "height")
+            for axis, name in enumerate("xyz"):
+                self._size(gui.add_slider(f"Size {name} [cm]", *lengths), Box, "sizes", axis)
+            bind(
+                gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
+                lambda s: round(100 * s.margin, 3),
+                lambda _s, value: {"margin": value / 100},
+            )
+
+        @self._choice.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if self._session is not None and event.client is not None and self._choice.value != NONE:
+                index = self._choice.options.index(self._choice.value)
+                self._session.edit("select", view=replace(self._session.scenario.view, selected=index))
+
+        @self._add.on_click
+        async def _(_event: viser.GuiEvent) -> None:
+            self.add(SHAPES[self._add.value])
+
+        @self._change.on_click
+        async def _(_event: viser.GuiEvent) -> None:
+            {"Duplicate": self._duplicate, "Delete": self._delete}[self._change.value]()
+
+    def connect(self, session: Session) -> None:
+        """Let the controls edit this session."""
+        self._session = session
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's obstacles; what is tied by `bind` shows itself."""
+        options = tuple(f"{k}: {name_of(obstacle)}" for k, obstacle in enumerate(scenario.obstacles, 1)) or (NONE,)
+        if self._choice.options != options:
+            self._choice.options = options
+        value = options[scenario.selected or 0]
+        if self._choice.value != value:
+            self._choice.value = value
+        chosen = _selected(scenario)
+        for handle, shape in self._sizes:
+            if handle.visible != isinstance(chosen, shape):
+                handle.visible = isinstance(chosen, shape)
+        full = len(scenario.obstacles) >= MAX_OBSTACLES
+        if self._add.disabled != full:
+            self._add.disabled = full
+        if self._change.disabled != (chosen is None):
+            self._change.disabled = chosen is None
+
+    def add(self, obstacle: Obstacle) -> None:
+        """Put another obstacle, turned as it is, where there is room on the motion, and select it."""
+        session = self._session
+        if session is None or len(session.scenario.obstacles) >= MAX_OBSTACLES:
+            return
+        before = session.scenario.obstacles
+        added = with_room(obstacle, before, session.task)
+        self._replace((*before, added), selected=len(before))
+
+    def _duplicate(self) -> None:
+        chosen = None if self._session is None else _selected(self._session.scenario)
+        if chosen is not None:
+            self.add(chosen)
+
+    def _delete(self) -> None:
+        if self._session is not None and (index := self._session.scenario.selected) is not None:
+            before = self._session.scenario.obstacles
+            self._replace((*before[:index], *before[index + 1 :]), selected=max(0, index - 1))
+
+    def _replace(self, obstacles: Sequence[Obstacle], selected: int) -> None:
+        """One step for undo."""
+        session = self._session
+        if session is not None:
+            view = replace(session.scenario.view, selected=selected)
+            session.edit("obstacles", obstacles=tuple(obstacles), view=view)
+            session.end_gesture()
+
+    def _size(self, handle: Any, shape: type[Obstacle], field: str, axis: int | None = None) -> None:  # noqa: ANN401
+        """Tie a slider [cm] to a size of the selected obstacle, metres, while that has this shape."""
+
+        def read(scenario: Scenario) -> float:
+            chosen = _selected(scenario)
+            if not isinstance(chosen, shape):
+                return handle.value
+            size = getattr(chosen, field)
+            return round(100 * (size if axis is None else size[axis]), 3)
+
+        def change(scenario: Scenario, value: float) -> dict[str, Any]:
+            chosen = _selected(scenario)
+            if not isinstance(chosen, shape):
+                return {}
+            size: Any = value / 100
+            if axis is not None:
+                sizes = getattr(chosen, field)
+                size = (*sizes[:axis], size, *sizes[axis + 1 :])
+            index, before = scenario.selected or 0, scenario.obstacles
+            changed: Any = replace(cast(Any, chosen), **{field: size})
+            return {"obstacles": (*before[:index], changed, *before[index + 1 :])}
+
+        handle.visible = False
+        self._bind(handle, read, change)
+        self._sizes.append((handle, shape))
+
+
+def _selected(scenario: Scenario) -> Obstacle | None:
+    return None if scenario.selected is None else scenario.obstacles[scenario.selected]
+
+
+def name_of(obstacle: Obstacle) -> str:
+    """As the panel calls it."""
+    if isinstance(obstacle, Box) and len(set(obstacle.sizes)) == 1:
+        return "cube"
+    return type(obstacle).__name__.removesuffix("Obstacle").lower()
+
+
+def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obstacle:
+    """The obstacle beside the mean demonstration, where that is farthest from its ends and other obstacles."""
+    mean = np.mean([resample_by_arc_length(path, 101) for path in task.paths], axis=0)
+    ends = np.concatenate([task.starts, mean[-1:]])
+    room = np.linalg.norm(mean[:, None] - ends, axis=-1).min(axis=1)
+    room = np.minimum(room, Several(tuple(others)).signed_distance(mean))
+    best = int(room.argmax())
+    along = mean[min(best + 1, 100)] - mean[max(best - 1, 0)]
+    aside = np.cross(along, np.cross(*task.slice.axes.T))
+    x, y, z = (float(c) for c in mean[best] + ASIDE * obstacle.depth * aside / max(float(np.linalg.norm(aside)), 1e-12))
+    return obstacle.moved((x, y, z), obstacle.wxyz)

@@ -1,0 +1,185 @@
+"""The obstacles in the scene: each can be dragged itself, the selected one also by handles that move and turn it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import trimesh
+import viser
+from numpy.typing import NDArray
+
+from dt_viz.engine import Frame
+from dt_viz.fields import Array
+from dt_viz.obstacles import Obstacle, Sphere
+from dt_viz.scenario import MAX_DIAMETER, Scenario
+from dt_viz.tasks import Slice
+from dt_viz.ui import palette
+from dt_viz.ui.picture import Picture
+
+HANDLE_SCALE = 0.2
+"""Metres that the handles stick out, about."""
+HIDDEN = 1e-6
+"""Size of handles that are not shown: hiding their node would hide what hangs on it."""
+OPACITY, OPACITY_OFF = 0.8, 0.3
+"""The path that an obstacle blocks shines through; more so while it is not avoided."""
+MIN_SLOPE = 0.2
+"""Of the line of sight to the slice, below which the slice counts as seen on edge."""
+CREASE = 0.6
+"""Angle between neighbouring faces above which their edge is drawn sharp, rad."""
+
+Moved = Callable[[int, Array, Array, str], None]
+"""Told which obstacle was moved, its position (3,), metres, and quaternion (4,), and the phase of the drag."""
+
+
+class ObstaclePicture:
+    """One obstacle, hung on a gizmo: the browser moves both together, without asking the server."""
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        index: int,
+        moved: Moved,
+        selected: Callable[[int], None],
+        along: Callable[[viser.SceneNodeDragEvent], Array],
+    ) -> None:
+        """Draw nothing yet.
+
+        Args:
+            scene: of the visitor.
+            index: in the scenario.
+            moved: told of each new pose.
+            selected: told that this obstacle was clicked.
+            along: how far (3,) an event drags what it has grabbed, metres.
+        """
+        self.gizmo = scene.add_transform_controls(
+            f"/obstacles/{index}", scale=HIDDEN, opacity=0.0, line_width=3.0, depth_test=False
+        )
+        self.mesh = scene.add_mesh_simple(
+            f"/obstacles/{index}/surface",
+            np.zeros((3, 3), np.float32),
+            np.array([[0, 1, 2]], np.uint32),
+            color=palette.OBSTACLE,
+            opacity=OPACITY,
+        )
+        self._look: Obstacle | None = None
+        self._scale = HIDDEN
+        self._selected = False
+
+        @self.gizmo.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            moved(index, event.target.position.copy(), event.target.wxyz.copy(), event.phase)
+
+        @self.mesh.on_drag
+        async def _(event: viser.SceneNodeDragEvent) -> None:
+            if event.phase == "start":
+                selected(index)
+            self.gizmo.position = self.gizmo.position + along(event)
+            moved(index, self.gizmo.position.copy(), self.gizmo.wxyz.copy(), event.phase)
+
+        @self.mesh.on_click
+        async def _(_event: viser.SceneNodePointerEvent) -> None:
+            selected(index)
+
+    @property
+    def has_handles(self) -> bool:
+        """Whether handles are shown."""
+        return self.gizmo.opacity > 0
+
+    def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool) -> None:
+        """Look like the obstacle and stand where it does, unless that is where the browser has put it already."""
+        if np.abs(self.gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
+            self.gizmo.position = obstacle.position
+        if np.abs(self.gizmo.wxyz - np.asarray(obstacle.wxyz)).max() > 1e-9:
+            self.gizmo.wxyz = obstacle.wxyz
+        look = obstacle.moved((0.0, 0.0, 0.0))
+        if look != self._look:
+            self._look = look
+            self.mesh.vertices, self.mesh.faces = shaded(look)
+            self.gizmo.disable_rotations = isinstance(look, Sphere)
+            self._scale = HANDLE_SCALE * (0.5 + min(look.radius / MAX_DIAMETER, 0.8))
+        self._selected = selected
+        self.show_handles(selected)
+        opacity = OPACITY if avoided else OPACITY_OFF
+        if self.mesh.opacity != opacity:
+            self.mesh.opacity = opacity
+
+    def show_handles(self, shown: bool) -> None:
+        """Show the handles if this is the selected obstacle, or hide them."""
+        scale, opacity = (self._scale, 1.0) if shown and self._selected else (HIDDEN, 0.0)
+        if (self.gizmo.scale, self.gizmo.opacity) != (scale, opacity):
+            self.gizmo.scale, self.gizmo.opacity = scale, opacity
+
+    def remove(self) -> None:
+        """Take it out of the scene."""
+        self.gizmo.remove()
+
+
+class Obstacles(Picture):
+    """All obstacles of a scenario."""
+
+    def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[int], None]) -> None:
+        """Begin with none.
+
+        Args:
+            scene: of the visitor.
+            moved: told of a new pose of one of them; the phase is "start", "update" or "end".
+            selected: told which one the user has clicked or taken hold of.
+        """
+        super().__init__(scene.add_frame("/obstacles", show_axes=False))
+        self._scene = scene
+        self._moved, self._selected = moved, selected
+        self._slice: Slice | None = None
+        self.items: list[ObstaclePicture] = []
+        """In the order of the scenario."""
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`: remembers the slice to be dragged in."""
+        self._slice = frame.task.slice
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's obstacles where they stand."""
+        while len(self.items) > len(scenario.obstacles):
+            self.items.pop().remove()
+        while len(self.items) < len(scenario.obstacles):
+            index = len(self.items)
+            self.items.append(ObstaclePicture(self._scene, index, self._moved, self._selected, self._along))
+        for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
+            item.adopt(obstacle, selected=index == scenario.selected, avoided=scenario.avoidance)
+
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide the handles, not the obstacles, for as long as a picture takes."""
+        for item in self.items:
+            item.show_handles(False)
+        try:
+            yield
+        finally:
+            for item in self.items:
+                item.show_handles(True)
+
+    def _along(self, event: viser.SceneNodeDragEvent) -> Array:
+        return in_slice(self._slice, np.asarray(event.client.camera.position), event.start_position, event.end_position)
+
+
+def in_slice(area: Slice | None, camera: Array, grabbed: Sequence[float], pointer: Sequence[float]) -> Array:
+    """How far (3,) the grabbed point must move, parallel to the slice, to lie under the pointer, metres."""
+    shift = np.asarray(pointer) - np.asarray(grabbed)
+    if area is None:
+        return shift
+    normal = np.cross(*area.axes.T)
+    sight = np.asarray(pointer) - camera
+    sight /= np.linalg.norm(sight)
+    slope = float(sight @ normal)
+    if abs(slope) < MIN_SLOPE:
+        return shift  # the slice is seen on edge: move across the line of sight instead
+    return shift - sight * float(shift @ normal) / slope
+
+
+def shaded(obstacle: Obstacle) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Vertices (V, 3), metres, and faces (F, 3) of its surface, with vertices of their own along sharp edges."""
+    mesh = trimesh.Trimesh(*obstacle.surface(), process=False)
+    if not isinstance(obstacle, Sphere):
+        mesh = trimesh.graph.smooth_shade(mesh, angle=CREASE)
+    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
