@@ -12,7 +12,7 @@ import pytest
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Stage
 from dt_viz.imitation import ImitationError
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Box, Sphere
 from dt_viz.scenario import Scenario, View
 from dt_viz.ui import session as session_module
 from dt_viz.ui.session import GESTURE_PAUSE, MAX_UNDO, Session
@@ -240,6 +240,19 @@ def test_another_task_brings_its_place_and_keeps_other_choices(opened):
     opened.session.undo()
     assert opened.session.scenario.task == "draw_s"
     assert opened.session.scenario.obstacles[0] == Sphere((0.0, 0.0, 0.0), 0.22)
+
+
+def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first(opened):
+    box = Box((0.0, 0.0, 0.0), (0.1, 0.2, 0.1), (0.6, 0.8, 0.0, 0.0))
+    for obstacles in ((box,), (box, at(1.0), at(2.0))):
+        opened.session.edit("shapes", obstacles=obstacles)
+        opened.session.choose_task("lift_box")
+        assert opened.session.scenario.obstacles == (replace(box, position=fresh("lift_box").obstacles[0].position),)
+        opened.session.undo()
+        assert opened.session.scenario.obstacles == obstacles
+    opened.session.edit("shapes", obstacles=())
+    opened.session.choose_task("lift_box")
+    assert opened.session.scenario.obstacles == ()
 
 
 def test_choosing_the_same_task_changes_nothing(opened):

@@ -72,7 +72,7 @@ class ObstaclePanel:
 
         @self._change.on_click
         async def _(_event: viser.GuiEvent) -> None:
-            {"Duplicate": self._duplicate, "Delete": self._delete}[self._change.value]()
+            {"Duplicate": self.duplicate, "Delete": self.delete}[self._change.value]()
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -90,11 +90,12 @@ class ObstaclePanel:
         for handle, shape in self._sizes:
             if handle.visible != isinstance(chosen, shape):
                 handle.visible = isinstance(chosen, shape)
-        full = len(scenario.obstacles) >= MAX_OBSTACLES
-        if self._add.disabled != full:
-            self._add.disabled = full
-        if self._change.disabled != (chosen is None):
-            self._change.disabled = chosen is None
+        for group, useful in (
+            (self._add, len(scenario.obstacles) < MAX_OBSTACLES),
+            (self._change, chosen is not None),
+        ):
+            if group.visible != useful:  # groups of buttons cannot be disabled
+                group.visible = useful
 
     def add(self, obstacle: Obstacle) -> None:
         """Put another obstacle, turned as it is, where there is room on the motion, and select it."""
@@ -105,12 +106,14 @@ class ObstaclePanel:
         added = with_room(obstacle, before, session.task)
         self._replace((*before, added), selected=len(before))
 
-    def _duplicate(self) -> None:
+    def duplicate(self) -> None:
+        """Add another one like the selected obstacle."""
         chosen = None if self._session is None else _selected(self._session.scenario)
         if chosen is not None:
             self.add(chosen)
 
-    def _delete(self) -> None:
+    def delete(self) -> None:
+        """Take the selected obstacle out."""
         if self._session is not None and (index := self._session.scenario.selected) is not None:
             before = self._session.scenario.obstacles
             self._replace((*before[:index], *before[index + 1 :]), selected=max(0, index - 1))

@@ -1,0 +1,204 @@
+"""Obstacles in the page, without a browser: the scene follows the scenario, and controls edit the selected one."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import viser  # noqa: TID251 - a scene of its own
+
+from dt_viz.collision import NOTHING, CollisionReport, Nearest
+from dt_viz.obstacles import Box, Cylinder, Sphere, rotation
+from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
+from dt_viz.several import Several
+from dt_viz.tasks import TASKS
+from dt_viz.ui.obstacle_panel import SHAPES, ObstaclePanel, name_of, with_room
+from dt_viz.ui.obstacles import Obstacles, in_slice, shaded
+from dt_viz.ui.panel import _clearance, _collision_rows
+
+BALL = Sphere((0.0, -0.5, 0.4), 0.12)
+BOX = Box((0.1, -0.5, 0.5), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3))
+TUBE = Cylinder((-0.1, -0.5, 0.3), 0.08, 0.2)
+ALL = (BALL, BOX, TUBE)
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def shown(server):
+    yield Obstacles(server.scene, lambda *_: None, lambda _: None)
+    server.scene.reset()
+
+
+def scenario(*obstacles, selected=0, **changes):
+    return Scenario("draw_s", obstacles, view=View(selected=selected), **changes)
+
+
+# --- The scene ---
+
+
+def test_the_scene_follows_the_scenario_whatever_comes_and_goes(shown):
+    for obstacles in (ALL, (), (TUBE,), (BOX, TUBE), ALL[::-1], (BALL,) * 5, (BOX,)):
+        shown.adopt(scenario(*obstacles))
+        assert len(shown.items) == len(obstacles)
+        for item, obstacle in zip(shown.items, obstacles, strict=True):
+            np.testing.assert_allclose(item.gizmo.position, obstacle.position)
+            np.testing.assert_allclose(item.gizmo.wxyz, obstacle.wxyz)
+            placed = item.mesh.vertices @ rotation(obstacle.wxyz).T + item.gizmo.position
+            np.testing.assert_allclose(obstacle.signed_distance(placed), 0, atol=1e-6)
+            assert item.gizmo.disable_rotations == isinstance(obstacle, Sphere)
+
+
+@pytest.mark.parametrize(("selected", "expected"), [(0, [1, 0, 0]), (1, [0, 1, 0]), (2, [0, 0, 1]), (7, [0, 0, 1])])
+def test_only_the_selected_obstacle_has_handles_and_none_in_a_picture(shown, selected, expected):
+    def handles():
+        return [int(item.has_handles) for item in shown.items]
+
+    shown.adopt(scenario(*ALL, selected=selected))
+    assert handles() == expected
+    with shown.without_handles():
+        assert handles() == [0, 0, 0]
+        assert all(item.gizmo.visible and item.mesh.visible for item in shown.items)
+    assert handles() == expected
+
+
+def test_obstacles_that_are_not_avoided_are_fainter(shown):
+    shown.adopt(scenario(*ALL))
+    before = [item.mesh.opacity for item in shown.items]
+    shown.adopt(scenario(*ALL, avoidance=False))
+    assert all(item.mesh.opacity < opacity for item, opacity in zip(shown.items, before, strict=True))
+
+
+@pytest.mark.parametrize("obstacle", ALL)
+def test_surfaces_are_drawn_outward_with_sharp_edges(obstacle):
+    vertices, faces = shaded(obstacle.moved((0.0, 0.0, 0.0)))
+    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+    normals = np.cross(b - a, c - a)
+    assert ((normals * (a + b + c)).sum(axis=1) > 0).all()  # seen from their middle, all three are convex
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    summed = np.zeros_like(vertices, dtype=float)
+    for corner in range(3):
+        np.add.at(summed, faces[:, corner], normals)
+    shading = summed[faces[:, 0]] / np.linalg.norm(summed[faces[:, 0]], axis=1, keepdims=True)
+    assert (shading * normals).sum(axis=1).min() > 0.9  # no face is shaded as if it leaned to its neighbour
+
+
+def test_what_is_dragged_stays_in_the_slice_and_under_the_pointer():
+    area = TASKS["draw_s"]().slice
+    camera, grabbed, pointer = np.array([0.8, -1.6, 0.7]), np.array([0.02, -0.53, 0.44]), np.array([0.1, -0.6, 0.5])
+    shift = in_slice(area, camera, grabbed.tolist(), pointer.tolist())
+    assert shift @ np.cross(*area.axes.T) == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(np.cross(grabbed + shift - camera, pointer - camera), 0, atol=1e-12)
+
+
+# --- The panel ---
+
+
+class FakeSession:
+    """Keeps the scenario of its edits."""
+
+    def __init__(self, scenario, panel):
+        self.scenario, self.task, self._panel = scenario, TASKS["draw_s"](), panel
+        self.steps = 0
+        panel.adopt(scenario)
+
+    def edit(self, _gesture, **changes):
+        self.scenario = replace(self.scenario, **changes)
+        self._panel.adopt(self.scenario)
+
+    def end_gesture(self):
+        self.steps += 1
+
+
+@pytest.fixture
+def opened(server):
+    controls = {}
+
+    def bind(handle, read, change):
+        controls.setdefault(handle.label, []).append(SimpleNamespace(handle=handle, read=read, change=change))
+
+    panel = ObstaclePanel(server.gui, bind)
+    session: Any = FakeSession(scenario(BALL), panel)
+    panel.connect(session)
+    yield SimpleNamespace(panel=panel, session=session, controls=controls)
+    server.gui.reset()
+
+
+def test_what_is_added_is_selected_stands_apart_and_is_a_step_for_undo(opened):
+    for number, shape in enumerate(SHAPES.values(), start=1):
+        before = opened.session.scenario.obstacles
+        opened.panel.add(shape)
+        *others, added = opened.session.scenario.obstacles
+        assert tuple(others) == before
+        assert added.moved((0.0, 0.0, 0.0), added.wxyz) == shape
+        assert opened.session.scenario.selected == number == opened.session.steps
+    assert len(opened.session.scenario.obstacles) == MAX_OBSTACLES
+    opened.panel.add(BALL)
+    assert len(opened.session.scenario.obstacles) == MAX_OBSTACLES
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=list(SHAPES))
+@pytest.mark.parametrize("task", ["draw_s", "lift_box", "push_box"])
+def test_a_new_obstacle_is_near_the_motion_but_covers_no_end_of_it(task, shape):
+    task = TASKS[task]()
+    placed = with_room(shape, (Sphere(task.obstacle_position, 0.1),), task)
+    ends = np.stack([path[k] for path in task.paths for k in (0, -1)])
+    assert placed.signed_distance(ends).min() > 0
+    assert placed.signed_distance(np.concatenate(task.paths)).min() < 0
+    assert np.linalg.norm(np.subtract(placed.position, task.obstacle_position)) > 0.05
+
+
+def test_deleting_and_duplicating_act_on_the_selected_obstacle(opened):
+    opened.session.edit("", obstacles=ALL, view=View(selected=1))
+    opened.panel.duplicate()
+    assert opened.session.scenario.obstacles[:3] == ALL
+    copy = opened.session.scenario.obstacles[3]
+    assert copy.moved(BOX.position, copy.wxyz) == BOX
+    opened.session.edit("", view=View(selected=1))
+    opened.panel.delete()
+    assert opened.session.scenario.obstacles == (BALL, TUBE, copy)
+    for _ in range(4):
+        opened.panel.delete()
+    assert opened.session.scenario.obstacles == ()
+    opened.panel.duplicate()
+    assert opened.session.scenario.obstacles == ()
+    opened.panel.add(BALL)
+    assert len(opened.session.scenario.obstacles) == 1
+
+
+SIZES = [
+    (0, "Diameter [cm]", replace(BALL, diameter=0.2)),
+    (1, "Size y [cm]", replace(BOX, sizes=(0.2, 0.2, 0.06))),
+    (2, "Diameter [cm]", replace(TUBE, diameter=0.2)),
+    (2, "Height [cm]", replace(TUBE, height=0.2)),
+]
+
+
+@pytest.mark.parametrize(("selected", "label", "expected"), SIZES)
+def test_the_sizes_are_those_of_the_selected_obstacle(opened, selected, label, expected):
+    opened.session.edit("", obstacles=ALL, view=View(selected=selected))
+    (control,) = (c for c in opened.controls[label] if c.handle.visible)
+    changed = replace(opened.session.scenario, **control.change(opened.session.scenario, 20.0))
+    assert changed.obstacles == (*ALL[:selected], expected, *ALL[selected + 1 :])
+    assert control.read(changed) == 20.0
+    hidden = [c for controls in opened.controls.values() for c in controls if not c.handle.visible]
+    assert hidden and all(c.change(changed, 7.0) == {} for c in hidden)
+
+
+def test_obstacles_are_called_by_number_and_shape():
+    assert [name_of(obstacle) for obstacle in (*ALL, SHAPES["Cube (fig. 3a)"])] == ["sphere", "box", "cylinder", "cube"]
+
+
+# --- The status ---
+
+
+def test_the_status_says_that_there_is_no_obstacle():
+    assert _clearance(float(Several().signed_distance(np.zeros((4, 3))).min()), "end effector") == "no obstacle"
+    report = CollisionReport(NOTHING, None, Nearest(0.034, ("hand",), 4.0))
+    assert _collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
