@@ -23,6 +23,10 @@ class Motion:
     """(N,) which rollout a sample belongs to."""
     positions: Array
     """(N, 3) samples of the rollouts, metres."""
+    above: Diffeomorphism | None = None
+    """ψ from the top of the stack to the manifold of the behaviour, as far as it has been built."""
+    top: Array | None = None
+    """(N, 3) the same samples at the top of the stack, where the robot moves, metres; None before it is built."""
     keeps_goal: bool = True
     """Whether behaviours that do not mean to move the goal leave it where it is, or may move it after all."""
 

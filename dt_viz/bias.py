@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -169,6 +169,9 @@ class Biasing:
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built:
         """See `Behaviour`. With `auto` the duration is the shortest that brings every motion to the target."""
         point = self.point
+        if motion.above is not None:  # what is above must not lead the motion past the target again
+            x, y, z = motion.above.forward(np.asarray(point.position))
+            point = replace(point, position=(float(x), float(y), float(z)))
         nearest, at_end = closest_points(point, motion)
         if point.moves_goal:
             nearest = motion.goal[None]
@@ -196,6 +199,8 @@ class Biasing:
         """Whether every motion passes close to the target, where that is to be seen to."""
         if self.point.strength is not None:
             return True
+        if motion.top is not None:
+            motion = replace(motion, positions=motion.top)
         if self.point.moves_goal:
             last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
             distances = np.linalg.norm(self.point.offsets(motion.positions[last]), axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 from dt_viz.avoidance import ObstacleAvoidance
 from dt_viz.behaviours import Behaviour
 from dt_viz.collision import load_collision_model
-from dt_viz.diffeo import AdaptiveFlow, Identity
+from dt_viz.diffeo import Flow, Identity
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
 from dt_viz.following import NUM_ARM_SAMPLES, Follower
@@ -332,7 +332,7 @@ def _uses_whole_arm(scenario: Scenario) -> bool:
 def _region_radius(stack: Solution, behaviour: Behaviour) -> float | None:
     """Radius of the region that a behaviour acts in, if it is on and has one."""
     flow = next((made.transform for layer, made in stack.built if layer == behaviour), None)
-    return flow.field.scale if isinstance(flow, AdaptiveFlow) and isinstance(flow.field, PlacedField) else None
+    return flow.field.scale if isinstance(flow, Flow) and isinstance(flow.field, PlacedField) else None
 
 
 def _moves_goal(ground: Ground, stack: Solution) -> bool:
@@ -364,8 +364,11 @@ def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: floa
             )
     elif scenario.avoidance and clearance < 0 and not doubts:
         doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
-    elif not solved.stack.satisfied and not doubts:
+    elif any(isinstance(layer, ObstacleAvoidance) for layer in solved.stack.unsatisfied) and not doubts:
         doubts.append(f"a motion keeps only {1e3 * clearance:.1f} mm from the obstacle")
+    if not solved.stack.doubts:
+        missed_by = [layer.name for layer in scenario.layers if layer.behaviour in solved.stack.unsatisfied]
+        doubts += [f"{name or 'a layer'}: not every motion does what it asks for" for name in missed_by]
     if missed > MAX_GOAL_MISS and not doubts and not _moves_goal(ground, solved.stack):
         doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
     return tuple(doubts)

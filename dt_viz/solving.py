@@ -90,8 +90,8 @@ class Solution:
     bundle: Bundle
     built: tuple[tuple[Behaviour, Built], ...]
     """The behaviours that are on, from the inside out."""
-    satisfied: bool
-    """Whether every behaviour found what it was made for."""
+    unsatisfied: tuple[Behaviour, ...]
+    """Behaviours that do not find what they were made for."""
 
     @property
     def system(self) -> DiffeomorphicSystem:
@@ -152,11 +152,19 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
     for keeps_goal in (True, False):
         rays, bundle = ground.rays, ground.bundle
         ends_below = ground.ends
-        durations = [0.0] * len(layers)
+        durations, above = [0.0] * len(layers), (None,) * len(layers)
         for _ in range(MAX_ATTEMPTS):
-            lowest = Motion(scenario, ground.task.starts, ground.goal, bundle.index, bundle.levels[:, 0], keeps_goal)
+            lowest = Motion(
+                scenario,
+                ground.task.starts,
+                ground.goal,
+                bundle.index,
+                bundle.levels[:, 0],
+                keeps_goal=keeps_goal,
+            )
             checkpoint()
-            built = _build(layers, lowest, precision.tolerance, durations)
+            built = _build(layers, lowest, precision.tolerance, durations, above)
+            above = _above([made for _, made in built])
             checkpoint()
             durations = [made.duration if made else 0.0 for _, made in built]
             outer = [made.transform for _, made in built if made]
@@ -172,21 +180,29 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
             bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
             stack = [ground.system.transform, *outer]
             bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            satisfied = _satisfied(layers, built, bundle)
+            unsatisfied = _unsatisfied(layers, built, above, bundle)
             on = tuple((layer, made) for layer, (_, made) in zip(layers, built, strict=True) if made)
-            solution = Solution(Chain(stack), rays, bundle, on, satisfied)
-            if satisfied or any(made.hopeless for _, made in on):
+            solution = Solution(Chain(stack), rays, bundle, on, unsatisfied)
+            if not unsatisfied or any(made.hopeless for _, made in on):
                 return solution
+        assert solution is not None
+        if not any(isinstance(layer, ObstacleAvoidance) for layer in solution.unsatisfied):
+            break  # the goal has nothing to do with it
     assert solution is not None
     return solution
 
 
 def _build(
-    layers: Sequence[Behaviour], motion: Motion, tolerance: float, durations: Sequence[float]
+    layers: Sequence[Behaviour],
+    motion: Motion,
+    tolerance: float,
+    durations: Sequence[float],
+    above: Sequence[Diffeomorphism | None],
 ) -> list[tuple[Motion, Built | None]]:
     """Each behaviour's transform, None where it is off, with the motion that it was made for."""
     built = []
     for k, behaviour in enumerate(layers):
+        motion = replace(motion, above=above[k])
         made = behaviour.build(motion, tolerance, durations[k])
         built.append((motion, made))
         if made and k < len(layers) - 1:
@@ -194,13 +210,25 @@ def _build(
     return built
 
 
-def _satisfied(layers: Sequence[Behaviour], built: Sequence[tuple[Motion, Built | None]], bundle: Bundle) -> bool:
-    """Whether each behaviour finds on its level of the bundle what it was made for."""
-    level = 0
-    for behaviour, (motion, made) in zip(layers, built, strict=True):
+def _above(built: Sequence[Built | None]) -> tuple[Diffeomorphism | None, ...]:
+    """For each behaviour, the transforms of those above it."""
+    transforms = [[made.transform for made in built[k + 1 :] if made] for k in range(len(built))]
+    return tuple(Chain(stacked) if stacked else None for stacked in transforms)
+
+
+def _unsatisfied(
+    layers: Sequence[Behaviour],
+    built: Sequence[tuple[Motion, Built | None]],
+    above: Sequence[Diffeomorphism | None],
+    bundle: Bundle,
+) -> tuple[Behaviour, ...]:
+    """The behaviours that do not find in the bundle what they were made for."""
+    level, unsatisfied = 0, []
+    for behaviour, (motion, made), stacked in zip(layers, built, above, strict=True):
         if made:
             level += 1
-            after = replace(motion, index=bundle.index, positions=bundle.levels[:, level])
+            at = {"positions": bundle.levels[:, level], "top": bundle.positions, "above": stacked}
+            after = replace(motion, index=bundle.index, **at)
             if not behaviour.satisfied(after):
-                return False
-    return True
+                unsatisfied.append(behaviour)
+    return tuple(unsatisfied)
