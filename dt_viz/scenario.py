@@ -68,6 +68,10 @@ class View:
     """Whether the arm moves along its rollout."""
     speed: float = 1.0
     """Of the playback, times real time."""
+    bias: str = ""
+    """Name of the bias point that the panel changes and that has the handles."""
+    level: str = ""
+    """Name of the level of the stack whose rollouts are shown beside those of all of it; none if empty."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,8 @@ class Scenario:
     """How many of these layers the end effector's avoidance is stacked on; None is all of them."""
     arm_rollout: int = 0
     """Which rollout the arm follows."""
+    scene: str = ""
+    """Name of the scene of the paper that it began as, if any."""
     view: View = field(default_factory=View)
 
     @property

@@ -93,6 +93,8 @@ class Task:
     """Position and look-at, metres."""
     obstacle_position: tuple[float, float, float]
     """Where the obstacle first stands, metres."""
+    pots: tuple[Pot, ...] = ()
+    """That stand on the table, from left to right."""
 
     def to_world(self, points: Array) -> Array:
         """World points (*B, 3) of points (*B, k) of the demonstrations."""
@@ -205,6 +207,7 @@ def drop_pots() -> Task:
         slice=Slice(paths.mean(axis=(0, 1)), np.stack([[1.0, 0.0, 0.0], down], axis=1), (0.30, 0.24)),
         camera=((0.62, -1.58, 0.90), (0.06, -0.38, 0.24)),
         obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.5),
+        pots=POTS,
     )
 
 

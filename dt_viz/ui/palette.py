@@ -13,6 +13,10 @@ STALE = (158, 163, 171)
 GOAL = (0, 158, 115)
 START = (213, 94, 0)
 OBSTACLE = (204, 121, 167)
+BIAS = (230, 159, 0)
+"""Bias points."""
+LEVEL = (0, 114, 178)
+"""Rollouts on the selected level of the stack."""
 ARROW_SLOW = (198, 205, 216)
 ARROW_FAST = (64, 84, 120)
 GENERATOR_WEAK = (246, 214, 150)
@@ -21,6 +25,7 @@ GENERATOR = (230, 159, 0)
 GRID = (0, 114, 178)
 """Thinnest lines."""
 INSET = (120, 126, 136)
+POT = (176, 132, 98)
 TABLE = (226, 217, 204)
 ARM = (206, 210, 216)
 ARM_RING = (62, 66, 74)

@@ -14,6 +14,7 @@ from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Frame, Stage
 from dt_viz.imitation import ImitationError
 from dt_viz.occupancy import GENERATORS
+from dt_viz.paper_scenes import SCENES
 from dt_viz.robot import Robot
 from dt_viz.scenario import (
     MAX_MANUAL_DURATION,
@@ -25,10 +26,12 @@ from dt_viz.scenario import (
     View,
 )
 from dt_viz.ui.arm_layers import NUM_ARMS
+from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.export import RESOLUTIONS
 from dt_viz.ui.obstacle_panel import ObstaclePanel
 from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.session import Pace, Session
+from dt_viz.ui.stack_panel import StackPanel
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -55,6 +58,7 @@ SPACE_LABELS: Mapping[str, str] = {"task": "End effector", "cspace": "Whole arm"
 assert set(SPACE_LABELS) == set(SPACES)
 GENERATOR_LABELS = {"free-space": "Free space (−∇log(1−p))", "probability": "Probability (∇p, the paper's)"}
 assert set(GENERATOR_LABELS) == set(GENERATORS)
+_NO_SCENE = "–"
 MAX_FLOWS = 3
 """That ψ is composed of, for a start: each picture brings its own number."""
 
@@ -101,6 +105,8 @@ class Panel:
 
         self._build_task()
         self._obstacles = ObstaclePanel(gui, self._bind)
+        self._biases = BiasPanel(gui, self._bind)
+        self._stack = StackPanel(gui)
         self._build_stack()
         self._build_arm()
         self._build_view()
@@ -111,11 +117,15 @@ class Panel:
         """Let the controls edit this session."""
         self._session = session
         self._obstacles.connect(session)
+        self._biases.connect(session)
+        self._stack.connect(session)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
         self._adopted = scenario
         self._obstacles.adopt(scenario)
+        self._biases.adopt(scenario)
+        self._stack.adopt(scenario)
         for control in self._controls:
             value = control.read(scenario)
             if control.handle.value != value:
@@ -133,7 +143,10 @@ class Panel:
         self._learned()
         if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
             self._notice.visible, self._noticed = False, None
-        self._hint.content = f"<div style='{_SMALL}'>{html.escape(frame.task.hint)}</div>"
+        scene = SCENES.get(frame.scenario.scene)
+        self._hint.content = f"<div style='{_SMALL}'>{html.escape(scene.line if scene else frame.task.hint)}</div>"
+        self._biases.report(frame)
+        self._stack.report(frame)
         self.joints.draw(frame.arm)
         _set_max(self._rollout, len(frame.rollouts))
         if frame.pictures.generator is not None:
@@ -208,6 +221,21 @@ class Panel:
                 return
             try:
                 session.choose_task(names[task.value])
+            except DemonstrationError as error:
+                self.fail(error)
+                self.adopt(session.scenario)
+
+        scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
+        scene = self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each")
+        self._controls.append(_Control(scene, lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE))
+
+        @scene.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            session = self._session
+            if session is None or event.client is None or scene.value not in scenes:
+                return
+            try:
+                session.load(scenes[scene.value].task, scenes[scene.value].scenario)
             except DemonstrationError as error:
                 self.fail(error)
                 self.adopt(session.scenario)

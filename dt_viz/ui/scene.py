@@ -13,9 +13,13 @@ from dt_viz.scenario import Scenario
 from dt_viz.tasks import Task
 from dt_viz.ui import palette
 from dt_viz.ui.arm_layers import Onion
+from dt_viz.ui.bias import Biases
+from dt_viz.ui.bias import Moved as BiasMoved
+from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
 from dt_viz.ui.obstacles import Moved, Obstacles
 from dt_viz.ui.picture import Arrows, Lines, Picture
+from dt_viz.ui.pots import Pots
 
 ARROW_LENGTH = 0.024
 """Of the fastest arrow, metres."""
@@ -136,11 +140,21 @@ def set_lights(scene: viser.SceneApi) -> None:
 class ScenePictures:
     """Everything in the scene of one visitor that is drawn from frames."""
 
-    def __init__(self, scene: viser.SceneApi, robot: Robot, moved: Moved, selected: Callable[[int], None]) -> None:
-        """Build the scene of this robot; `moved` and `selected` are told what the user does, see `Obstacles`."""
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        robot: Robot,
+        moved: Moved,
+        selected: Callable[[int], None],
+        bias_moved: BiasMoved,
+        bias_selected: Callable[[str], None],
+    ) -> None:
+        """Build the scene of this robot; the others are told what the user does, see `Obstacles` and `Biases`."""
         set_lights(scene)
         self.obstacles = Obstacles(scene, moved, selected)
-        self._always: tuple[Picture, ...] = (self.obstacles, Goal(scene))
+        self.biases = Biases(scene, bias_moved, bias_selected)
+        self.level = LevelRollouts(scene)
+        self._always: tuple[Picture, ...] = (self.obstacles, self.biases, self.level, Goal(scene), Pots(scene))
         self._by_view: dict[str, Picture] = {
             "demonstrations": Demonstrations(scene),
             "rollouts": Rollouts(scene),
@@ -165,5 +179,7 @@ class ScenePictures:
     def adopt(self, scenario: Scenario) -> None:
         """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
         self.obstacles.adopt(scenario)
+        self.biases.adopt(scenario)
+        self.level.adopt(scenario)
         for name, picture in self._by_view.items():
             picture.visible = getattr(scenario.view, name)

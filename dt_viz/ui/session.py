@@ -153,19 +153,35 @@ class Session:
         """
         if name != self.scenario.task:
             fresh = self._initial(name)
-            kept = zip(fresh.obstacles, self.scenario.obstacles, strict=False)
+            # a scene of the paper leaves nothing behind, what the user has put there stays
+            kept = zip(
+                fresh.obstacles, fresh.obstacles if self.scenario.scene else self.scenario.obstacles, strict=False
+            )
             self.edit(
                 "task",
                 task=name,
                 arm_rollout=0,
                 obstacles=tuple(had.moved(there.position, had.wxyz) for there, had in kept),
+                layers=fresh.layers,
+                avoidance_level=fresh.avoidance_level,
+                scene="",
             )
             self.end_gesture()
 
     def reset(self) -> None:
         """Back to how the task began; can be undone."""
-        fresh = self._initial(self.scenario.task)
-        self.edit("reset", **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "view"})
+        self._begin("reset", self._initial(self.scenario.task))
+
+    def load(self, task: str, scenario: Callable[[Task], Scenario]) -> None:
+        """Begin with a scenario for a task, seen as what is shown now; can be undone.
+
+        Raises:
+            DemonstrationError: the task's demonstrations cannot be used; the session stays with its own.
+        """
+        self._begin("load", scenario(self._engine.task(task)))
+
+    def _begin(self, gesture: str, fresh: Scenario) -> None:
+        self.edit(gesture, **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "view"})
         self.end_gesture()
 
     def undo(self) -> None:

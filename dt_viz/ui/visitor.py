@@ -12,6 +12,7 @@ from dt_viz.fields import Array
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario
+from dt_viz.stacking import bias_points, with_changed_point
 from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
 from dt_viz.ui.arm_layers import Arms
@@ -51,7 +52,14 @@ class Visitor:
         client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
-            self.pictures = ScenePictures(client.scene, robot, self._obstacle_moved, self._obstacle_selected)
+            self.pictures = ScenePictures(
+                client.scene,
+                robot,
+                self._obstacle_moved,
+                self._obstacle_selected,
+                self._bias_moved,
+                self._bias_selected,
+            )
             self.arms = Arms(client.scene, robot)
         self._playback = Playback(self._pose)
         self._panel = Panel(client.gui, titles, robot, self._save_png)
@@ -117,12 +125,27 @@ class Visitor:
     def _obstacle_selected(self, index: int) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, selected=index))
 
+    def _bias_moved(self, name: str, position: Array, phase: str) -> None:
+        if phase == "start":
+            self.session.begin_gesture()
+        layers = self.session.scenario.layers
+        point = bias_points(layers).get(name)
+        if point is not None:  # or it was deleted a moment ago
+            x, y, z = (float(c) for c in position)
+            moved = with_changed_point(layers, name, replace(point, position=(x, y, z)))
+            self.session.edit(name, layers=moved)
+        if phase == "end":
+            self.session.end_gesture()
+
+    def _bias_selected(self, name: str) -> None:
+        self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
+
     def _pose(self, q: Array, without: Array) -> None:
         with self.client.atomic():
             self.arms.pose(q, without)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
-        with self.pictures.obstacles.without_handles():
+        with self.pictures.obstacles.without_handles(), self.pictures.biases.without_handles():
             content = render_png(self.client, RESOLUTIONS[resolution], transparent=transparent)
         name = f"dt-viz-{self.session.scenario.task}.png"
         self.client.send_file_download(name, content, save_immediately=True)
