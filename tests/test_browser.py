@@ -170,6 +170,44 @@ def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
     assert_shows_the_obstacle_where_it_is(visitor)
 
 
+def click_button(page, name):
+    page.get_by_role("button", name=name, exact=True).evaluate("button => button.click()")  # wherever it is scrolled to
+
+
+def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit):
+    page, visitor = visit
+    session, pictures = visitor.session, visitor.pictures.obstacles
+    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
+    session.edit("test", view=light, avoidance=False)  # software rendering is slow
+    (sphere,) = session.scenario.obstacles
+    click_button(page, "Box")
+    wait_until(lambda: [item.has_handles for item in pictures.items] == [False, True], "the box and its handles")
+    before = np.array(session.scenario.obstacles[1].position)
+
+    def dragged():
+        place = np.array(session.scenario.obstacles[1].position)
+        return np.linalg.norm(place - before) > 0.03 and session.wait_idle(0.3)
+
+    x, y = project(visitor, before - (0.05, 0.05, 0.015))  # on its face, away from the handles
+    deadline = time.monotonic() + PATIENCE
+    while not dragged():
+        assert time.monotonic() < deadline
+        drag(page, (x, y), (x - 50, y + 30), steps=4)  # again, if the page had not drawn the box yet
+    assert session.scenario.obstacles[0] == sphere
+    np.testing.assert_allclose(pictures.items[1].gizmo.position, session.scenario.obstacles[1].position, atol=1e-9)
+
+    x, y = project(visitor, sphere.position)
+    page.mouse.click(x - 18, y + 14)
+    wait_until(lambda: [item.has_handles for item in pictures.items] == [True, False], "the sphere to be selected")
+    page.locator("input[value='1: sphere']").first.click()
+    page.get_by_role("option", name="2: box").click()
+    wait_until(lambda: session.scenario.selected == 1, "the box to be selected")
+    click_button(page, "Delete")
+    wait_until(lambda: session.scenario.obstacles == (sphere,) and len(pictures.items) == 1, "the box to go")
+    click_button(page, "Delete")
+    page.get_by_text("no obstacle").first.wait_for(timeout=1000 * PATIENCE)
+
+
 def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     page, _ = visit
     page.get_by_role("button", name="Picture").or_(page.get_by_text("Picture", exact=True)).first.click()
