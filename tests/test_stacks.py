@@ -1,0 +1,69 @@
+"""Any stack that a user can build: obstacles of all shapes and bias points, in any order."""
+
+import numpy as np
+import pytest
+
+from dt_viz.bias import BiasPoint, Biasing
+from dt_viz.obstacles import Box, Cylinder, Sphere
+from dt_viz.scenario import Layer, Scenario
+
+TASK_NAMES = ("draw_s", "lift_box", "push_box")
+
+
+def random_scenario(engine, seed):
+    """Up to three obstacles and two bias points near the motion of a task."""
+    rng = np.random.default_rng(seed)
+    task = engine.task(TASK_NAMES[seed % len(TASK_NAMES)])
+
+    def place():
+        path = task.paths[int(rng.integers(len(task.paths)))]
+        return tuple(float(x) for x in path[int(rng.integers(len(path)))] + rng.normal(scale=0.06, size=3))
+
+    def obstacle():
+        turn = rng.normal(size=4)
+        turn = tuple(float(w) for w in turn / np.linalg.norm(turn))
+        sizes = [float(size) for size in rng.uniform(0.04, 0.16, 3)]
+        kind = rng.integers(3)
+        if kind == 0:
+            return Sphere(place(), sizes[0])
+        return Box(place(), tuple(sizes), turn) if kind == 1 else Cylinder(place(), sizes[0], sizes[1], turn)
+
+    layers = tuple(
+        Layer(Biasing(BiasPoint(place(), moves_goal=bool(rng.integers(4) == 0))), name=f"Bias {k + 1}")
+        for k in range(rng.integers(3))
+    )
+    return Scenario(
+        task.name,
+        tuple(obstacle() for _ in range(rng.integers(4))),
+        layers=layers,
+        avoidance_level=int(rng.integers(len(layers) + 1)),
+        temperature=float(rng.uniform(2, 12)),
+    )
+
+
+def check(engine, seed):
+    scenario = random_scenario(engine, seed)
+    *_, frame = engine.frames(scenario)
+    task, health = engine.task(scenario.task), frame.health
+    assert len(frame.levels) == 1 + len(scenario.layers) + bool(scenario.obstacles)
+    assert all(np.isfinite(path).all() for path in frame.rollouts)
+    for path, start in zip(frame.rollouts, task.starts, strict=True):
+        np.testing.assert_allclose(path[-1], frame.reached, atol=1e-3)
+        np.testing.assert_allclose(path[0], start, atol=1e-3)
+    moved = np.linalg.norm(frame.reached - frame.goal)
+    may_move = scenario.obstacles or any(layer.behaviour.point.moves_goal for layer in scenario.layers)
+    assert moved < 1e-3 or may_move
+    assert health.min_det_jacobian > 0
+    assert health.round_trip_error < 1e-6 or any("there and back" in doubt for doubt in health.doubts)
+    return health.round_trip_error < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_random_stack_is_a_diffeomorphism_that_leads_to_its_goal_or_says_what_it_loses(engine, seed):
+    check(engine, seed)
+
+
+@pytest.mark.slow
+def test_so_are_nearly_all_of_two_hundred(engine):
+    exact = [check(engine, seed) for seed in range(1000, 1200)]
+    assert np.mean(exact) >= 0.97  # squeezed between obstacles, a few lose digits, and say so
