@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dt_viz.bias import BiasPoint, Biasing
+from dt_viz.bias import Biasing, BiasPoint
 from dt_viz.obstacles import Box, Cylinder, Sphere
 from dt_viz.scenario import Layer, Scenario
 
