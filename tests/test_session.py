@@ -13,7 +13,7 @@ from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Stage
 from dt_viz.imitation import ImitationError
 from dt_viz.obstacles import Box, Sphere
-from dt_viz.scenario import Scenario, View
+from dt_viz.scenario import Layer, Scenario, View
 from dt_viz.ui import session as session_module
 from dt_viz.ui.session import GESTURE_PAUSE, MAX_UNDO, Session
 
@@ -529,3 +529,23 @@ def test_who_avoids_can_be_undone(opened):
     opened.session.undo()
     opened.settle()
     assert opened.shown.space == "task"
+
+
+def test_a_scene_replaces_all_but_the_view_and_is_undone_at_once(opened):
+    session = opened.session
+    session.edit("view", view=View(grid=True))
+    before = session.scenario
+    scene = Scenario("draw_s", (), space="cspace", scene="somewhere")
+    opened.engine.task = lambda name: name
+    session.load("draw_s", lambda task: replace(scene, task=task))
+    opened.settle()
+    assert opened.shown == replace(scene, view=View(grid=True))
+    session.undo()
+    assert session.scenario == before
+
+
+def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):
+    session = opened.session
+    session.edit("scene", obstacles=(), layers=(cast(Layer, "a layer"),), avoidance_level=0, scene="somewhere")
+    session.choose_task("lift_box")
+    assert session.scenario == fresh("lift_box")

@@ -70,7 +70,7 @@ class BiasPicture:
             f"{node}/label",
             "",
             position=(0.0, 0.0, 0.0),
-            anchor="bottom-left",
+            anchor="top-left",
             font_screen_scale=0.8,
         )
         self._selected = False

@@ -1,0 +1,89 @@
+"""The scenes of the paper: each can be computed, and what its line says is true."""
+
+import numpy as np
+import pytest
+
+from dt_viz.metrics import maximum_collision_distance
+from dt_viz.obstacles import Box, Cylinder
+from dt_viz.paper_scenes import SCENES
+from dt_viz.stacking import bias_points
+from dt_viz.tasks import POTS, TASKS
+
+
+@pytest.fixture(scope="module")
+def certified(engine):
+    """The last frame of each scene, computed once."""
+    frames = {}
+
+    def frame(name):
+        if name not in frames:
+            scene = SCENES[name]
+            *_, frames[name] = engine.frames(scene.scenario(engine.task(scene.task)))
+        return frames[name]
+
+    return frame
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_is_computed_without_doubts(certified, name):
+    frame, scene = certified(name), SCENES[name]
+    assert frame.scenario.scene == name == scene.name
+    assert scene.task in TASKS
+    assert scene.title and scene.line.endswith(".")
+    assert frame.blocked == ()
+    assert frame.health.doubts == ()
+    assert frame.health.min_det_jacobian > 0
+    assert frame.health.round_trip_error < 1e-6
+    assert frame.health.lyapunov_falls
+    assert frame.arm is not None
+
+
+def test_scenes_have_titles_of_their_own():
+    assert len({scene.title for scene in SCENES.values()}) == len(SCENES)
+
+
+@pytest.mark.parametrize("name", ["lift", "push"])
+def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certified, name):
+    frame = certified(name)
+    (bottle,) = frame.scenario.obstacles
+    assert isinstance(bottle, Cylinder)
+    assert bottle.position[2] == pytest.approx(bottle.height / 2)  # stands on the table
+    assert frame.scenario.space == "cspace"
+    undisturbed = max(maximum_collision_distance(path, bottle.signed_distance) for path in frame.ghost)
+    assert undisturbed > 0.01  # it is in the way
+    assert frame.health.clearance > 0
+    assert frame.health.arm_duration > 0
+    np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
+
+
+def test_every_stroke_leaves_the_cube_and_the_ends_of_the_letter_stay(certified):
+    frame = certified("cube")
+    (cube,) = frame.scenario.obstacles
+    assert isinstance(cube, Box) and len(set(cube.sizes)) == 1
+    assert max(maximum_collision_distance(path, cube.signed_distance) for path in frame.ghost) > 0.02
+    assert max(maximum_collision_distance(path, cube.signed_distance) for path in frame.rollouts) == 0
+    for path, before in zip(frame.rollouts, frame.ghost, strict=True):
+        np.testing.assert_allclose(path[[0, -1]], before[[0, -1]], atol=1e-3)
+        last = before[np.linalg.norm(before - before[-1], axis=1) < 0.05]
+        assert max(np.linalg.norm(path - point, axis=1).min() for point in last) < 0.01
+
+
+def test_every_stroke_of_the_j_passes_both_points_within_a_centimetre(certified):
+    frame = certified("two_points")
+    points = bias_points(frame.scenario.layers)
+    assert len(points) == 2
+    for point in points.values():
+        assert min(np.linalg.norm(path - point.position, axis=1).min() for path in frame.ghost) > 0.05
+        for path in frame.rollouts:
+            assert np.linalg.norm(path - point.position, axis=1).min() <= 0.0105  # between samples, too
+    np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "chosen"), [("left_pot", 0), ("right_pot", 2)])
+def test_the_object_falls_into_the_chosen_pot(certified, name, chosen):
+    frame = certified(name)
+    assert frame.task.pots == POTS
+    assert [pot.x for pot in POTS] == sorted(pot.x for pot in POTS)
+    for before, path in zip(frame.ghost, frame.rollouts, strict=True):
+        assert [pot.catches(before[-1]) for pot in POTS] == [False, True, False]
+        assert [pot.catches(path[-1]) for pot in POTS] == [k == chosen for k in range(3)]
