@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import coal
 import numpy as np
 
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Box, Cylinder, Obstacle, Sphere, rotation
 from dt_viz.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
 from dt_viz.several import Several
+from dt_viz.solids import grid_nodes, inside_of_grid, surface_samples
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -32,6 +33,22 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-4
 """How much more than the smallest distance on a path may be reported, metres."""
+SHAPE_TOLERANCE = 1e-3
+"""The same for obstacles that are no balls."""
+SURFACE_SPACING = 2e-3
+"""Of points on a link that its depth in an obstacle is found with, metres; vertices are among them."""
+INNER_SPACING = 4e-3
+"""Of points inside, which count where an obstacle is deepest inside the link."""
+RESOLUTION = 3.5e-3
+"""Metres by which the depth in an obstacle that is no ball may be larger than reported. On a link's surface 1.5 mm."""
+CERTAIN = 3e-3
+"""Depth, metres, that is more than an obstacle's signed distance is off by: what is deeper intersects it."""
+GROUP_SIZE = 0.02
+"""Of the cells in which these points are told deep or not at once, metres."""
+BALL_SIZE = 0.06
+"""Of the cells that a link is divided into for quick bounds, metres."""
+AT_ONCE = 8
+"""Cells whose points are measured at once."""
 SELF_TOLERANCE = 1e-3
 """The same for the distance of links from each other."""
 SELF_REACH = 0.05
@@ -110,6 +127,32 @@ class Poses(NamedTuple):
         return cls(np.concatenate([base, rotations], axis=1), np.pad(origins, [(0, 0), (1, 0), (0, 0)]))
 
 
+class _Groups(NamedTuple):
+    """Points, those near to each other in groups; or balls, when they have radii."""
+
+    points: Array  # (N, 3), metres, one group after the other
+    ends: Indices  # (G,) where each group ends
+    centres: Array  # (G, 3)
+    radii: Array  # (G,) metres, of the balls around the centres that hold the groups
+
+    @classmethod
+    def of(cls, points: Array, size: float, radii: Array | float = 0.0) -> _Groups:
+        """Groups of the points (N, 3) in the cells, that large, of a grid."""
+        cell = np.floor((points - points.min(axis=0)) / size).astype(np.intp)
+        _, member = np.unique(cell, axis=0, return_inverse=True)
+        order = np.argsort(member.ravel(), kind="stable")
+        points, radii = points[order], np.broadcast_to(radii, len(points))[order]
+        ends = np.cumsum(np.bincount(member.ravel()))
+        begins = np.r_[0, ends[:-1]]
+        centres = (np.minimum.reduceat(points, begins) + np.maximum.reduceat(points, begins)) / 2
+        apart = np.linalg.norm(points - np.repeat(centres, ends - begins, axis=0), axis=1) + radii
+        return cls(points, ends, centres, np.maximum.reduceat(apart, begins))
+
+    def of_group(self, group: int) -> Array:
+        """(M, 3) the points of a group."""
+        return self.points[self.ends[group - 1] if group else 0 : self.ends[group]]
+
+
 class Link:
     """A link as a solid, in the frame of its joint.
 
@@ -130,11 +173,8 @@ class Link:
             self.name = f"link {self.name}"
         self.frame = mesh.joint + 1
         self._triangles = mesh.vertices[mesh.faces]  # (F, 3, 3)
-        self.surface = coal.BVHModelOBBRSS()
-        self.surface.beginModel(len(mesh.faces), len(mesh.vertices))
-        self.surface.addVertices(mesh.vertices)
-        self.surface.addTriangles(mesh.faces)
-        self.surface.endModel()
+        self._vertices = mesh.vertices
+        self.surface = _bounding_volumes(mesh.vertices, mesh.faces)
         lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         self.centre, self.half_size = (lower + upper) / 2, (upper - lower) / 2
         self.radius = float(np.linalg.norm(mesh.vertices - self.centre, axis=1).max())
@@ -142,6 +182,21 @@ class Link:
         self.corners = self.centre + signs * self.half_size
         self.surface.buildConvexHull(False, "Qt")
         self.hull = np.array(self.surface.convex.points())
+
+    @cached_property
+    def groups(self) -> _Groups:
+        """Points of the solid, so dense that none of it is farther than `RESOLUTION` from one."""
+        surface, _ = surface_samples(self._triangles, SURFACE_SPACING)
+        shape = tuple(int(n) for n in np.ceil(2 * self.half_size / INNER_SPACING) + 1)
+        origin = self.centre - INNER_SPACING * (np.array(shape) - 1) / 2
+        inside = inside_of_grid(self._triangles, origin, INNER_SPACING, shape)
+        inner = grid_nodes(origin, INNER_SPACING, shape)[inside.ravel()]
+        return _Groups.of(np.concatenate([self._vertices, surface, inner]), GROUP_SIZE)
+
+    @cached_property
+    def balls(self) -> _Groups:
+        """A few balls that hold the mesh."""
+        return _Groups.of(self.groups.centres, BALL_SIZE, self.groups.radii)
 
     def contains(self, point: Array) -> bool:
         """Whether a point (3,) off the surface is inside, by the winding number: the hand's mesh has small holes."""
@@ -207,8 +262,8 @@ class _Measure(Protocol):
         ...
 
 
-class _FromObstacle:
-    """Signed distances of the links from an obstacle."""
+class _FromBall:
+    """Signed distances of the links from a ball."""
 
     def __init__(self, links: Sequence[Link], obstacle: Sphere) -> None:
         self._links, self._obstacle = links, _rounded(obstacle)
@@ -247,6 +302,93 @@ class _FromObstacle:
         inside = self._links[item].contains(point)  # slow, so remembered
         known.append((point, gap, inside))
         return inside
+
+
+class _FromShape:
+    """Signed distances of the links from an obstacle of any shape.
+
+    Outside, coal's distance of its surface (a mesh's, a cloud's as it is drawn) from the links', which is exact. Where
+    they intersect, the smallest signed distance, as the obstacle knows it, of points that fill the link: the depth may
+    be larger by up to `RESOLUTION`.
+    """
+
+    def __init__(self, links: Sequence[Link], obstacle: Obstacle) -> None:
+        self._links, self._obstacle = links, obstacle
+        self._core = _coal_shape(obstacle)
+        self._turn, self._position = rotation(obstacle.wxyz), np.asarray(obstacle.position)
+        self._on_surface = self._turn @ obstacle.surface()[0][0] + self._position
+        self._frames = np.array([link.frame for link in links])
+        # the balls of all links, as many for each
+        most = max(len(link.balls.radii) for link in links)
+        fill = [np.minimum(np.arange(most), len(link.balls.radii) - 1) for link in links]
+        self._centres = np.stack([link.balls.centres[k] for link, k in zip(links, fill, strict=True)])
+        self._radii = np.stack([link.balls.radii[k] for link, k in zip(links, fill, strict=True)])
+        self.bodies = np.arange(len(links))
+        self.bases = np.zeros(len(links), dtype=np.intp)
+        self.lowest = SHAPE_TOLERANCE - obstacle.depth
+
+    def names(self, item: int) -> tuple[str, ...]:
+        return (self._links[item].name,)
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        frames = self._frames[items]
+        turned = np.einsum("nij,nkj->nki", poses.rotations[rows, frames], self._centres[items])
+        centres = turned + poses.origins[rows, frames][:, None]
+        return (self._obstacle.signed_distance(centres) - self._radii[items]).min(axis=1)
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        link = self._links[item]
+        turn, origin = poses.rotations[row, link.frame], poses.origins[row, link.frame]
+        deepest = self._deepest(link, turn, origin)
+        if deepest < -CERTAIN:
+            return deepest
+        place = coal.Transform3s(turn.T @ self._turn, turn.T @ (self._position - origin))
+        gap = _coal_distance(link.surface, coal.Transform3s(), self._core, place, max(ceiling, CERTAIN))
+        if gap > 0 and not (deepest < 0 and link.contains(turn.T @ (self._on_surface - origin))):
+            return gap
+        return min(deepest, 0.0)
+
+    def _deepest(self, link: Link, turn: Array, origin: Array) -> float:
+        """The smallest signed distance of the link's points, if it is negative; else 0."""
+        groups, deepest = link.groups, 0.0
+        lower = self._obstacle.signed_distance(groups.centres @ turn.T + origin) - groups.radii
+        order = np.argsort(lower)
+        order = order[lower[order] < 0]
+        for first in range(0, len(order), AT_ONCE):
+            some = [group for group in order[first : first + AT_ONCE] if lower[group] < deepest]
+            if not some:
+                break
+            points = np.concatenate([groups.of_group(group) for group in some])
+            deepest = min(deepest, float(self._obstacle.signed_distance(points @ turn.T + origin).min()))
+        return deepest
+
+
+def _coal_shape(obstacle: Obstacle) -> coal.CollisionGeometry:
+    """The obstacle's surface in its own frame."""
+    if isinstance(obstacle, Box):
+        return coal.Box(*obstacle.sizes)
+    if isinstance(obstacle, Cylinder):
+        return coal.Cylinder(obstacle.diameter / 2, obstacle.height)
+    return _drawn(obstacle.moved((0.0, 0.0, 0.0)))
+
+
+@lru_cache(maxsize=16)
+def _drawn(obstacle: Obstacle) -> coal.CollisionGeometry:
+    return _bounding_volumes(*obstacle.surface())
+
+
+def _bounding_volumes(vertices: Array, faces: Indices) -> coal.CollisionGeometry:
+    """Triangles as coal measures them."""
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(len(faces), len(vertices))
+    model.addVertices(vertices)
+    model.addTriangles(faces)
+    model.endModel()
+    return model
+
+
+def _measure_from(links: Sequence[Link], obstacle: Obstacle) -> _Measure:
+    return _FromBall(links, obstacle) if isinstance(obstacle, Sphere) else _FromShape(links, obstacle)
 
 
 class _BetweenLinks:
@@ -449,7 +591,7 @@ class CollisionModel:
                 beyond += steps[i + 1]
         return bounds
 
-    def obstacle_distance(self, q: ArrayLike, obstacle: Sphere) -> tuple[Array, Indices]:
+    def obstacle_distance(self, q: ArrayLike, obstacle: Obstacle) -> tuple[Array, Indices]:
         """Signed distance of the whole arm from the obstacle, and the nearest link.
 
         The smallest signed distance from the obstacle of any point of the arm, so minus the depth where it enters.
@@ -462,7 +604,7 @@ class CollisionModel:
             Distances (T,), metres, negative inside; indices (T,) into `links`.
         """
         q = np.asarray(q, dtype=float)
-        measure, poses = _FromObstacle(self.links, obstacle), Poses.of(self.robot, q)
+        measure, poses = _measure_from(self.links, obstacle), Poses.of(self.robot, q)
         rows, items = (index.ravel() for index in np.indices((len(q), len(self.links))))
         lower = measure.lower(poses, rows, items).reshape(len(q), -1)
         distances, nearest = np.full(len(q), np.inf), np.zeros(len(q), dtype=np.intp)
@@ -475,11 +617,15 @@ class CollisionModel:
                     distances[row], nearest[row] = distance, item
         return distances, nearest
 
-    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Several | Sphere) -> Nearest:
-        """The smallest signed distance of the arm from the obstacle on a path q (T, 6), rad, to `TOLERANCE`."""
+    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Several | Obstacle) -> Nearest:
+        """The smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.
+
+        To `TOLERANCE` for a ball; to `SHAPE_TOLERANCE` and, inside, `RESOLUTION` for other shapes.
+        """
         nearest = NOTHING
         for part in obstacle.parts if isinstance(obstacle, Several) else (obstacle,):
-            found = self._search(_FromObstacle(self.links, part), q, TOLERANCE)
+            tolerance = TOLERANCE if isinstance(part, Sphere) else SHAPE_TOLERANCE
+            found = self._search(_measure_from(self.links, part), q, tolerance)
             assert found is not None  # without a ceiling there always is one
             nearest = min(nearest, found, key=lambda near: near.distance)
         return nearest
@@ -500,7 +646,7 @@ class CollisionModel:
         assert found is not None
         return found
 
-    def report(self, q: ArrayLike, obstacle: Several | Sphere) -> CollisionReport:
+    def report(self, q: ArrayLike, obstacle: Several | Obstacle) -> CollisionReport:
         """All of it for one path q (T, 6), rad."""
         return CollisionReport(
             self.nearest_to_obstacle(q, obstacle), self.nearest_to_itself(q), self.nearest_to_table(q)

@@ -206,7 +206,7 @@ class _Surface:
         self._triangles = triangles
         a, b, c = triangles.swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-        self.samples, self._owner = _samples(triangles, np.sqrt(area / NUM_SAMPLES))
+        self.samples, self._owner = surface_samples(triangles, np.sqrt(area / NUM_SAMPLES))
         self._tree = KDTree(self.samples)
 
     def nearest(self, s: Array) -> Array:
@@ -318,7 +318,7 @@ def closest_on_triangles(s: Array, triangles: Array) -> Array:
     return a + v[:, None] * ab + w[:, None] * ac
 
 
-def _samples(triangles: Array, spacing: float) -> tuple[Array, Indices]:
+def surface_samples(triangles: Array, spacing: float) -> tuple[Array, Indices]:
     """Points on triangles (F, 3, 3), about that far apart, one at least on each; to which triangle each belongs."""
     longest = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).argmax(axis=1)
     turned = (longest[:, None] + np.arange(3)) % 3  # its longest side first

@@ -14,20 +14,31 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dt_viz.collision import (
+    RESOLUTION,
     SELF_REACH,
     SELF_TOLERANCE,
+    SHAPE_TOLERANCE,
     TOLERANCE,
     CollisionModel,
     CollisionReport,
     Nearest,
     load_collision_model,
 )
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Box, Cylinder, MeshObstacle, Quaternion, Sphere
 from dt_viz.robot import LinkMesh, collision_meshes, package_folder, urdf_path
+from dt_viz.solids import Solid
 from dt_viz.tracking import inverse_kinematics, track
 
 HAND = 6
 FOLDED = np.array([0.0, np.pi, 0.5, 0.0, 5.7, 0.0])  # the hand in the upper arm
+TILTED: Quaternion = (0.5, -0.5, 0.1, 0.7)
+SIDES = [(-75, -75), (75, -75), (75, 75), (35, 75), (35, -35), (-35, -35), (-35, 75), (-75, 75)]  # millimetres
+CAP = np.array([(0, 1, 4), (0, 4, 5), (1, 2, 4), (2, 3, 4), (0, 5, 7), (5, 6, 7)])
+WALLS = [face for k in range(8) for face in [(k, (k + 1) % 8, (k + 1) % 8 + 8), (k, (k + 1) % 8 + 8, k + 8)]]
+U_SHAPE = Solid(
+    1e-3 * np.array([(x, y, z) for z in (-50, 50) for x, y in SIDES]),
+    np.concatenate([CAP[:, ::-1], CAP + 8, WALLS]),
+)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -161,6 +172,80 @@ class TestObstacle:
         after, nearest_after = model.obstacle_distance(q + turn * np.eye(6)[0], Sphere(tuple(turned)))
         moving = (nearest > 0) & (nearest_after > 0)  # the base does not turn along
         np.testing.assert_allclose(after[moving], before[moving], atol=1e-9)
+
+
+PLACES = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.3), (0.12, 0.1, 0.1), (-0.2, 0.0, 0.1)]
+SHAPES = [
+    Box((0.0, 0.0, 0.0), (0.15, 0.15, 0.15), TILTED),
+    Box((0.0, 0.0, 0.0), (0.2, 0.2, 0.03), TILTED),
+    Cylinder((0.0, 0.0, 0.0), 0.12, 0.2, TILTED),
+    MeshObstacle((0.0, 0.0, 0.0), U_SHAPE, TILTED),
+]
+
+
+class TestShapes:
+    @pytest.mark.parametrize("shape", SHAPES, ids=["cube", "plate", "cylinder", "U"])
+    @pytest.mark.parametrize("place", PLACES)
+    def test_distances_are_those_of_dense_points(self, model, robot, shape, place):
+        """Of the arm outside, and of random points within both inside."""
+        centre = robot.end_effector(robot.home) + np.array(place)
+        obstacle = shape.moved(tuple(centre), shape.wxyz)
+        found = model.obstacle_distance(robot.home[None], obstacle)[0][0]
+        blur = 2e-3 if isinstance(shape, MeshObstacle) else 1e-6
+        rotations, origins = robot.forward_kinematics(robot.home)
+        points = [solid.sample(4000, seed=0) for solid in solids()]  # on the surface
+        inside = centre + np.random.default_rng(0).uniform(-1, 1, (3000, 3)) * obstacle.radius
+        inside = inside[obstacle.signed_distance(inside) < -blur]
+        common, outer = [], []
+        for mesh, solid, surface in zip(collision_meshes(), solids(), points, strict=True):
+            turn, origin = (np.eye(3), np.zeros(3)) if mesh.joint < 0 else (rotations[mesh.joint], origins[mesh.joint])
+            outer.append(np.concatenate([np.asarray(surface), mesh.vertices]) @ turn.T + origin)
+            local = (inside - origin) @ turn
+            near = ((local > solid.bounds[0]) & (local < solid.bounds[1])).all(axis=1)
+            common.append(inside[near][solid.ray.contains_points(local[near])] if near.any() else inside[:0])
+        smallest = obstacle.signed_distance(np.concatenate(outer)).min()
+        assert found <= smallest + (blur if smallest > 0 else RESOLUTION)
+        deepest = obstacle.signed_distance(np.concatenate(common)).min(initial=np.inf)
+        assert found <= deepest + RESOLUTION
+        assert found >= min(smallest, deepest) - 5e-3  # the points are that dense
+        assert (found > 0) == (min(smallest, deepest) > 0)
+
+    @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.1, 0.1, 0.1), (0.0, 0.0, 0.3)])
+    def test_a_round_mesh_is_as_far_as_a_ball(self, model, robot, offset):
+        centre = tuple(robot.end_effector(robot.home) + np.array(offset))
+        ball, mesh = Sphere(centre), trimesh.creation.icosphere(4, 0.075)
+        q = robot.home + np.linspace(-0.4, 0.4, 10)[:, None] * np.eye(6)[0]
+        expected = model.nearest_to_obstacle(q, ball).distance
+        found = model.nearest_to_obstacle(q, MeshObstacle(centre, Solid(mesh.vertices, mesh.faces)))
+        np.testing.assert_allclose(found.distance, expected, atol=2e-3 if expected > 0 else 6e-3)
+
+    @pytest.mark.parametrize("kind", ["box", "mesh"])
+    def test_shapes_within_a_link_and_around_the_hand(self, model, robot, kind):
+        def cube(centre, size):
+            if kind == "box":
+                return Box(tuple(centre), (size, size, size))
+            mesh = trimesh.creation.box((size, size, size))
+            return MeshObstacle(tuple(centre), Solid(mesh.vertices, mesh.faces))
+
+        rotations, origins = robot.forward_kinematics(robot.home)
+        middle = origins[1] + rotations[1] @ model.links[2].centre
+        within = model.report(robot.home[None], cube(middle, 0.02)).obstacle
+        assert within.links == ("link 2",)
+        np.testing.assert_allclose(within.distance, -0.01, atol=RESOLUTION)
+        centre = robot.end_effector(robot.home)
+        around = model.report(robot.home[None], cube(centre, 0.5)).obstacle
+        assert -0.25 <= around.distance < -0.2
+
+    @pytest.mark.parametrize("shape", SHAPES, ids=["cube", "plate", "cylinder", "U"])
+    def test_nothing_nearer_is_found_by_fine_sampling(self, model, robot, shape):
+        for seed in range(3):
+            q = random_path(seed)
+            centre = robot.forward_kinematics(q[len(q) // 2])[1][seed] + np.array([0.1, 0.0, 0.05])
+            obstacle = shape.moved(tuple(centre), shape.wxyz)
+            found = model.nearest_to_obstacle(q, obstacle).distance
+            fine = model.obstacle_distance(finely(q, 60), obstacle)[0].min()
+            assert found <= fine + SHAPE_TOLERANCE + 1e-9
+            assert found >= fine - 0.03  # between two of the fine samples
 
 
 class TestBetweenSamples:
