@@ -1,4 +1,4 @@
-"""Drag an obstacle through a motion and measure the time from each edit until its frame is ready.
+"""Drag an obstacle or a bias point through a motion and measure the time from each edit until its frame is ready.
 
 The real session, worker and engine run; only the page is replaced, by a display that records. The JSON file holds, in
 milliseconds and over all sessions together:
@@ -22,11 +22,13 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from dt_viz.bias import Biasing, BiasPoint
 from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
@@ -43,8 +45,9 @@ from dt_viz.fits import FitStore, default_cache_folder
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
-from dt_viz.scenario import Scenario
+from dt_viz.scenario import Layer, Scenario
 from dt_viz.solving import NUM_SAMPLES
+from dt_viz.stacking import plane_of
 from dt_viz.tasks import Task
 from dt_viz.ui.session import Pace, Session
 from dt_viz.whole_arm import NUM_CONFIGURATIONS
@@ -93,6 +96,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
     add_task(parser)
     add_space(parser)
+    parser.add_argument("--drag", choices=("obstacle", "bias"), default="obstacle", help="what (default: %(default)s)")
+    parser.add_argument(
+        "--obstacles", type=whole_number(0), default=1, help="in the scene, along the path (default: %(default)s)"
+    )
     parser.add_argument("--sessions", type=whole_number(1), default=1, help="that drag at once (default: %(default)s)")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), required=True, help="to measure")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
@@ -104,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".json")
     fits = FitStore(default_cache_folder())
     fits.get(task.demonstrations)
-    scenario = Scenario(task.name, (Sphere(task.obstacle_position),), space=options.space)
+    scenario = _scenario(task, options)
     recorders = [Recorder() for _ in range(options.sessions)]
     robot = load_jaco()
     sessions = [Session(Engine(tasks, fits, robot), lambda _: scenario, task.name, shown) for shown in recorders]
@@ -147,7 +154,8 @@ def run(options: argparse.Namespace) -> int:
             "edits_per_second": num_edits / options.sessions / elapsed,
             "rollouts": recorders[0].num_rollouts,
             "points_a_rollout": NUM_SAMPLES if options.space == "task" else NUM_CONFIGURATIONS,
-            "diameter": 2 * scenario.obstacles[0].radius,
+            "drag": options.drag,
+            "obstacles": options.obstacles,
             "cores": os.cpu_count(),
             "python": platform.python_version(),
             "numpy": np.__version__,
@@ -180,6 +188,30 @@ def moving_through(task: Task) -> Callable[[float], tuple[float, float, float]]:
     return position
 
 
+def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
+    """The scene that the drag begins with: obstacles along the mean path, and a bias point where that is dragged."""
+    mean = np.mean([resample_by_arc_length(path, 101) for path in task.paths], axis=0)
+    places = np.linspace(0, 100, options.obstacles + 2).round().astype(int)[1:-1]
+    diameter = Sphere(task.obstacle_position).diameter / max(1, options.obstacles)
+    if options.drag == "obstacle" and options.obstacles == 0:
+        raise InputError("--obstacles", "0", "1 or more, or --drag bias")
+    obstacles = tuple(Sphere((float(x), float(y), float(z)), diameter) for x, y, z in mean[places])
+    bias = BiasPoint(task.obstacle_position, plane=plane_of(task))
+    layers = (Layer(Biasing(bias), name="Bias 1"),) if options.drag == "bias" else ()
+    return Scenario(task.name, obstacles, layers=layers, space=options.space)
+
+
+def _moved(scenario: Scenario, place: tuple[float, float, float]) -> dict[str, Any]:
+    """The fields of the scenario with what is dragged somewhere else."""
+    if not scenario.layers:
+        first, *others = scenario.obstacles
+        return {"obstacles": (first.moved(place), *others)}
+    (layer,) = scenario.layers
+    assert isinstance(layer.behaviour, Biasing)
+    point = replace(layer.behaviour.point, position=place)
+    return {"layers": (replace(layer, behaviour=Biasing(point)),)}
+
+
 def _drag(
     sessions: Sequence[Session], position: Callable[[float], tuple[float, float, float]], seconds: float
 ) -> tuple[int, float]:
@@ -193,8 +225,7 @@ def _drag(
         time.sleep(max(0.0, began + tick / EDITS_PER_SECOND - time.perf_counter()))
         for k, session in enumerate(sessions):
             place = position(tick / EDITS_PER_SECOND + 1.7 * k)
-            (obstacle,) = session.scenario.obstacles
-            session.edit("obstacle", obstacles=(obstacle.moved(place),))
+            session.edit("drag", **_moved(session.scenario, place))
     return ticks * len(sessions), time.perf_counter() - began
 
 
