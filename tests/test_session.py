@@ -516,7 +516,7 @@ def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(open
 @pytest.mark.parametrize("layer", ["ghost_arm", "onion", "body_points", "joint_plots"])
 def test_what_is_drawn_from_the_motion_itself_needs_no_new_frame(opened, layer):
     asked = len(opened.engine.asked)
-    opened.session.edit(layer, view=View(**{layer: True}))
+    opened.session.edit(layer, view=replace(View(), **{layer: True}))
     opened.settle()
     assert len(opened.engine.asked) == asked
     assert getattr(opened.page.adopted[-1].view, layer)

@@ -1,0 +1,249 @@
+"""What the page shows of bias points, the stack and pots, without a browser."""
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import viser  # noqa: TID251 - a page of its own
+
+from dt_viz.bias import BiasPoint
+from dt_viz.engine import Frame, Stage
+from dt_viz.health import Health
+from dt_viz.obstacles import Sphere
+from dt_viz.paper_scenes import SCENES
+from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import AVOIDANCE, IMITATION, MAX_BIAS_POINTS, bias_points, names, with_bias_point
+from dt_viz.tasks import POTS, TASKS
+from dt_viz.ui.bias import Biases, selected_point
+from dt_viz.ui.bias_panel import BiasPanel
+from dt_viz.ui.levels import LevelRollouts
+from dt_viz.ui.pots import Pots, surface
+from dt_viz.ui.session import Session
+from dt_viz.ui.stack_panel import ARM, BASE, StackPanel, durations, legend_html, rows
+
+PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+SCENARIO = Scenario(
+    "draw_s",
+    (Sphere((0.0, -0.5, 0.4)),),
+    layers=with_bias_point(with_bias_point((), BiasPoint((0.2, -0.5, 0.4), plane=PLANE)), BiasPoint((0.0, -0.4, 0.2))),
+)
+
+
+def frame(scenario=SCENARIO, **changes):
+    nothing: Any = None
+    empty = Frame(
+        scenario=scenario,
+        task=TASKS[scenario.task](),
+        stage=Stage.CERTIFIED,
+        ghost=(),
+        rollouts=(),
+        times=(),
+        levels=tuple((np.full((5, 3), float(k)),) for k in range(4)),
+        goal=nothing,
+        reached=nothing,
+        blocked=(),
+        health=Health(0.01, duration=0.4, layer_durations=(0.8, None)),
+        layer_radii=(0.2, None),
+    )
+    return replace(empty, **changes)
+
+
+class Edited:
+    """Stands in for a session: keeps the scenario."""
+
+    def __init__(self, scenario=SCENARIO):
+        self.scenario = scenario
+        self.task = TASKS[scenario.task]()
+
+    def edit(self, _gesture, **changes):
+        self.scenario = replace(self.scenario, **changes)
+
+    def end_gesture(self):
+        pass
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def scene(server):
+    yield server.scene
+    server.scene.reset()
+
+
+# --- The list ---
+
+
+def listed(scenario):
+    return {row.name: row for row in rows(scenario, durations(frame(scenario)))}
+
+
+def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
+    assert list(listed(SCENARIO)) == [AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(replace(SCENARIO, space="both"))) == [ARM, AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(replace(SCENARIO, space="cspace"))) == [ARM, "Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(replace(SCENARIO, obstacles=()))) == ["Bias 2", "Bias 1", IMITATION, BASE]
+
+
+def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done():
+    by_name = listed(SCENARIO)
+    assert [by_name[name].label for name in ("Bias 1", "Bias 2", AVOIDANCE)] == [
+        "Bias 1  0.80",
+        "Bias 2",
+        "Avoidance  0.40",
+    ]
+    assert by_name["Bias 1"].buttons == ("on", "↑", "see")
+    assert by_name["Bias 2"].buttons == ("on", "↑", "↓", "see")
+    assert by_name[AVOIDANCE].buttons == ("on", "↓", "see")
+
+
+@pytest.fixture
+def panel(server):
+    panel, session = StackPanel(server.gui), Edited()
+    panel.connect(cast(Session, session))
+    return panel, session
+
+
+@pytest.mark.parametrize("name", ["Bias 1", "Bias 2", AVOIDANCE, IMITATION])
+def test_a_row_switches_its_transform_off_and_on_again(panel, name):
+    panel, session = panel
+    panel.press(name, "on")
+    assert session.scenario != SCENARIO
+    row = listed(session.scenario)[name]
+    assert row.buttons[0] == "off" and (name == IMITATION or "see" not in row.buttons)
+    panel.press(name, "off")
+    assert session.scenario == SCENARIO
+
+
+def test_rows_move_their_transform_outwards_and_inwards(panel):
+    panel, session = panel
+    panel.press("Bias 2", "↑")
+    assert names(session.scenario) == ("Bias 1", AVOIDANCE, "Bias 2")
+    panel.press("Bias 1", "↑")
+    assert names(session.scenario) == (AVOIDANCE, "Bias 1", "Bias 2")
+    panel.press(AVOIDANCE, "↑")
+    panel.press(AVOIDANCE, "↑")
+    assert session.scenario == SCENARIO
+
+
+def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(panel):
+    panel, session = panel
+    assert legend_html(SCENARIO) == ""
+    for name in (IMITATION, "Bias 1"):
+        panel.press(name, "see")
+        assert session.scenario.view.level == name
+        assert [row.name for row in listed(session.scenario).values() if "seen" in row.buttons] == [name]
+    assert "Bias 1" in legend_html(session.scenario)
+    panel.press("Bias 1", "seen")
+    panel.press(BASE, "see")
+    assert session.scenario.view == View(base=True)
+
+
+def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
+    panel, _ = panel
+    panel.adopt(SCENARIO)
+    panel.report(frame())
+    shown = [handle.label for handle in panel._rows if handle.visible]
+    assert shown == ["Avoidance  0.40", "Bias 2", "Bias 1  0.80", IMITATION, BASE]
+    panel.adopt(replace(SCENARIO, layers=(), obstacles=()))
+    assert [handle.label for handle in panel._rows if handle.visible] == [IMITATION, BASE]
+    panel.adopt(SCENARIO)
+    assert len(panel._rows) == 5
+
+
+def test_the_selected_level_is_drawn_without_a_new_frame(scene):
+    picture = LevelRollouts(scene)
+    picture.adopt(SCENARIO)
+    picture.draw(frame())
+    for level, height in ((IMITATION, 0.0), ("Bias 2", 2.0), (AVOIDANCE, 3.0)):
+        picture.adopt(replace(SCENARIO, view=View(level=level)))
+        assert len(picture.lines.node.points) == 4
+        assert (picture.lines.node.points == height).all()
+    picture.adopt(SCENARIO)
+    assert len(picture.lines.node.points) == 0
+
+
+# --- Bias points ---
+
+
+def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(scene):
+    picture = Biases(scene, lambda *_: None, lambda _: None)
+    picture.adopt(SCENARIO)
+    picture.draw(frame())
+    first, second, *others = picture.items
+    assert [item.gizmo.visible for item in picture.items] == [True, True, *[False] * len(others)]
+    for item, point in zip((first, second), bias_points(SCENARIO.layers).values(), strict=True):
+        np.testing.assert_allclose(item.gizmo.position, point.position)
+    assert first.gizmo.active_axes == (True, True, False)  # in the drawing's plane
+    assert second.gizmo.active_axes == (True, True, True)
+    assert (first.gizmo.opacity, second.gizmo.opacity) == (0.0, 1.0)  # the newest
+    picture.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
+    assert (first.gizmo.opacity, second.gizmo.opacity) == (1.0, 0.0)
+    with picture.without_handles():
+        assert first.gizmo.opacity == 0.0
+    assert first.gizmo.opacity == 1.0
+    assert first.region.visible and np.ravel(first.region.scale)[0] == 0.2
+    assert not second.region.visible  # nobody knows how large
+    picture.adopt(replace(SCENARIO, layers=()))
+    assert not any(item.gizmo.visible for item in picture.items)
+
+
+def test_bias_points_are_added_changed_and_deleted(server):
+    panel, session = BiasPanel(server.gui, lambda handle, *_: handle), Edited(replace(SCENARIO, layers=()))
+    panel.connect(cast(Session, session))
+    for _ in range(MAX_BIAS_POINTS + 1):
+        panel.adopt(session.scenario)
+        panel.add()
+    points = bias_points(session.scenario.layers)
+    assert len(points) == MAX_BIAS_POINTS
+    assert selected_point(session.scenario) == list(points)[-1]
+    panel.adopt(session.scenario)
+    session.edit("select", view=View(bias="Bias 2"))
+    panel.delete()
+    assert list(bias_points(session.scenario.layers)) == ["Bias 1", "Bias 3", "Bias 4"]
+    for _ in range(4):
+        panel.delete()
+        panel.adopt(session.scenario)
+    assert session.scenario.layers == ()
+
+
+def test_the_panel_shows_what_auto_chose(server):
+    panel = BiasPanel(server.gui, lambda handle, *_: handle)
+    panel.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
+    panel.report(frame())
+    assert (panel._radius.value, panel._strength.value) == (20.0, 0.8)
+    assert panel._radius.disabled and panel._strength.disabled
+
+
+# --- Pots ---
+
+
+def test_pots_are_open_above_and_hold_what_falls_in():
+    for pot in POTS:
+        vertices, faces = surface(pot)
+        radius = np.linalg.norm(vertices[:, :2], axis=1)
+        assert vertices[:, 2].min() == 0 and vertices[:, 2].max() == pot.height
+        rim = vertices[:, 2] == pot.height
+        assert radius[rim].min() == pytest.approx(pot.radius)
+        corners = vertices[faces]
+        volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+        outer, inner = radius.max(), pot.radius
+        floor = np.unique(vertices[:, 2])[1]
+        expected = np.pi * (outer**2 * pot.height - inner**2 * (pot.height - floor))
+        assert volume == pytest.approx(expected, rel=0.01)  # positive: faces look outward
+
+
+def test_pots_are_drawn_for_tasks_that_have_some(scene):
+    picture = Pots(scene)
+    picture.draw(frame())
+    assert picture.handles == ()
+    pots = SCENES["left_pot"]
+    picture.draw(frame(Scenario(pots.task, ())))
+    assert [tuple(handle.position) for handle in picture.handles] == [(pot.x, pot.y, 0.0) for pot in POTS]
+    picture.draw(frame())
+    assert picture.handles == ()
