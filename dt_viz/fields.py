@@ -252,3 +252,33 @@ class Sum:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
         values, derivatives = zip(*(part.with_jacobian(s) for part in self.parts), strict=True)
         return np.sum(values, axis=0), np.sum(derivatives, axis=0)
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """The sum of one field at several places; at least one. It is evaluated for all of them at once."""
+
+    places: tuple[PlacedField, ...]
+    """All with the same inner field."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.places[0].dim
+
+    def __call__(self, s: Array) -> Array:
+        """V at the points `s` (N, d), as (N, d)."""
+        values = self.places[0].inner(self._local(s)).reshape(len(self.places), *s.shape)
+        return np.sum([v @ (at.scale * at.axes.T) for v, at in zip(values, self.places, strict=True)], axis=0)
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
+        num, (values, derivatives) = len(self.places), self.places[0].inner.with_jacobian(self._local(s))
+        values = values.reshape(num, *s.shape)
+        derivatives = derivatives.reshape(num, *s.shape, self.dim)
+        V = np.sum([v @ (at.scale * at.axes.T) for v, at in zip(values, self.places, strict=True)], axis=0)
+        DV = np.sum([at.axes @ D @ at.axes.T for D, at in zip(derivatives, self.places, strict=True)], axis=0)
+        return V, DV
+
+    def _local(self, s: Array) -> Array:
+        return np.concatenate([(s - at.origin) @ (at.axes / at.scale) for at in self.places])

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.fields import Array, Sum
-from dt_viz.obstacles import Obstacle
+from dt_viz.fields import Array, Repeated, Sum, VectorField
+from dt_viz.obstacles import Obstacle, Sphere
 from dt_viz.occupancy import Generator
 
 ROUNDS = 3
@@ -38,6 +38,8 @@ class Several:
                 s = part.nearest_free(s)
         return s
 
-    def field(self, generator: Generator, temperature: float) -> Sum:
+    def field(self, generator: Generator, temperature: float) -> VectorField:
         """The generators of the parts, added up (sec. 4.4)."""
-        return Sum(tuple(part.field(generator, temperature) for part in self.parts))
+        spheres = tuple(part.field(generator, temperature) for part in self.parts if isinstance(part, Sphere))
+        others = tuple(part.field(generator, temperature) for part in self.parts if not isinstance(part, Sphere))
+        return Sum((*((Repeated(spheres),) if spheres else ()), *others))

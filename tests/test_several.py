@@ -1,0 +1,42 @@
+"""Several obstacles as one, and the fields that add up to theirs."""
+
+import numpy as np
+import pytest
+
+from dt_viz.obstacles import Box, Sphere
+from dt_viz.several import Several
+
+PARTS = (
+    Sphere((0.0, 0.0, 0.0), 0.15),
+    Sphere((0.12, 0.05, -0.02), 0.08),
+    Box((-0.1, 0.1, 0.05), (0.1, 0.06, 0.08), (0.8, 0.6, 0.0, 0.0)),
+)
+
+
+@pytest.fixture(name="points")
+def _points():
+    return np.random.default_rng(0).uniform(-0.25, 0.25, (300, 3))
+
+
+def test_the_distance_is_that_of_the_nearest_part(points):
+    apart = np.stack([part.signed_distance(points) for part in PARTS])
+    np.testing.assert_array_equal(Several(PARTS).signed_distance(points), apart.min(axis=0))
+    assert np.isinf(Several().signed_distance(points)).all()
+
+
+def test_what_is_moved_out_is_outside_of_all(points):
+    free = Several(PARTS).nearest_free(points)
+    assert Several(PARTS).signed_distance(free).min() > -1e-3
+    outside = Several(PARTS).signed_distance(points) > 0
+    np.testing.assert_array_equal(free[outside], points[outside])
+
+
+@pytest.mark.parametrize("parts", [PARTS, PARTS[:2], PARTS[2:], PARTS[:1]])
+def test_the_fields_add_up(points, parts):
+    together = Several(parts).field("free-space", 6.0)
+    apart = [part.field("free-space", 6.0) for part in parts]
+    np.testing.assert_allclose(together(points), sum(field(points) for field in apart), rtol=0, atol=1e-14)
+    value, derivative = together.with_jacobian(points)
+    np.testing.assert_allclose(value, together(points), rtol=0, atol=1e-14)
+    expected = sum(field.with_jacobian(points)[1] for field in apart)
+    np.testing.assert_allclose(derivative, expected, rtol=0, atol=1e-12)
