@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from dt_viz.belief import OccupancyPicture
 from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Placed
 from dt_viz.fields import Array, Indices, Mask
 from dt_viz.rollouts import Bundle, Rays, refined
@@ -87,6 +88,7 @@ class Pictures:
     generator: GeneratorPicture | None = None
     grid: GridPicture | None = None
     base: BasePicture | None = None
+    occupancy: OccupancyPicture | None = None
 
 
 NO_PICTURES = Pictures()

@@ -30,7 +30,7 @@ MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
 MAX_MANUAL_DURATION = 2.0
 
 
-COMPUTED_VIEWS = ("generator", "grid", "base")
+COMPUTED_VIEWS = ("generator", "grid", "base", "occupancy")
 """Fields of `View` whose pictures are computed only while they are shown."""
 
 
@@ -64,6 +64,8 @@ class View:
     """The warped grid: lines of base space seen through ψ⁻¹."""
     base: bool = False
     """The base attractor beside the learned system."""
+    occupancy: bool = False
+    """What the obstacles' occupancy maps believe, on a slice."""
     playing: bool = True
     """Whether the arm moves along its rollout."""
     speed: float = 1.0

@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - a scene of its own
 
+from dt_viz.belief import occupancy_picture
 from dt_viz.collision import NOTHING, CollisionReport, Nearest
 from dt_viz.obstacles import Box, Cylinder, Sphere, rotation
 from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
@@ -15,6 +16,7 @@ from dt_viz.several import Several
 from dt_viz.tasks import TASKS
 from dt_viz.ui.obstacle_panel import SHAPES, ObstaclePanel, name_of, with_room
 from dt_viz.ui.obstacles import Obstacles, in_slice, shaded
+from dt_viz.ui.occupancy import OccupancySlice
 from dt_viz.ui.panel import _clearance, _collision_rows
 
 BALL = Sphere((0.0, -0.5, 0.4), 0.12)
@@ -202,3 +204,33 @@ def test_the_status_says_that_there_is_no_obstacle():
     assert _clearance(float(Several().signed_distance(np.zeros((4, 3))).min()), "end effector") == "no obstacle"
     report = CollisionReport(NOTHING, None, Nearest(0.034, ("hand",), 4.0))
     assert _collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
+
+
+# --- The learned occupancy ---
+
+
+def test_the_map_is_painted_on_the_slice_the_right_way_up(server):
+    picture, task = OccupancySlice(server.scene), TASKS["draw_s"]()
+    centre = task.slice.centre + task.slice.axes @ [0.08, 0.12]  # to the upper right
+    ball = Sphere((float(centre[0]), float(centre[1]), float(centre[2])), 0.1)
+    made = occupancy_picture(task.slice, (ball,), coarse=True)
+    picture.draw(cast(Any, SimpleNamespace(pictures=SimpleNamespace(occupancy=made))))
+    image = picture.image
+    assert image is not None
+    rows, columns = np.nonzero(image.image[..., 3] > 190)
+    height, width = image.image.shape[:2]
+    across = (columns.mean() + 0.5) / width - 0.5, (rows.mean() + 0.5) / height - 0.5
+    # the image's own axes are right and down
+    right, down = 2 * np.multiply(task.slice.half_size, across)
+    w, x, y, z = (float(c) for c in image.wxyz)
+    painted = image.position + rotation((w, x, y, z)) @ [right, down, 0.0]
+    np.testing.assert_allclose(painted, ball.position, atol=0.004)
+    np.testing.assert_allclose(picture.level.node.points, made.level, atol=1e-6)
+    server.scene.reset()
+
+
+def test_obstacles_are_open_towards_the_viewer_while_their_map_is_shown(shown):
+    shown.adopt(scenario(*ALL))
+    assert {item.mesh.side for item in shown.items} == {"front"}
+    shown.adopt(replace(scenario(*ALL), view=View(occupancy=True)))
+    assert {item.mesh.side for item in shown.items} == {"back"}

@@ -22,8 +22,8 @@ HANDLE_SCALE = 0.2
 """Metres that the handles stick out, about."""
 HIDDEN = 1e-6
 """Size of handles that are not shown: hiding their node would hide what hangs on it."""
-OPACITY, OPACITY_OFF = 0.8, 0.3
-"""The path that an obstacle blocks shines through; more so while it is not avoided."""
+OPACITY, OPACITY_FAINT = 0.8, 0.3
+"""The path that an obstacle blocks shines through; more so while it is not avoided, or its map is shown."""
 MIN_SLOPE = 0.2
 """Of the line of sight to the slice, below which the slice counts as seen on edge."""
 CREASE = 0.6
@@ -87,8 +87,15 @@ class ObstaclePicture:
         """Whether handles are shown."""
         return self.gizmo.opacity > 0
 
-    def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool) -> None:
-        """Look like the obstacle and stand where it does, unless that is where the browser has put it already."""
+    def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool, opened: bool) -> None:
+        """Look like the obstacle and stand where it does, unless that is where the browser has put it already.
+
+        Args:
+            obstacle: to show.
+            selected: whether it has handles.
+            avoided: whether motions avoid it.
+            opened: whether its nearer half is left out, to show what is inside.
+        """
         if np.abs(self.gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
             self.gizmo.position = obstacle.position
         if np.abs(self.gizmo.wxyz - np.asarray(obstacle.wxyz)).max() > 1e-9:
@@ -101,7 +108,10 @@ class ObstaclePicture:
             self._scale = HANDLE_SCALE * (0.5 + min(look.radius / MAX_DIAMETER, 0.8))
         self._selected = selected
         self.show_handles(selected)
-        opacity = OPACITY if avoided else OPACITY_OFF
+        side = "back" if opened else "front"
+        if self.mesh.side != side:
+            self.mesh.side = side
+        opacity = OPACITY if avoided and not opened else OPACITY_FAINT
         if self.mesh.opacity != opacity:
             self.mesh.opacity = opacity
 
@@ -146,7 +156,12 @@ class Obstacles(Picture):
             index = len(self.items)
             self.items.append(ObstaclePicture(self._scene, index, self._moved, self._selected, self._along))
         for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
-            item.adopt(obstacle, selected=index == scenario.selected, avoided=scenario.avoidance)
+            item.adopt(
+                obstacle,
+                selected=index == scenario.selected,
+                avoided=scenario.avoidance,
+                opened=scenario.view.occupancy,
+            )
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:

@@ -8,6 +8,8 @@ CHOSEN_ROLLOUT = (150, 45, 0)
 """The one that the arm follows."""
 GHOST = (84, 88, 96)
 """Dashed lines."""
+PUSHED = (118, 42, 131)
+"""The path of the hand after a push."""
 STALE = (158, 163, 171)
 """Rollouts that are not the scenario's."""
 GOAL = (0, 158, 115)
@@ -17,6 +19,9 @@ BIAS = (230, 159, 0)
 """Bias points."""
 LEVEL = (0, 114, 178)
 """Rollouts on the selected level of the stack."""
+OCCUPANCY = (230, 159, 0)
+OCCUPANCY_LEVEL = (153, 88, 0)
+"""Where the map finds occupied and free equally likely."""
 ARROW_SLOW = (198, 205, 216)
 ARROW_FAST = (64, 84, 120)
 GENERATOR_WEAK = (246, 214, 150)

@@ -81,6 +81,11 @@ class Lines:
         self.node.points = np.concatenate(segments).astype(np.float32)
         self.node.colors = np.concatenate(colours)
 
+    def show_segments(self, segments: Array) -> None:
+        """Show these segments (K, 2, 3), metres."""
+        self.node.points = segments.astype(np.float32)
+        self.node.colors = rgb(self._colour, segments.shape)
+
 
 def rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """One colour for an array of points of lines of that shape."""

@@ -18,6 +18,7 @@ from dt_viz.ui.bias import Moved as BiasMoved
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
 from dt_viz.ui.obstacles import Moved, Obstacles
+from dt_viz.ui.occupancy import OccupancySlice
 from dt_viz.ui.picture import Arrows, Lines, Picture
 from dt_viz.ui.pots import Pots
 
@@ -164,6 +165,7 @@ class ScenePictures:
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
             "base": BaseInset(scene),
+            "occupancy": OccupancySlice(scene),
             "onion": Onion(scene, robot),
         }
 

@@ -1,0 +1,64 @@
+"""What the occupancy maps believe, as a picture: by its level line, its outline and what it is near."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.belief import believed, level_line, occupancy_picture
+from dt_viz.engine import Stage
+from dt_viz.obstacles import Box, Cylinder, Sphere
+from dt_viz.scenario import View
+from dt_viz.several import Several
+from dt_viz.tasks import Slice
+
+AREA = Slice(np.array([0.0, -0.5, 0.4]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T, (0.2, 0.15))
+SHAPES = [
+    Sphere((0.02, -0.5, 0.42), 0.14),
+    Box((0.0, -0.51, 0.38), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3)),
+    Cylinder((-0.03, -0.5, 0.4), 0.08, 0.2, (0.8, 0.6, 0.0, 0.0)),
+]
+
+
+def test_the_level_line_of_a_plane_is_where_the_plane_is_zero():
+    rng = np.random.default_rng(1)
+    normal, offset = rng.normal(size=3), 0.1
+    points = np.stack([*np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 7), indexing="ij")], axis=-1)
+    points = points @ rng.normal(size=(2, 3))
+    segments = level_line(points, points @ normal - offset)
+    assert len(segments) > 5
+    np.testing.assert_allclose(segments @ normal, offset, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=["sphere", "box", "cylinder"])
+@pytest.mark.parametrize("coarse", [True, False])
+def test_the_picture_shows_the_true_outline_and_what_is_believed(shape, coarse):
+    picture = occupancy_picture(AREA, (shape,), coarse=coarse)
+    spacing = 0.010 if coarse else 0.004
+    assert np.abs(shape.signed_distance(picture.outline)).max() < 0.3 * spacing
+    assert np.abs(believed(shape, picture.level.reshape(-1, 3)) - 0.5).max() < (0.2 if coarse else 0.05)
+    assert np.abs(shape.signed_distance(picture.level)).max() < 0.25 * shape.radius  # it has learned the shape
+    normal = np.cross(*AREA.axes.T)
+    for segments in (picture.level, picture.outline):
+        np.testing.assert_allclose((segments - AREA.centre) @ normal, 0, atol=1e-12)
+    corner = AREA.centre - AREA.axes @ AREA.half_size
+    assert picture.probability[0, 0] == pytest.approx(float(believed(shape, corner[None])[0]), abs=1e-9)
+
+
+def test_what_any_obstacle_is_believed_to_occupy_is_occupied():
+    both = occupancy_picture(AREA, SHAPES[:2], coarse=True).probability
+    each = [occupancy_picture(AREA, (shape,), coarse=True).probability for shape in SHAPES[:2]]
+    assert (both >= np.maximum(*each) - 1e-12).all()
+    nothing = occupancy_picture(AREA, (), coarse=True)
+    assert nothing.probability.max() == 0 and len(nothing.level) == len(nothing.outline) == 0
+
+
+def test_the_picture_is_worked_out_only_while_it_is_shown(engine, initial):
+    scenario = initial("draw_s")
+    shown = replace(scenario, view=View(occupancy=True))
+    assert not shown.computes_like(scenario)
+    assert all(frame.pictures.occupancy is None for frame in engine.frames(scenario))
+    for frame in engine.frames(shown):
+        assert (frame.pictures.occupancy is not None) == (frame.stage >= Stage.LIVE)
+    outline = frame.pictures.occupancy.outline
+    assert np.abs(Several(scenario.obstacles).signed_distance(outline)).max() < 1e-3
