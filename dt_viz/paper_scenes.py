@@ -107,7 +107,7 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "cube",
             "Fig. 3 (a): a cube in the S",
-            "Every stroke leaves the cube, and the rest of the S stays as it was drawn.",
+            "Every stroke leaves the cube, the rest stays. Only the path gives way: avoid with “Both” for the arm.",
             "draw_s",
             _cube_in_the_letter,
         ),

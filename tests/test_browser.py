@@ -14,6 +14,7 @@ import dt_viz.fits
 from dt_viz.fits import FitStore
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.scenario import View
+from dt_viz.stacking import bias_points
 from dt_viz.tasks import TASKS
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
@@ -206,6 +207,34 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     wait_until(lambda: session.scenario.obstacles == (sphere,) and len(pictures.items) == 1, "the box to go")
     click_button(page, "Delete")
     page.get_by_text("no obstacle").first.wait_for(timeout=1000 * PATIENCE)
+
+
+def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_the_stack(visit):
+    page, visitor = visit
+    session, pictures = visitor.session, visitor.pictures.biases
+    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
+    session.edit("test", obstacles=(), view=light)  # software rendering is slow
+    click_button(page, "Add")
+    wait_until(lambda: session.scenario.layers and session.wait_idle(0.3), "the bias point")
+
+    def place():
+        return np.array(bias_points(session.scenario.layers)["Bias 1"].position)
+
+    before, deadline = place(), time.monotonic() + PATIENCE
+    x, y = project(visitor, before)
+    while not (np.linalg.norm(place() - before) > 0.03 and session.wait_idle(0.3)):
+        assert time.monotonic() < deadline
+        drag(page, (x - 2, y + 2), (x + 30, y - 25), steps=4)  # again, if the page had not drawn the ball yet
+    time.sleep(0.3)  # for the last event
+    wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
+    assert abs(place()[1] - before[1]) < 1e-6  # the drawing plane is y = const
+    np.testing.assert_allclose(pictures.items[0].gizmo.position, place(), atol=1e-9)
+    assert all(np.linalg.norm(path - place(), axis=1).min() < 0.015 for path in visitor.shown.rollouts)
+
+    page.get_by_role("button", name="on", exact=True).first.evaluate("button => button.click()")  # of the outermost
+    wait_until(lambda: not session.scenario.layers[0].on and session.wait_idle(0.3), "the switch")
+    for path, undisturbed in zip(visitor.shown.rollouts, visitor.shown.ghost, strict=True):
+        assert max(np.linalg.norm(undisturbed - point, axis=1).min() for point in path) < 0.02
 
 
 def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):

@@ -53,6 +53,7 @@ def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certi
     assert undisturbed > 0.01  # it is in the way
     assert frame.health.clearance > 0
     assert frame.health.arm_duration > 0
+    assert frame.health.collision.problems == ()
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
 
 

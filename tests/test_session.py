@@ -546,6 +546,9 @@ def test_a_scene_replaces_all_but_the_view_and_is_undone_at_once(opened):
 
 def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):
     session = opened.session
-    session.edit("scene", obstacles=(), layers=(cast(Layer, "a layer"),), avoidance_level=0, scene="somewhere")
+    session.edit("scene", layers=(cast(Layer, "a layer"),), avoidance_level=0, temperature=8.0)
     session.choose_task("lift_box")
-    assert session.scenario == fresh("lift_box")
+    assert session.scenario == replace(fresh("lift_box"), temperature=8.0)
+    session.edit("scene", obstacles=(), space="cspace", scene="somewhere")
+    session.choose_task("draw_s")
+    assert session.scenario == fresh("draw_s")

@@ -14,7 +14,7 @@ from dt_viz.stacking import AVOIDANCE, IMITATION, levels, shifted, switched, vis
 from dt_viz.ui import palette
 from dt_viz.ui.session import Session
 
-BASE, ARM = "Base attractor", "Arm avoidance"
+BASE, ARM = "Base attractor", "Whole arm"
 ON, OFF, UP, DOWN, SEE, SEEN = "on", "off", "↑", "↓", "see", "seen"
 
 
