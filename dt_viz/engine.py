@@ -18,11 +18,12 @@ from dt_viz.collision import load_collision_model
 from dt_viz.diffeo import Flow, Identity
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
-from dt_viz.following import NUM_ARM_SAMPLES, Follower
+from dt_viz.following import NUM_ARM_SAMPLES, ArmMotion, Follower
 from dt_viz.health import Health, certified, certified_arm
 from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.pictures import NO_PICTURES, Pictures
+from dt_viz.pushing import Pushed, pushed
 from dt_viz.retiming import within_velocity_limits
 from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle, Rays, evenly_sampled
@@ -60,18 +61,6 @@ class FieldPicture:
     """(N, 3), metres."""
     velocities: Array
     """(N, 3), m/s."""
-
-
-@dataclass(frozen=True)
-class ArmMotion:
-    """The joint motion along one rollout."""
-
-    times: Array
-    """(T,) seconds, later than the rollout's where the joints' velocity limits ask for it."""
-    q: Array
-    """(T, 6) joint angles at these times, rad; continuous joints unwrapped."""
-    without: Array
-    """(T, 6) the same at the same moments of the motion without avoidance."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +130,8 @@ class Engine:
         self._tasks: dict[str, Task] = {}
         self._grounds: dict[tuple[str, bool, str], Ground] = {}
         self._good: dict[str, Frame] = {}
+        self._shown: tuple[Scenario, Ground, _Solved] | None = None
+        """The last motion that an arm was shown for."""
 
     def task(self, name: str) -> Task:
         """The task of that name, loaded on first use. Raises DemonstrationError if its file cannot be used."""
@@ -189,6 +180,23 @@ class Engine:
             health = health.doubting(*doubts)
         return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
 
+    def pushed(self, scenario: Scenario, q: Array, rng: np.random.Generator) -> Pushed | None:
+        """The arm's motion after the hand is pushed aside; None unless a motion of this scenario is shown.
+
+        Args:
+            scenario: whose frames were computed last.
+            q: (6,) joint angles when the push begins, rad.
+            rng: for its direction.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        if self._shown is None or not self._shown[0].moves_like(scenario):
+            return None
+        _, ground, solved = self._shown
+        with _turn:
+            return pushed(self._follower, ground, scenario, solved.stack, solved.arm, q, rng)
+
     def _stages(self, ground: Ground, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
         if _uses_whole_arm(scenario):
             with _turn:
@@ -203,7 +211,7 @@ class Engine:
         with _turn:
             frame = self._with_field_and_arm(frame, ground, live)
             frame = replace(frame, stage=Stage.LIVE, pictures=_pictures(ground, scenario, live.stack, coarse=True))
-            self._good[scenario.task] = frame
+            self._good[scenario.task], self._shown = frame, (scenario, ground, live)
         yield frame
 
         with _turn:
@@ -212,7 +220,7 @@ class Engine:
             frame = self._with_field_and_arm(self._frame(ground, scenario, fine), ground, fine)
         with _turn:
             frame = replace(frame, stage=Stage.FINE, pictures=_pictures(ground, scenario, fine.stack, coarse=False))
-            self._good[scenario.task] = frame
+            self._good[scenario.task], self._shown = frame, (scenario, ground, fine)
         yield frame
         with _turn:
             health = certified(frame.health, fine.stack.system, fine.stack.bundle)

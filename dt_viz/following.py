@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from dt_viz.body import load_body_points
@@ -18,6 +20,18 @@ MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
 NUM_ARM_SAMPLES = 200
 """Of the motion that the arm shows where it follows a path of the end effector."""
+
+
+@dataclass(frozen=True)
+class ArmMotion:
+    """The joint motion along one rollout."""
+
+    times: Array
+    """(T,) seconds, later than the rollout's where the joints' velocity limits ask for it."""
+    q: Array
+    """(T, 6) joint angles at these times, rad; continuous joints unwrapped."""
+    without: Array
+    """(T, 6) the same at the same moments of the motion without avoidance."""
 
 
 class Follower:

@@ -30,6 +30,7 @@ from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.export import RESOLUTIONS
 from dt_viz.ui.obstacle_panel import ObstaclePanel
 from dt_viz.ui.plots import JointPlots
+from dt_viz.ui.push import PushButton
 from dt_viz.ui.session import Pace, Session
 from dt_viz.ui.stack_panel import StackPanel
 
@@ -128,6 +129,7 @@ class Panel:
         self._obstacles.adopt(scenario)
         self._biases.adopt(scenario)
         self._stack.adopt(scenario)
+        self.push.adopt(scenario)
         for control in self._controls:
             value = control.read(scenario)
             if control.handle.value != value:
@@ -150,6 +152,7 @@ class Panel:
         self._biases.report(frame)
         self._stack.report(frame)
         self.joints.draw(frame.arm)
+        self.push.report(frame)
         _set_max(self._rollout, len(frame.rollouts))
         if frame.pictures.generator is not None:
             _set_max(self._flow, frame.pictures.generator.num_flows)
@@ -324,6 +327,7 @@ class Panel:
                 lambda s: s.view.speed,
                 lambda s, value: {"view": replace(s.view, speed=value)},
             )
+            self.push = PushButton(gui)
             self._rollout = self._bind(
                 gui.add_slider("Follows rollout", 1, 8, 1, 1),
                 lambda s: s.arm_rollout + 1,

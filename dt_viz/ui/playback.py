@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from dt_viz.fields import Array
 PICTURES_PER_SECOND = 25
 REST = 0.8
 """Seconds at the goal before the motion begins again."""
+CATCH_UP = 0.3
+"""Seconds in which the arm gets onto a detour: it has moved on while the detour was computed."""
 
 
 def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
@@ -25,12 +28,39 @@ def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
     return q, without
 
 
+@dataclass(eq=False)
+class _Detour:
+    """A motion that is followed once, beginning from where the arm is."""
+
+    motion: ArmMotion
+    ended: Callable[[], None]
+    offsets: tuple[Array, Array] | None
+    """(6,) each: from the motion's first postures to those of the arms when it began, rad."""
+    clock: float = 0.0
+
+    @property
+    def over(self) -> bool:
+        """Whether the goal is reached."""
+        return self.clock > self.motion.times[-1] + REST
+
+    def postures(self) -> tuple[Array, Array]:
+        """As `at_moment`, now."""
+        q, without = at_moment(self.motion, min(self.clock, self.motion.times[-1]))
+        left = max(0.0, 1 - self.clock / CATCH_UP)
+        if self.offsets is not None and left > 0:
+            q, without = q + left * self.offsets[0], without + left * self.offsets[1]
+        return q, without
+
+
 class Playback:
     """Poses the arms along the newest motion. A new motion takes over at the same moment of the loop."""
 
     def __init__(self, pose: Callable[[Array, Array], None]) -> None:
         self._pose = pose
         self._motion: ArmMotion | None = None
+        self._detour: _Detour | None = None
+        self._changing = threading.Lock()
+        self._posed: tuple[Array, Array] | None = None
         self._playing = True
         self._speed = 1.0
         self._clock = 0.0
@@ -38,9 +68,30 @@ class Playback:
         self._thread = threading.Thread(target=self._loop, name="playback", daemon=True)
         self._thread.start()
 
+    @property
+    def q(self) -> Array | None:
+        """Joint angles (6,) of the arm now, rad; None before there is a motion."""
+        return None if self._posed is None else self._posed[0]
+
     def follow(self, motion: ArmMotion | None) -> None:
         """Go on along this motion; None keeps the arm where it is."""
         self._motion = motion
+
+    def take_detour(self, motion: ArmMotion, ended: Callable[[], None]) -> None:
+        """Leave the loop for this motion, once, to its end; then call `ended` and begin the loop again.
+
+        A detour that is under way is left for it, and its `ended` is not called.
+        """
+        posed = self._posed
+        offsets = None if posed is None else (posed[0] - motion.q[0], posed[1] - motion.without[0])
+        with self._changing:
+            self._detour = _Detour(motion, ended, offsets)
+
+    def end_detour(self) -> None:
+        """Go on with the loop now."""
+        detour = self._detour
+        if detour is not None:
+            self._leave(detour)
 
     def set_pace(self, playing: bool, speed: float) -> None:
         """Play or pause, and how many times faster than real time."""
@@ -51,15 +102,34 @@ class Playback:
         self._closed.set()
         self._thread.join(timeout=1)
 
+    def _leave(self, detour: _Detour) -> None:
+        with self._changing:
+            if self._detour is not detour:  # another one has begun
+                return
+            self._detour = None
+        detour.ended()
+
     def _loop(self) -> None:
         before, shown = time.monotonic(), None
         while not self._closed.wait(1 / PICTURES_PER_SECOND):
             now = time.monotonic()
-            if self._playing:
-                self._clock += self._speed * (now - before)
-            before, motion = now, self._motion
-            if motion is None or (shown is motion and not self._playing):
+            step = self._speed * (now - before) if self._playing else 0.0
+            before, motion, detour = now, self._motion, self._detour
+            if detour is not None:
+                detour.clock += step
+                if detour.over:
+                    self._clock = 0.0
+                    self._leave(detour)
+                    continue
+            else:
+                self._clock += step
+            follows = motion if detour is None else detour
+            if motion is None or follows is None or (shown is follows and not self._playing):
                 continue
-            moment = min(self._clock % (motion.times[-1] + REST), motion.times[-1])
-            self._pose(*at_moment(motion, moment))
-            shown = motion
+            if detour is not None:
+                posed = detour.postures()
+            else:
+                posed = at_moment(motion, min(self._clock % (motion.times[-1] + REST), motion.times[-1]))
+            self._posed = posed
+            self._pose(*posed)
+            shown = follows

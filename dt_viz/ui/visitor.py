@@ -10,6 +10,7 @@ import viser
 from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.fields import Array
 from dt_viz.obstacles import Sphere
+from dt_viz.pushing import Pushed
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario
 from dt_viz.stacking import bias_points, with_changed_point
@@ -19,6 +20,7 @@ from dt_viz.ui.arm_layers import Arms
 from dt_viz.ui.export import RESOLUTIONS, render_png
 from dt_viz.ui.panel import Panel
 from dt_viz.ui.playback import Playback
+from dt_viz.ui.push import PushedPath
 from dt_viz.ui.scene import ScenePictures
 from dt_viz.ui.session import Pace, Session
 
@@ -61,10 +63,12 @@ class Visitor:
                 self._bias_selected,
             )
             self.arms = Arms(client.scene, robot)
+            self.pushed_path = PushedPath(client.scene)
         self._playback = Playback(self._pose)
         self._panel = Panel(client.gui, titles, robot, self._save_png)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
+        self._panel.push.connect(self._push)
 
     @property
     def arm(self) -> ArmPicture:
@@ -80,6 +84,8 @@ class Visitor:
             self.pictures.draw(frame)
             self.arm.stale = bool(frame.blocked)
         if frame.stage is not Stage.ROLLOUTS:
+            if self.pushed_path.is_of_another(frame.scenario):
+                self._playback.end_detour()
             self._playback.follow(frame.arm)
             self._panel.report(frame, pace)
         self.client.flush()
@@ -139,6 +145,14 @@ class Visitor:
 
     def _bias_selected(self, name: str) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
+
+    def _push(self) -> None:
+        if self._playback.q is not None:
+            self.session.push(self._playback.q, self._show_pushed)
+
+    def _show_pushed(self, pushed: Pushed) -> None:
+        self.pushed_path.show(pushed)
+        self._playback.take_detour(pushed.motion, self.pushed_path.hide)
 
     def _pose(self, q: Array, without: Array) -> None:
         with self.client.atomic():

@@ -1,0 +1,150 @@
+"""The hand is pushed aside in the middle of its motion, and goes on to the goal from there.
+
+ψ is a conjugacy, so the motion from any place y is known at once: z₀ = ψ(y), z(t) in closed form, y(t) = ψ⁻¹(z(t)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.fields import Array
+from dt_viz.following import MAX_TRACKING_ERROR, ArmMotion, Follower
+from dt_viz.retiming import within_velocity_limits
+from dt_viz.rollouts import Rays, evenly_sampled
+from dt_viz.scenario import Scenario
+from dt_viz.solving import Ground, Solution
+from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.tracking import track
+from dt_viz.whole_arm import ArmSolution
+
+DISTANCES = (0.06, 0.03, 0.015)
+"""Metres by which the hand is pushed: less where there is no room for more."""
+PUSH_SECONDS = 0.3
+"""That a push takes, if the joints can be as fast."""
+NUM_PUSH_SAMPLES, NUM_SAMPLES = 12, 150
+"""Of the push and of the motion after it."""
+NUM_DIRECTIONS = 4
+"""That are tried at each distance."""
+TABLE_ROOM = 0.03
+"""Metres above the table that a push leaves to the hand, where the motions themselves leave as much."""
+LOWER = 5e-3
+"""Metres below the lowest motion that do not count."""
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """What the arm does after a push: it is moved aside, and goes on to the goal."""
+
+    scenario: Scenario
+    motion: ArmMotion
+    """From where the arm was; the joints without the whole arm's avoidance are its `without`."""
+    path: Array
+    """(T, 3) the end effector at the times of the motion, metres."""
+    begins: int
+    """The sample where the push is over and the system's own motion begins."""
+
+
+def pushed(
+    follower: Follower,
+    ground: Ground,
+    scenario: Scenario,
+    stack: Solution,
+    arm: ArmSolution | None,
+    q: Array,
+    rng: np.random.Generator,
+) -> Pushed:
+    """Push the hand aside, in a random direction across its motion, and let it go on.
+
+    Of a few directions the first is taken in which nothing is in the way, or else the one with the most room. Where
+    the whole arm avoids, the end effector of the motion below is pushed, and p = ψ_q⁻¹(q) lifts that motion.
+
+    Args:
+        follower: lifts paths to the joints.
+        ground: the undisturbed motion.
+        scenario: what is shown.
+        stack: its system of the end effector.
+        arm: its whole-arm avoidance, None where only the end effector avoids.
+        q: (6,) joint angles when the push begins, rad.
+        rng: for the directions.
+
+    Raises:
+        UnreachableError: the arm cannot get to where the motions start.
+    """
+    best, most = None, -np.inf
+    for place in _places(follower, scenario, stack, arm, q, rng):
+        found, room = _motion(follower, ground, scenario, stack, arm, q, place)
+        if best is None or room > most:
+            best, most = found, room
+        if most >= 0:
+            break
+    assert best is not None
+    return best
+
+
+def _places(
+    follower: Follower,
+    scenario: Scenario,
+    stack: Solution,
+    arm: ArmSolution | None,
+    q: Array,
+    rng: np.random.Generator,
+) -> Iterator[Array]:
+    """Places (3,), metres, to push the end effector to, the farthest first."""
+    hand = follower.robot.end_effector(_below(follower, arm, q))
+    directions = _across(stack.system, hand, rng)
+    for distance in DISTANCES:
+        yield from hand + distance * directions
+
+
+def _across(system: DiffeomorphicSystem, hand: Array, rng: np.random.Generator) -> Array:
+    """Random unit vectors (NUM_DIRECTIONS, 3) at right angles to the motion at `hand` (3,)."""
+    velocity = system.velocity(hand[None])[0]
+    along = velocity / max(np.linalg.norm(velocity), 1e-9)
+    directions = rng.normal(size=(NUM_DIRECTIONS, 3))
+    directions -= np.outer(directions @ along, along)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _below(follower: Follower, arm: ArmSolution | None, q: Array) -> Array:
+    """The configuration (6,) of the motion that the whole arm's avoidance is made for."""
+    return q if arm is None else arm.transform.forward(follower.whole_arm.limits.inside(q))
+
+
+def _motion(
+    follower: Follower,
+    ground: Ground,
+    scenario: Scenario,
+    stack: Solution,
+    arm: ArmSolution | None,
+    q: Array,
+    place: Array,
+) -> tuple[Pushed, float]:
+    """The motion by way of `place` (3,), and how much room it has, metres; below 0 there is too little."""
+    robot, below = follower.robot, _below(follower, arm, q)
+    rays = Rays(stack.system.transform.forward(place[None]), stack.rays.base)
+    bundle = evenly_sampled(lambda i, u: stack.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
+
+    u = np.linspace(0, 1, NUM_PUSH_SAMPLES)
+    hand = robot.end_effector(below)
+    aside = hand + (u * u * (3 - 2 * u))[:, None] * (place - hand)
+    path = np.concatenate([aside[:-1], bundle.positions])
+    times = np.concatenate([PUSH_SECONDS * u[:-1], PUSH_SECONDS + rays.times(bundle.index, bundle.fraction)])
+
+    tracked = track(robot, path, below, reference=follower.undisturbed(ground).reference)
+    joints = tracked.q
+    if arm is not None:
+        joints = arm.transform.inverse(follower.whole_arm.limits.inside(joints))
+        path = robot.end_effector(joints)
+    motion = ArmMotion(within_velocity_limits(times, joints, robot.velocity_limits), joints, tracked.q)
+
+    lowest = min(TABLE_ROOM, float(stack.bundle.positions[:, 2].min())) - LOWER
+    room = min(float(path[:, 2].min()) - lowest, MAX_TRACKING_ERROR - float(tracked.error.max()))
+    if arm is not None:
+        room = min(room, float(follower.whole_arm.clearance(joints, scenario.obstacle).min()))
+    else:
+        avoiding = path if scenario.avoidance else aside
+        room = min(room, float(scenario.obstacle.signed_distance(avoiding).min()))
+    return Pushed(scenario, motion, path, NUM_PUSH_SAMPLES - 1), room

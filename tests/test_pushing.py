@@ -1,0 +1,175 @@
+"""The hand is pushed aside in the middle of its motion: what the arm does then."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.engine import ArmMotion, Stage
+from dt_viz.pushing import DISTANCES, MAX_TRACKING_ERROR, PUSH_SECONDS
+from dt_viz.retiming import used_fraction
+from dt_viz.solving import FINE, solve
+from dt_viz.ui import playback as playback_module
+from dt_viz.ui.playback import Playback
+
+MOMENTS = (0.1, 0.5, 0.9)
+"""Of the motion, between 0 and 1."""
+
+
+@pytest.fixture(params=["draw_s", "push_box"], name="task")
+def _task(request):
+    return request.param
+
+
+def shown(engine, scenario):
+    return next(frame for frame in engine.frames(scenario) if frame.stage is Stage.FINE)
+
+
+def pushes(engine, scenario):
+    """The frame, and joints before and what is done after a push at some moments."""
+    frame, rng = shown(engine, scenario), np.random.default_rng(3)
+    for moment in MOMENTS:
+        q = frame.arm.q[int(moment * len(frame.arm.q))]
+        yield frame, q, engine.pushed(scenario, q, rng)
+
+
+def test_the_hand_is_pushed_aside_and_still_reaches_the_goal(engine, initial, robot, task):
+    for frame, q, pushed in pushes(engine, initial(task)):
+        hand, motion = robot.end_effector(q), pushed.motion
+        np.testing.assert_allclose(pushed.path[0], hand, atol=1e-9)
+        np.testing.assert_allclose(robot.end_effector(motion.q), pushed.path, atol=MAX_TRACKING_ERROR)
+        np.testing.assert_allclose(motion.q[0], q, atol=5e-3)
+        assert any(
+            np.linalg.norm(pushed.path[pushed.begins] - hand) == pytest.approx(distance) for distance in DISTANCES
+        )
+        np.testing.assert_allclose(pushed.path[-1], frame.goal, atol=1e-4)
+        assert np.linalg.norm(robot.end_effector(motion.q[-1]) - frame.goal) < 1e-3
+        assert motion.times[pushed.begins] >= PUSH_SECONDS and (np.diff(motion.times) > 0).all()
+
+
+def test_after_the_push_it_is_a_motion_of_the_system(engine, initial, task):
+    scenario = initial(task)
+    system = solve(engine._ground(scenario, None), scenario, FINE).system
+    for _, _, pushed in pushes(engine, scenario):
+        after = pushed.path[pushed.begins :]
+        assert (np.diff(system.lyapunov(after)) < 0).all()
+        z = system.transform.forward(after)
+        to_goal = system.base.goal - z[0]
+        aside = (z - z[0]) - np.outer((z - z[0]) @ to_goal, to_goal) / (to_goal @ to_goal)
+        assert np.abs(aside).max() < 1e-6  # a straight ray in base space
+
+
+@pytest.mark.parametrize("space", ["task", "cspace", "both"])
+def test_the_arm_keeps_its_limits_and_keeps_clear(engine, initial, robot, task, space):
+    for frame, q, pushed in pushes(engine, replace(initial(task), space=space)):
+        motion = pushed.motion
+        assert (motion.q >= robot.lower).all() and (motion.q <= robot.upper).all()
+        assert used_fraction(motion.times, motion.q, robot.velocity_limits) < 1 + 1e-6
+        np.testing.assert_allclose(motion.q[0], q, atol=5e-3)
+        assert np.abs(np.diff(motion.q, axis=0)).max() < 0.15
+        assert np.linalg.norm(robot.end_effector(motion.q[-1]) - frame.goal) < 1e-3
+        assert frame.scenario.obstacle.signed_distance(pushed.path).min() > 0
+        assert pushed.path[:, 2].min() > 0
+
+
+def test_directions_differ_and_come_from_the_generator(engine, initial):
+    first, again = (list(pushes(engine, initial("draw_s"))) for _ in range(2))
+    for (_, _, a), (_, _, b) in zip(first, again, strict=True):
+        np.testing.assert_allclose(a.path, b.path, rtol=0, atol=1e-9)
+    scenario, q = initial("draw_s"), first[0][1]
+    rng = np.random.default_rng(0)
+    one, other = (engine.pushed(scenario, q, rng) for _ in range(2))
+    assert np.linalg.norm(one.path[one.begins] - other.path[other.begins]) > 0.01
+
+
+def test_nothing_is_pushed_that_is_not_shown(new_engine, initial, robot):
+    engine, scenario, rng = new_engine(), initial("push_box"), np.random.default_rng(0)
+    assert engine.pushed(scenario, robot.home, rng) is None
+    shown(engine, scenario)
+    assert engine.pushed(replace(scenario, arm_rollout=1), robot.home, rng) is None
+    assert engine.pushed(replace(scenario, view=replace(scenario.view, field=False)), robot.home, rng) is not None
+
+
+# --- Playback ---
+
+
+class Recorder:
+    """Poses with the moments at which they were taken, and a way to wait for one."""
+
+    def __init__(self):
+        self.poses = []
+        self.posed = threading.Condition()
+
+    def __call__(self, q, _without):
+        with self.posed:
+            self.poses.append(q[0])
+            self.posed.notify_all()
+
+    def wait(self, wanted):
+        with self.posed:
+            assert self.posed.wait_for(lambda: bool(self.poses) and wanted(self.poses[-1]), 20.0)
+
+
+def ramp(begin, end, seconds):
+    q = np.linspace(begin, end, 50)[:, None] * np.eye(6)[:1]
+    return ArmMotion(np.linspace(0, seconds, 50), q, q)
+
+
+@pytest.fixture
+def player(monkeypatch):
+    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
+    monkeypatch.setattr(playback_module, "REST", 0.05)
+    monkeypatch.setattr(playback_module, "CATCH_UP", 0.1)
+    recorder = Recorder()
+    player = Playback(recorder)
+    yield player, recorder
+    player.close()
+
+
+def test_a_detour_is_followed_once_from_where_the_arm_is_and_then_the_loop_goes_on(player):
+    playback, recorder = player
+    ended = threading.Event()
+    assert playback.q is None
+    playback.follow(ramp(0.0, 1.0, 0.5))
+    recorder.wait(lambda place: place > 0.3)
+    before = len(recorder.poses)
+    playback.take_detour(ramp(3.0, 4.0, 0.5), ended.set)
+    recorder.wait(lambda place: place == 4.0)
+    first = next(place for place in recorder.poses[before:] if place > 1.0 or place < 0.3)
+    assert first < 3.0  # it does not jump there
+    assert ended.wait(20.0)
+    recorder.wait(lambda place: 0.5 < place < 1.0)
+    back = recorder.poses[max(k for k, place in enumerate(recorder.poses) if place == 4.0) + 1 :]
+    assert max(back) <= 1.0 and back[0] < 0.5  # the loop from its start
+    assert playback.q is not None
+
+
+def test_a_detour_ends_at_once_when_told_to_and_only_the_newest_one_says_so(player):
+    playback, recorder = player
+    ended = []
+    playback.follow(ramp(0.0, 1.0, 0.5))
+    recorder.wait(lambda place: place > 0)
+    playback.take_detour(ramp(3.0, 4.0, 30.0), lambda: ended.append("first"))
+    playback.take_detour(ramp(5.0, 6.0, 30.0), lambda: ended.append("second"))
+    recorder.wait(lambda place: place > 5.0)
+    playback.end_detour()
+    assert ended == ["second"]
+    recorder.wait(lambda place: place <= 1.0)
+    playback.end_detour()
+    assert ended == ["second"]
+
+
+def test_a_pause_holds_a_detour(player):
+    playback, recorder = player
+    playback.follow(ramp(0.0, 1.0, 0.5))
+    playback.take_detour(ramp(3.0, 4.0, 0.5), lambda: None)
+    recorder.wait(lambda place: place > 3.2)
+    playback.set_pace(False, 1.0)
+    time.sleep(0.1)
+    held = recorder.poses[-1]
+    time.sleep(0.2)
+    assert recorder.poses[-1] == held
+    playback.set_pace(True, 1.0)
+    recorder.wait(lambda place: place == 4.0)
