@@ -58,7 +58,7 @@ def test_the_picture_is_worked_out_only_while_it_is_shown(engine, initial):
     shown = replace(scenario, view=View(occupancy=True))
     assert not shown.computes_like(scenario)
     assert all(frame.pictures.occupancy is None for frame in engine.frames(scenario))
-    for frame in engine.frames(shown):
-        assert (frame.pictures.occupancy is not None) == (frame.stage >= Stage.LIVE)
-    outline = frame.pictures.occupancy.outline
+    frames = list(engine.frames(shown))
+    assert [frame.pictures.occupancy is not None for frame in frames] == [frame.stage >= Stage.LIVE for frame in frames]
+    outline = frames[-1].pictures.occupancy.outline
     assert np.abs(Several(scenario.obstacles).signed_distance(outline)).max() < 1e-3

@@ -16,6 +16,7 @@ from dt_viz.obstacles import Obstacle, Sphere
 from dt_viz.scenario import MAX_DIAMETER, Scenario
 from dt_viz.tasks import Slice
 from dt_viz.ui import palette
+from dt_viz.ui.links import simplified
 from dt_viz.ui.picture import Picture
 
 HANDLE_SCALE = 0.2
@@ -28,6 +29,10 @@ MIN_SLOPE = 0.2
 """Of the line of sight to the slice, below which the slice counts as seen on edge."""
 CREASE = 0.6
 """Angle between neighbouring faces above which their edge is drawn sharp, rad."""
+MAX_FACES = 30_000
+"""That are drawn in full."""
+FINEST = 0.035
+"""Size of what is left of a larger mesh, in radii."""
 
 Moved = Callable[[int, Array, Array, str], None]
 """Told which obstacle was moved, its position (3,), metres, and quaternion (4,), and the phase of the drag."""
@@ -195,6 +200,8 @@ def in_slice(area: Slice | None, camera: Array, grabbed: Sequence[float], pointe
 def shaded(obstacle: Obstacle) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Vertices (V, 3), metres, and faces (F, 3) of its surface, with vertices of their own along sharp edges."""
     mesh = trimesh.Trimesh(*obstacle.surface(), process=False)
+    if len(mesh.faces) > MAX_FACES:
+        mesh = simplified(mesh, FINEST * obstacle.radius)
     if not isinstance(obstacle, Sphere):
         mesh = trimesh.graph.smooth_shade(mesh, angle=CREASE)
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
