@@ -35,6 +35,7 @@ class FakeEngine:
         self.asked = []
         self.begun, self.gate = threading.Event(), None
         self.unlearned, self.learning = set(), threading.Event()
+        self.pushes, self.pushable = [], True
 
     def frames(self, scenario, progress=None, checkpoint=None):
         self.asked.append(scenario)
@@ -52,6 +53,10 @@ class FakeEngine:
             raise DemonstrationError("unlucky.csv", "file", "13", "another")
         for stage in Stage:
             yield Sketch(scenario, stage)
+
+    def pushed(self, scenario, q, rng):
+        self.pushes.append((scenario, q, rng.random(), threading.current_thread().name))
+        return ("pushed", scenario) if self.pushable else None
 
 
 class Page:
@@ -552,3 +557,60 @@ def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_wi
     session.edit("scene", obstacles=(), space="cspace", scene="somewhere")
     session.choose_task("draw_s")
     assert session.scenario == fresh("draw_s")
+
+
+# --- Pushing the hand ---
+
+
+def push(opened):
+    """Push; what was shown of it, and on which threads."""
+    shown = []
+    opened.session.push(np.arange(6.0), lambda pushed: shown.append((pushed, threading.current_thread().name)))
+    return shown
+
+
+def test_a_push_goes_through_the_worker_and_computes_no_frames(opened):
+    num_frames = len(opened.page.frames)
+    shown = push(opened)
+    opened.settle()
+    assert shown == [(("pushed", opened.session.scenario), "session")]
+    ((scenario, q, first, thread),) = opened.engine.pushes
+    assert (scenario, thread) == (opened.session.scenario, "session")
+    np.testing.assert_array_equal(q, np.arange(6.0))
+    assert len(opened.page.frames) == num_frames
+    push(opened)
+    opened.settle()
+    assert opened.engine.pushes[1][2] != first  # another direction
+    opened.session.undo()
+    opened.settle()
+    assert opened.session.scenario == fresh("draw_s")  # and none is an edit
+
+
+def test_a_push_interrupts_frames_and_they_are_completed_after_it(opened):
+    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
+    opened.session.edit("grid", view=View(grid=True))  # the same motion: a push is possible
+    assert opened.engine.begun.wait(PATIENCE)
+    shown = push(opened)
+    opened.engine.gate.set()
+    opened.settle()
+    assert len(shown) == 1
+    assert opened.shown.view.grid and opened.page.frames[-1].stage is max(Stage)
+
+
+def test_nothing_is_pushed_while_another_motion_is_computed_and_no_edit_is_lost(opened):
+    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    assert opened.engine.begun.wait(PATIENCE)
+    opened.session.edit("obstacle", obstacles=(at(2.0),))
+    shown = push(opened)
+    opened.engine.gate.set()
+    opened.settle()
+    assert shown == [] and opened.engine.pushes == []
+    assert opened.shown.obstacles[0] == at(2.0) and opened.page.frames[-1].stage is max(Stage)
+
+
+def test_a_motion_that_cannot_be_pushed_shows_nothing(opened):
+    opened.engine.pushable = False
+    shown = push(opened)
+    opened.settle()
+    assert shown == [] and opened.page.errors == []

@@ -14,7 +14,9 @@ import numpy as np
 
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.fields import Array
 from dt_viz.imitation import ImitationError
+from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
 from dt_viz.tasks import Task
 from dt_viz.ui.worker import LatestWorker
@@ -38,6 +40,18 @@ class Pace:
     """Live frames in the last second."""
     num_skipped: int
     """Edits that a newer one overtook, since the session began."""
+
+
+@dataclass(frozen=True)
+class _Push:
+    """What a push needs."""
+
+    q: Array
+    show: Callable[[Pushed], None]
+
+
+_Job = tuple[Scenario, float, _Push | None]
+"""What to compute, when it was asked for, and what to do before."""
 
 
 class _UnwantedError(Exception):
@@ -97,9 +111,11 @@ class Session:
         self._held = False
         self._learning = self._stopped = self._closed = False
         self._shown: Scenario | None = None
+        self._complete = False
+        self._rng = np.random.default_rng(0)
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
-        self._worker = LatestWorker[tuple[Scenario, float]](self._compute, display.fail, name="session")
+        self._worker = LatestWorker[_Job](self._compute, display.fail, name="session")
         display.adopt(self.scenario)
         self._submit()
 
@@ -183,6 +199,17 @@ class Session:
         self.edit(gesture, **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "view"})
         self.end_gesture()
 
+    def push(self, q: Array, show: Callable[[Pushed], None]) -> None:
+        """Push the hand aside. Nothing is done while another motion than the scenario's is shown.
+
+        Args:
+            q: (6,) joint angles when the push begins, rad.
+            show: given what the arm does then. Called on the worker thread.
+        """
+        with self._lock:
+            if self._shown is not None and self.scenario.moves_like(self._shown):
+                self._submit(_Push(q, show))
+
     def undo(self) -> None:
         """Take the last gesture back."""
         self._travel(self._past, self._future)
@@ -245,11 +272,11 @@ class Session:
         self._submit()
         return True
 
-    def _submit(self) -> None:
+    def _submit(self, push: _Push | None = None) -> None:
         self._stopped = False
-        self._worker.submit((self.scenario, time.perf_counter()))
+        self._worker.submit((self.scenario, time.perf_counter(), push))
 
-    def _compute(self, job: tuple[Scenario, float], superseded: Callable[[], bool]) -> None:
+    def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:
         try:
             self._show_frames(job, superseded)
         except _UnwantedError:
@@ -271,14 +298,26 @@ class Session:
             self._learning = True
         self._display.learning(fraction, message)
 
-    def _show_frames(self, job: tuple[Scenario, float], superseded: Callable[[], bool]) -> None:
-        scenario, edited = job
+    def _pushed(self, scenario: Scenario, push: _Push) -> bool:
+        """Show the push; whether the frames of the scenario, which it may have interrupted, are complete."""
+        pushed = self._engine.pushed(scenario, push.q, self._rng)
+        if pushed is not None:
+            push.show(pushed)
+        return self._complete and self._shown is not None and scenario.computes_like(self._shown)
+
+    def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
+        scenario, edited, push = job
+        if push is not None:
+            if self._pushed(scenario, push):
+                return
+            edited = time.perf_counter()
         wanted = partial(_end_if, superseded)
         for frame in self._engine.frames(scenario, partial(self._learn, scenario), wanted):
             now = time.perf_counter()
             if self._learning:
                 edited = now - frame.seconds  # learning is no rebuild
             self._learning, self._shown = False, scenario
+            self._complete = frame.stage is Stage.CERTIFIED
             if frame.stage <= Stage.LIVE:
                 self._latency = now - edited
             if frame.stage is Stage.LIVE:
