@@ -21,9 +21,9 @@ REACH = 1.2
 points that lie at random on a surface then leave no hole."""
 FEWEST_CELLS = 1.2
 """The same at least, in cells of the grid: what is thinner would be full of holes."""
-KERNELS_ACROSS = 6
+KERNELS_ACROSS = 5
 """Kernel widths along the largest side of what is labelled as occupied."""
-NUM_SAMPLES = 2500
+NUM_SAMPLES = 2000
 """Labelled points that the map is learned from, at most."""
 REGULARISATION = 0.1
 

@@ -1,0 +1,283 @@
+"""Meshes and clouds from files: what is read, what is mended, and what is refused, with the reason."""
+
+import io
+import json
+import struct
+import time
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dt_viz.obstacles import CloudObstacle, MeshObstacle
+from dt_viz.shapes import MAX_BYTES, MAX_FACES, ShapeError, load_cloud, load_mesh, read_cloud, read_mesh
+
+FORMATS = ("stl", "obj", "ply", "glb")
+BOX = trimesh.creation.box((0.15, 0.1, 0.05))
+POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (1000, 3))
+LABELS: np.ndarray = np.asarray(np.abs(POINTS).max(axis=1) < 0.06)
+
+
+def exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
+    content = mesh.export(file_type=kind)
+    assert content is not None
+    return content.encode() if isinstance(content, str) else bytes(content)  # pyright: ignore[reportArgumentType]
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+    return file.getvalue()
+
+
+def table(points: np.ndarray, labels: np.ndarray | None = None) -> bytes:
+    rows = points if labels is None else np.column_stack([points, labels])
+    header = "x,y,z" if labels is None else "x,y,z,occupied"
+    return "\n".join([header, *(",".join(f"{value:.6g}" for value in row) for row in rows)]).encode()
+
+
+def labelled_ply(points: np.ndarray, labels: np.ndarray, name: str = "occupied") -> bytes:
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    lines += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {name}", "end_header"]
+    return "\n".join(lines + [f"{x} {y} {z} {int(o)}" for (x, y, z), o in zip(points, labels, strict=True)]).encode()
+
+
+def refusal(read, content: bytes, name: str, **options) -> str:
+    with pytest.raises(ShapeError) as info:
+        read(content, name, **options)
+    assert str(info.value).startswith(f"{name}: ")
+    assert "; accepted: " in str(info.value)
+    return str(info.value)
+
+
+class TestMeshes:
+    @pytest.mark.parametrize("kind", FORMATS)
+    def test_every_format_gives_the_same_solid(self, kind):
+        loaded = read_mesh(exported(BOX, kind), f"crate.{kind.upper()}")
+        assert loaded.name == "crate"
+        assert loaded.notes == ()
+        np.testing.assert_allclose(np.ptp(loaded.solid.vertices, axis=0), (0.15, 0.1, 0.05), atol=1e-6)
+        np.testing.assert_allclose(loaded.solid.bounds.mean(axis=0), 0, atol=1e-6)
+        obstacle = MeshObstacle((0.3, 0.0, 0.0), loaded.solid)
+        np.testing.assert_allclose(obstacle.signed_distance(np.array([0.3, 0.0, 0.2])), 0.175, atol=2e-3)
+
+    def test_from_a_path(self, tmp_path):
+        (tmp_path / "a.stl").write_bytes(exported(BOX, "stl"))
+        assert load_mesh(tmp_path / "a.stl").solid == read_mesh(exported(BOX, "stl"), "a.stl").solid
+        with pytest.raises(ShapeError, match="no such file"):
+            load_mesh(tmp_path / "b.stl")
+
+    def test_text_stl(self):
+        assert len(read_mesh(exported(BOX, "stl_ascii"), "a.stl").solid.faces) == 12
+
+    def test_parts_of_a_scene_are_placed(self):
+        scene = trimesh.Scene()
+        for x in (-0.1, 0.1):
+            scene.add_geometry(
+                trimesh.creation.icosphere(2, 0.05), transform=trimesh.transformations.translation_matrix([x, 0, 0])
+            )
+        content = scene.export(file_type="glb")
+        assert isinstance(content, bytes)
+        np.testing.assert_allclose(np.ptp(read_mesh(content, "a.glb").solid.vertices, axis=0).max(), 0.3, atol=1e-3)
+
+    def test_millimetres_are_guessed_and_accepted_with_a_scale(self):
+        content = exported(trimesh.creation.box((150, 100, 50)), "stl")
+        message = refusal(read_mesh, content, "big.stl")
+        assert "150 × 100 × 50 m; is the file in millimetres? then give scale=0.001" in message
+        solid = read_mesh(content, "big.stl", scale=1e-3).solid
+        np.testing.assert_allclose(np.ptp(solid.vertices, axis=0), (0.15, 0.1, 0.05), atol=1e-9)
+
+    def test_too_small(self):
+        assert "0.0015 × 0.001 × 0.0005 m" in refusal(
+            read_mesh, exported(trimesh.creation.box((0.0015, 0.001, 0.0005)), "stl"), "a.stl"
+        )
+
+    def test_a_small_hole_is_filled_and_said(self):
+        ball = trimesh.creation.icosphere(3, 0.07)
+        holed = trimesh.Trimesh(ball.vertices, ball.faces[1:], process=False)
+        loaded = read_mesh(exported(holed, "ply"), "a.ply")
+        assert loaded.notes == ("holes were filled with 1 triangles",)
+        np.testing.assert_allclose(
+            trimesh.Trimesh(loaded.solid.vertices, loaded.solid.faces).volume, ball.volume, rtol=1e-3
+        )
+
+    def test_open_seams_are_closed_and_said(self):
+        loose = BOX.triangles.reshape(-1, 3) + np.random.default_rng(0).normal(scale=1e-8, size=(36, 3))
+        loaded = read_mesh(
+            exported(trimesh.Trimesh(loose, np.arange(36).reshape(-1, 3), process=False), "ply"), "a.ply"
+        )
+        assert loaded.notes in ((), ("open seams were closed",))
+        assert len(loaded.solid.vertices) == 8
+
+    def test_an_inside_out_mesh_is_turned(self):
+        turned = BOX.copy()
+        turned.invert()
+        solid = read_mesh(exported(turned, "ply"), "a.ply").solid
+        assert trimesh.Trimesh(solid.vertices, solid.faces).volume > 0
+
+    def test_an_open_mesh_is_refused(self):
+        ball = trimesh.creation.icosphere(3, 0.07)
+        half = ball.slice_plane([0, 0, 0], [0, 0, 1])
+        several = trimesh.Trimesh(half.vertices, half.faces[::2], process=False)
+        assert "edges that do not join two triangles" in refusal(read_mesh, exported(several, "ply"), "open.ply")
+
+    def test_a_flat_mesh_is_refused(self):
+        flat = trimesh.creation.box((0.1, 0.1, 1e-9))
+        message = refusal(read_mesh, exported(flat, "ply"), "flat.ply")
+        assert "volume" in message or "thickness" in message or "edges" in message
+
+    def test_a_thin_wall_is_said(self):
+        wall, post = trimesh.creation.box((0.3, 0.3, 0.004)), trimesh.creation.box((0.05, 0.05, 0.1))
+        post.apply_translation([0.2, 0.0, 0.0])
+        corners = np.concatenate([wall.vertices, post.vertices])
+        both = trimesh.Trimesh(corners, np.concatenate([wall.faces, post.faces + 8]), process=False)
+        assert "thinner than about" in read_mesh(exported(both, "ply"), "a.ply").notes[0]
+
+    def test_too_many_faces_and_too_large_files(self):
+        assert "20" in refusal(read_mesh, b"x" * (MAX_BYTES + 1), "a.obj")
+        header = bytes(80) + struct.pack("<I", MAX_FACES + 1)
+        assert f"faces: found {MAX_FACES + 1}" in refusal(read_mesh, header, "a.stl")
+
+    def test_not_a_number(self):
+        content = exported(BOX, "stl")
+        bad = content[:96] + struct.pack("<f", np.nan) + content[100:]
+        assert "nan in vertex" in refusal(read_mesh, bad, "a.stl")
+
+    @pytest.mark.parametrize("name", ["a.step", "mesh", "a.npz"])
+    def test_other_files(self, name):
+        assert ".stl, .obj, .ply, .glb" in refusal(read_mesh, b"x", name)
+
+    @pytest.mark.parametrize("kind", FORMATS)
+    def test_empty(self, kind):
+        assert "an empty file" in refusal(read_mesh, b"", f"a.{kind}")
+        refusal(read_mesh, b"\n", f"a.{kind}")
+
+    def test_a_scale_that_is_none(self):
+        assert "scale" in refusal(read_mesh, exported(BOX, "stl"), "a.stl", scale=0.0)
+
+    def test_a_cloud_is_no_mesh(self):
+        assert "cloud" in refusal(read_mesh, exported(trimesh.PointCloud(POINTS), "ply"), "a.ply")  # pyright: ignore[reportArgumentType]
+
+    @pytest.mark.parametrize("kind", FORMATS)
+    @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+    def test_truncated_files_are_refused(self, kind, share):
+        content = exported(trimesh.creation.icosphere(2, 0.07), kind)
+        refusal(read_mesh, content[: int(share * len(content))], f"a.{kind}")
+
+    def test_huge_counts_make_no_room(self):
+        ply = b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n"
+        assert "999999999999" in refusal(read_mesh, ply, "a.ply")
+        many = b"ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nelement face 400000\nend_header\n"
+        assert "8 vertex, 400000 face" in refusal(read_mesh, many, "a.ply")
+        text = json.dumps(
+            {"asset": {"version": "2.0"}, "accessors": [{"count": 10**12, "componentType": 5126, "type": "VEC3"}]}
+        )
+        body = text.encode().ljust((len(text) + 3) // 4 * 4)
+        glb = b"glTF" + struct.pack("<III", 2, 20 + len(body), len(body)) + b"JSON" + body
+        assert "no bufferView" in refusal(read_mesh, glb, "a.glb")
+
+    @settings(max_examples=25)
+    @given(kind=st.sampled_from(FORMATS), seed=st.integers(0, 2**32 - 1))
+    def test_corrupt_files_are_read_or_refused(self, kind, seed):
+        rng = np.random.default_rng(seed)
+        content = bytearray(exported(BOX, kind))
+        for place in rng.integers(0, len(content), rng.integers(1, 8)):
+            content[place] = rng.integers(256)
+        try:
+            assert read_mesh(bytes(content), f"a.{kind}").solid.distances.depth > 0
+        except ShapeError as error:
+            assert str(error).startswith(f"a.{kind}: ")
+
+    def test_many_faces_are_ready_soon(self):
+        content = exported(trimesh.creation.icosphere(6, 0.07), "stl")
+        start = time.perf_counter()
+        loaded = read_mesh(content, "fine.stl")
+        MeshObstacle((0.0, 0.0, 0.0), loaded.solid).field("free-space", 3.0)
+        assert len(loaded.solid.faces) == 81_920
+        assert time.perf_counter() - start < 20  # a tenth of it on a machine at rest
+
+
+class TestClouds:
+    @pytest.mark.parametrize(
+        ("content", "name"),
+        [
+            (npz(points=POINTS, labels=LABELS), "a.npz"),
+            (table(POINTS, LABELS), "a.csv"),
+            (labelled_ply(POINTS, LABELS), "a.ply"),
+            (labelled_ply(POINTS, LABELS, "label"), "a.ply"),
+        ],
+    )
+    def test_labelled_points(self, content, name):
+        loaded = read_cloud(content, name)
+        assert loaded.cloud.labels is not None
+        np.testing.assert_array_equal(loaded.cloud.labels, LABELS)
+        sizes = np.ptp(loaded.cloud.solid.vertices, axis=0)
+        np.testing.assert_allclose(sizes, 0.12, atol=0.02)
+
+    @pytest.mark.parametrize(
+        ("content", "name"),
+        [
+            (npz(points=POINTS[LABELS]), "a.npz"),
+            (table(POINTS[LABELS]), "a.csv"),
+            (exported(trimesh.PointCloud(POINTS[LABELS]), "ply"), "a.ply"),  # pyright: ignore[reportArgumentType]
+        ],
+    )
+    def test_points_without_labels(self, content, name):
+        loaded = read_cloud(content, name)
+        assert loaded.cloud.labels is None
+        obstacle = CloudObstacle((0.0, 0.0, 0.0), loaded.cloud)
+        assert obstacle.signed_distance(np.zeros(3)) < -0.03
+        assert obstacle.signed_distance(np.array([0.15, 0.0, 0.0])) > 0.05
+
+    def test_from_a_path(self, tmp_path):
+        (tmp_path / "a.csv").write_bytes(table(POINTS, LABELS))
+        assert load_cloud(tmp_path / "a.csv").cloud == read_cloud(table(POINTS, LABELS), "a.csv").cloud
+
+    def test_millimetres(self):
+        content = npz(points=1e3 * POINTS, labels=LABELS)
+        assert "scale=0.001" in refusal(read_cloud, content, "a.npz")
+        read_cloud(content, "a.npz", scale=1e-3)
+
+    @pytest.mark.parametrize(
+        ("content", "name", "words"),
+        [
+            (npz(points=POINTS[:40]), "a.npz", "points: found 40; accepted: at least 50"),
+            (npz(points=POINTS, labels=np.ones(1000)), "a.npz", "all 1000 points occupied"),
+            (npz(points=POINTS, labels=np.zeros(1000)), "a.npz", "all 1000 points free"),
+            (npz(points=POINTS, labels=np.multiply(3, LABELS)), "a.npz", "labels: found 3 for point"),
+            (npz(points=POINTS, labels=LABELS[:10]), "a.npz", "shape (10,)"),
+            (npz(points=POINTS[:, :2]), "a.npz", "shape (1000, 2)"),
+            (npz(other=POINTS), "a.npz", "arrays: found other"),
+            (
+                npz(points=np.where(np.equal(np.arange(3000).reshape(-1, 3), 7), np.nan, POINTS)),
+                "a.npz",
+                "nan in point 3",
+            ),
+            (npz(points=np.array([None] * 60)), "a.npz", "pickled"),
+            (b"PK not a zip", "a.npz", "an npz archive"),
+            (npz(points=np.zeros((2_000_000, 3))), "a.npz", "when unpacked"),
+            (b"a,b,c\n1,2,3\n", "a.csv", "'a,b,c'"),
+            (b"x,y,z\n1,2\n", "a.csv", "line 2: found 2 columns"),
+            (b"x,y,z\n1,2,one\n", "a.csv", "line 2: found '1,2,one'"),
+            (b"x,y,z\n", "a.csv", "points: found 0"),
+            (b"\xff\xfe", "a.csv", "UTF-8"),
+            (b"", "a.csv", "an empty file"),
+            (b"ply\n", "a.ply", "end_header"),
+            (b"x", "a.xyz", ".ply, .npz, .csv"),
+        ],
+    )
+    def test_bad_input_is_named(self, content, name, words):
+        assert words in refusal(read_cloud, content, name)
+
+    @pytest.mark.parametrize("share", [0.2, 0.6, 0.97])
+    def test_truncated_files_are_refused(self, share):
+        for name, content in (("a.npz", npz(points=POINTS)), ("a.ply", exported(trimesh.PointCloud(POINTS), "ply"))):  # pyright: ignore[reportArgumentType]
+            refusal(read_cloud, content[: int(share * len(content))], name)
+
+    def test_of_very_many_points_some_are_used(self):
+        points = np.random.default_rng(0).uniform(-0.1, 0.1, (150_000, 3)).astype(np.float32)
+        loaded = read_cloud(npz(points=points), "a.npz")
+        assert len(loaded.cloud.points) == 100_000
+        assert "100000 of its 150000 points" in loaded.notes[0]
