@@ -6,13 +6,15 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import trimesh
 import viser  # noqa: TID251 - a scene of its own
 
 from dt_viz.belief import occupancy_picture
 from dt_viz.collision import NOTHING, CollisionReport, Nearest
-from dt_viz.obstacles import Box, Cylinder, Sphere, rotation
+from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, rotation
 from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
 from dt_viz.several import Several
+from dt_viz.solids import Solid
 from dt_viz.tasks import TASKS
 from dt_viz.ui.obstacle_panel import SHAPES, ObstaclePanel, name_of, with_room
 from dt_viz.ui.obstacles import Obstacles, in_slice, shaded
@@ -125,10 +127,11 @@ def opened(server):
     def bind(handle, read, change):
         controls.setdefault(handle.label, []).append(SimpleNamespace(handle=handle, read=read, change=change))
 
-    panel = ObstaclePanel(server.gui, bind)
+    said = []
+    panel = ObstaclePanel(server.gui, bind, lambda text, wrong: said.append((text, wrong)))
     session: Any = FakeSession(scenario(BALL), panel)
     panel.connect(session)
-    yield SimpleNamespace(panel=panel, session=session, controls=controls)
+    yield SimpleNamespace(panel=panel, session=session, controls=controls, said=said)
     server.gui.reset()
 
 
@@ -191,6 +194,36 @@ def test_the_sizes_are_those_of_the_selected_obstacle(opened, selected, label, e
     assert control.read(changed) == 20.0
     hidden = [c for controls in opened.controls.values() for c in controls if not c.handle.visible]
     assert hidden and all(c.change(changed, 7.0) == {} for c in hidden)
+
+
+def test_a_file_that_is_uploaded_becomes_an_obstacle_and_a_bad_one_is_refused_with_the_reason(opened):
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=40.0)  # millimetres
+    cloud = trimesh.PointCloud(ball.vertices)
+    files = {
+        "ball.stl": (ball.export(file_type="stl"), MeshObstacle, "2: mesh"),
+        "ball.ply": (ball.export(file_type="ply"), MeshObstacle, "3: mesh"),
+        "cloud.ply": (cloud.export(file_type="ply"), CloudObstacle, "4: cloud"),
+    }
+    for name, (content, shape, label) in files.items():
+        opened.panel.load(content, name, 0.001)
+        *_, added = opened.session.scenario.obstacles
+        assert isinstance(added, shape) and added.radius == pytest.approx(0.04, abs=0.01)
+        assert f"{opened.session.scenario.selected + 1}: {name_of(added)}" == label
+    before = opened.session.scenario
+    broken = trimesh.Trimesh(ball.vertices, ball.faces[:-200]).export(file_type="stl")
+    for content, name, scale in ((broken, "open.stl", 0.001), (b"", "empty.obj", 1.0), (b"?", "what.txt", 1.0)):
+        opened.said.clear()
+        opened.panel.load(content, name, scale)
+        ((text, wrong),) = opened.said
+        assert wrong and text.startswith(f"{name}: ") and "accepted: " in text
+    assert opened.session.scenario == before
+
+
+def test_large_meshes_are_drawn_with_fewer_triangles():
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.1)
+    vertices, faces = shaded(MeshObstacle((0.0, 0.0, 0.0), Solid(ball.vertices, ball.faces)))
+    assert len(faces) < len(ball.faces) / 2
+    assert np.abs(np.linalg.norm(vertices, axis=1) - 0.1).max() < 0.004
 
 
 def test_obstacles_are_called_by_number_and_shape():

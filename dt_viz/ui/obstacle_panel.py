@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import viser
 
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.obstacles import Box, Cylinder, Obstacle, Point, Sphere
+from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
 from dt_viz.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.several import Several
+from dt_viz.shapes import CLOUD_SUFFIXES, MESH_SUFFIXES, ShapeError, read_cloud, read_mesh
 from dt_viz.tasks import Task
 from dt_viz.ui.session import Session
 
@@ -28,6 +31,9 @@ ASIDE = 0.4
 """Of its inner radius, by which a new obstacle stands beside the motion: dead ahead no side is the shorter one."""
 MIN_SIZE, MAX_SIZE = 0.03, 0.40
 """Of a box along one axis, and of a cylinder's height, metres."""
+UNITS: Mapping[str, float] = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
+"""Of files, in metres."""
+FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
 NONE: str = "none"
 
 Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Any]
@@ -37,10 +43,15 @@ Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[
 class ObstaclePanel:
     """The folder "Obstacles" of one visitor's panel."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Bind) -> None:
-        """Build the controls; they act once `connect` has given them a session."""
-        self._gui = gui
-        self._bind = bind
+    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str, bool], None]) -> None:
+        """Build the controls; they act once `connect` has given them a session.
+
+        Args:
+            gui: of the visitor.
+            bind: ties a control to the scenario.
+            say: shows a text for a while, and whether it is about an error.
+        """
+        self._bind, self._say = bind, say
         self._session: Session | None = None
         self._sizes: list[tuple[Any, type[Obstacle]]] = []
         with gui.add_folder("Obstacles"):
@@ -59,6 +70,19 @@ class ObstaclePanel:
                 lambda s: round(100 * s.margin, 3),
                 lambda _s, value: {"margin": value / 100},
             )
+            with gui.add_folder("From a file", expand_by_default=False):
+                unit = gui.add_dropdown("File is in", tuple(UNITS))
+                self._upload = gui.add_upload_button(
+                    "Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=f"{FORMATS}; a mesh must be closed"
+                )
+
+        @self._upload.on_upload
+        def _(_event: viser.GuiEvent) -> None:  # in a thread: reading takes a while
+            self._upload.disabled = True
+            try:
+                self.load(self._upload.value.content, self._upload.value.name, UNITS[unit.value])
+            finally:
+                self._upload.disabled = False
 
         @self._choice.on_update
         async def _(event: viser.GuiEvent) -> None:
@@ -92,6 +116,7 @@ class ObstaclePanel:
                 handle.visible = isinstance(chosen, shape)
         for group, useful in (
             (self._add, len(scenario.obstacles) < MAX_OBSTACLES),
+            (self._upload, len(scenario.obstacles) < MAX_OBSTACLES),
             (self._change, chosen is not None),
         ):
             if group.visible != useful:  # groups of buttons cannot be disabled
@@ -105,6 +130,17 @@ class ObstaclePanel:
         before = session.scenario.obstacles
         added = with_room(obstacle, before, session.task)
         self._replace((*before, added), selected=len(before))
+
+    def load(self, content: bytes, name: str, scale: float) -> None:
+        """Add what a file holds, or say why that cannot be; see `from_file`."""
+        try:
+            obstacle, notes = from_file(content, name, scale)
+        except ShapeError as error:
+            self._say(str(error), True)
+            return
+        self.add(obstacle)
+        if notes:
+            self._say(f"{name}: {'; '.join(notes)}", False)
 
     def duplicate(self) -> None:
         """Add another one like the selected obstacle."""
@@ -162,6 +198,31 @@ def name_of(obstacle: Obstacle) -> str:
     if isinstance(obstacle, Box) and len(set(obstacle.sizes)) == 1:
         return "cube"
     return type(obstacle).__name__.removesuffix("Obstacle").lower()
+
+
+def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[str, ...]]:
+    """The obstacle that a file holds, around the origin, and what is to be said about it.
+
+    Args:
+        content: all bytes of the file.
+        name: of the file; its suffix says what it is. A PLY without faces is a point cloud.
+        scale: metres for one unit of the file.
+
+    Raises:
+        ShapeError: the file cannot be used.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix not in (*MESH_SUFFIXES, *CLOUD_SUFFIXES):
+        raise ShapeError(name, "suffix", repr(suffix) if suffix else "no suffix", FORMATS)
+    if suffix == ".ply":
+        is_cloud = re.search(rb"element\s+face\s+0*[1-9]", content.partition(b"end_header")[0]) is None
+    else:
+        is_cloud = suffix in CLOUD_SUFFIXES
+    if is_cloud:
+        loaded = read_cloud(content, name, scale=scale)
+        return CloudObstacle(ORIGIN, loaded.cloud), loaded.notes
+    loaded = read_mesh(content, name, scale=scale)
+    return MeshObstacle(ORIGIN, loaded.solid), loaded.notes
 
 
 def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obstacle:

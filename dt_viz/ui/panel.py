@@ -107,7 +107,9 @@ class Panel:
                 self._session.cancel()
 
         self._build_task()
-        self._obstacles = ObstaclePanel(gui, self._bind)
+        self._obstacles = ObstaclePanel(
+            gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
+        )
         self._biases = BiasPanel(gui, self._bind)
         self._stack = StackPanel(gui)
         self._build_stack()
