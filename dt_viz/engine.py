@@ -23,6 +23,7 @@ from dt_viz.health import Health, certified, certified_arm
 from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.pictures import NO_PICTURES, Pictures
+from dt_viz.profiles import Profiles, body_profile, hand_profile
 from dt_viz.pushing import Pushed, pushed
 from dt_viz.retiming import within_velocity_limits
 from dt_viz.robot import Robot
@@ -94,6 +95,8 @@ class Frame:
     """None before stage LIVE, and where the arm cannot reach the start."""
     pictures: Pictures = NO_PICTURES
     """Of ψ itself, as far as the view shows them; empty before stage LIVE."""
+    profiles: Profiles | None = None
+    """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
     seconds: float = 0.0
     """From the start of the rebuild until this frame."""
 
@@ -220,6 +223,8 @@ class Engine:
             frame = self._with_field_and_arm(self._frame(ground, scenario, fine), ground, fine)
         with _turn:
             frame = replace(frame, stage=Stage.FINE, pictures=_pictures(ground, scenario, fine.stack, coarse=False))
+            if scenario.view.health_plots:
+                frame = replace(frame, profiles=self._profiles(frame, ground, fine))
             self._good[scenario.task], self._shown = frame, (scenario, ground, fine)
         yield frame
         with _turn:
@@ -329,6 +334,26 @@ class Engine:
             doubts = self._follower.doubts(joints, chosen)
         without = undisturbed.at(np.full(len(fraction), chosen), fraction)
         return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), doubts
+
+    def _profiles(self, frame: Frame, ground: Ground, solved: _Solved) -> Profiles:
+        """Of the rollout that the arm follows, with and without behaviours."""
+        chosen, obstacle, arm = frame.scenario.arm_rollout % len(frame.rollouts), frame.scenario.obstacle, solved.arm
+        path, undisturbed = frame.rollouts[chosen], ground.bundle.paths[chosen]
+        demonstration, system = ground.task.paths[chosen], solved.stack.system
+        if arm is None:
+            return Profiles(
+                hand_profile(path, demonstration, system, obstacle),
+                hand_profile(undisturbed, demonstration, ground.system, obstacle),
+            )
+        p, rows = arm.p[arm.index == chosen], ground.bundle.index == chosen
+        below = self._robot.end_effector(arm.transform.forward(p))
+        q = self._follower.undisturbed(ground).at(ground.bundle.index[rows], ground.bundle.fraction[rows])
+        clearance = self._follower.whole_arm.clearance
+        return Profiles(
+            body_profile(path, demonstration, system.lyapunov(below), clearance(p, obstacle)),
+            body_profile(undisturbed, demonstration, ground.system.lyapunov(undisturbed), clearance(q, obstacle)),
+            of_body=True,
+        )
 
     def _any_arm(self, frame: Frame) -> Array:
         return self._robot.home[None] if frame.arm is None else frame.arm.q

@@ -112,6 +112,23 @@ def rms_at_equal_times(
     return float(np.sqrt((error**2).sum(axis=1).mean()))
 
 
+def distance_from_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """Return how far points are from a polyline, also between its points.
+
+    Args:
+        points: shape ``(N, d)``.
+        path: shape ``(T, d)``, T at least 2; successive points may coincide.
+
+    Returns:
+        Shape ``(N,)``.
+    """
+    step = np.diff(path, axis=0)
+    from_start = points[:, None] - path[:-1]
+    squared = np.maximum((step**2).sum(axis=1), np.finfo(float).tiny)
+    share = ((from_start * step).sum(axis=2) / squared).clip(0, 1)
+    return np.linalg.norm(from_start - share[..., None] * step, axis=2).min(axis=1)
+
+
 def maximum_collision_distance(
     points: np.ndarray, signed_distance: Callable[[np.ndarray], np.ndarray], tolerance: float = 1e-5
 ) -> float:

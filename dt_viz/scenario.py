@@ -30,7 +30,7 @@ MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
 MAX_MANUAL_DURATION = 2.0
 
 
-COMPUTED_VIEWS = ("generator", "grid", "base", "occupancy")
+COMPUTED_VIEWS = ("generator", "grid", "base", "occupancy", "health_plots")
 """Fields of `View` whose pictures are computed only while they are shown."""
 
 
@@ -53,6 +53,8 @@ class View:
     """The spheres that cover the arm, and how far avoidance has moved each."""
     joint_plots: bool = False
     """Joint angles and speeds over time, with their limits."""
+    health_plots: bool = False
+    """Lyapunov value, distance to the demonstration and clearance along the rollout that the arm follows."""
     table: bool = True
     selected: int = 0
     """The obstacle that has handles; the last one if there are fewer."""

@@ -28,6 +28,7 @@ from dt_viz.scenario import (
 from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.export import RESOLUTIONS
+from dt_viz.ui.health_plots import HealthPlots
 from dt_viz.ui.obstacle_panel import ObstaclePanel
 from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.push import PushButton
@@ -44,6 +45,7 @@ VIEW_LABELS: Mapping[str, str] = {
     "onion": "Arms along the motion",
     "body_points": "Body points",
     "joint_plots": "Joint plots",
+    "health_plots": "Health plots",
     "table": "Table",
     "grid": "Warped grid ψ⁻¹(grid)",
     "base": "Base attractor beside it",
@@ -56,6 +58,7 @@ VIEW_HINTS: Mapping[str, str] = {
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
     "joint_plots": "angles and speeds over time, with their limits",
+    "health_plots": "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
 }
 SPACE_LABELS: Mapping[str, str] = {"task": "End effector", "cspace": "Whole arm", "both": "Both"}
 assert set(SPACE_LABELS) == set(SPACES)
@@ -116,6 +119,7 @@ class Panel:
         self._build_arm()
         self._build_view()
         self.joints = JointPlots(gui, robot)
+        self.health = HealthPlots(gui)
         self._build_export(save_png)
 
     def connect(self, session: Session) -> None:
@@ -139,6 +143,7 @@ class Panel:
         self._duration.disabled = scenario.duration is None
         self._flow.visible = scenario.view.generator
         self.joints.visible = scenario.view.joint_plots
+        self.health.visible = scenario.view.health_plots
         self._play.label = "Pause" if scenario.view.playing else "Play"
 
     def report(self, frame: Frame, pace: Pace) -> None:
@@ -154,6 +159,7 @@ class Panel:
         self._biases.report(frame)
         self._stack.report(frame)
         self.joints.draw(frame.arm)
+        self.health.draw(frame.profiles)
         self.push.report(frame)
         _set_max(self._rollout, len(frame.rollouts))
         if frame.pictures.generator is not None:

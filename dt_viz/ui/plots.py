@@ -22,7 +22,7 @@ MAX_SPEED = 200
 """Percent of a joint's limit that the plot shows at most: a joint that leaps would press all others to the ground."""
 HEIGHT = 170
 """Of a plot, pixels."""
-_SMALL = "font-size:0.75em;line-height:1.3;padding:0.2em 0.9em 0"
+SMALL = "font-size:0.75em;line-height:1.3;padding:0.2em 0.9em 0"
 
 
 @dataclass(frozen=True)
@@ -60,22 +60,22 @@ class JointPlots:
         self._drawing = threading.Lock()  # whoever switches them on is not who computes
         limited = [j for j in range(NUM_JOINTS) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
-        bounded = [_css(palette.JOINTS[j]) for j in limited for _ in range(2)]
+        bounded = [css(palette.JOINTS[j]) for j in limited for _ in range(2)]
         blank = (np.zeros(2),)
         self._folder = gui.add_folder("Joints", visible=False)
         with self._folder:
             gui.add_html(_legend())
-            gui.add_html(f"<div style='{_SMALL}'>Angle [°]; dashed: limits</div>")
+            gui.add_html(f"<div style='{SMALL}'>Angle [°]; dashed: limits</div>")
             self.angles = gui.add_uplot(
                 blank * (1 + NUM_JOINTS + len(bounded)),
                 (uplot.Series(label="t [s]"), *_curves(), *_dashed(bounded)),
-                **_LOOK,
+                **LOOK,
             )
-            gui.add_html(f"<div style='{_SMALL}'>Speed [% of its limit], up to {MAX_SPEED}; time [s]</div>")
+            gui.add_html(f"<div style='{SMALL}'>Speed [% of its limit], up to {MAX_SPEED}; time [s]</div>")
             self.speeds = gui.add_uplot(
                 blank * (2 + NUM_JOINTS),
-                (uplot.Series(label="t [s]"), *_curves(), *_dashed([_css(palette.ARM_RING)])),
-                **_LOOK,
+                (uplot.Series(label="t [s]"), *_curves(), *_dashed([css(palette.ARM_RING)])),
+                **LOOK,
             )
 
     def draw(self, motion: ArmMotion | None) -> None:
@@ -105,23 +105,24 @@ class JointPlots:
 
     def _plot(self, curves: JointCurves) -> None:
         limits = np.tile(self._limits, (NUM_SAMPLES, 1))
-        self.angles.data = _columns(curves.times, curves.angles, limits)
+        self.angles.data = columns(curves.times, curves.angles, limits)
         speeds, limit = np.minimum(curves.speeds, MAX_SPEED), np.full((NUM_SAMPLES, 1), 100.0)
-        self.speeds.data = _columns(curves.times, speeds, limit)
+        self.speeds.data = columns(curves.times, speeds, limit)
 
 
-def _columns(*arrays: Array) -> tuple[NDArray[np.float64], ...]:
+def columns(*arrays: Array) -> tuple[NDArray[np.float64], ...]:
     """What uPlot takes: all columns of arrays (N,) and (N, k), one after the other."""
     return tuple(np.column_stack(arrays).T.astype(np.float64))
 
 
-def _css(colour: tuple[int, int, int]) -> str:
+def css(colour: tuple[int, int, int]) -> str:
+    """The colour as a browser reads it."""
     return "rgb({}, {}, {})".format(*colour)
 
 
 def _curves() -> list[uplot.Series]:
     return [
-        uplot.Series(label=f"{j + 1}", stroke=_css(colour), width=2, points={"show": False})
+        uplot.Series(label=f"{j + 1}", stroke=css(colour), width=2, points={"show": False})
         for j, colour in enumerate(palette.JOINTS)
     ]
 
@@ -135,14 +136,14 @@ def _dashed(colours: Sequence[str]) -> list[uplot.Series]:
 def _legend() -> str:
     marks = "".join(
         "<span style='white-space:nowrap;margin-right:0.8em'><span style='display:inline-block;width:0.9em;"
-        f"height:0.3em;vertical-align:middle;margin-right:0.3em;background:{_css(colour)}'></span>{j}</span>"
+        f"height:0.3em;vertical-align:middle;margin-right:0.3em;background:{css(colour)}'></span>{j}</span>"
         for j, colour in enumerate(palette.JOINTS, start=1)
     )
-    return f"<div style='{_SMALL}'><span style='opacity:0.65;margin-right:0.8em'>Joint</span>{marks}</div>"
+    return f"<div style='{SMALL}'><span style='opacity:0.65;margin-right:0.8em'>Joint</span>{marks}</div>"
 
 
 _FONT = "11px sans-serif"
-_LOOK = {
+LOOK = {
     "scales": {"x": {"time": False}},
     "axes": ({"size": 26, "space": 40, "font": _FONT}, {"size": 42, "space": 24, "font": _FONT}),
     "legend": {"show": False},
