@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from dt_viz.body import load_body_points
 from dt_viz.cspace import COMPLEX_STEP, CORE, SHARPNESS, GradientField, JointLimits, WholeArmField, by_complex_steps
 from dt_viz.diffeo import AdaptiveFlow, Chain, Flow, Inverse, round_trip_error
-from dt_viz.obstacles import Sphere
+from dt_viz.obstacles import Box, Sphere
 from dt_viz.robot import HOME, NUM_JOINTS, Robot, load_jaco
 
 ROBOT: Robot = load_jaco()
@@ -158,7 +158,7 @@ class TestGradientField:
 
     def potential(self, field, q):
         distance = field.obstacle.signed_distance(BODY.positions(ROBOT, q)) - BODY.radius
-        depth = field.reach + CORE * (field.obstacle.radius + BODY.radius)
+        depth = field.reach + CORE * (field.obstacle.depth + BODY.radius)
         u = np.clip((field.reach - distance) / depth, 0, 1)
         return (depth * (6 * u**5 - 15 * u**4 + 10 * u**3)).sum(axis=-1)
 
@@ -167,6 +167,11 @@ class TestGradientField:
         expected = central_differences(partial(self.potential, gradient), q)
         assert np.abs(expected).max() > 0.1
         np.testing.assert_allclose(gradient(q), expected, rtol=0, atol=1e-6)
+
+    def test_it_is_the_gradient_around_a_box(self):
+        field = GradientField(ROBOT, BODY, Box(HAND.position, (0.2, 0.1, 0.06), (0.8, 0.0, 0.6, 0.0)), REACH)
+        expected = central_differences(partial(self.potential, field), near(60))
+        np.testing.assert_allclose(field(near(60)), expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
     def test_its_jacobian_is_symmetric(self, gradient):
         DV = gradient.with_jacobian(near(60))[1]

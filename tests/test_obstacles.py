@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dt_viz.avoidance import clearing_duration
 from dt_viz.clouds import Cloud
 from dt_viz.integrate import integrate_adaptive
 from dt_viz.obstacles import (
@@ -192,6 +193,15 @@ def test_every_point_inside_leaves_along_the_reverse_flow(obstacle, temperature)
     field = obstacle.field("free-space", temperature)
     ends, _ = integrate_adaptive(field, within(obstacle, 300), None, -4.0, 1e-5)
     assert obstacle.signed_distance(ends).min() > 0
+
+
+@obstacles
+def test_a_motion_through_it_is_cleared(obstacle):
+    along = np.array([0.6, 0.64, 0.48])
+    path = np.asarray(obstacle.position) + np.array([1e-3, 2e-3, 1e-3]) + np.linspace(-0.4, 0.4, 401)[:, None] * along
+    duration = clearing_duration(obstacle.field("free-space", 3.0), obstacle, path, 0.01)
+    assert duration is not None
+    assert 0 < duration < 2.5
 
 
 @obstacles
