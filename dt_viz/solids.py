@@ -36,8 +36,6 @@ NUM_PROBES = 100_000
 """Points at which the slope is looked at."""
 CHUNK = 1_000_000
 """Triangles times lines that are looked at at once."""
-FEWEST_CELLS = 3.0
-"""Thickness, in cells, below which the grid cannot tell the inside from the outside any more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,10 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class DistanceGrid:
-    """A signed distance sampled on a grid; analytic between and beyond its nodes."""
+    """A signed distance sampled on a grid; analytic between and beyond its nodes.
+
+    For an object of 15 cm it is off by up to 2 mm beside edges, 0.3 mm elsewhere near the surface, and 2 % far from it.
+    """
 
     origin: Array
     """(3,) the first node, metres."""
@@ -144,7 +145,7 @@ class DistanceGrid:
 
     @cached_property
     def _coefficients(self) -> tuple[Array, Indices]:
-        """The values, flat and half as large: the working set then fits the cache; offsets of a node's neighbours."""
+        """The values, flat and in single precision, which fits the cache; offsets of a node's neighbours."""
         strides = np.array([self.values.shape[1] * self.values.shape[2], self.values.shape[2], 1])
         around = (np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1) @ strides).ravel()
         return self.values.astype(np.float32).ravel(), around
@@ -378,7 +379,8 @@ def _winding(triangles: Array, origin: Array, cell: float, shape: tuple[int, ...
         a, b, c = (flat[owner, k] - np.stack([i, j], axis=1) for k in range(3))
         wa, wb, wc = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] for u, v in ((b, c), (c, a), (a, b)))
         through = ((wa > 0) & (wb > 0) & (wc > 0)) | ((wa < 0) & (wb < 0) & (wc < 0))
-        owner, i, j, wa, wb, wc = (part[through] for part in (owner, i, j, wa, wb, wc))
+        owner, i, j = owner[through], i[through], j[through]
+        wa, wb, wc = wa[through], wb[through], wc[through]
         z = (wa * t[owner, 0, 2] + wb * t[owner, 1, 2] + wc * t[owner, 2, 2]) / (wa + wb + wc)
         k = np.clip(np.ceil(z), 0, nz).astype(np.intp)  # the first node above
         np.add.at(crossings, (i, j, k), np.where(wa > 0, 1, -1))

@@ -17,16 +17,17 @@ def random_scenario(engine, seed):
 
     def place():
         path = task.paths[int(rng.integers(len(task.paths)))]
-        return tuple(float(x) for x in path[int(rng.integers(len(path)))] + rng.normal(scale=0.06, size=3))
+        x, y, z = path[int(rng.integers(len(path)))] + rng.normal(scale=0.06, size=3)
+        return float(x), float(y), float(z)
 
     def obstacle():
         turn = rng.normal(size=4)
-        turn = tuple(float(w) for w in turn / np.linalg.norm(turn))
-        sizes = [float(size) for size in rng.uniform(0.04, 0.16, 3)]
+        w, x, y, z = (float(c) for c in turn / np.linalg.norm(turn))
+        a, b, c = (float(size) for size in rng.uniform(0.04, 0.16, 3))
         kind = rng.integers(3)
         if kind == 0:
-            return Sphere(place(), sizes[0])
-        return Box(place(), tuple(sizes), turn) if kind == 1 else Cylinder(place(), sizes[0], sizes[1], turn)
+            return Sphere(place(), a)
+        return Box(place(), (a, b, c), (w, x, y, z)) if kind == 1 else Cylinder(place(), a, b, (w, x, y, z))
 
     layers = tuple(
         Layer(Biasing(BiasPoint(place(), moves_goal=bool(rng.integers(4) == 0))), name=f"Bias {k + 1}")
@@ -51,14 +52,15 @@ def check(engine, seed):
         np.testing.assert_allclose(path[-1], frame.reached, atol=1e-3)
         np.testing.assert_allclose(path[0], start, atol=1e-3)
     moved = np.linalg.norm(frame.reached - frame.goal)
-    may_move = scenario.obstacles or any(layer.behaviour.point.moves_goal for layer in scenario.layers)
+    points = [layer.behaviour.point for layer in scenario.layers if isinstance(layer.behaviour, Biasing)]
+    may_move = scenario.obstacles or any(point.moves_goal for point in points)
     assert moved < 1e-3 or may_move
     assert health.min_det_jacobian > 0
     assert health.round_trip_error < 1e-6 or any("there and back" in doubt for doubt in health.doubts)
     return health.round_trip_error < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(5))
 def test_a_random_stack_is_a_diffeomorphism_that_leads_to_its_goal_or_says_what_it_loses(engine, seed):
     check(engine, seed)
 
