@@ -40,10 +40,12 @@ def main() -> None:
         (visitor,) = server.visitors
         page.locator("button.mantine-Notification-closeButton").first.click()
         session = visitor.session
-        session.edit("screenshot", view=View(playing=False))
+        session.edit("screenshot", space="cspace", view=View(playing=False, ghost_arm=True))
+        session.wait_idle(60)
         assert visitor.shown is not None and visitor.shown.arm is not None
-        joints = visitor.shown.arm.q
-        visitor.arm.pose(joints[round(MOMENT * (len(joints) - 1))])
+        arm = visitor.shown.arm
+        moment = round(MOMENT * (len(arm.q) - 1))
+        visitor.arms.pose(arm.q[moment], arm.without[moment])
         time.sleep(10)  # software rendering is slow
         page.screenshot(path=PICTURE)
         browser.close()
