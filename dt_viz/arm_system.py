@@ -11,7 +11,7 @@ from dt_viz.cspace import COMPLEX_STEP
 from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array
 from dt_viz.robot import NUM_JOINTS, Robot
-from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.systems import DiffeomorphicSystem, stepped
 from dt_viz.tracking import DIRECTION_WEIGHT, LIMIT_MARGIN, LIMIT_WEIGHT, track
 
 NUM_POLISHING = 4
@@ -128,16 +128,7 @@ class ArmSystem:
         Returns:
             (*B, T, 6) states.
         """
-        p, motion = p0, [p0]
-        for h in np.diff(times) / substeps:
-            for _ in range(substeps):
-                k1 = self._velocity_by_solve(p)
-                k2 = self._velocity_by_solve(p + h / 2 * k1)
-                k3 = self._velocity_by_solve(p + h / 2 * k2)
-                k4 = self._velocity_by_solve(p + h * k3)
-                p = p + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            motion.append(p)
-        return np.stack(motion, axis=-2)
+        return stepped(self._velocity_by_solve, p0, times, substeps)
 
     def _velocity_by_solve(self, p: Array) -> Array:
         q, J_arm = self.transform.jacobian(p)

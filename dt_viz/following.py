@@ -9,6 +9,7 @@ import numpy as np
 from dt_viz.body import load_body_points
 from dt_viz.collision import load_collision_model
 from dt_viz.fields import Array, Indices
+from dt_viz.metrics import arc_length
 from dt_viz.obstacles import Obstacle
 from dt_viz.robot import Robot
 from dt_viz.several import Several
@@ -62,9 +63,9 @@ class Follower:
 
     def behaving(self, ground: Ground, solution: Solution) -> Lift:
         """The joints along the motion with the behaviours of the end effector."""
-        index, fraction = solution.bundle.index, []
+        fraction = []
         for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
-            length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
+            length = arc_length(path)
             fraction.append(np.interp(np.linspace(0, length[-1], NUM_CONFIGURATIONS), length, fractions))
         index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
         paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from dt_viz.bias import Biasing, BiasPoint, Vector
 from dt_viz.fields import Array
-from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Box, Cylinder
 from dt_viz.scenario import Layer, Scenario
 from dt_viz.stacking import aware, plane_of
@@ -42,11 +39,6 @@ class PaperScene:
         return replace(self.make(task), scene=self.name)
 
 
-def mean_path(task: Task) -> Array:
-    """(101, 3) the mean demonstration by arc length, metres."""
-    return np.mean([resample_by_arc_length(path, 101) for path in task.paths], axis=0)
-
-
 def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
     (x, y, _), (diameter, height) = task.obstacle_position, BOTTLE
@@ -60,7 +52,7 @@ def _cube_in_the_letter(task: Task) -> Scenario:
 
 def _two_points(task: Task) -> Scenario:
     """Fig. 4."""
-    mean, plane = mean_path(task), plane_of(task)
+    mean, plane = task.mean_path, plane_of(task)
     places = [mean[round(100 * u)] + task.slice.axes @ offset for u, offset in J_OFFSETS]
     layers = [Layer(Biasing(BiasPoint(_vector(p), plane=plane)), name=f"Bias {k}") for k, p in enumerate(places, 1)]
     return Scenario(task.name, (), layers=aware(layers))

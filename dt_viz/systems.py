@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,20 +104,35 @@ class DiffeomorphicSystem:
         Returns:
             (*B, T, d) positions.
         """
-        y, motion = y0, [y0]
-        for h in np.diff(times) / substeps:
-            for _ in range(substeps):
-                k1 = self._velocity_by_solve(y)
-                k2 = self._velocity_by_solve(y + h / 2 * k1)
-                k3 = self._velocity_by_solve(y + h / 2 * k2)
-                k4 = self._velocity_by_solve(y + h * k3)
-                y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            motion.append(y)
-        return np.stack(motion, axis=-2)
+        return stepped(self._velocity_by_solve, y0, times, substeps)
 
     def _velocity_by_solve(self, y: Array) -> Array:
         z, J = self.transform.jacobian(y)
         return np.linalg.solve(J, self.base.velocity(z)[..., None])[..., 0]
+
+
+def stepped(velocity: Callable[[Array], Array], y0: Array, times: Array, substeps: int) -> Array:
+    """Integrate ẏ = velocity(y) with RK4.
+
+    Args:
+        velocity: takes states (*B, d).
+        y0: (*B, d) starts.
+        times: (T,) increasing, seconds; the first is the start's.
+        substeps: between neighbouring times.
+
+    Returns:
+        (*B, T, d) states.
+    """
+    y, motion = y0, [y0]
+    for h in np.diff(times) / substeps:
+        for _ in range(substeps):
+            k1 = velocity(y)
+            k2 = velocity(y + h / 2 * k1)
+            k3 = velocity(y + h / 2 * k2)
+            k4 = velocity(y + h * k3)
+            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        motion.append(y)
+    return np.stack(motion, axis=-2)
 
 
 def log_sinh(a: Array) -> Array:

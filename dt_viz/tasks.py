@@ -113,6 +113,11 @@ class Task:
         return tuple(self.to_world(d.positions) for d in self.demonstrations)
 
     @property
+    def mean_path(self) -> Array:
+        """(101, 3) the mean demonstration by arc length, metres."""
+        return np.mean([resample_by_arc_length(path, 101) for path in self.paths], axis=0)
+
+    @property
     def starts(self) -> Array:
         """First points of the demonstrations in the world, (R, 3), metres."""
         return np.stack([path[0] for path in self.paths])

@@ -42,7 +42,6 @@ from dt_viz.evaluate.options import (
     write_json,
 )
 from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Layer, Scenario
@@ -178,7 +177,7 @@ def run(options: argparse.Namespace) -> int:
 
 def moving_through(task: Task) -> Callable[[float], tuple[float, float, float]]:
     """Where the obstacle is at a time in seconds: on a smooth curve around the middle of the mean demonstration."""
-    middle = np.mean([resample_by_arc_length(path, 101)[50] for path in task.paths], axis=0)
+    middle = task.mean_path[50]
 
     def position(seconds: float) -> tuple[float, float, float]:
         offset = [AMPLITUDE * math.sin(2 * math.pi * seconds / period) for period in PERIODS]
@@ -190,12 +189,11 @@ def moving_through(task: Task) -> Callable[[float], tuple[float, float, float]]:
 
 def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
     """The scene that the drag begins with: obstacles along the mean path, and a bias point where that is dragged."""
-    mean = np.mean([resample_by_arc_length(path, 101) for path in task.paths], axis=0)
     places = np.linspace(0, 100, options.obstacles + 2).round().astype(int)[1:-1]
     diameter = Sphere(task.obstacle_position).diameter / max(1, options.obstacles)
     if options.drag == "obstacle" and options.obstacles == 0:
         raise InputError("--obstacles", "0", "1 or more, or --drag bias")
-    obstacles = tuple(Sphere((float(x), float(y), float(z)), diameter) for x, y, z in mean[places])
+    obstacles = tuple(Sphere((float(x), float(y), float(z)), diameter) for x, y, z in task.mean_path[places])
     bias = BiasPoint(task.obstacle_position, plane=plane_of(task))
     layers = (Layer(Biasing(bias), name="Bias 1"),) if options.drag == "bias" else ()
     return Scenario(task.name, obstacles, layers=layers, space=options.space)

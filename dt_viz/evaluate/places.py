@@ -27,7 +27,6 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.fields import Array
 from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Scenario
@@ -97,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _places(task: Task, count: int, rng: np.random.Generator) -> Array:
     """The middle of the mean demonstration, and places evenly spread in the ball around it, (1 + count, 3), metres."""
-    middle = np.mean([resample_by_arc_length(path, 101)[50] for path in task.paths], axis=0)
+    middle = task.mean_path[50]
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return np.concatenate([[middle], middle + WITHIN * rng.uniform(size=(count, 1)) ** (1 / 3) * direction])

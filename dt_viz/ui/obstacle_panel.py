@@ -11,7 +11,6 @@ from typing import Any, cast
 import numpy as np
 import viser
 
-from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
 from dt_viz.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.several import Several
@@ -227,7 +226,7 @@ def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[
 
 def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obstacle:
     """The obstacle beside the mean demonstration, where that is farthest from its ends and other obstacles."""
-    mean = np.mean([resample_by_arc_length(path, 101) for path in task.paths], axis=0)
+    mean = task.mean_path
     ends = np.concatenate([task.starts, mean[-1:]])
     room = np.linalg.norm(mean[:, None] - ends, axis=-1).min(axis=1)
     room = np.minimum(room, Several(tuple(others)).signed_distance(mean))
