@@ -33,13 +33,7 @@ def draw_s(num_demonstrations: int = 7, seed: int = 41) -> tuple[Demonstration, 
         Demonstrations in metres, 2-D, origin in the middle of the letter (about 0.30 wide and 0.40 high),
         u to the right and v up.
     """
-    rng = np.random.default_rng(seed)
-    letter = _letter_s()
-    goal = letter[-1].round(6)
-    return tuple(
-        _perform(_vary(letter, goal, rng, start_spread=0.013, bow=0.006), goal, rng, f"draw S {i}")
-        for i in range(num_demonstrations)
-    )
+    return _draw(_letter_s(), "draw S", num_demonstrations, seed)
 
 
 def lift_box(num_demonstrations: int = 8, seed: int = 48) -> tuple[Demonstration, ...]:
@@ -79,13 +73,47 @@ def draw_j(num_demonstrations: int = 7, seed: int = 103) -> tuple[Demonstration,
         Demonstrations in metres, 2-D, origin in the middle of the letter (about 0.24 wide and 0.40 high),
         u to the right and v up.
     """
-    rng = np.random.default_rng(seed)
-    letter = _letter_j()
-    goal = letter[-1].round(6)
-    return tuple(
-        _perform(_vary(letter, goal, rng, start_spread=0.013, bow=0.006), goal, rng, f"draw J {i}")
-        for i in range(num_demonstrations)
-    )
+    return _draw(_letter_j(), "draw J", num_demonstrations, seed)
+
+
+def draw_c(num_demonstrations: int = 7, seed: int = 52) -> tuple[Demonstration, ...]:
+    """Draw the letter C on a plane, from its upper right end round to its lower right one.
+
+    Returns:
+        Demonstrations in metres, 2-D, origin in the middle of the letter (about 0.28 wide and 0.40 high),
+        u to the right and v up.
+    """
+    return _draw(_letter_c(), "draw C", num_demonstrations, seed)
+
+
+def draw_g(num_demonstrations: int = 7, seed: int = 18) -> tuple[Demonstration, ...]:
+    """Draw the letter G on a plane in one stroke: a C that goes on up to the middle and in along its bar.
+
+    Returns:
+        Demonstrations in metres, 2-D, origin in the middle of the letter (about 0.32 wide and 0.40 high),
+        u to the right and v up.
+    """
+    return _draw(_letter_g(), "draw G", num_demonstrations, seed)
+
+
+def draw_w(num_demonstrations: int = 7, seed: int = 22) -> tuple[Demonstration, ...]:
+    """Draw the letter W on a plane, from its upper left end to its upper right one.
+
+    Returns:
+        Demonstrations in metres, 2-D, origin in the middle of the letter (about 0.41 wide and 0.30 high),
+        u to the right and v up.
+    """
+    return _draw(_letter_w(), "draw W", num_demonstrations, seed)
+
+
+def draw_z(num_demonstrations: int = 7, seed: int = 71) -> tuple[Demonstration, ...]:
+    """Draw the letter Z on a plane: to the right, down to the lower left, and to the right again.
+
+    Returns:
+        Demonstrations in metres, 2-D, origin in the middle of the letter (about 0.29 wide and 0.39 high),
+        u to the right and v up.
+    """
+    return _draw(_letter_z(), "draw Z", num_demonstrations, seed)
 
 
 def drop_pots(num_demonstrations: int = 8, seed: int = 98) -> tuple[Demonstration, ...]:
@@ -100,6 +128,16 @@ def drop_pots(num_demonstrations: int = 8, seed: int = 98) -> tuple[Demonstratio
         path = _vary(_drop_path(), DROP_GOAL, rng, start_spread=0.020, bow=0.005)
         demonstrations.append(_perform(path, DROP_GOAL, rng, f"drop pots {i}"))
     return tuple(demonstrations)
+
+
+def _draw(letter: np.ndarray, name: str, num_demonstrations: int, seed: int) -> tuple[Demonstration, ...]:
+    """Draw a letter several times, each a little differently, all to its last point."""
+    rng = np.random.default_rng(seed)
+    goal = letter[-1].round(6)
+    return tuple(
+        _perform(_vary(letter, goal, rng, start_spread=0.013, bow=0.006), goal, rng, f"{name} {i}")
+        for i in range(num_demonstrations)
+    )
 
 
 def _letter_s() -> np.ndarray:
@@ -129,6 +167,45 @@ def _letter_j() -> np.ndarray:
     return path - (path.min(axis=0) + path.max(axis=0)) / 2
 
 
+def _letter_c() -> np.ndarray:
+    """Return the path of a C: an ellipse, open to the right, shape ``(DENSE, 2)``."""
+    return _arc(47.0, 313.0)
+
+
+def _letter_g() -> np.ndarray:
+    """Return the path of a G: an ellipse that is open to the upper right, and a bar, shape ``(DENSE, 2)``."""
+    bowl = _arc(47.0, 352.0)
+    corner = np.array([0.158, -0.005])
+    return _rounded(np.concatenate([bowl, [corner, corner - [0.115, 0.0]]]), 0.012)
+
+
+def _letter_w() -> np.ndarray:
+    """Return the path of a W with narrow bends, shape ``(DENSE, 2)``."""
+    corners = np.array([[-0.205, 0.16], [-0.115, -0.17], [0.0, 0.12], [0.115, -0.17], [0.205, 0.16]])
+    return _rounded(corners, 0.020)
+
+
+def _letter_z() -> np.ndarray:
+    """Return the path of a Z with narrow bends and bars that bow a little, shape ``(DENSE, 2)``."""
+    u = np.linspace(-1.0, 1.0, 101)[:, None]
+    bar = u * [0.15, 0.0] + (1 - u**2) * [0.0, 0.012]
+    up = np.array([0.0, 0.18])
+    return _rounded(np.concatenate([bar + up, bar * [1.0, -1.0] - up]), 0.016)
+
+
+def _arc(start: float, end: float) -> np.ndarray:
+    """Return an upright ellipse, 0.32 by 0.40 metres, between two angles in degrees, shape ``(DENSE, 2)``."""
+    turn = np.deg2rad(np.linspace(start, end, DENSE))
+    return np.stack([0.16 * np.cos(turn), 0.20 * np.sin(turn)], axis=1)
+
+
+def _rounded(corners: np.ndarray, radius: float) -> np.ndarray:
+    """Return a polyline whose corners are smoothed over about ``radius`` metres, shape ``(DENSE, d)``."""
+    path = _equidistant(corners)
+    spacing = np.linalg.norm(path[1] - path[0])
+    return gaussian_filter1d(path, radius / spacing, axis=0, mode="nearest")
+
+
 def _lift_path(corner: np.ndarray) -> np.ndarray:
     """Return the way into the box, a narrow bend at ``corner``, and the way up, shape ``(DENSE, 3)``."""
     u = np.linspace(0.0, 1.0, DENSE)[:, None]
@@ -136,9 +213,7 @@ def _lift_path(corner: np.ndarray) -> np.ndarray:
     into = corner + np.array([0.15, 0.10, 0.03])
     reach = (1 - u) ** 3 * LIFT_START + 3 * (1 - u) ** 2 * u * over + 3 * (1 - u) * u**2 * into + u**3 * corner
     lift = corner + u * (LIFT_GOAL - corner) + np.sin(np.pi * u) * [0.008, -0.006, 0.0]
-    path = _equidistant(np.concatenate([reach, lift[1:]]))
-    spacing = np.linalg.norm(path[1] - path[0])
-    return gaussian_filter1d(path, 0.010 / spacing, axis=0, mode="nearest")
+    return _rounded(np.concatenate([reach, lift[1:]]), 0.010)
 
 
 def _push_path(contact: np.ndarray) -> np.ndarray:
@@ -148,9 +223,7 @@ def _push_path(contact: np.ndarray) -> np.ndarray:
     down = contact + np.array([0.08, 0.02, 0.08])
     approach = (1 - u) ** 3 * PUSH_START + 3 * (1 - u) ** 2 * u * over + 3 * (1 - u) * u**2 * down + u**3 * contact
     push = contact + u * (PUSH_GOAL - contact) + np.sin(np.pi * u) * [0.0, -0.11, 0.0]
-    path = _equidistant(np.concatenate([approach, push[1:]]))
-    spacing = np.linalg.norm(path[1] - path[0])
-    return gaussian_filter1d(path, 0.035 / spacing, axis=0, mode="nearest")
+    return _rounded(np.concatenate([approach, push[1:]]), 0.035)
 
 
 def _drop_path() -> np.ndarray:
@@ -231,8 +304,5 @@ def _smooth_step(x: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    save_demonstrations(FOLDER / "draw_s.npz", draw_s())
-    save_demonstrations(FOLDER / "lift_box.npz", lift_box())
-    save_demonstrations(FOLDER / "push_box.npz", push_box())
-    save_demonstrations(FOLDER / "draw_j.npz", draw_j())
-    save_demonstrations(FOLDER / "drop_pots.npz", drop_pots())
+    for make in (draw_s, lift_box, push_box, draw_j, drop_pots, draw_c, draw_g, draw_w, draw_z):
+        save_demonstrations(FOLDER / f"{make.__name__}.npz", make())

@@ -7,14 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.fields import Array
-from dt_viz.obstacles import Obstacle
+from dt_viz.fields import Array, Mask
+from dt_viz.obstacles import CloudObstacle, Obstacle
 from dt_viz.occupancy import AvoidanceField, StretchedField
 from dt_viz.several import Several
 from dt_viz.tasks import Slice
 
 SPACING, COARSE_SPACING = 0.004, 0.010
 """Metres between neighbouring samples."""
+NEAR = 0.006
+"""Metres from the slice, within which labelled points are shown on it."""
+MAX_POINTS = 600
+"""That are shown."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,10 @@ class OccupancyPicture:
     """(K, 2, 3) segments of the line p = 1/2, metres."""
     outline: Array
     """(L, 2, 3) segments of the obstacles' true outline, metres."""
+    points: Array
+    """(K, 3) what is known of obstacles from point clouds: points beside the slice, moved into it, metres."""
+    occupied: Mask
+    """(K,) their labels."""
 
 
 def occupancy_picture(area: Slice, obstacles: Sequence[Obstacle], *, coarse: bool) -> OccupancyPicture:
@@ -50,16 +58,33 @@ def occupancy_picture(area: Slice, obstacles: Sequence[Obstacle], *, coarse: boo
     distance = Several(tuple(obstacles)).signed_distance(points).reshape(shape)
     world = points.reshape(*shape, 3)
     return OccupancyPicture(
-        area, probability, level_line(world, probability - 0.5), level_line(world, -np.minimum(distance, 1e3))
+        area,
+        probability,
+        level_line(world, probability - 0.5),
+        level_line(world, -np.minimum(distance, 1e3)),
+        *_known(area, obstacles),
     )
+
+
+def _known(area: Slice, obstacles: Sequence[Obstacle]) -> tuple[Array, Mask]:
+    """Points (K, 3) of point clouds on the slice, and whether they are occupied (K,)."""
+    clouds = [obstacle.labelled() for obstacle in obstacles if isinstance(obstacle, CloudObstacle)]
+    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in clouds)])
+    occupied = np.concatenate([np.zeros(0, dtype=bool), *(labels for _, labels in clouds)])
+    offset = points - area.centre
+    normal = np.cross(*area.axes.T)
+    across = offset @ normal
+    near = np.flatnonzero((np.abs(across) < NEAR) & (np.abs(offset @ area.axes) < area.half_size).all(axis=1))
+    near = near[:: -(-len(near) // MAX_POINTS) or 1]
+    return points[near] - across[near, None] * normal, occupied[near]
 
 
 def believed(obstacle: Obstacle, s: Array) -> Array:
     """p(o = 1 | s) of the map learned from samples of the obstacle, at the world points `s` (N, 3), (N,)."""
     placed = obstacle.field("free-space", 1.0)
-    own, inner = (s - placed.origin) @ (placed.axes / placed.scale), placed.inner
+    own, inner = placed.to_frame(s), placed.inner
     if isinstance(inner, StretchedField):
-        own, inner = np.linalg.solve(inner.axes, own.T).T, inner.inner
+        own, inner = inner.to_frame(own), inner.inner
     assert isinstance(inner, AvoidanceField)
     return inner.occupancy.probability(own)
 

@@ -55,6 +55,12 @@ REACH = 0.95
 """Metres from the shoulder, beyond which the hand gets nowhere."""
 
 
+def vector(v: Array) -> Vector:
+    """An array (3,) as a value."""
+    x, y, z = (float(c) for c in v)
+    return x, y, z
+
+
 @dataclass(frozen=True)
 class BiasPoint:
     """A place that motions are pulled towards, and how."""

@@ -223,13 +223,17 @@ class PlacedField:
         """Dimension d of the space."""
         return self.inner.dim
 
+    def to_frame(self, s: Array) -> Array:
+        """Where the world points `s` (N, d) lie in the frame of `inner`, Rᵀ(s − o)/c, (N, d)."""
+        return (s - self.origin) @ (self.axes / self.scale)
+
     def __call__(self, s: Array) -> Array:
         """V at the world points `s` (N, d), as (N, d)."""
-        return self.inner((s - self.origin) @ (self.axes / self.scale)) @ (self.scale * self.axes.T)
+        return self.inner(self.to_frame(s)) @ (self.scale * self.axes.T)
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the world points `s` (N, d)."""
-        v, DV = self.inner.with_jacobian((s - self.origin) @ (self.axes / self.scale))
+        v, DV = self.inner.with_jacobian(self.to_frame(s))
         return v @ (self.scale * self.axes.T), self.axes @ DV @ self.axes.T
 
 

@@ -383,6 +383,11 @@ class CloudObstacle(_Triangles):
         """See `Cloud`."""
         return self.cloud.solid
 
+    def labelled(self) -> tuple[Array, Mask]:
+        """Its points in the world (K, 3), metres, and whether each is occupied (K,)."""
+        points, labels = self._to_world(self.cloud.points), self.cloud.labels
+        return points, np.ones(len(points), dtype=bool) if labels is None else labels > 0.5
+
 
 @lru_cache(maxsize=256)
 def rotation(wxyz: Quaternion) -> Array:

@@ -190,11 +190,15 @@ class StretchedField:
         """Dimension d of the space."""
         return self.inner.dim
 
+    def to_frame(self, s: Array) -> Array:
+        """Where the points `s` (N, d) lie in the frame of `inner`, M⁻¹s, (N, d)."""
+        return s @ self._inverse.T
+
     def __call__(self, s: Array) -> Array:
         """V_out at the points `s` (N, d), as (N, d)."""
-        return self.inner(s @ self._inverse.T) @ self.axes.T
+        return self.inner(self.to_frame(s)) @ self.axes.T
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V_out (N, d) and its derivative (N, d, d) at the points `s` (N, d)."""
-        v, DV = self.inner.with_jacobian(s @ self._inverse.T)
+        v, DV = self.inner.with_jacobian(self.to_frame(s))
         return v @ self.axes.T, self.axes @ DV @ self._inverse

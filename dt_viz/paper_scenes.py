@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
-from dt_viz.bias import Biasing, BiasPoint, Vector
-from dt_viz.fields import Array
-from dt_viz.obstacles import Box, Cylinder
-from dt_viz.scenario import Layer, Scenario
+import numpy as np
+
+from dt_viz.bias import Biasing, BiasPoint, Vector, vector
+from dt_viz.clouds import Cloud
+from dt_viz.fields import Array, Mask
+from dt_viz.obstacles import Box, CloudObstacle, Cylinder, Sphere
+from dt_viz.occupancy import sample_labels
+from dt_viz.scenario import Layer, Scenario, View
 from dt_viz.stacking import aware, plane_of
 from dt_viz.tasks import Pot, Task
 
@@ -16,6 +21,14 @@ BOTTLE = (0.07, 0.24)
 """Diameter and height, metres."""
 CUBE = 0.10
 """Edge, metres."""
+CLOVER_RADIUS, CLOVER_THICKNESS = 0.06, 0.06
+"""Mean radius and half the thickness, metres."""
+CLOVER_LOBES = 0.4
+"""How far its three lobes stand out, relative to the mean radius."""
+NUM_LABELS = 4000
+"""Of the clover."""
+STROKE_SPHERE = 0.10
+"""Diameter of the sphere in the strokes of fig. 5, metres."""
 J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
 """Of the two points beside the J: fraction of its length, and metres to the right and up as seen from the front."""
 ABOVE = 0.16
@@ -33,6 +46,8 @@ class PaperScene:
     task: str
     """Name of its task."""
     make: Callable[[Task], Scenario]
+    view: Mapping[str, bool] = field(default_factory=dict)
+    """What it switches on and off to be seen: fields of `View`."""
 
     def scenario(self, task: Task) -> Scenario:
         """The scenario for its task."""
@@ -50,11 +65,35 @@ def _cube_in_the_letter(task: Task) -> Scenario:
     return Scenario(task.name, (Box(task.obstacle_position, (CUBE, CUBE, CUBE)),), space="task")
 
 
+def in_clover(s: Array) -> Mask:
+    """Whether the points `s` (N, 3), metres, lie in a clover of three leaves around the y axis: smooth, not convex."""
+    turn = np.arctan2(s[:, 2], s[:, 0])
+    radius = CLOVER_RADIUS * (1 + CLOVER_LOBES * np.cos(3 * turn))
+    return (s[:, 0] ** 2 + s[:, 2] ** 2) / radius**2 + (s[:, 1] / CLOVER_THICKNESS) ** 2 < 1
+
+
+@lru_cache(maxsize=1)
+def clover() -> Cloud:
+    """Points labelled by whether they lie in a clover: all that is known of it."""
+    half = np.array([1 + CLOVER_LOBES, 0, 1 + CLOVER_LOBES]) * CLOVER_RADIUS + [0, CLOVER_THICKNESS, 0]
+    return Cloud(*sample_labels(in_clover, -half, half, NUM_LABELS, np.random.default_rng(0)))
+
+
+def _cloud_in_the_letter(task: Task) -> Scenario:
+    """Fig. 3 (b)."""
+    return Scenario(task.name, (CloudObstacle(task.obstacle_position, clover()),), space="task")
+
+
+def _sphere_in_the_stroke(task: Task) -> Scenario:
+    """Fig. 5."""
+    return Scenario(task.name, (Sphere(task.obstacle_position, STROKE_SPHERE),), space="both")
+
+
 def _two_points(task: Task) -> Scenario:
     """Fig. 4."""
     mean, plane = task.mean_path, plane_of(task)
     places = [mean[round(100 * u)] + task.slice.axes @ offset for u, offset in J_OFFSETS]
-    layers = [Layer(Biasing(BiasPoint(_vector(p), plane=plane)), name=f"Bias {k}") for k, p in enumerate(places, 1)]
+    layers = [Layer(Biasing(BiasPoint(vector(p), plane=plane)), name=f"Bias {k}") for k, p in enumerate(places, 1)]
     return Scenario(task.name, (), layers=aware(layers))
 
 
@@ -72,11 +111,6 @@ def _into_pot(index: int) -> Callable[[Task], Scenario]:
         return Scenario(task.name, (), layers=(Layer(Biasing(point), name="Bias 1"),))
 
     return scenario
-
-
-def _vector(v: Array) -> Vector:
-    x, y, z = (float(c) for c in v)
-    return x, y, z
 
 
 SCENES: Mapping[str, PaperScene] = {
@@ -104,11 +138,29 @@ SCENES: Mapping[str, PaperScene] = {
             _cube_in_the_letter,
         ),
         PaperScene(
+            "cloud",
+            "Fig. 3 (b): labelled points in the S",
+            "All that is known of the clover: which points lie in it (dark). Strokes leave what is learned from them.",
+            "draw_s",
+            _cloud_in_the_letter,
+            view={"occupancy": True, "field": False},
+        ),
+        PaperScene(
             "two_points",
             "Fig. 4: a J biased to two points",
             "Every stroke passes both points within a centimetre: drag them.",
             "draw_j",
             _two_points,
+        ),
+        *(
+            PaperScene(
+                f"letter_{character.lower()}",
+                f"Fig. 5: the letter {character}",
+                "Every stroke goes around the sphere, and the whole arm with it; the letter stays legible.",
+                f"draw_{character.lower()}",
+                _sphere_in_the_stroke,
+            )
+            for character in "CGWZ"
         ),
         PaperScene(
             "left_pot",
@@ -127,3 +179,21 @@ SCENES: Mapping[str, PaperScene] = {
     )
 }
 """By name, in the order of the figures."""
+
+
+def seen_in(view: View, scene: str, before: str) -> View:
+    """How a scene that follows another is looked at: as before, but for what one of the two switches on or off.
+
+    Args:
+        view: as it was.
+        scene: name of the scene; one that is none switches nothing.
+        before: name of the scene that was shown before; what it switched is as it is for a start.
+    """
+    if scene == before:
+        return view
+    back = {name: getattr(View(), name) for name in _switched(before)}
+    return replace(view, **(back | _switched(scene)))
+
+
+def _switched(scene: str) -> dict[str, bool]:
+    return dict(SCENES[scene].view) if scene in SCENES else {}

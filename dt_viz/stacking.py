@@ -8,8 +8,7 @@ from typing import TypedDict
 
 import numpy as np
 
-from dt_viz.bias import Biasing, BiasPoint, Vector
-from dt_viz.fields import Array
+from dt_viz.bias import Biasing, BiasPoint, Vector, vector
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.scenario import Layer, Scenario
 from dt_viz.tasks import Task
@@ -19,7 +18,7 @@ BESIDE = 0.08
 """Metres from the mean path at which a new bias point is placed."""
 ROOM = 0.04
 """Metres that it keeps from obstacles."""
-PLACES = (0.50, 0.30, 0.70, 0.15)
+PLACES = (0.50, 0.30, 0.70, 0.15, 0.85, 0.40, 0.60)
 """Along the mean path, beside which new bias points are placed, as fractions of its length."""
 IMITATION, AVOIDANCE = "Imitation", "Avoidance"
 """Names of the levels that are no layers."""
@@ -117,7 +116,7 @@ def plane_of(task: Task) -> tuple[Vector, Vector] | None:
     if task.demonstrations[0].dimension != 2:
         return None
     u, v = task.slice.axes.T
-    return _vector(u), _vector(v)
+    return vector(u), vector(v)
 
 
 def place_beside(task: Task, scenario: Scenario) -> BiasPoint:
@@ -136,11 +135,7 @@ def place_beside(task: Task, scenario: Scenario) -> BiasPoint:
         # first the side that is farther from the rest of the motion
         places += sorted(sides, key=lambda place: -np.linalg.norm(mean - place, axis=1).min())
     taken = [np.asarray(other.position) for other in bias_points(scenario.layers).values()]
-    free = [place for place in places if all(np.linalg.norm(place - other) > BESIDE for other in taken)]
+    free = [place for place in places if np.linalg.norm(mean - place, axis=1).min() > BESIDE / 2]  # of other strokes
+    free = [place for place in free if all(np.linalg.norm(place - other) > BESIDE for other in taken)]
     room = (place for place in free if scenario.obstacle.signed_distance(place) > ROOM)
-    return BiasPoint(_vector(next(room, (free or places)[0])), plane=plane)
-
-
-def _vector(v: Array) -> Vector:
-    x, y, z = (float(c) for c in v)
-    return x, y, z
+    return BiasPoint(vector(next(room, (free or places)[0])), plane=plane)

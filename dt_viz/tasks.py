@@ -135,11 +135,10 @@ class TaskEntry:
         return self.load()
 
 
-def draw_s() -> Task:
-    """Draw the letter S in a vertical plane before the robot (sec. 5)."""
-    return drawing_task(
-        "draw_s", "Draw S", "Drag the sphere through the letter.", load_demonstrations(ASSETS / "draw_s.npz")
-    )
+def letter(character: str, hint: str = "Drag the sphere through the letter.", obstacle_at: float = 0.5) -> Task:
+    """Draw a letter that ships with DT-Viz, in a vertical plane before the robot (sec. 5); see `drawing_task`."""
+    name = f"draw_{character.lower()}"
+    return drawing_task(name, f"Draw {character}", hint, load_demonstrations(ASSETS / f"{name}.npz"), obstacle_at)
 
 
 def lift_box() -> Task:
@@ -187,13 +186,6 @@ def push_box() -> Task:
     )
 
 
-def draw_j() -> Task:
-    """Draw the letter J in a vertical plane before the robot, to be biased towards points beside it (fig. 4)."""
-    return drawing_task(
-        "draw_j", "Draw J", "Bias the letter to points beside it.", load_demonstrations(ASSETS / "draw_j.npz")
-    )
-
-
 def drop_pots() -> Task:
     """Carry an object over the centre pot, to be biased towards the left or the right one (fig. 8)."""
     demonstrations = load_demonstrations(ASSETS / "drop_pots.npz")
@@ -216,10 +208,19 @@ def drop_pots() -> Task:
     )
 
 
-def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonstration, ...]) -> Task:
+def drawing_task(
+    name: str, title: str, hint: str, demonstrations: tuple[Demonstration, ...], obstacle_at: float = 0.5
+) -> Task:
     """A task from 2-D demonstrations, on the vertical plane before the robot.
 
     Drawings between a half and the whole of `DRAWING_SIZE` keep their size; others are scaled to it.
+
+    Args:
+        name: of the task.
+        title: for the page.
+        hint: what to try.
+        demonstrations: of one drawing.
+        obstacle_at: where on the mean drawing the obstacle first stands, as a fraction of its length.
     """
     points = np.concatenate([d.positions for d in demonstrations])
     lower, upper = points.min(axis=0), points.max(axis=0)
@@ -237,7 +238,9 @@ def drawing_task(name: str, title: str, hint: str, demonstrations: tuple[Demonst
         scale=scale,
         slice=Slice(DRAWING_CENTRE, DRAWING_AXES[:, :2], (float(half[0]), float(half[1]))),
         camera=((0.79, -1.56, 0.75), (0.15, -0.33, 0.355)),
-        obstacle_position=_on_mean_path(demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, 0.5),
+        obstacle_position=_on_mean_path(
+            demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, obstacle_at
+        ),
     )
 
 
@@ -270,10 +273,14 @@ def _on_mean_path(
 
 
 TASKS: Mapping[str, TaskEntry] = {
-    "draw_s": TaskEntry("Draw S", draw_s),
+    "draw_s": TaskEntry("Draw S", partial(letter, "S")),
+    "draw_j": TaskEntry("Draw J", partial(letter, "J", "Bias the letter to points beside it.")),
+    "draw_c": TaskEntry("Draw C", partial(letter, "C")),
+    "draw_g": TaskEntry("Draw G", partial(letter, "G")),
+    "draw_w": TaskEntry("Draw W", partial(letter, "W", obstacle_at=0.36)),  # not between two strokes
+    "draw_z": TaskEntry("Draw Z", partial(letter, "Z")),
     "lift_box": TaskEntry("Lift box", lift_box),
     "push_box": TaskEntry("Push box", push_box),
-    "draw_j": TaskEntry("Draw J", draw_j),
     "drop_pots": TaskEntry("Drop in pots", drop_pots),
 }
 """The tasks that ship with DT-Viz, by name."""

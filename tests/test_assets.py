@@ -11,7 +11,7 @@ from dt_viz.metrics import arc_length, resample_by_arc_length, sharpest_turn
 from dt_viz.tasks import POTS
 
 ASSETS = Path(__file__).parents[1] / "assets"
-TASKS = ["draw_s", "lift_box", "push_box", "draw_j", "drop_pots"]
+TASKS = ["draw_s", "lift_box", "push_box", "draw_j", "drop_pots", "draw_c", "draw_g", "draw_w", "draw_z"]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,12 @@ def test_the_script_makes_the_files_that_ship(script, task):
 
 @pytest.mark.parametrize(
     ("task", "number", "dimension"),
-    [("draw_s", 7, 2), ("lift_box", 8, 3), ("push_box", 7, 3), ("draw_j", 7, 2), ("drop_pots", 8, 3)],
+    [
+        *((f"draw_{letter}", 7, 2) for letter in "sjcgwz"),
+        ("lift_box", 8, 3),
+        ("push_box", 7, 3),
+        ("drop_pots", 8, 3),
+    ],
 )
 def test_number_and_dimension(task, number, dimension):
     assert [d.dimension for d in shipped(task)] == [dimension] * number
@@ -131,6 +136,30 @@ def test_the_letter_j_is_centred_and_drawn_down_its_stem_and_up_its_bow():
     lowest = mean[mean[:, 1].argmin()]
     assert mean[0, 1] == mean[:, 1].max() and mean[0, 0] > 0.08  # from the top of the stem
     assert mean[-1, 0] == mean[:, 0].min() and mean[-1, 1] > lowest[1] + 0.08  # to the upper left end of the bow
+
+
+def test_each_letter_is_written_in_its_own_direction_with_its_own_corners():
+    def mean(letter):
+        return np.mean([resample_by_arc_length(d.positions, 201) for d in shipped(f"draw_{letter}")], axis=0)
+
+    sizes = {"c": (0.27, 0.40), "g": (0.32, 0.40), "w": (0.41, 0.30), "z": (0.29, 0.39)}
+    for letter, size in sizes.items():
+        path = mean(letter)
+        np.testing.assert_allclose(np.ptp(path, axis=0), size, atol=0.02)
+        np.testing.assert_allclose((path.min(axis=0) + path.max(axis=0)) / 2, 0, atol=0.03)
+
+    c, g, w, z = (mean(letter) for letter in "cgwz")
+    assert c[0, 0] > 0.08 and c[0, 1] > 0.1 and c[-1, 0] > 0.08 and c[-1, 1] < -0.1  # open to the right
+    assert sharpest_turn(c, 0.02) < 20
+    bar = g[-20:]
+    assert np.ptp(bar[:, 1]) < 0.02 and (np.diff(bar[:, 0]) < 0).all()  # in, along the bar
+    assert sharpest_turn(g, 0.04) > 60  # into it
+    heights = np.diff(np.sign(np.diff(w[:, 1])))
+    assert heights[heights != 0].tolist() == [2, -2, 2]  # down, up, down, up
+    assert (np.diff(w[:, 0]) > 0).all()
+    across = np.diff(z[:, 0])
+    assert across[:40].min() > 0 and across[-40:].min() > 0 and across[90:110].max() < 0  # right, back, right
+    assert z[0, 1] > 0.15 and z[-1, 1] < -0.15
 
 
 def test_the_object_is_carried_over_the_centre_pot_and_stops_above_it():

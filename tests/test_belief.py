@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.belief import believed, level_line, occupancy_picture
+from dt_viz.belief import MAX_POINTS, NEAR, believed, level_line, occupancy_picture
+from dt_viz.clouds import Cloud
 from dt_viz.engine import Stage
-from dt_viz.obstacles import Box, Cylinder, Sphere
+from dt_viz.obstacles import Box, CloudObstacle, Cylinder, Sphere
 from dt_viz.scenario import View
 from dt_viz.several import Several
 from dt_viz.tasks import Slice
@@ -51,6 +52,22 @@ def test_what_any_obstacle_is_believed_to_occupy_is_occupied():
     assert (both >= np.maximum(*each) - 1e-12).all()
     nothing = occupancy_picture(AREA, (), coarse=True)
     assert nothing.probability.max() == 0 and len(nothing.level) == len(nothing.outline) == 0
+
+
+def test_the_points_beside_the_slice_are_shown_on_it_with_their_labels():
+    rng = np.random.default_rng(4)
+    own = rng.uniform(-0.1, 0.1, (20_000, 3))
+    labels = np.linalg.norm(own, axis=1) < 0.06
+    cloud = CloudObstacle((0.05, -0.5, 0.42), Cloud(own, labels), (0.9, 0.1, 0.3, -0.3))
+    picture = occupancy_picture(AREA, (SHAPES[0], cloud), coarse=True)
+    normal = np.cross(*AREA.axes.T)
+    assert MAX_POINTS / 2 < len(picture.points) <= MAX_POINTS
+    np.testing.assert_allclose((picture.points - AREA.centre) @ normal, 0, atol=1e-12)
+    assert (np.abs((picture.points - AREA.centre) @ AREA.axes) < AREA.half_size).all()
+    distance = np.linalg.norm(picture.points - cloud.position, axis=1)
+    assert (distance[picture.occupied] < 0.06).all()
+    assert (distance[~picture.occupied] > np.sqrt(0.06**2 - NEAR**2)).all()
+    assert len(occupancy_picture(AREA, SHAPES, coarse=True).points) == 0
 
 
 def test_the_picture_is_worked_out_only_while_it_is_shown(engine, initial):

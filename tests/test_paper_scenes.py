@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from dt_viz.clouds import Cloud
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.obstacles import Box, Cylinder
-from dt_viz.paper_scenes import SCENES
+from dt_viz.obstacles import Box, CloudObstacle, Cylinder, Sphere
+from dt_viz.paper_scenes import SCENES, clover, in_clover, seen_in
+from dt_viz.scenario import View
 from dt_viz.stacking import bias_points
 from dt_viz.tasks import POTS, TASKS
 
@@ -67,6 +69,61 @@ def test_every_stroke_leaves_the_cube_and_the_ends_of_the_letter_stay(certified)
         np.testing.assert_allclose(path[[0, -1]], before[[0, -1]], atol=1e-3)
         last = before[np.linalg.norm(before - before[-1], axis=1) < 0.05]
         assert max(np.linalg.norm(path - point, axis=1).min() for point in last) < 0.01
+
+
+def assert_only_the_stroke_gives_way(frame, obstacle, until):
+    """Of the letter, what lies farther than so many metres from the obstacle stays legible."""
+    for path, before in zip(frame.rollouts, frame.ghost, strict=True):
+        np.testing.assert_allclose(path[[0, -1]], before[[0, -1]], atol=1e-3)
+        away = before[obstacle.signed_distance(before) > until]
+        assert len(away) > 50
+        assert max(np.linalg.norm(path - point, axis=1).min() for point in away) < 0.03
+
+
+def test_the_clover_is_known_by_labelled_points_only_and_every_stroke_leaves_it(certified):
+    frame = certified("cloud")
+    (cloud,) = frame.scenario.obstacles
+    assert isinstance(cloud, CloudObstacle) and cloud.cloud == clover()
+    points, occupied = cloud.labelled()
+    assert 0.05 < occupied.mean() < 0.5
+    own = points - cloud.position
+    np.testing.assert_array_equal(in_clover(own), occupied)
+    assert not in_clover((own[occupied][:-1] + own[occupied][1:]) / 2).all()  # it is not convex
+    distance = cloud.signed_distance(points)  # from what is learned, which is rounder than the tips of the leaves
+    assert (distance[occupied] < 0).mean() > 0.95 and distance[occupied].max() < 0.012
+    assert (distance[~occupied] > 0).mean() > 0.95 and distance[~occupied].min() > -0.012
+    undisturbed = max(maximum_collision_distance(path, cloud.signed_distance) for path in frame.ghost)
+    assert undisturbed > 0.02
+    assert max(maximum_collision_distance(path, cloud.signed_distance) for path in frame.rollouts) == 0
+    assert_only_the_stroke_gives_way(frame, cloud, 0.06)
+    assert SCENES["cloud"].view["occupancy"]
+
+
+def test_the_clover_is_the_same_every_time():
+    clover.cache_clear()
+    before = clover()
+    clover.cache_clear()
+    assert clover() == before == Cloud(before.points, before.labels)
+
+
+@pytest.mark.parametrize("letter", "cgwz")
+def test_every_stroke_of_a_letter_goes_around_the_sphere_and_the_arm_with_it(certified, letter):
+    frame = certified(f"letter_{letter}")
+    (sphere,) = frame.scenario.obstacles
+    assert isinstance(sphere, Sphere) and frame.task.name == f"draw_{letter}"
+    assert min(maximum_collision_distance(path, sphere.signed_distance) for path in frame.ghost) > 0.02  # on each
+    assert max(maximum_collision_distance(path, sphere.signed_distance) for path in frame.rollouts) == 0
+    assert frame.health.collision.problems == ()
+    assert_only_the_stroke_gives_way(frame, sphere, 0.12)
+
+
+def test_what_a_scene_switches_on_is_off_again_once_it_is_left():
+    mine = View(arm=False, grid=True)
+    there = seen_in(mine, "cloud", "")
+    assert there.occupancy and not there.field and not there.arm and there.grid
+    assert seen_in(there, "cloud", "cloud") == there
+    for after in ("", "cube", "what is none"):
+        assert seen_in(there, after, "cloud") == mine
 
 
 def test_every_stroke_of_the_j_passes_both_points_within_a_centimetre(certified):

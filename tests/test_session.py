@@ -549,6 +549,19 @@ def test_a_scene_replaces_all_but_the_view_and_is_undone_at_once(opened):
     assert session.scenario == before
 
 
+def test_what_a_scene_shows_goes_with_it_also_when_it_is_undone_or_done_again(opened):
+    session, mine = opened.session, View(grid=True)
+    session.edit("view", view=mine)
+    opened.engine.task = lambda name: name
+    for leave in (session.undo, session.reset, lambda: session.choose_task("lift_box")):
+        session.load("draw_s", lambda task: Scenario(task, (), scene="cloud"))
+        assert session.scenario.view == replace(mine, occupancy=True, field=False)
+        leave()
+        assert session.scenario.view == mine
+    session.undo()
+    assert session.scenario.view.occupancy
+
+
 def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):
     session = opened.session
     session.edit("scene", layers=(cast(Layer, "a layer"),), avoidance_level=0, temperature=8.0)

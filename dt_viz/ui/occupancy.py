@@ -14,7 +14,7 @@ from dt_viz.ui.picture import Lines, Picture
 
 MOST_OPAQUE = 0.85
 """Opacity where the map is sure that something is there."""
-DASH = 0.008
+POINT_SIZE = 0.0025
 """Metres."""
 
 
@@ -28,6 +28,9 @@ class OccupancySlice(Picture):
         self._area: Slice | None = None
         self.level = Lines(scene, "/occupancy/level", palette.OCCUPANCY_LEVEL, 0.0035)
         self.outline = Lines(scene, "/occupancy/outline", palette.GHOST, 0.0016)
+        self.points = scene.add_point_cloud(
+            "/occupancy/points", np.zeros((0, 3), np.float32), palette.FREE, point_size=POINT_SIZE, point_shape="circle"
+        )
         self._shown: object = None
 
     def draw(self, frame: Frame) -> None:
@@ -39,6 +42,8 @@ class OccupancySlice(Picture):
         self._paint(picture.area, picture.probability)
         self.level.show_segments(picture.level)
         self.outline.show_segments(picture.outline)
+        self.points.points = picture.points.astype(np.float32)
+        self.points.colors = np.where(picture.occupied[:, None], palette.OCCUPIED, palette.FREE).astype(np.uint8)
 
     def _paint(self, area: Slice, probability: Array) -> None:
         pixels = np.empty((*probability.T.shape, 4), np.uint8)

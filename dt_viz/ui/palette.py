@@ -22,6 +22,8 @@ LEVEL = (0, 114, 178)
 OCCUPANCY = (230, 159, 0)
 OCCUPANCY_LEVEL = (153, 88, 0)
 """Where the map finds occupied and free equally likely."""
+OCCUPIED, FREE = (92, 48, 0), (150, 158, 168)
+"""Labelled points."""
 ARROW_SLOW = (198, 205, 216)
 ARROW_FAST = (64, 84, 120)
 GENERATOR_WEAK = (246, 214, 150)

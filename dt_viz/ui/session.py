@@ -16,6 +16,7 @@ from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.fields import Array
 from dt_viz.imitation import ImitationError
+from dt_viz.paper_scenes import seen_in
 from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
 from dt_viz.tasks import Task
@@ -188,7 +189,7 @@ class Session:
         self._begin("reset", self._initial(self.scenario.task))
 
     def load(self, task: str, scenario: Callable[[Task], Scenario]) -> None:
-        """Begin with a scenario for a task, seen as what is shown now; can be undone.
+        """Begin with a scenario for a task, seen as what is shown now or as its scene wants it; can be undone.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be used; the session stays with its own.
@@ -196,8 +197,13 @@ class Session:
         self._begin("load", scenario(self._engine.task(task)))
 
     def _begin(self, gesture: str, fresh: Scenario) -> None:
-        self.edit(gesture, **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "view"})
+        fresh = self._as_seen(fresh)
+        self.edit(gesture, **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__})
         self.end_gesture()
+
+    def _as_seen(self, other: Scenario) -> Scenario:
+        """Another scenario, looked at as this one."""
+        return replace(other, view=seen_in(self.scenario.view, other.scene, self.scenario.scene))
 
     def push(self, q: Array, show: Callable[[Pushed], None]) -> None:
         """Push the hand aside. Nothing is done while another motion than the scenario's is shown.
@@ -242,7 +248,7 @@ class Session:
             if not source:
                 return
             target.append(self.scenario)
-            self.scenario = replace(source.pop(), view=self.scenario.view)
+            self.scenario = self._as_seen(source.pop())
             self._gesture = ("", 0.0)
             self._submit()
         self._adopt()
@@ -267,7 +273,7 @@ class Session:
             if history and history[-1].learns_like(shown):
                 before = history.pop()
                 break
-        self.scenario = replace(before, view=self.scenario.view)
+        self.scenario = self._as_seen(before)
         self._gesture = ("", 0.0)
         self._submit()
         return True
