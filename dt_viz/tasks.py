@@ -203,7 +203,7 @@ def drop_pots() -> Task:
         scale=1.0,
         slice=Slice(paths.mean(axis=(0, 1)), np.stack([[1.0, 0.0, 0.0], down], axis=1), (0.30, 0.24)),
         camera=((0.62, -1.58, 0.90), (0.06, -0.38, 0.24)),
-        obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.5),
+        obstacle_position=(0.0, -0.58, 0.36),  # beyond: where the hand comes from there is the arm, once it is there
         pots=POTS,
     )
 

@@ -1,5 +1,7 @@
 """Tasks: demonstrations and their place in the robot's world."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -7,6 +9,7 @@ from scipy.io import savemat
 from dt_viz.demos import DemonstrationError
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.robot import load_jaco
+from dt_viz.scenario import SPACES
 from dt_viz.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
 from dt_viz.tracking import inverse_kinematics, track
 
@@ -38,10 +41,20 @@ def test_a_file_in_space_is_refused_and_named(tmp_path):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_the_obstacle_first_stands_on_the_motion(name):
-    task = TASKS[name]()
-    distance = np.linalg.norm(np.concatenate(task.paths) - task.obstacle_position, axis=1)
-    assert distance.min() < 0.03
+def test_the_obstacle_first_stands_in_the_way_of_the_motion(name, initial):
+    scenario = initial(name)
+    clearance = scenario.obstacle.signed_distance(np.concatenate(TASKS[name]().paths)).min()
+    assert clearance < scenario.margin
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("name", TASKS)
+def test_the_obstacle_first_stands_where_hand_and_arm_find_a_way_to_the_goal(name, space, engine, initial):
+    *_, frame = engine.frames(replace(initial(name), space=space))
+    assert frame.blocked == () and frame.health.doubts == ()
+    np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
+    if space != "task":
+        assert frame.health.collision.problems == () and frame.health.arm_duration > 0.05  # it is in the arm's way, too
 
 
 @pytest.mark.parametrize("name", TASKS)
