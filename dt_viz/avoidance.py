@@ -42,7 +42,9 @@ class ObstacleAvoidance:
         duration = scenario.duration
         if duration is None:
             # the deepest samples leave last, or nearly so; where they did not tell the whole story, take all
-            points = motion.positions[_avoidable(motion)] if at_least else _deepest(motion)
+            points = motion.positions[_avoidable(motion)]
+            if not at_least:
+                points = np.concatenate([_deepest(motion), _crests(field, motion)])
             duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
         hopeless = duration is None
         if duration is None:
@@ -96,6 +98,24 @@ def _deepest(motion: Motion) -> Array:
     order = np.lexsort([depth, motion.index])
     rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
     return motion.positions[order[(rank < NUM_DEEPEST) & avoidable[order]]]
+
+
+def _crests(field: VectorField, motion: Motion) -> Array:
+    """(M, 3) places between the samples of the rollouts where the field stops leading onwards and starts leading back.
+
+    The field is a gradient, or nearly so: its potential is largest there, and what is there leaves last.
+    """
+    s, step = motion.positions, np.diff(motion.positions, axis=0)
+    avoidable = _avoidable(motion) & (motion.scenario.obstacle.signed_distance(s) < _margin(motion))
+    same = np.diff(motion.index) == 0
+    k = np.flatnonzero(same & avoidable[:-1] & avoidable[1:])
+    here, there = (field(np.concatenate([s[k], s[k + 1]])) * np.tile(step[k], (2, 1))).sum(axis=1).reshape(2, -1)
+    turns = (here > 0) & (there < 0)
+    k, part = k[turns], (here / np.where(turns, here - there, 1))[turns, None]
+    # between two samples a path bends like the parabolas through them and the ones beside them
+    bend = np.zeros_like(s)
+    bend[1:-1] = np.diff(step, axis=0) * (same[:-1] & same[1:])[:, None]
+    return s[k] + part * step[k] - part * (1 - part) * (bend[k] + bend[k + 1]) / 4
 
 
 def _avoidable(motion: Motion) -> Mask:

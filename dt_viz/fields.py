@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.floating[Any]]
 Indices = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]
+Selection = slice | Indices
+
+BLOCK = 4096
+"""Points that a sum over a grid is worked out for at once: of more, what is worked out on the way leaves the cache."""
 
 
 class VectorField(Protocol):
@@ -115,7 +119,7 @@ class GaussianGrid:
         values = self._gaussians(s, max_order)
         return [np.ascontiguousarray(values[:, part].swapaxes(1, 2)) for part in self._flat_axes[2]]
 
-    def contract(self, s: Array, weights: Array, orders: tuple[tuple[int, ...], ...]) -> list[Array]:
+    def contract(self, s: Array, weights: Array, orders: tuple[tuple[int, ...], ...]) -> Array:
         """Partial derivatives of Σ_i w_i k(s, ŝ_i).
 
         Args:
@@ -124,23 +128,27 @@ class GaussianGrid:
             orders: multi-indices; (0, 1) asks for ∂/∂s_2 in the plane.
 
         Returns:
-            One array (N, k) for each multi-index. Multi-indices that begin alike share the work of their beginning.
+            (len(orders), N, k). Multi-indices that begin alike share the work of their beginning.
         """
         num, k = len(s), weights.shape[1]
         if not num:  # an obstacle that covers the whole slice leaves no arrows to evaluate
-            return [np.empty((0, k)) for _ in orders]
-        values = self._gaussians(s, max(map(max, orders)))
+            return np.empty((len(orders), 0, k))
+        if num > BLOCK:
+            blocks = [self.contract(s[i : i + BLOCK], weights, orders) for i in range(0, num, BLOCK)]
+            return np.concatenate(blocks, axis=1)
+        highest, levels, order = _plan(orders)
+        values = self._gaussians(s, highest)
         first, *others = self._flat_axes[2]
-        rest = weights.reshape(self.shape[0], -1).T  # (n_2 ⋯ n_d k, n_1)
-        partial = {order: rest @ values[order[0], first] for order in _beginnings(orders, 1)}
-        for j, part in enumerate(others, start=1):
-            partial = {
-                order: np.einsum(
-                    "arn,an->rn", partial[order[:j]].reshape(self.shape[j], -1, num), values[order[j], part]
-                )
-                for order in _beginnings(orders, j + 1)
-            }
-        return [partial[order].T for order in orders]
+        (pieces, _), *rest = levels
+        weights = weights.reshape(self.shape[0], -1).T  # (n_2 ⋯ n_d k, n_1)
+        partial = weights @ values[[derivative for derivative, *_ in pieces], first]
+        for n, part, (pieces, size) in zip(self.shape[1:], others, rest, strict=True):
+            longer = np.empty((size, partial.shape[1] // n, num))
+            partial = partial.reshape(len(partial), n, -1, num)
+            for derivative, source, target in pieces:
+                np.einsum("parn,an->prn", partial[source], values[derivative, part], out=longer[target])
+            partial = longer
+        return partial[order].swapaxes(1, 2)
 
     def features(self, s: Array) -> Array:
         """The dense matrix k(s, ŝ), (N, m): for fitting, not for evaluating."""
@@ -154,10 +162,41 @@ class GaussianGrid:
         return self.features(self.inducing_points)
 
 
+_Piece = tuple[int, Selection, slice]
+"""Which derivative along an axis makes which beginnings of multi-indices into which longer ones."""
+
+
+class _Plan(NamedTuple):
+    """In which order a contraction works out multi-indices, axis after axis."""
+
+    highest: int
+    """Derivative along an axis."""
+    levels: tuple[tuple[tuple[_Piece, ...], int], ...]
+    """For each axis its pieces, and how many beginnings of multi-indices there are with it."""
+    order: Selection
+    """Of the multi-indices at the end."""
+
+
 @lru_cache(maxsize=256)
-def _beginnings(orders: tuple[tuple[int, ...], ...], length: int) -> tuple[tuple[int, ...], ...]:
-    """The different beginnings of that length among multi-indices."""
-    return tuple(dict.fromkeys(order[:length] for order in orders))
+def _plan(orders: tuple[tuple[int, ...], ...]) -> _Plan:
+    """Put together what takes the same derivative along an axis: it is one call."""
+    levels: list[tuple[tuple[_Piece, ...], int]] = []
+    before: list[tuple[int, ...]] = [()]
+    for length in range(1, len(orders[0]) + 1):
+        wanted, now, pieces = {order[:length] for order in orders}, [], []
+        for derivative in sorted({beginning[-1] for beginning in wanted}):
+            source = [i for i, beginning in enumerate(before) if (*beginning, derivative) in wanted]
+            pieces.append((derivative, _selection(source), slice(len(now), len(now) + len(source))))
+            now += [(*before[i], derivative) for i in source]
+        levels.append((tuple(pieces), len(now)))
+        before = now
+    return _Plan(max(map(max, orders)), tuple(levels), _selection([before.index(order) for order in orders]))
+
+
+def _selection(rows: list[int]) -> Selection:
+    """Rows of an array, without a copy where they are one after the other."""
+    one_after_the_other = rows == list(range(rows[0], rows[-1] + 1))
+    return slice(rows[0], rows[-1] + 1) if one_after_the_other else np.array(rows)
 
 
 @lru_cache
@@ -250,17 +289,28 @@ class Sum:
 
     def __call__(self, s: Array) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
-        return np.sum([part(s) for part in self.parts], axis=0)
+        first, *others = self.parts
+        V = first(s)
+        for part in others:
+            V = V + part(s)
+        return V
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
-        values, derivatives = zip(*(part.with_jacobian(s) for part in self.parts), strict=True)
-        return np.sum(values, axis=0), np.sum(derivatives, axis=0)
+        first, *others = self.parts
+        V, DV = first.with_jacobian(s)
+        for part in others:
+            v, Dv = part.with_jacobian(s)
+            V, DV = V + v, DV + Dv
+        return V, DV
 
 
 @dataclass(frozen=True)
 class Repeated:
-    """The sum of one field at several places; at least one. It is evaluated for all of them at once."""
+    """The sum of one field at several places; at least one.
+
+    It is evaluated for all of them at once: a point is a row of its coordinates in each of their frames.
+    """
 
     places: tuple[PlacedField, ...]
     """All with the same inner field."""
@@ -272,17 +322,32 @@ class Repeated:
 
     def __call__(self, s: Array) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
-        values = self.places[0].inner(self._local(s)).reshape(len(self.places), *s.shape)
-        return np.sum([v @ (at.scale * at.axes.T) for v, at in zip(values, self.places, strict=True)], axis=0)
+        return self.places[0].inner(self._local(s)).reshape(len(s), len(self._to_world)) @ self._to_world
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
-        num, (values, derivatives) = len(self.places), self.places[0].inner.with_jacobian(self._local(s))
-        values = values.reshape(num, *s.shape)
-        derivatives = derivatives.reshape(num, *s.shape, self.dim)
-        V = np.sum([v @ (at.scale * at.axes.T) for v, at in zip(values, self.places, strict=True)], axis=0)
-        DV = np.sum([at.axes @ D @ at.axes.T for D, at in zip(derivatives, self.places, strict=True)], axis=0)
-        return V, DV
+        v, DV = self.places[0].inner.with_jacobian(self._local(s))
+        V = v.reshape(len(s), len(self._to_world)) @ self._to_world
+        DV = DV.reshape(len(s), len(self._derivatives_to_world)) @ self._derivatives_to_world
+        return V, DV.reshape(len(s), self.dim, self.dim)
 
     def _local(self, s: Array) -> Array:
-        return np.concatenate([(s - at.origin) @ (at.axes / at.scale) for at in self.places])
+        """The points (N·P, d) in the frames of the P places, of the first point first."""
+        return (s @ self._to_local - self._origins).reshape(-1, self.dim)
+
+    @cached_property
+    def _to_local(self) -> Array:
+        return np.concatenate([at.axes / at.scale for at in self.places], axis=1)
+
+    @cached_property
+    def _origins(self) -> Array:
+        return np.concatenate([at.origin @ (at.axes / at.scale) for at in self.places])
+
+    @cached_property
+    def _to_world(self) -> Array:
+        return np.concatenate([at.scale * at.axes.T for at in self.places])
+
+    @cached_property
+    def _derivatives_to_world(self) -> Array:
+        # R·D·Rᵀ, row by row, is the row D times (R ⊗ R)ᵀ
+        return np.concatenate([np.kron(at.axes, at.axes).T for at in self.places])

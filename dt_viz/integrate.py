@@ -83,7 +83,8 @@ def integrate_adaptive(
 
     Every point has its own step length, chosen so that the estimated error of each step is below `tolerance` (in the
     unit of `s`) and, for motions as small as that and for tangents, below `RELATIVE_TOLERANCE` of them: points that the
-    field hardly moves take one step, only those in its stiff core take many.
+    field hardly moves take one step, only those in its stiff core take many. The first step is short where the field
+    changes quickly along it: the estimated error of a step far too long may be small by chance.
 
     Raises:
         ArithmeticError: if some point needs more than `max_rounds` steps.
@@ -95,20 +96,24 @@ def integrate_adaptive(
     state, rate = _augment(field, s, U)
     state = state.copy()
     first = rate(state)
-    still = _still(field, state, first, U is None, duration, tolerance)
+    turning = _turning(field, state, first, duration, tolerance)
+    still = _still(state, first, turning, d, total, tolerance)
     state[still] += duration * first[still]
-    active, first = np.flatnonzero(~still), first[~still]
-    done, h = np.zeros(len(s)), np.full(len(s), total)
+    # of those that are still on their way: row, state, rate, time left, length of the next step
+    active = np.flatnonzero(~still)
+    start, first, left = state[active], first[active], np.full(len(active), total)
+    h = _first_step(first[:, :d], turning[active], total, tolerance)
     for _ in range(max_rounds):
         if not len(active):
             return _split(state, s, U)
-        start, step = state[active], np.sign(duration) * h[active, None]
-        stages = [first]
-        for row in _DP_STAGES:
-            stages.append(rate(start + step * sum(a * k for a, k in zip(row, stages, strict=True) if a)))
-        # the last stage point is the fifth-order result: first same as last
-        end = start + step * sum(a * k for a, k in zip(_DP_STAGES[-1], stages[:-1], strict=True) if a)
-        defect = step * sum(e * k for e, k in zip(_DP_ERROR, stages, strict=True) if e)
+        step = np.sign(duration) * h[:, None]
+        stages = np.empty((len(_DP_STAGES), *start.shape))
+        end, stages[0] = start, first
+        for i, row in enumerate(_DP_STAGES[1:], start=1):
+            # the last stage point is the fifth-order result: first same as last
+            end = start + step * _combined(row[:i], stages[:i])
+            stages[i] = rate(end)
+        defect = step * _combined(_DP_ERROR, stages)
         # beside a rest point a small error is a large part of the motion, which grows with the motion
         allowed = np.clip(RELATIVE_TOLERANCE * np.abs(end - start)[:, :d].max(axis=1), ROUNDING, tolerance)
         error = np.abs(defect[:, :d]).max(axis=1) / allowed
@@ -116,52 +121,87 @@ def integrate_adaptive(
             largest = np.maximum(np.abs(end[:, d:]).max(axis=1), np.finfo(float).tiny)
             error = np.maximum(error, np.abs(defect[:, d:]).max(axis=1) / (RELATIVE_TOLERANCE * largest))
         accepted = error <= 1
-        state[active[accepted]] = end[accepted]
-        done[active] += np.where(accepted, h[active], 0)
-        growth = 0.9 * np.maximum(error, 1e-10) ** -0.2
-        h[active] = np.minimum(h[active] * np.clip(growth, 0.1, 5.0), total - done[active])
+        start = np.where(accepted[:, None], end, start)
         first = np.where(accepted[:, None], stages[-1], first)
-        unfinished = done[active] < total * (1 - 1e-12)
-        active, first = active[unfinished], first[unfinished]
+        left = left - accepted * h
+        h = np.minimum(h * np.clip(0.9 * np.maximum(error, 1e-10) ** -0.2, 0.1, 5.0), left)
+        unfinished = left > total * 1e-12
+        if not unfinished.all():
+            state[active[~unfinished]] = start[~unfinished]
+            active, start, first, left, h = (values[unfinished] for values in (active, start, first, left, h))
     raise ArithmeticError(f"{len(active)} points need more than {max_rounds} steps: the field is too steep for them")
 
 
-_DP_STAGES = (
-    (1 / 5,),
-    (3 / 40, 9 / 40),
-    (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    (35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+_DP_STAGES = np.array(
+    [
+        (0, 0, 0, 0, 0, 0),
+        (1 / 5, 0, 0, 0, 0, 0),
+        (3 / 40, 9 / 40, 0, 0, 0, 0),
+        (44 / 45, -56 / 15, 32 / 9, 0, 0, 0),
+        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0),
+        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0),
+        (35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+    ]
 )
-_DP_ERROR = (71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+_DP_ERROR = np.array((71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40))
 
 
 RELATIVE_TOLERANCE = 3e-4
 """Of the motion of a step, and of a tangent."""
 ROUNDING = 1e-15
 """Below which differences of coordinates mean nothing, in their unit."""
+STRAIGHT = 0.1
+"""Part of a velocity that may change along a motion that counts as straight."""
+LONGEST_TURN = 0.8
+"""Largest first step, in the time in which a velocity changes by as much as it is: where `RELATIVE_TOLERANCE` is what
+is asked for, about the longest that is accepted."""
 
 
-def _still(field: VectorField, state: Array, rate: Array, alone: bool, duration: float, tolerance: float) -> Mask:
+def _combined(coefficients: Array, stages: Array) -> Array:
+    """Weighted sum of stages (S, N, ·), (N, ·), as one product."""
+    return (coefficients @ stages.reshape(len(stages), -1)).reshape(stages.shape[1:])
+
+
+def _turning(field: VectorField, state: Array, rate: Array, duration: float, tolerance: float) -> Array:
+    """By how much a velocity changes for each unit of time, (N,), relative to it, of states (N, ·) with that `rate`.
+
+    It is looked at where an Euler step of the whole duration leads, or at `tolerance` in that direction if that is
+    nearer.
+    """
+    d = field.dim
+    turning = np.zeros(len(state))
+    speed = np.abs(rate[:, :d]).max(axis=1, initial=0.0)
+    moving = np.flatnonzero(speed)
+    if not len(moving):
+        return turning
+    speed, velocity = speed[moving], rate[moving, :d]
+    ahead = np.minimum(np.abs(duration), tolerance / speed)
+    there = field(state[moving, :d] + (np.sign(duration) * ahead)[:, None] * velocity)
+    turning[moving] = np.abs(there - velocity).max(axis=1) / (ahead * speed)
+    return turning
+
+
+def _still(state: Array, rate: Array, turning: Array, d: int, total: float, tolerance: float) -> Mask:
     """Which states (N, ·) with that `rate` one Euler step carries well enough: those that hardly move or turn.
 
     That the field is weak is not enough: it is so, too, beside a rest point, where motions grow from nothing and
     tangents are stretched most.
     """
-    d, total = field.dim, np.abs(duration)
     still = np.abs(rate[:, :d]).max(axis=1, initial=0.0) * total <= tolerance
-    if not alone:
-        return still & (
-            np.abs(rate[:, d:]).max(axis=1) * total <= RELATIVE_TOLERANCE * np.abs(state[:, d:]).max(axis=1)
-        )
-    slow = np.flatnonzero(still & rate.any(axis=1))
-    if not len(slow):
-        return still
-    velocity = rate[slow]
-    change = field(state[slow] + duration * velocity) - velocity
-    still[slow] = np.abs(change).max(axis=1, initial=0.0) <= 0.1 * np.abs(velocity).max(axis=1, initial=0.0)
-    return still
+    if rate.shape[1] == d:
+        return still & (turning * total <= STRAIGHT)
+    changing = np.abs(rate[:, d:]).max(axis=1)
+    return still & (changing * total <= RELATIVE_TOLERANCE * np.abs(state[:, d:]).max(axis=1))
+
+
+def _first_step(velocity: Array, turning: Array, total: float, tolerance: float) -> Array:
+    """Length (N,) of the first step of points with a `velocity` (N, d) that changes at the rate `turning` (N,).
+
+    The error of a step h grows as its fifth power, and `tolerance` allows less of a fast motion than of a slow one.
+    """
+    asked = RELATIVE_TOLERANCE * total * np.abs(velocity).max(axis=1, initial=0.0)
+    caution = (np.clip(asked, ROUNDING, tolerance) / np.maximum(asked, ROUNDING)) ** 0.2
+    return np.minimum(total, LONGEST_TURN * caution / np.maximum(turning, ROUNDING))
 
 
 def _augment(field: VectorField, s: Array, U: Array | None) -> tuple[Array, Callable[[Array], Array]]:

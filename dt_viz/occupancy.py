@@ -41,18 +41,19 @@ class OccupancyMap:
     def logit_gradient(self, s: Array) -> tuple[Array, Array]:
         """The logit (N,) and its gradient (N, d) at the points `s` (N, d)."""
         d = self.grid.dim
-        value, *partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d)))
-        return value[:, 0] + self.bias, np.concatenate(partials, axis=1)
+        partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d)))[..., 0]
+        return partials[0] + self.bias, partials[1:].T
 
     def logit_hessian(self, s: Array) -> tuple[Array, Array, Array]:
         """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
         d = self.grid.dim
         second = second_orders(d)
-        value, *partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d), *second.values()))
+        orders = ((0,) * d, *unit_orders(d), *second.values())
+        partials = self.grid.contract(s, self.weights[:, None], orders)[..., 0]
         hessian = np.empty((len(s), d, d))
-        for (i, j), column in zip(second, partials[d:], strict=True):
-            hessian[:, i, j] = hessian[:, j, i] = column[:, 0]
-        return value[:, 0] + self.bias, np.concatenate(partials[:d], axis=1), hessian
+        for (i, j), column in zip(second, partials[1 + d :], strict=True):
+            hessian[:, i, j] = hessian[:, j, i] = column
+        return partials[0] + self.bias, partials[1 : 1 + d].T, hessian
 
 
 def fit_occupancy(
@@ -140,9 +141,13 @@ class AvoidanceField:
         """Dimension d of the space."""
         return self.occupancy.grid.dim
 
-    @property
+    @cached_property
     def _gain(self) -> float:
         return 0.5 / self.occupancy.grid.ell  # the squared kernel width
+
+    @cached_property
+    def _far(self) -> float:
+        return float(expit(self.occupancy.bias / self.temperature))
 
     def __call__(self, s: Array) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
@@ -165,8 +170,8 @@ class AvoidanceField:
             weight = p * (1 - p)
             return weight, weight * (1 - 2 * p)
         p = expit(logit / self.temperature)
-        far = expit(self.occupancy.bias / self.temperature)
-        return np.maximum(p - far, 0), np.where(p > far, p * (1 - p) / self.temperature, 0)
+        weight = np.maximum(p - self._far, 0)
+        return weight, (weight > 0) * p * (1 - p) / self.temperature
 
 
 @dataclass(frozen=True)

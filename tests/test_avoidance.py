@@ -99,6 +99,24 @@ def test_the_built_transform_clears_the_motion_it_was_built_for():
     assert ObstacleAvoidance().satisfied(after)
 
 
+@given(seeds, st.floats(0.0005, 0.02), st.floats(0, 1), st.floats(0.05, 0.5))
+def test_the_duration_hardly_depends_on_where_a_path_is_sampled(seed, miss, phase, bend):
+    """What leaves last lies between samples, mostly: there the path is closest to where the field vanishes."""
+    along, aside, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+
+    def path(u):
+        u = u[:, None]
+        return np.array(SPHERE.position) + 0.2 * u * along + (miss + bend * (0.2 * u) ** 2) * aside
+
+    def duration(u):
+        built = ObstacleAvoidance().build(motion([path(u)]), 1e-8, 0.0)
+        assert built is not None
+        return built.duration
+
+    coarse = np.linspace(-1, 1, 80) + phase / 40
+    assert duration(coarse) == pytest.approx(duration(np.linspace(coarse[0], coarse[-1], 8000)), rel=0.02)
+
+
 def test_nothing_is_built_when_avoidance_is_off():
     assert ObstacleAvoidance().build(motion([passing_points(1)], avoidance=False), 1e-8, 0.0) is None
 

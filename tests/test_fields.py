@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.fields import GaussianGrid, GridRBF, PlacedField, second_orders, unit_orders
+from dt_viz.fields import BLOCK, GaussianGrid, GridRBF, PlacedField, Repeated, Sum, second_orders, unit_orders
 
 seeds = st.integers(0, 2**32 - 1)
 dims = st.sampled_from([2, 3])
@@ -73,7 +73,7 @@ def test_contract_gives_partial_derivatives_up_to_second_order(seed, dim, num_su
     zero, first, second = (0,) * dim, unit_orders(dim), second_orders(dim)
 
     def gradient(points):
-        return np.stack(grid.contract(points, weights, first), axis=-1)
+        return np.moveaxis(grid.contract(points, weights, first), 0, -1)
 
     value, *partials = grid.contract(s, weights, (zero, *first, *second.values()))
     assert value.shape == (7, num_sums)
@@ -96,6 +96,27 @@ def test_contract_answers_in_the_order_of_the_question(seed, dim):
     shuffled = [orders[i] for i in rng.permutation(len(orders))]
     for order, column in zip(shuffled, grid.contract(s, weights, tuple(shuffled)), strict=True):
         np.testing.assert_allclose(column, grid.contract(s, weights, (order,))[0], rtol=0, atol=1e-12)
+
+
+@given(seeds, dims)
+def test_contract_gives_any_selection_of_partial_derivatives(seed, dim):
+    rng = np.random.default_rng(seed)
+    grid, s = random_grid(rng, dim), rng.uniform(-1, 1, (5, dim))
+    weights = rng.normal(size=(grid.num_points, 2))
+    orders = tuple(tuple(int(n) for n in row) for row in np.unique(rng.integers(0, 4, (4, dim)), axis=0))
+    values = grid._gaussians(s, 3)  # (derivative, Σn_j, N)
+    for order, found in zip(orders, grid.contract(s, weights, orders), strict=True):
+        columns = np.ones((len(s), 1))
+        for n, part in zip(order, grid._flat_axes[2], strict=True):
+            columns = (columns[:, :, None] * values[n, part].T[:, None]).reshape(len(s), -1)
+        np.testing.assert_allclose(found, columns @ weights, rtol=1e-12, atol=1e-11)
+
+
+def test_many_points_are_worked_out_as_few_are():
+    rng = np.random.default_rng(0)
+    field, s = random_field(rng, 3), rng.uniform(-1, 1, (2 * BLOCK + 7, 3))
+    few = np.concatenate([field(part) for part in np.array_split(s, 50)])
+    np.testing.assert_allclose(field(s), few, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -144,6 +165,21 @@ def test_a_placed_field_is_the_field_of_the_moved_turned_and_scaled_thing(seed, 
     np.testing.assert_allclose(placed.with_jacobian(world)[0], expected, rtol=0, atol=1e-11 * scale)
     derivative = central_difference(placed, world, 1e-3 * scale)
     np.testing.assert_allclose(placed.with_jacobian(world)[1], derivative, rtol=0, atol=1e-8)
+
+
+@given(seeds, dims, st.integers(1, 4))
+def test_a_field_repeated_at_several_places_is_the_sum_of_them(seed, dim, num):
+    rng = np.random.default_rng(seed)
+    inner, s = random_field(rng, dim), rng.uniform(-1, 1, (9, dim))
+    places = tuple(
+        PlacedField(inner, rng.normal(size=dim), random_rotation(rng, dim), rng.uniform(0.2, 2)) for _ in range(num)
+    )
+    values, derivatives = zip(*(place.with_jacobian(s) for place in places), strict=True)
+    for field in (Repeated(places), Sum(places)):
+        value, derivative = field.with_jacobian(s)
+        np.testing.assert_allclose(field(s), sum(values), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(value, sum(values), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(derivative, sum(derivatives), rtol=0, atol=1e-12)
 
 
 @given(seeds, dims, st.floats(0.1, 10))

@@ -1,7 +1,5 @@
 """Integrators by their order of convergence, and tangents as the derivative of the numerical step."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 from dt_viz.fields import GaussianGrid, GridRBF
 from dt_viz.integrate import euler, implicit_euler, integrate, integrate_adaptive, rk4
+from dt_viz.obstacles import Sphere
 
 seeds = st.integers(0, 2**32 - 1)
 STEPS = [euler, implicit_euler, rk4]
@@ -112,6 +111,41 @@ def test_adaptive_error_falls_with_its_tolerance(duration):
     assert errors[3] < errors[2] < errors[1] < errors[0]
 
 
+@pytest.mark.parametrize(("tolerance", "largest"), [(2e-5, 1e-3), (2e-9, 1e-7)])
+@pytest.mark.parametrize("duration", [-0.9, -0.6, -0.3, 0.3, 0.9])
+def test_adaptive_is_not_deceived_by_a_first_step_that_is_far_too_long(tolerance, largest, duration):
+    """In several times the time in which a field turns motions around, some error estimate is small by chance."""
+    s = np.random.default_rng(0).normal(size=(3000, 3))
+    s *= np.linspace(0.001, 0.08, 3000)[:, None] / np.linalg.norm(s, axis=1, keepdims=True)
+    for temperature in (3.0, 6.0, 9.0):
+        field = Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", temperature)
+        reference, _ = integrate(rk4, field, s, None, duration, 300)
+        end, _ = integrate_adaptive(field, s, None, duration, tolerance)
+        assert np.abs(end - reference).max() < largest
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-6, 1e-3, 1e-2])
+def test_adaptive_steps_are_hardly_ever_tried_in_vain(distance):
+    """The first step fits the steep core at once."""
+    field = Counting(Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", 6.0))
+    integrate_adaptive(field, np.array([[distance, 0.0, 0.0]]), None, -1.0, 2e-5)
+    assert len(field.calls) <= 2 + 6 * 9
+
+
+class Counting:
+    """A field that remembers how many points it was asked for."""
+
+    def __init__(self, inner):
+        self.inner, self.dim, self.calls = inner, inner.dim, []
+
+    def __call__(self, s):
+        self.calls.append(len(s))
+        return self.inner(s)
+
+    def with_jacobian(self, s):
+        return self.inner.with_jacobian(s)
+
+
 @given(seeds, st.floats(-1.0, 1.0))
 def test_adaptive_points_do_not_depend_on_their_batch(seed, duration):
     rng = np.random.default_rng(seed)
@@ -157,23 +191,12 @@ def test_adaptive_gives_up_with_a_reason_on_a_field_that_is_too_steep():
 
 
 def test_adaptive_spends_its_steps_where_the_field_is_steep():
-    calls = []
-    inner = smooth_field(np.random.default_rng(6), strength=20.0)
-
-    class Counting:
-        dim = 2
-
-        def __call__(self, s):
-            calls.append(len(s))
-            return inner(s)
-
-        with_jacobian = partial(inner.with_jacobian)
-
+    field = Counting(smooth_field(np.random.default_rng(6), strength=20.0))
     far, near = np.full((50, 2), 30.0), np.zeros((1, 2))
-    integrate_adaptive(Counting(), np.concatenate([far, near]), None, 1.0, 1e-8)
-    assert calls[0] == 51  # all are looked at once
-    assert max(calls[2:]) == 1  # and then only the one that is carried away
-    assert len(calls) > 20
+    integrate_adaptive(field, np.concatenate([far, near]), None, 1.0, 1e-8)
+    assert field.calls[0] == 51  # all are looked at once
+    assert max(field.calls[1:]) == 1  # and then only the one that is carried away
+    assert len(field.calls) > 20
 
 
 class Saddle:
