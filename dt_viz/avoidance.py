@@ -6,7 +6,8 @@ import numpy as np
 
 from dt_viz.behaviours import Built, Motion
 from dt_viz.diffeo import AdaptiveFlow
-from dt_viz.fields import Array, Indices, Mask, VectorField
+from dt_viz.fields import Array, Mask, VectorField
+from dt_viz.ground import named_starts
 from dt_viz.integrate import integrate_adaptive, rk4
 from dt_viz.obstacles import Obstacle
 from dt_viz.several import Several
@@ -36,7 +37,8 @@ class ObstacleAvoidance:
             return None
         obstacle = scenario.obstacle
         field = obstacle.field(scenario.generator, scenario.temperature)
-        doubts = _inside(np.flatnonzero(_blocked(motion)) + 1)
+        num_demonstrated = len(motion.demonstrated.starts)
+        doubts = named_starts(np.flatnonzero(_blocked(motion)), num_demonstrated, "inside the obstacle")
         if obstacle.signed_distance(motion.goal) < 0:
             doubts.append("the goal is inside the obstacle: motions end beside it")
         duration = scenario.duration
@@ -63,13 +65,6 @@ class ObstacleAvoidance:
             return True
         distance = motion.scenario.obstacle.signed_distance(motion.positions[_avoidable(motion)])
         return bool((distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING).all())
-
-
-def _inside(starts: Indices) -> list[str]:
-    """What there is to say of starts, counted from 1, inside the obstacle."""
-    if len(starts) < 2:
-        return [f"start {start} is inside the obstacle" for start in starts]
-    return [f"starts {', '.join(map(str, starts))} are inside the obstacle"]
 
 
 def _goal(motion: Motion) -> Array:
@@ -121,17 +116,19 @@ def _crests(field: VectorField, motion: Motion) -> Array:
 def _avoidable(motion: Motion) -> Mask:
     """(N,) bool: samples that a transform can keep out of the obstacle.
 
-    Not the first ones of a motion that starts inside it, and not the last ones if it covers the goal.
+    Not the first ones of a motion that starts inside it, until it keeps the margin, and not the last ones if it covers
+    the goal.
     """
     obstacle = motion.scenario.obstacle
-    free = obstacle.signed_distance(motion.positions) >= -ROUNDING
+    distance = obstacle.signed_distance(motion.positions)
+    free, clear = distance >= -ROUNDING, distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING
     goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
     avoidable = np.ones(len(free), dtype=bool)
     for rollout, blocked in enumerate(_blocked(motion)):
         if not (blocked or goal_covered):
             continue
         rows = np.flatnonzero(motion.index == rollout)
-        outside = np.flatnonzero(free[rows])
+        outside = np.flatnonzero((clear if clear[rows].any() else free)[rows])
         if blocked:
             avoidable[rows[: outside[0] if len(outside) else None]] = False
         if goal_covered:

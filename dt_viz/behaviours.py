@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
+
+import numpy as np
 
 from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array, Indices
@@ -29,6 +31,19 @@ class Motion:
     """(N, 3) the same samples at the top of the stack, where the robot moves, metres; None before it is built."""
     keeps_goal: bool = True
     """Whether behaviours that do not mean to move the goal leave it where it is, or may move it after all."""
+    num_demonstrated: int | None = None
+    """How many of the rollouts, the first ones, have a demonstration; None is all. The others begin anywhere."""
+
+    @property
+    def demonstrated(self) -> Motion:
+        """The rollouts that have a demonstration, only."""
+        num = self.num_demonstrated
+        if num is None or num == len(self.starts):
+            return self
+        rows = slice(np.searchsorted(self.index, num))
+        top = None if self.top is None else self.top[rows]
+        samples = {"index": self.index[rows], "positions": self.positions[rows], "top": top}
+        return replace(self, starts=self.starts[:num], **samples)
 
 
 @dataclass(frozen=True)

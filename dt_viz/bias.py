@@ -14,8 +14,7 @@ from dt_viz.behaviours import Built, Motion
 from dt_viz.diffeo import Flow
 from dt_viz.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
 from dt_viz.integrate import integrate, rk4
-
-Vector = tuple[float, float, float]
+from dt_viz.scenario import Vector
 
 NUM_SAMPLES = 400
 """Unit vectors sampled in one octant of the region, or quadrant of the disc; the others are its mirror images."""
@@ -166,6 +165,7 @@ class Biasing:
     """Motions are pulled towards a bias point.
 
     With the goal where it is, every motion passes the target on its way. If the goal moves, it does so to the target.
+    It is made for the motions that have a demonstration: one that was started elsewhere changes nothing about it.
     """
 
     point: BiasPoint
@@ -174,7 +174,7 @@ class Biasing:
 
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built:
         """See `Behaviour`. With `auto` the duration is the shortest that brings every motion to the target."""
-        point = self.point
+        point, motion = self.point, motion.demonstrated
         if motion.above is not None:  # what is above must not lead the motion past the target again
             x, y, z = motion.above.forward(np.asarray(point.position))
             point = replace(point, position=(float(x), float(y), float(z)))
@@ -205,6 +205,7 @@ class Biasing:
         """Whether every motion passes close to the target, where that is to be seen to."""
         if self.point.strength is not None:
             return True
+        motion = motion.demonstrated
         if motion.top is not None:
             motion = replace(motion, positions=motion.top)
         if self.point.moves_goal:

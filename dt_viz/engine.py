@@ -15,10 +15,11 @@ from dt_viz.avoidance import ObstacleAvoidance
 from dt_viz.behaviours import Behaviour
 from dt_viz.belief import occupancy_picture
 from dt_viz.collision import load_collision_model
-from dt_viz.diffeo import Flow, Identity
+from dt_viz.diffeo import Flow
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
-from dt_viz.following import NUM_ARM_SAMPLES, ArmMotion, Follower
+from dt_viz.following import NUM_ARM_SAMPLES, OUT_OF_REACH, ArmMotion, Follower
+from dt_viz.ground import Ground, Learned, named_starts
 from dt_viz.health import Health, certified, certified_arm
 from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
@@ -27,10 +28,9 @@ from dt_viz.profiles import Profiles, body_profile, hand_profile
 from dt_viz.pushing import Pushed, pushed
 from dt_viz.retiming import within_velocity_limits
 from dt_viz.robot import Robot
-from dt_viz.rollouts import Bundle, Rays, evenly_sampled
+from dt_viz.rollouts import Bundle
 from dt_viz.scenario import Scenario
-from dt_viz.solving import FINE, LIVE, NUM_SAMPLES, Checkpoint, Ground, Precision, Solution, solve
-from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.solving import FINE, LIVE, Checkpoint, Precision, Solution, solve
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
 from dt_viz.whole_arm import ArmSolution, Lift
@@ -74,7 +74,7 @@ class Frame:
     ghost: tuple[Array, ...]
     """Undeformed rollouts, (T_i, 3)."""
     rollouts: tuple[Array, ...]
-    """(T_i, 3), metres."""
+    """(T_i, 3), metres: first those from the task's starts, then those from added ones."""
     times: tuple[Array, ...]
     """(T_i,) seconds of the samples of each rollout."""
     levels: tuple[tuple[Array, ...], ...]
@@ -86,6 +86,8 @@ class Frame:
     blocked: tuple[str, ...]
     """Why there is no motion for this scenario, in words; what is shown then is the last one that there was."""
     health: Health
+    chosen: int | None = 0
+    """Which rollout the arm follows; None where it cannot begin the one that the scenario asks for."""
     layer_radii: tuple[float | None, ...] = ()
     """Radius of the region that each layer acts in, in the order of `Scenario.layers`, metres; None where it is off or
     acts everywhere."""
@@ -131,7 +133,7 @@ class Engine:
         self._robot = robot
         self._follower = Follower(robot)
         self._tasks: dict[str, Task] = {}
-        self._grounds: dict[tuple[str, bool, str], Ground] = {}
+        self._learned: dict[tuple[str, bool, str], Learned] = {}
         self._good: dict[str, Frame] = {}
         self._shown: tuple[Scenario, Ground, _Solved] | None = None
         """The last motion that an arm was shown for."""
@@ -174,6 +176,7 @@ class Engine:
             if blocked:
                 *_, frame = self._stages_without_motion(ground, scenario, blocked)
                 return frame, ()
+            ground = self._follower.admitted(ground, scenario.obstacle)
         fine = self._solved(ground, scenario, FINE)
         frame = self._frame(ground, scenario, fine)
         arms, health = [], frame.health
@@ -204,9 +207,11 @@ class Engine:
         if _uses_whole_arm(scenario):
             with _turn:
                 blocked = self._follower.obstructions(ground, scenario.obstacle)
+                admitted = ground if blocked else self._follower.admitted(ground, scenario.obstacle)
             if blocked:
                 yield from self._stages_without_motion(ground, scenario, blocked)
                 return
+            ground = admitted
         with _turn:
             live = self._solved(ground, scenario, LIVE)
             frame = self._frame(ground, scenario, live)
@@ -223,8 +228,8 @@ class Engine:
             frame = self._with_field_and_arm(self._frame(ground, scenario, fine), ground, fine)
         with _turn:
             frame = replace(frame, stage=Stage.FINE, pictures=_pictures(ground, scenario, fine.stack, coarse=False))
-            if scenario.view.health_plots:
-                frame = replace(frame, profiles=self._profiles(frame, ground, fine))
+            if scenario.view.health_plots and frame.chosen is not None:
+                frame = replace(frame, profiles=self._profiles(frame, ground, fine, frame.chosen))
             self._good[scenario.task], self._shown = frame, (scenario, ground, fine)
         yield frame
         with _turn:
@@ -250,18 +255,11 @@ class Engine:
 
     def _ground(self, scenario: Scenario, progress: Progress | None) -> Ground:
         key = (scenario.task, scenario.imitation, scenario.objective)
-        if key not in self._grounds:
+        if key not in self._learned:
             task = self.task(scenario.task)
             imitation = self._fits.get(task.demonstrations, ImitationSettings(scenario.objective), progress)
-            goal, system = task.to_world(imitation.goal), task.system(imitation)
-            if not scenario.imitation:
-                system = DiffeomorphicSystem(Identity(len(goal)), replace(system.base, goal=goal))
-            rays = Rays(system.transform.forward(task.starts), system.base)
-            bundle = evenly_sampled(
-                lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], len(rays.z0), NUM_SAMPLES
-            )
-            self._grounds[key] = Ground(task, imitation, system, goal, rays, bundle)
-        return self._grounds[key]
+            self._learned[key] = Learned.of(task, imitation, imitates=scenario.imitation)
+        return self._learned[key].ground(scenario.starts)
 
     def _solved(
         self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint = lambda: None
@@ -291,8 +289,9 @@ class Engine:
             scenario=scenario,
             task=ground.task,
             stage=Stage.ROLLOUTS,
-            ghost=ground.bundle.paths,
+            ghost=ground.paths,
             rollouts=shown.paths,
+            chosen=ground.rollout(scenario.arm_rollout),
             times=shown.split(stack.rays.times(index, fraction)),
             levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
             goal=ground.goal,
@@ -312,15 +311,19 @@ class Engine:
         lattice = frame.task.slice.lattice(ARROW_SPACING)
         lattice = lattice[frame.scenario.obstacle.signed_distance(lattice) > 0]
         picture = FieldPicture(lattice, solved.stack.system.velocity(lattice))
+        arm, doubts = None, ()
         try:
-            arm, doubts = self._arm(frame, ground, solved, frame.scenario.arm_rollout % len(frame.rollouts))
+            far = self._follower.out_of_reach(ground)
+            if frame.chosen is not None and not far[frame.chosen]:
+                arm, doubts = self._arm(frame, ground, solved, frame.chosen)
+            doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
         except UnreachableError as error:
-            arm, doubts = None, (f"the arm cannot reach the starts: {error}",)
+            doubts = (f"the arm cannot reach the starts: {error}",)
         return replace(frame, field=picture, arm=arm, health=frame.health.doubting(*doubts))
 
     def _arm(self, frame: Frame, ground: Ground, solved: _Solved, chosen: int) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
-        times, undisturbed = frame.times[chosen], self._follower.undisturbed(ground)
+        times = frame.times[chosen]
         if solved.arm is not None and solved.lifted is not None:
             rows = solved.arm.index == chosen
             q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
@@ -332,27 +335,30 @@ class Engine:
             joints = self._follower.along(ground, chosen, path[keep])
             q, times, fraction = joints.q, times[keep], fraction[keep]
             doubts = self._follower.doubts(joints, chosen)
-        without = undisturbed.at(np.full(len(fraction), chosen), fraction)
+        without = self._follower.undisturbed(ground.only([chosen])).at(np.zeros(len(fraction), int), fraction)
         return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), doubts
 
-    def _profiles(self, frame: Frame, ground: Ground, solved: _Solved) -> Profiles:
-        """Of the rollout that the arm follows, with and without behaviours."""
-        chosen, obstacle, arm = frame.scenario.arm_rollout % len(frame.rollouts), frame.scenario.obstacle, solved.arm
-        path, undisturbed = frame.rollouts[chosen], ground.bundle.paths[chosen]
-        demonstration, system = ground.task.paths[chosen], solved.stack.system
+    def _profiles(self, frame: Frame, ground: Ground, solved: _Solved, chosen: int) -> Profiles:
+        """Of a rollout, with and without behaviours."""
+        obstacle, arm, task = frame.scenario.obstacle, solved.arm, ground.task
+        path, undisturbed = frame.rollouts[chosen], ground.paths[chosen]
+        of_mean, system = chosen >= ground.num_demonstrated, solved.stack.system
+        demonstration = task.mean_path if of_mean else task.paths[chosen]
         if arm is None:
             return Profiles(
                 hand_profile(path, demonstration, system, obstacle),
                 hand_profile(undisturbed, demonstration, ground.system, obstacle),
+                of_mean=of_mean,
             )
-        p, rows = arm.p[arm.index == chosen], ground.bundle.index == chosen
+        p, only = arm.p[arm.index == chosen], ground.only([chosen])
         below = self._robot.end_effector(arm.transform.forward(p))
-        q = self._follower.undisturbed(ground).at(ground.bundle.index[rows], ground.bundle.fraction[rows])
+        q = self._follower.undisturbed(only).at(only.bundle.index, only.bundle.fraction)
         clearance = self._follower.whole_arm.clearance
         return Profiles(
             body_profile(path, demonstration, system.lyapunov(below), clearance(p, obstacle)),
             body_profile(undisturbed, demonstration, ground.system.lyapunov(undisturbed), clearance(q, obstacle)),
             of_body=True,
+            of_mean=of_mean,
         )
 
     def _any_arm(self, frame: Frame) -> Array:
@@ -378,7 +384,7 @@ def _moves_goal(ground: Ground, stack: Solution) -> bool:
 
 def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse: bool) -> Pictures:
     """Those that the view shows."""
-    view, book = scenario.view, ground.sketchbook
+    view, book = scenario.view, ground.learned.sketchbook
     return Pictures(
         generator=book.generator(view.generator_layer) if view.generator else None,
         grid=book.grid([made.transform for _, made in solution.built], coarse=coarse) if view.grid else None,
@@ -406,4 +412,4 @@ def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: floa
         doubts += [f"{name or 'a layer'}: not every motion does what it asks for" for name in missed_by]
     if missed > MAX_GOAL_MISS and not doubts and not _moves_goal(ground, solved.stack):
         doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
-    return tuple(doubts)
+    return (*doubts, *ground.doubts)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from dt_viz.body import load_body_points
 from dt_viz.collision import load_collision_model
-from dt_viz.fields import Array, Indices
+from dt_viz.fields import Array, Mask
+from dt_viz.ground import Ground, Learned, Strand, named_starts
 from dt_viz.metrics import arc_length
 from dt_viz.obstacles import Obstacle
 from dt_viz.robot import Robot
+from dt_viz.scenario import MAX_STARTS
 from dt_viz.several import Several
-from dt_viz.solving import Ground, Solution
+from dt_viz.solving import Solution
 from dt_viz.tracking import JointPath, UnreachableError, inverse_kinematics, track
-from dt_viz.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, lift
+from dt_viz.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
 
 MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
@@ -42,8 +45,11 @@ class Follower:
         self.robot = robot
         self.body = load_body_points()
         self.whole_arm = WholeArm(robot, self.body)
-        self._lifts: dict[Ground, Lift | UnreachableError] = {}
-        self._before: dict[tuple[Ground, int | None], Array] = {}
+        self._lifts: dict[Learned, Lift | UnreachableError] = {}
+        self._before: dict[tuple[Learned, int | None], Array] = {}
+        newest = lru_cache(maxsize=2 * MAX_STARTS)  # a start that is dragged leaves nothing behind
+        self._added, self._reaches = newest(self._lift_added), newest(self._gets_to)
+        self._joined = lru_cache(maxsize=4)(self._join)
 
     def undisturbed(self, ground: Ground) -> Lift:
         """The joints along the motion without any behaviour.
@@ -51,15 +57,26 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        if ground not in self._lifts:
+        learned = ground.learned
+        if learned not in self._lifts:
             try:
-                self._lifts[ground] = self._lift_undisturbed(ground)
+                self._lifts[learned] = self._lift_demonstrated(learned)
             except UnreachableError as error:
-                self._lifts[ground] = error
-        lifted = self._lifts[ground]
+                self._lifts[learned] = error
+        lifted = self._lifts[learned]
         if isinstance(lifted, UnreachableError):
             raise lifted
-        return lifted
+        if ground is learned.demonstrated:
+            return lifted
+        return self._joined(ground)
+
+    def reference(self, ground: Ground) -> Array:
+        """The posture (6,), rad, that the arm stays near to.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        return self.undisturbed(ground.learned.demonstrated).reference
 
     def behaving(self, ground: Ground, solution: Solution) -> Lift:
         """The joints along the motion with the behaviours of the end effector."""
@@ -69,31 +86,64 @@ class Follower:
             fraction.append(np.interp(np.linspace(0, length[-1], NUM_CONFIGURATIONS), length, fractions))
         index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
         paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)
-        reference = self.undisturbed(ground).reference
-        lifted = lift(self.robot, np.stack(fraction), paths, reference, self._before.get((ground, None)))
-        self._before[ground, None] = lifted.tracked.q
+        initial = self._before.get((ground.learned, None))
+        if initial is not None and len(initial) != len(paths):
+            initial = None  # starts have come or gone
+        lifted = lift(self.robot, np.stack(fraction), paths, self.reference(ground), initial)
+        self._before[ground.learned, None] = lifted.tracked.q
         return lifted
 
     def along(self, ground: Ground, rollout: int, path: Array) -> JointPath:
         """The joints along one path (T, 3) of the end effector, metres, T being `NUM_ARM_SAMPLES`."""
-        reference = self.undisturbed(ground).reference
-        joints = track(self.robot, path, reference, self._before.get((ground, rollout)))
-        self._before[ground, rollout] = joints.q
+        number = ground.numbers[rollout]
+        joints = track(self.robot, path, self.reference(ground), self._before.get((ground.learned, number)))
+        self._before[ground.learned, number] = joints.q
         return joints
 
     def obstructions(self, ground: Ground, obstacle: Several) -> tuple[str, ...]:
-        """Why the whole arm cannot move from the starts to the goal, in words; empty where nothing is in the way."""
+        """Why the whole arm cannot move from the task's starts to the goal, in words; empty where nothing does."""
         try:
-            lifted = self.undisturbed(ground)
+            lifted = self.undisturbed(ground.learned.demonstrated)
         except UnreachableError as error:
             return (f"the arm cannot reach the starts: {error}",)
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
-        reasons = _named("start", np.flatnonzero(missed[:, 0]), "out of the arm's reach")
+        reasons = named_starts(np.flatnonzero(missed[:, 0]), len(missed), OUT_OF_REACH)
         if missed[:, 1].any():
             reasons.append("the goal is out of the arm's reach")
         for part in obstacle.parts:
             reasons += self._touching(lifted.pins, part)
         return tuple(reasons)
+
+    def out_of_reach(self, ground: Ground) -> Mask:
+        """(R,) bool: which rollouts begin at an added start that the arm cannot get to.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the task's motions start.
+        """
+        num_demonstrated = ground.num_demonstrated
+        added = ground.strands[num_demonstrated:]
+        return np.array([False] * num_demonstrated + [not self._reaches(ground.learned, strand) for strand in added])
+
+    def admitted(self, ground: Ground, obstacle: Several) -> Ground:
+        """The rollouts that the whole arm can begin: without those from added starts where it is out of reach or room.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the task's motions start.
+        """
+        num, far = ground.num_demonstrated, self.out_of_reach(ground)
+        touches = np.zeros_like(far)
+        candidates = np.flatnonzero(~far)[num:]
+        if len(candidates):
+            postures = self.undisturbed(ground.only(candidates)).tracked.q[:, 0]
+            near = self.whole_arm.clearance(postures, obstacle) < 0
+            for rollout, posture in zip(candidates[near], postures[near], strict=True):
+                gaps = [load_collision_model().obstacle_distance(posture[None], part)[0][0] for part in obstacle.parts]
+                touches[rollout] = min(gaps) < 0
+        if not (far | touches).any():
+            return ground
+        numbers = np.array(ground.numbers)
+        doubts = named_starts(numbers[far], num, OUT_OF_REACH) + named_starts(numbers[touches], num, TOUCHES)
+        return ground.only(np.flatnonzero(~(far | touches)), doubts)
 
     def _touching(self, pins: Array, obstacle: Obstacle) -> list[str]:
         """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6), in words."""
@@ -107,7 +157,7 @@ class Follower:
         name = model.links[int(links[0])].name
         if gaps[0] < 0 and name in PEDESTAL:
             return [f"the obstacle touches the arm's {name}, which cannot move away"]
-        reasons = _named("start", np.flatnonzero(gaps[:-1] < 0), "inside the obstacle: the arm there touches it")
+        reasons = named_starts(np.flatnonzero(gaps[:-1] < 0), len(gaps) - 1, TOUCHES)
         if gaps[-1] < 0:
             reasons.append("the goal is inside the obstacle: the arm there touches it")
         return reasons
@@ -123,23 +173,33 @@ class Follower:
             doubts.append("the arm is stretched out or folded on the way: its pseudo-inverse is damped there")
         return tuple(doubts)
 
-    def _lift_undisturbed(self, ground: Ground) -> Lift:
-        bundle = ground.bundle
-        num_rollouts = len(ground.task.starts)
+    def _lift_demonstrated(self, learned: Learned) -> Lift:
+        bundle, starts = learned.demonstrated.bundle, learned.task.starts
+        num_rollouts = len(starts)
         stride = np.linspace(0, len(bundle.index) // num_rollouts - 1, NUM_CONFIGURATIONS).round().astype(int)
         fractions = bundle.fraction.reshape(num_rollouts, -1)[:, stride]
         paths = bundle.positions.reshape(num_rollouts, -1, 3)[:, stride]
-        reference = inverse_kinematics(self.robot, ground.task.starts.mean(axis=0))
+        reference = inverse_kinematics(self.robot, starts.mean(axis=0))
         return lift(self.robot, fractions, paths, reference)
+
+    def _join(self, ground: Ground) -> Lift:
+        learned, num_demonstrated = ground.learned, ground.num_demonstrated
+        whole = self.undisturbed(learned.demonstrated)
+        parts = zip(ground.numbers, ground.strands, strict=True)
+        return joined([whole.only(n) if n < num_demonstrated else self._added(learned, strand) for n, strand in parts])
+
+    def _lift_added(self, learned: Learned, strand: Strand) -> Lift:
+        path, fraction = strand.positions, strand.fraction
+        keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
+        return lift(self.robot, fraction[None, keep], path[None, keep], self.reference(learned.demonstrated))
+
+    def _gets_to(self, learned: Learned, strand: Strand) -> bool:
+        reached = track(self.robot, strand.start[None], self.reference(learned.demonstrated))
+        return bool(reached.error[0] <= MAX_TRACKING_ERROR)
 
 
 PEDESTAL = ("base", "link 1")
 """What no joint carries away from an obstacle."""
 
-
-def _named(what: str, which: Indices, how: str) -> list[str]:
-    """What there is to say of some things, counted from 0; empty if it is of none."""
-    if len(which) == 0:
-        return []
-    numbers = ", ".join(str(k + 1) for k in which)
-    return [f"{what} {numbers} is {how}" if len(which) == 1 else f"{what}s {numbers} are {how}"]
+OUT_OF_REACH = "out of the arm's reach"
+TOUCHES = "inside the obstacle: the arm there touches it"

@@ -8,12 +8,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from dt_viz.bias import Biasing, BiasPoint, Vector, vector
+from dt_viz.bias import Biasing, BiasPoint, vector
 from dt_viz.clouds import Cloud
 from dt_viz.fields import Array, Mask
 from dt_viz.obstacles import Box, CloudObstacle, Cylinder, Sphere
 from dt_viz.occupancy import sample_labels
-from dt_viz.scenario import Layer, Scenario, View
+from dt_viz.scenario import Layer, Scenario, Vector, View
 from dt_viz.stacking import aware, plane_of
 from dt_viz.tasks import Pot, Task
 

@@ -45,6 +45,8 @@ class Profiles:
     undisturbed: Profile
     of_body: bool = False
     """Whether clearance and depth are of the spheres that cover the arm, not of the end effector."""
+    of_mean: bool = False
+    """Whether the distances are to the mean demonstration: the motion begins at an added start."""
 
     @property
     def along(self) -> Array:

@@ -12,10 +12,11 @@ import numpy as np
 
 from dt_viz.fields import Array
 from dt_viz.following import MAX_TRACKING_ERROR, ArmMotion, Follower
+from dt_viz.ground import Ground
 from dt_viz.retiming import within_velocity_limits
 from dt_viz.rollouts import Rays, evenly_sampled
 from dt_viz.scenario import Scenario
-from dt_viz.solving import Ground, Solution
+from dt_viz.solving import Solution
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tracking import track
 from dt_viz.whole_arm import ArmSolution
@@ -133,7 +134,7 @@ def _motion(
     path = np.concatenate([aside[:-1], bundle.positions])
     times = np.concatenate([PUSH_SECONDS * u[:-1], PUSH_SECONDS + rays.times(bundle.index, bundle.fraction)])
 
-    tracked = track(robot, path, below, reference=follower.undisturbed(ground).reference)
+    tracked = track(robot, path, below, reference=follower.reference(ground))
     joints = tracked.q
     if arm is not None:
         joints = arm.transform.inverse(follower.whole_arm.limits.inside(joints))

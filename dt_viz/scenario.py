@@ -20,10 +20,14 @@ Space = Literal["task", "cspace", "both"]
 """What avoids the obstacle: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""
 SPACES: tuple[Space, ...] = ("task", "cspace", "both")
 
+Vector = tuple[float, float, float]
+
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
 """Metres."""
 MAX_OBSTACLES = 5
 """In the page: each costs time while a hand moves."""
+MAX_STARTS = 36
+"""Added ones, in the page."""
 MAX_MARGIN = 0.05
 """Metres."""
 MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
@@ -114,8 +118,10 @@ class Scenario:
     """What else the end effector's motion is to do, from the inside out."""
     avoidance_level: int | None = None
     """How many of these layers the end effector's avoidance is stacked on; None is all of them."""
+    starts: tuple[Vector, ...] = ()
+    """Where motions begin besides the task's starts, metres."""
     arm_rollout: int = 0
-    """Which rollout the arm follows."""
+    """Which rollout the arm follows: those from the task's starts come first, then those from `starts`."""
     scene: str = ""
     """Name of the scene of the paper that it began as, if any."""
     view: View = field(default_factory=View)

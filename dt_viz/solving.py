@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -12,19 +11,13 @@ from dt_viz.avoidance import ObstacleAvoidance
 from dt_viz.behaviours import Behaviour, Built, Motion
 from dt_viz.diffeo import Chain, Diffeomorphism
 from dt_viz.fields import Array, Indices
-from dt_viz.imitation import Imitation
-from dt_viz.pictures import Sketchbook, in_frame
+from dt_viz.ground import Ground
 from dt_viz.rollouts import Bundle, Rays, refined
 from dt_viz.scenario import Scenario
 from dt_viz.systems import DiffeomorphicSystem
-from dt_viz.tasks import Task
 
-NUM_SAMPLES = 200
-"""Of each rollout before refinement."""
 MAX_ATTEMPTS = 4
 """At a duration that clears the samples that refinement finds, too."""
-MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
-"""Steps towards the images of moved ends, and metres by which they may miss."""
 
 
 @dataclass(frozen=True)
@@ -44,46 +37,9 @@ LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
 FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """What depends on the task and the imitation only: the undisturbed motion."""
-
-    task: Task
-    imitation: Imitation
-    system: DiffeomorphicSystem
-    goal: Array
-    rays: Rays
-    bundle: Bundle
-
-    @cached_property
-    def ends(self) -> Array:
-        """(R + 1, 3) starts and goal, metres."""
-        return np.concatenate([self.task.starts, [self.goal]])
-
-    @cached_property
-    def sketchbook(self) -> Sketchbook:
-        """Makes the pictures of ψ."""
-        return Sketchbook(self.task, in_frame(self.system.transform), self.system, self.rays)
-
-    @cached_property
-    def _linearised(self) -> tuple[Array, Array]:
-        return self.system.transform.jacobian(self.ends)
-
-    def images(self, ends: Array) -> Array:
-        """ψ of points (R + 1, 3) not far from `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
-        images, J = self._linearised
-        error = ends - self.ends
-        for _ in range(MAX_CHORDS):
-            images = images + (J @ error[..., None])[..., 0]
-            error = ends - self.system.transform.inverse(images)
-            if np.abs(error).max() <= IMAGE_TOLERANCE:
-                return images
-        return self.system.transform.forward(ends)
-
-
 @dataclass(frozen=True)
 class Solution:
-    """The stack that a scenario asks for, and its rollouts from the task's starts."""
+    """The stack that a scenario asks for, and its rollouts."""
 
     transform: Diffeomorphism
     rays: Rays
@@ -156,11 +112,12 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
         for _ in range(MAX_ATTEMPTS):
             lowest = Motion(
                 scenario,
-                ground.task.starts,
+                ground.starts,
                 ground.goal,
                 bundle.index,
                 bundle.levels[:, 0],
                 keeps_goal=keeps_goal,
+                num_demonstrated=ground.num_demonstrated,
             )
             checkpoint()
             built = _build(layers, lowest, precision.tolerance, durations, above)
@@ -170,7 +127,7 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
             outer = [made.transform for _, made in built if made]
             goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
 
-            ends = np.concatenate([ground.task.starts, [goal]])
+            ends = np.concatenate([ground.starts, [goal]])
             below = Chain(outer).forward(ends) if outer else ends
             if np.abs(below - ends_below).max() > precision.ends:
                 *z0, z_e = ground.images(below)

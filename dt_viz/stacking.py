@@ -8,9 +8,9 @@ from typing import TypedDict
 
 import numpy as np
 
-from dt_viz.bias import Biasing, BiasPoint, Vector, vector
+from dt_viz.bias import Biasing, BiasPoint, vector
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.scenario import Layer, Scenario
+from dt_viz.scenario import Layer, Scenario, Vector
 from dt_viz.tasks import Task
 
 MAX_BIAS_POINTS = 4

@@ -8,7 +8,7 @@ costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -77,10 +77,26 @@ class Lift:
             q[rows] = spline(fraction[rows])
         return q
 
+    def only(self, rollout: int) -> Lift:
+        """One of the rollouts."""
+        q, error, limits_hit, manipulability, damped = (
+            getattr(self.tracked, name)[rollout : rollout + 1] for name in JointPath.__dataclass_fields__
+        )
+        tracked = JointPath(q, error, limits_hit, manipulability, damped)
+        return Lift(self.fractions[rollout : rollout + 1], tracked, self.reference)
+
     @cached_property
     def pins(self) -> Array:
         """(R + 1, 6) postures at the starts and at the goal, rad."""
         return np.concatenate([self.tracked.q[:, 0], self.tracked.q[:1, -1]])
+
+
+def joined(lifts: Sequence[Lift]) -> Lift:
+    """The rollouts of several, one after the other, with the reference of the first."""
+    tracked = JointPath(
+        *(np.concatenate([getattr(part.tracked, name) for part in lifts]) for name in JointPath.__dataclass_fields__)
+    )
+    return Lift(np.concatenate([part.fractions for part in lifts]), tracked, lifts[0].reference)
 
 
 def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:

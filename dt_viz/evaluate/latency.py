@@ -42,10 +42,10 @@ from dt_viz.evaluate.options import (
     write_json,
 )
 from dt_viz.fits import FitStore, default_cache_folder
+from dt_viz.ground import NUM_SAMPLES
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Layer, Scenario
-from dt_viz.solving import NUM_SAMPLES
 from dt_viz.stacking import plane_of
 from dt_viz.tasks import Task
 from dt_viz.ui.session import Pace, Session

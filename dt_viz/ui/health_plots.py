@@ -27,7 +27,8 @@ class HealthPlots:
             self.table = gui.add_html("")
             gui.add_html(_legend())
             self.lyapunov = _plot(gui, "Lyapunov value, of its start’s", palette.LEVEL)
-            self.distance = _plot(gui, "Distance to the demonstration [mm]", palette.ROLLOUT)
+            self._to = gui.add_html("")
+            self.distance = _plot(gui, "", palette.ROLLOUT)
             self._whose = gui.add_html("")
             self.clearance = _plot(gui, "", palette.GOAL, zero=True)
 
@@ -49,6 +50,8 @@ class HealthPlots:
         along, shown, without = profiles.along, profiles.shown, profiles.undisturbed
         self.lyapunov.data = columns(along, shown.lyapunov, without.lyapunov)
         self.distance.data = columns(along, _MILLIMETRES * shown.distance, _MILLIMETRES * without.distance)
+        which = "mean demonstration" if profiles.of_mean else "demonstration"
+        self._to.content = _title(f"Distance to the {which} [mm]")
         bounded = bool(np.isfinite(shown.clearance).all())
         whose = "body points" if profiles.of_body else "end effector"
         self._whose.content = _title(f"Clearance of the {whose} [mm]" if bounded else "Clearance: no obstacle")

@@ -53,7 +53,7 @@ class Rollouts(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        chosen = frame.scenario.arm_rollout % len(frame.rollouts)
+        chosen = frame.chosen
         if frame.blocked:
             self.lines.show(frame.rollouts, chosen, mark=palette.GHOST, colour=palette.STALE)
         else:

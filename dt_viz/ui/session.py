@@ -178,6 +178,7 @@ class Session:
                 "task",
                 task=name,
                 arm_rollout=0,
+                starts=fresh.starts,
                 obstacles=tuple(had.moved(there.position, had.wxyz) for there, had in kept),
                 layers=fresh.layers,
                 avoidance_level=fresh.avoidance_level,

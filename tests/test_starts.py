@@ -1,0 +1,176 @@
+"""Motions that begin where the user wants: rollouts of the same system, which disturb nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.bias import Biasing, BiasPoint
+from dt_viz.engine import Stage
+from dt_viz.ground import Ground
+from dt_viz.obstacles import Sphere
+from dt_viz.scenario import Layer
+from dt_viz.solving import FINE, LIVE, solve
+from dt_viz.stacking import plane_of
+
+NUM = 5
+
+
+@pytest.fixture(params=["draw_s", "lift_box"], name="task")
+def _task(request):
+    return request.param
+
+
+def random_starts(engine, scenario, num=NUM, seed=0, room=0.02):
+    """Places on the slice and up to 3 cm beside it, clear of the obstacle and above the table."""
+    rng, area = np.random.default_rng(seed), engine.task(scenario.task).slice
+    axes = np.column_stack([area.axes, np.cross(*area.axes.T)])
+    found = []
+    while len(found) < num:
+        across = rng.uniform(-1, 1, 3) * (*area.half_size, 0.03)
+        start = area.centre + axes @ across
+        if start[2] > 0.05 and scenario.obstacle.signed_distance(start) > room:
+            found.append(tuple(float(c) for c in start))
+    return tuple(found)
+
+
+def frame_of(engine, scenario, stage=Stage.FINE):
+    return next(frame for frame in engine.frames(scenario) if frame.stage is stage)
+
+
+def test_added_rollouts_are_motions_of_the_system_and_end_at_the_goal(engine, initial, task):
+    scenario = initial(task)
+    scenario = replace(scenario, starts=random_starts(engine, scenario))
+    frame, num = frame_of(engine, scenario), len(engine.task(task).demonstrations)
+    system = solve(engine._ground(scenario, None), scenario, FINE).system
+    assert len(frame.rollouts) == num + NUM
+    for start, path, times in zip(scenario.starts, frame.rollouts[num:], frame.times[num:], strict=True):
+        np.testing.assert_allclose(path[0], start, atol=1e-6)
+        np.testing.assert_allclose(path[-1], frame.goal, atol=1e-4)
+        there = system.rollout(np.array([start]), times)[0]
+        np.testing.assert_allclose(there[:-1], path[:-1], atol=1e-5)
+        assert (np.diff(system.lyapunov(path)) < 0).all()
+
+
+def test_the_obstacle_is_avoided_by_added_rollouts_too(engine, initial, task):
+    scenario = initial(task)
+    scenario = replace(scenario, starts=random_starts(engine, scenario, seed=1))
+    without = replace(scenario, avoidance=False)
+    num = len(engine.task(task).demonstrations)
+
+    def clearance(scenario):
+        return min(scenario.obstacle.signed_distance(path).min() for path in frame_of(engine, scenario).rollouts[num:])
+
+    assert clearance(without) < 0 < clearance(scenario)
+
+
+def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(engine, initial, task):
+    target = engine.task(task).mean_path[45] + np.array([0.0, 0.0, 0.06])
+    x, y, z = (float(c) for c in target)
+    layers = (Layer(Biasing(BiasPoint((x, y, z), plane=plane_of(engine.task(task)))), name="Bias 1"),)
+    before = replace(initial(task), obstacles=(), layers=layers)
+    after = replace(before, starts=random_starts(engine, before, seed=2))
+    solutions = [solve(engine._ground(scenario, None), scenario, FINE) for scenario in (before, after)]
+    (a,), (b,) = ([made for _, made in solution.built] for solution in solutions)
+    assert a.duration == b.duration and a.doubts == b.doubts == ()
+    assert a.transform.field.scale == b.transform.field.scale
+    for path, other in zip(solutions[0].bundle.paths, solutions[1].bundle.paths, strict=False):
+        np.testing.assert_allclose(path[[0, -1]], other[[0, -1]], atol=1e-6)
+        assert max(np.linalg.norm(other - point, axis=1).min() for point in path) < 0.006
+
+
+@pytest.mark.parametrize("space", ["cspace", "both"])
+def test_the_whole_arm_begins_at_added_starts_and_keeps_clear(engine, initial, robot, space):
+    scenario = replace(initial("push_box"), space=space)
+    scenario = replace(scenario, starts=random_starts(engine, scenario, seed=3, room=0.12))
+    frame, num = frame_of(engine, scenario), 7
+    assert len(frame.rollouts) == num + NUM and frame.health.clearance > 0
+    for start, path in zip(scenario.starts, frame.rollouts[num:], strict=True):
+        np.testing.assert_allclose(path[0], start, atol=2e-3)
+        np.testing.assert_allclose(path[-1], frame.goal, atol=2e-3)
+        assert scenario.obstacle.signed_distance(path).min() > 0
+
+
+@pytest.mark.parametrize("space", ["task", "cspace"])
+def test_the_arm_follows_an_added_rollout(engine, initial, robot, space):
+    scenario = replace(initial("push_box"), space=space, view=replace(initial("push_box").view, health_plots=True))
+    scenario = replace(scenario, starts=random_starts(engine, scenario, seed=3, room=0.12), arm_rollout=7 + 2)
+    frame = frame_of(engine, scenario)
+    assert frame.chosen == 9 and frame.arm is not None
+    hand = robot.end_effector(frame.arm.q)
+    np.testing.assert_allclose(hand[0], scenario.starts[2], atol=2e-3)
+    np.testing.assert_allclose(hand[-1], frame.goal, atol=2e-3)
+    assert frame.profiles is not None and frame.profiles.of_mean
+    assert not frame_of(engine, replace(scenario, arm_rollout=3)).profiles.of_mean
+
+
+@pytest.mark.parametrize("space", ["task", "cspace"])
+def test_a_start_out_of_reach_is_said_to_be_and_blocks_nothing(engine, initial, space):
+    near, far = (0.2, -0.5, 0.3), (1.5, -0.5, 0.3)
+    scenario = replace(initial("push_box"), space=space, starts=(near, far, near), arm_rollout=7 + 1)
+    frame = frame_of(engine, scenario)
+    assert not frame.blocked and frame.arm is None
+    assert sum("added start 2 is out of the arm's reach" in doubt for doubt in frame.health.doubts) == 1
+    assert len(frame.rollouts) == (10 if space == "task" else 9)
+    other = frame_of(engine, replace(scenario, arm_rollout=9))
+    assert other.arm is not None and other.chosen == len(other.rollouts) - 1
+    np.testing.assert_allclose(other.rollouts[other.chosen][0], near, atol=2e-3)
+
+
+@pytest.mark.parametrize("space", ["task", "cspace"])
+def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
+    scenario = replace(initial("push_box"), space=space)
+    frame = frame_of(engine, replace(scenario, starts=(scenario.obstacles[0].position,)))
+    assert not frame.blocked
+    assert any("added start 1 is inside the obstacle" in doubt for doubt in frame.health.doubts)
+
+
+def test_an_added_start_at_the_goal_stays_there(engine, initial):
+    scenario = replace(initial("draw_s"), obstacles=())
+    goal = engine._ground(scenario, None).goal
+    frame = frame_of(engine, replace(scenario, starts=(tuple(float(c) for c in goal),), arm_rollout=7))
+    np.testing.assert_allclose(frame.rollouts[-1], np.broadcast_to(goal, frame.rollouts[-1].shape), atol=1e-6)
+    assert frame.arm is not None and np.isfinite(frame.arm.q).all()
+
+
+def test_dragging_a_start_keeps_only_the_newest_rollouts(new_engine, initial):
+    engine, scenario = new_engine(), initial("draw_s")
+    for x in np.linspace(-0.1, 0.1, 200):
+        moved = replace(scenario, starts=((float(x), -0.5, 0.45),))
+        assert isinstance(engine._ground(moved, None), Ground)
+    learned = engine._ground(scenario, None).learned
+    assert learned._added.cache_info().currsize < 100
+    assert learned._grounds.cache_info().currsize < 10
+
+
+def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine, new_engine, initial):
+    scenario = replace(initial("lift_box"), obstacles=(Sphere((0.13, -0.463, 0.192), 0.12),), space="both")
+    starts = random_starts(engine, scenario, seed=4, room=0.12)
+    used = new_engine()
+    for some in (starts, starts[2:], (), starts[:3], starts[3:]):
+        last = frame_of(used, replace(scenario, starts=some), Stage.LIVE)
+    fresh = frame_of(new_engine(), replace(scenario, starts=starts[3:]), Stage.LIVE)
+    for a, b in zip(last.rollouts, fresh.rollouts, strict=True):
+        assert max(np.linalg.norm(b - point, axis=1).min() for point in a) < 2e-3
+
+
+def test_the_ground_keeps_what_it_has_of_the_demonstrations(engine, initial):
+    ground = engine._ground(initial("lift_box"), None)
+    more = ground.learned.ground(((0.1, -0.5, 0.3),))
+    assert ground.learned.ground(()) is ground
+    np.testing.assert_array_equal(more.starts[:-1], ground.starts)
+    np.testing.assert_allclose(more.images(more.ends)[[0, -1]], ground.images(ground.ends)[[0, -1]], atol=1e-9)
+    moved = more.ends + 0.01
+    np.testing.assert_allclose(more.system.transform.inverse(more.images(moved)), moved, atol=1e-8)
+    assert more.only([0, 7]).rollout(7) == 1 and more.only([0, 7]).rollout(3) is None
+    assert solve(more, initial("lift_box"), LIVE).rays.z0.shape == (9, 3)
+
+
+def test_a_motion_that_begins_inside_the_obstacle_needs_no_longer_flow_than_the_others(engine, initial):
+    """It is not asked for the margin before it can have it."""
+    scenario = initial("draw_s")
+    (obstacle,) = scenario.obstacles
+    inside = tuple(c + d for c, d in zip(obstacle.position, (0.0, 0.0, 0.07), strict=True))
+    before, after = (solve(engine._ground(s, None), s, LIVE) for s in (scenario, replace(scenario, starts=(inside,))))
+    assert after.unsatisfied == before.unsatisfied == ()
+    assert after.avoidance_duration < 1.5 * before.avoidance_duration
