@@ -1,12 +1,15 @@
 """Motions that begin where the user wants: rollouts of the same system, which disturb nothing."""
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from dt_viz.bias import Biasing, BiasPoint
+from dt_viz.diffeo import Flow
 from dt_viz.engine import Stage
+from dt_viz.fields import PlacedField
 from dt_viz.ground import Ground
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Layer
@@ -73,7 +76,8 @@ def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(eng
     solutions = [solve(engine._ground(scenario, None), scenario, FINE) for scenario in (before, after)]
     (a,), (b,) = ([made for _, made in solution.built] for solution in solutions)
     assert a.duration == b.duration and a.doubts == b.doubts == ()
-    assert a.transform.field.scale == b.transform.field.scale
+    assert isinstance(a.transform, Flow) and isinstance(b.transform, Flow)
+    assert cast(PlacedField, a.transform.field).scale == cast(PlacedField, b.transform.field).scale
     for path, other in zip(solutions[0].bundle.paths, solutions[1].bundle.paths, strict=False):
         np.testing.assert_allclose(path[[0, -1]], other[[0, -1]], atol=1e-6)
         assert max(np.linalg.norm(other - point, axis=1).min() for point in path) < 0.006
@@ -173,4 +177,4 @@ def test_a_motion_that_begins_inside_the_obstacle_needs_no_longer_flow_than_the_
     inside = tuple(c + d for c, d in zip(obstacle.position, (0.0, 0.0, 0.07), strict=True))
     before, after = (solve(engine._ground(s, None), s, LIVE) for s in (scenario, replace(scenario, starts=(inside,))))
     assert after.unsatisfied == before.unsatisfied == ()
-    assert after.avoidance_duration < 1.5 * before.avoidance_duration
+    assert cast(float, after.avoidance_duration) < 1.5 * cast(float, before.avoidance_duration)
