@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # numerical libraries read these when they are first imported
-    from dt_viz.demos import DemonstrationError  # noqa: PLC0415
+    from dt_viz.errors import DataError  # noqa: PLC0415
     from dt_viz.fits import FitStore, default_cache_folder  # noqa: PLC0415
     from dt_viz.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.obstacles import unit_sphere_map  # noqa: PLC0415
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             port=options.port,
             max_sessions=options.max_sessions,
         )
-    except (DemonstrationError, ImitationError, AddressError) as error:
+    except (DataError, ImitationError, AddressError) as error:
         print(f"app.py: {error}", file=sys.stderr)
         return 2
     host = f"[{server.host}]" if ":" in server.host else server.host

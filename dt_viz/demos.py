@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.errors import DataError
 from dt_viz.matfile import Value, read_variable
 
 DIMENSIONS = (2, 3)
@@ -67,22 +68,8 @@ class Demonstration:
         return float(self.times[-1])
 
 
-class DemonstrationError(ValueError):
-    """A demonstration that cannot be used.
-
-    Attributes:
-        source: the file, folder or recording.
-        field: the part of it that is wrong.
-        found: what is there.
-        accepted: what would be right.
-    """
-
-    def __init__(self, source: str | Path, field: str, found: str, accepted: str) -> None:
-        super().__init__(source, field, found, accepted)
-        self.source, self.field, self.found, self.accepted = str(source), field, found, accepted
-
-    def __str__(self) -> str:
-        return f"{self.source}: {self.field}: found {self.found}; accepted: {self.accepted}"
+class DemonstrationError(DataError):
+    """A demonstration that cannot be used."""
 
 
 def check_demonstrations(

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -119,10 +119,14 @@ class _Turned:
         temperature: float,
         axes: Array,
         centre: Array | float = 0.0,
+        scale: float = 1.0,
     ) -> PlacedField:
-        """The field of a map in the frame u, where a point of this shape's own frame is axes·u + centre."""
+        """The field of a map in the frame u, where a point of this shape's own frame is axes·u + centre.
+
+        World metres are `scale` times the units of the own frame.
+        """
         local = StretchedField(AvoidanceField(occupancy, generator, temperature), axes)
-        return PlacedField(local, self._to_world(np.zeros(3) + centre), rotation(self.wxyz))
+        return PlacedField(local, self._to_world(np.zeros(3) + centre), rotation(self.wxyz), scale)
 
 
 @dataclass(frozen=True)
@@ -305,26 +309,38 @@ class Cylinder(_Turned):
 
 
 class _Triangles(_Turned):
-    """What is common to shapes that triangles bound."""
+    """What is common to shapes that triangles bound: larger or smaller ones share what was computed for one."""
+
+    scale: float
 
     @property
     def solid(self) -> Solid:
-        """What they enclose, in its own frame."""
+        """What they enclose, in its own frame, before it is scaled."""
         raise NotImplementedError
+
+    @property
+    def size(self) -> float:
+        """Largest side of its bounding box, metres."""
+        return self.scale * float(np.ptp(self.solid.bounds, axis=0).max())
+
+    def resized(self: T, size: float) -> T:
+        """The same shape with the largest side of its bounding box of this size, metres."""
+        shape: Any = self
+        return replace(shape, scale=size / shape.size * shape.scale)
 
     @property
     def radius(self) -> float:
         """See `Obstacle`."""
-        return self.solid.radius
+        return self.scale * self.solid.radius
 
     @property
     def depth(self) -> float:
         """See `Obstacle`."""
-        return self.solid.distances.depth
+        return self.scale * self.solid.distances.depth
 
     def signed_distance(self, s: Array) -> Array:
         """See `Obstacle`; interpolated on a grid, which rounds edges by about a quarter of its cells."""
-        return self.solid.distances(self._to_own(s))
+        return self.scale * self.solid.distances(self._to_own(s))
 
     def nearest_free(self, s: Array) -> Array:
         """See `Obstacle`."""
@@ -342,16 +358,22 @@ class _Triangles(_Turned):
     def field(self, generator: Generator, temperature: float) -> PlacedField:
         """See `Obstacle`."""
         occupancy, axes, centre = _solid_map(self.solid)
-        return self._placed(occupancy, generator, temperature, axes, centre)
+        return self._placed(occupancy, generator, temperature, axes, centre, self.scale)
 
     def cover(self) -> tuple[Array, Array]:
         """See `Obstacle`."""
         centres, radii = self.solid.balls(NUM_BALLS)
-        return self._to_world(centres), radii
+        return self._to_world(centres), self.scale * radii
 
     def surface(self) -> tuple[Array, Indices]:
         """See `Obstacle`."""
-        return self.solid.vertices, self.solid.faces
+        return self.scale * self.solid.vertices, self.solid.faces
+
+    def _to_own(self, s: Array) -> Array:
+        return super()._to_own(s) / self.scale
+
+    def _to_world(self, s: Array) -> Array:
+        return super()._to_world(self.scale * s)
 
 
 @dataclass(frozen=True)
@@ -362,6 +384,8 @@ class MeshObstacle(_Triangles):
     """Of the mesh's origin, metres."""
     mesh: Solid
     wxyz: Quaternion = UPRIGHT
+    scale: float = 1.0
+    """Of the mesh."""
 
     @property
     def solid(self) -> Solid:
@@ -377,6 +401,8 @@ class CloudObstacle(_Triangles):
     """Of the cloud's origin, metres."""
     cloud: Cloud
     wxyz: Quaternion = UPRIGHT
+    scale: float = 1.0
+    """Of the cloud."""
 
     @property
     def solid(self) -> Solid:

@@ -29,11 +29,14 @@ import numpy as np
 import trimesh
 
 from dt_viz.clouds import Cloud
+from dt_viz.errors import DataError
 from dt_viz.fields import Array, Indices
 from dt_viz.solids import Solid
 
 MAX_BYTES = 20 * 10**6
 """Of a file, and of what an npz unpacks to."""
+MAX_HEADER = 100_000
+"""Bytes in which the header of a PLY file ends."""
 MAX_FACES = 500_000
 MAX_POINTS = 1_000_000
 ENOUGH_POINTS = 100_000
@@ -41,29 +44,26 @@ ENOUGH_POINTS = 100_000
 MIN_POINTS = 50
 MIN_SIZE, MAX_SIZE = 0.01, 1.0
 """Metres, of the largest side of the bounding box."""
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "kilometres": 1e3}
+UNITS = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+"""Of files, in metres; the first that gives a sensible size is suggested."""
 LOST = 0.8
 """Part of the volume that the distances know of, below which it is said that a shape is too thin."""
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CLOUD_SUFFIXES = (".ply", ".npz", ".csv")
 
 
-class ShapeError(ValueError):
-    """A file that cannot be used as a shape.
+class ShapeError(DataError):
+    """A file that cannot be used as a shape."""
+
+
+class SizeError(ShapeError):
+    """A shape so large or small that its file must be in another unit.
 
     Attributes:
-        source: the file.
-        field: the part of it that is wrong.
-        found: what is there.
-        accepted: what would be right.
+        unit: one of `UNITS` in which its size would be sensible, if there is one.
     """
 
-    def __init__(self, source: str | Path, field: str, found: str, accepted: str) -> None:
-        super().__init__(source, field, found, accepted)
-        self.source, self.field, self.found, self.accepted = str(source), field, found, accepted
-
-    def __str__(self) -> str:
-        return f"{self.source}: {self.field}: found {self.found}; accepted: {self.accepted}"
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -235,14 +235,22 @@ def _check_finite(points: Array, source: Path, field: str, one: str) -> None:
 def _checked_size(points: Array, shape: Array, source: Path, scale: float) -> Array:
     """Points in metres, the middle of the shape's bounding box at 0."""
     lower, upper = shape.min(axis=0), shape.max(axis=0)
-    sizes = (upper - lower) * scale
-    if not MIN_SIZE <= sizes.max() <= MAX_SIZE:
-        found = "a bounding box of " + " × ".join(f"{size:.4g}" for size in sizes) + " m"
-        fitting = [unit for unit, metres in UNITS.items() if MIN_SIZE <= sizes.max() * metres <= MAX_SIZE]
+    sizes = upper - lower
+    if not MIN_SIZE <= scale * sizes.max() <= MAX_SIZE:
+        fitting = [unit for unit, metres in UNITS.items() if MIN_SIZE <= metres * sizes.max() <= MAX_SIZE]
+        found = f"a bounding box of {_box(scale * sizes)}"
         if fitting:
-            found += f"; is the file in {fitting[0]}? then give scale={scale * UNITS[fitting[0]]:g}"
-        raise ShapeError(source, "size", found, f"a largest side of {MIN_SIZE:g} m to {MAX_SIZE:g} m, after scaling")
+            metres = UNITS[fitting[0]]
+            found += f"; is the file in {fitting[0]} (scale={metres:g})? then that is {_box(metres * sizes)}"
+        accepted = f"a largest side of {MIN_SIZE:g} m to {MAX_SIZE:g} m, after scaling"
+        error = SizeError(source, "size", found, accepted)
+        error.unit = fitting[0] if fitting else None
+        raise error
     return (points - (lower + upper) / 2) * scale
+
+
+def _box(sizes: Array) -> str:
+    return " × ".join(f"{size:.4g}" for size in sizes) + " m"
 
 
 def _check_labels(labels: Array, source: Path) -> None:
@@ -349,7 +357,7 @@ PLY_BYTES = {
 
 def _ply_header(content: bytes, source: Path) -> dict[str, int]:
     """How many of each element a PLY file has, after looking whether there is room for them in it."""
-    end = re.search(rb"end_header\r?\n", content[:100_000])
+    end = re.search(rb"end_header\r?\n", content[:MAX_HEADER])
     if not content.startswith(b"ply") or end is None:
         raise ShapeError(source, "header", "no 'ply' … 'end_header'", "a PLY file")
     counts: dict[str, int] = {}

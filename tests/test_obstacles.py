@@ -70,6 +70,8 @@ OBSTACLES: dict[str, Obstacle] = {
     "U": MeshObstacle(PLACE, U_SHAPE, TILTED),
     "scan": CloudObstacle(PLACE, SCAN, TILTED),
     "labelled cloud": CloudObstacle(PLACE, LABELLED),
+    "smaller U": MeshObstacle(PLACE, U_SHAPE, TILTED, 0.6),
+    "larger cloud": CloudObstacle(PLACE, LABELLED, TILTED).resized(0.2),
 }
 obstacles = pytest.mark.parametrize("obstacle", OBSTACLES.values(), ids=OBSTACLES)
 
@@ -246,6 +248,23 @@ def test_distances_outside_and_inside_are_those_of_trimesh(name):
     if not isinstance(obstacle, MeshObstacle | CloudObstacle):
         np.testing.assert_allclose(obstacle.signed_distance(points), expected, rtol=0, atol=1e-3)
     assert (obstacle.signed_distance(points) < expected + 3e-3).all()  # never much more
+
+
+@pytest.mark.parametrize("name", ["U", "scan"])
+def test_what_is_resized_is_as_large_as_that_and_keeps_place_shape_and_all_that_was_computed(name):
+    shape = OBSTACLES[name]
+    assert isinstance(shape, MeshObstacle | CloudObstacle)
+    half = shape.resized(shape.size / 2)
+    assert half.size == pytest.approx(shape.size / 2) and (half.position, half.wxyz) == (shape.position, shape.wxyz)
+    assert half.resized(shape.size).signed_distance(around(shape, 50)) == pytest.approx(
+        shape.signed_distance(around(shape, 50)), abs=1e-12
+    )
+    assert np.ptp(half.surface()[0], axis=0).max() == pytest.approx(half.size)
+    assert half.solid is shape.solid
+    offset = around(shape, 200) - shape.position
+    for quantity in (lambda o, s: o.signed_distance(s), lambda o, s: o.field("free-space", 3.0)(s)):
+        whole = quantity(shape, shape.position + offset)
+        np.testing.assert_allclose(quantity(half, half.position + offset / 2), whole / 2, rtol=0, atol=1e-9)
 
 
 def test_boxes_of_the_same_proportions_share_one_map():

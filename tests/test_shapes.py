@@ -85,7 +85,7 @@ class TestMeshes:
     def test_millimetres_are_guessed_and_accepted_with_a_scale(self):
         content = exported(trimesh.creation.box((150, 100, 50)), "stl")
         message = refusal(read_mesh, content, "big.stl")
-        assert "150 × 100 × 50 m; is the file in millimetres? then give scale=0.001" in message
+        assert "150 × 100 × 50 m; is the file in millimetres (scale=0.001)? then that is 0.15 × 0.1 × 0.05 m" in message
         solid = read_mesh(content, "big.stl", scale=1e-3).solid
         np.testing.assert_allclose(np.ptp(solid.vertices, axis=0), (0.15, 0.1, 0.05), atol=1e-9)
 

@@ -1,5 +1,6 @@
 """Obstacles in the page, without a browser: the scene follows the scenario, and controls edit the selected one."""
 
+import io
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -9,7 +10,9 @@ import pytest
 import trimesh
 import viser  # noqa: TID251 - a scene of its own
 
+from dt_viz import shapes
 from dt_viz.belief import occupancy_picture
+from dt_viz.clouds import Cloud
 from dt_viz.collision import NOTHING, CollisionReport, Nearest
 from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, rotation
 from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
@@ -25,6 +28,10 @@ BALL = Sphere((0.0, -0.5, 0.4), 0.12)
 BOX = Box((0.1, -0.5, 0.5), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3))
 TUBE = Cylinder((-0.1, -0.5, 0.3), 0.08, 0.2)
 ALL = (BALL, BOX, TUBE)
+CRATE = trimesh.creation.box((0.15, 0.1, 0.05))
+MESH = MeshObstacle((0.1, -0.5, 0.4), Solid(CRATE.vertices, CRATE.faces), (0.9, 0.1, 0.3, -0.3))
+POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3))
+CLOUD = CloudObstacle((-0.1, -0.5, 0.4), Cloud(POINTS, np.linalg.norm(POINTS, axis=1) < 0.06))
 
 
 @pytest.fixture(scope="module")
@@ -48,15 +55,26 @@ def scenario(*obstacles, selected=0, **changes):
 
 
 def test_the_scene_follows_the_scenario_whatever_comes_and_goes(shown):
-    for obstacles in (ALL, (), (TUBE,), (BOX, TUBE), ALL[::-1], (BALL,) * 5, (BOX,)):
+    resized = MESH.resized(0.3), CLOUD.resized(0.05)
+    for obstacles in (ALL, (), (TUBE,), (BOX, TUBE), ALL[::-1], (MESH, CLOUD), resized, (BALL,) * 5, (BOX,)):
         shown.adopt(scenario(*obstacles))
         assert len(shown.items) == len(obstacles)
         for item, obstacle in zip(shown.items, obstacles, strict=True):
             np.testing.assert_allclose(item.gizmo.position, obstacle.position)
             np.testing.assert_allclose(item.gizmo.wxyz, obstacle.wxyz)
-            placed = item.mesh.vertices @ rotation(obstacle.wxyz).T + item.gizmo.position
-            np.testing.assert_allclose(obstacle.signed_distance(placed), 0, atol=1e-6)
+            placed = item.mesh.scale * item.mesh.vertices @ rotation(obstacle.wxyz).T + item.gizmo.position
+            rounding = 3e-3 if isinstance(obstacle, MeshObstacle | CloudObstacle) else 1e-6
+            np.testing.assert_allclose(obstacle.signed_distance(placed), 0, atol=rounding)
             assert item.gizmo.disable_rotations == isinstance(obstacle, Sphere)
+
+
+def test_what_is_resized_is_not_sent_again(shown):
+    shown.adopt(scenario(MESH))
+    (item,) = shown.items
+    sent = item.mesh.vertices
+    shown.adopt(scenario(MESH.resized(0.2)))
+    assert item.mesh.vertices is sent
+    assert item.mesh.scale == pytest.approx(0.2 / 0.15)
 
 
 @pytest.mark.parametrize(("selected", "expected"), [(0, [1, 0, 0]), (1, [0, 1, 0]), (2, [0, 0, 1]), (7, [0, 0, 1])])
@@ -177,26 +195,29 @@ def test_deleting_and_duplicating_act_on_the_selected_obstacle(opened):
     assert len(opened.session.scenario.obstacles) == 1
 
 
+SIZED = (*ALL, MESH, CLOUD)
 SIZES = [
     (0, "Diameter [cm]", replace(BALL, diameter=0.2)),
     (1, "Size y [cm]", replace(BOX, sizes=(0.2, 0.2, 0.06))),
     (2, "Diameter [cm]", replace(TUBE, diameter=0.2)),
     (2, "Height [cm]", replace(TUBE, height=0.2)),
+    (3, "Size [cm]", MESH.resized(0.2)),
+    (4, "Size [cm]", CLOUD.resized(0.2)),
 ]
 
 
 @pytest.mark.parametrize(("selected", "label", "expected"), SIZES)
 def test_the_sizes_are_those_of_the_selected_obstacle(opened, selected, label, expected):
-    opened.session.edit("", obstacles=ALL, view=View(selected=selected))
+    opened.session.edit("", obstacles=SIZED, view=View(selected=selected))
     (control,) = (c for c in opened.controls[label] if c.handle.visible)
     changed = replace(opened.session.scenario, **control.change(opened.session.scenario, 20.0))
-    assert changed.obstacles == (*ALL[:selected], expected, *ALL[selected + 1 :])
+    assert changed.obstacles == (*SIZED[:selected], expected, *SIZED[selected + 1 :])
     assert control.read(changed) == 20.0
     hidden = [c for controls in opened.controls.values() for c in controls if not c.handle.visible]
     assert hidden and all(c.change(changed, 7.0) == {} for c in hidden)
 
 
-def test_a_file_that_is_uploaded_becomes_an_obstacle_and_a_bad_one_is_refused_with_the_reason(opened):
+def test_a_file_that_is_uploaded_becomes_an_obstacle(opened):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=40.0)  # millimetres
     cloud = trimesh.PointCloud(ball.vertices)
     files = {
@@ -209,14 +230,80 @@ def test_a_file_that_is_uploaded_becomes_an_obstacle_and_a_bad_one_is_refused_wi
         *_, added = opened.session.scenario.obstacles
         assert isinstance(added, shape) and added.radius == pytest.approx(0.04, abs=0.01)
         assert f"{opened.session.scenario.selected + 1}: {name_of(added)}" == label
+
+
+def stl(mesh):
+    return mesh.export(file_type="stl")
+
+
+def npz(**arrays):
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+BALL_MESH = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+EDGED = np.where(np.arange(len(POINTS)) < 1, np.nan, POINTS[:, 0])[:, None] * [1, 0, 0] + POINTS * [0, 1, 1]
+BAD = {
+    "open.stl": (stl(trimesh.Trimesh(BALL_MESH.vertices, BALL_MESH.faces[:-200])), "a closed (watertight) mesh"),
+    "empty.obj": (b"", "an empty file"),
+    "no faces.obj": (b"# nothing\n", "faces: found none"),
+    "long.stl": (b"\0" * (shapes.MAX_BYTES + 1), "at most 20 MB"),
+    "fine.stl": (
+        b"\0" * 80 + (10**6).to_bytes(4, "little") + b"\0" * 60,
+        "faces: found 1000000; accepted: at most 500000",
+    ),
+    "tiny.stl": (stl(BALL_MESH.copy().apply_scale(1e-6)), "a largest side of 0.01 m to 1 m"),
+    "corrupt.glb": (b"glTF" + bytes(range(200)), "a complete GLB file"),
+    "half.stl": (stl(BALL_MESH)[:3000], "a complete STL file"),
+    "what.txt": (b"?", "stl, obj, ply, glb, npz, csv"),
+    "none": (b"?", "suffix: found no suffix"),
+    "nan.npz": (npz(points=EDGED), "found nan in point 1"),
+    "one label.npz": (npz(points=POINTS, labels=np.ones(len(POINTS))), "all 2000 points occupied"),
+    "few.csv": (b"x,y,z\n0,0,0\n1,1,1\n", "points: found 2; accepted: at least 50"),
+    "corrupt.npz": (npz(points=POINTS)[:2000], "an npz archive"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_is_refused_with_what_was_found_and_the_scene_stays(opened, name):
     before = opened.session.scenario
-    broken = trimesh.Trimesh(ball.vertices, ball.faces[:-200]).export(file_type="stl")
-    for content, name, scale in ((broken, "open.stl", 0.001), (b"", "empty.obj", 1.0), (b"?", "what.txt", 1.0)):
-        opened.said.clear()
-        opened.panel.load(content, name, scale)
-        ((text, wrong),) = opened.said
-        assert wrong and text.startswith(f"{name}: ") and "accepted: " in text
-    assert opened.session.scenario == before
+    content, words = BAD[name]
+    opened.panel.load(content, name, 1.0)
+    ((text, wrong),) = opened.said
+    assert wrong and text.startswith(f"{name}: ") and "found " in text and "accepted: " in text
+    assert words in text
+    assert opened.session.scenario == before and opened.session.steps == 0
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb", "npz", "csv"])
+def test_what_is_too_large_is_not_even_looked_at(opened, suffix, monkeypatch):
+    for parser in ("_triangles", "_check_counts", "_ply_points", "_npz_points", "_csv_points"):
+        monkeypatch.setattr(shapes, parser, None)
+    opened.panel.load(b"ply\n" * (shapes.MAX_BYTES // 4 + 1), f"huge.{suffix}", 1.0)
+    ((text, wrong),) = opened.said
+    assert wrong and text == f"huge.{suffix}: file: found 20.0 MB; accepted: at most 20 MB"
+
+
+def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
+    content = stl(BALL_MESH.copy().apply_scale(1000))
+    opened.panel.load(content, "ball.stl", 1.0)
+    ((text, wrong),) = opened.said
+    assert wrong and "is the file in millimetres (scale=0.001)? then that is 0.08 × 0.08 × 0.08 m" in text
+    assert opened.panel._again.visible and opened.panel._again.label == "Read it in millimetres"
+    opened.panel.load_again()
+    *_, added = opened.session.scenario.obstacles
+    assert added.size == pytest.approx(0.08, abs=1e-3)
+    assert not opened.panel._again.visible and opened.panel._unit.value == "millimetres"
+    opened.panel.load_again()
+    assert len(opened.session.scenario.obstacles) == 2 and len(opened.said) == 1
+
+
+def test_another_file_than_there_is_room_for_is_refused(opened):
+    opened.session.edit("", obstacles=(BALL,) * MAX_OBSTACLES)
+    opened.panel.load(stl(BALL_MESH), "ball.stl", 1.0)
+    ((text, wrong),) = opened.said
+    assert wrong and "delete one first" in text
 
 
 def test_large_meshes_are_drawn_with_fewer_triangles():

@@ -16,7 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # numerical libraries read these when they are first imported; one thread is how the figures compare
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from dt_viz.demos import DemonstrationError  # noqa: PLC0415
+    from dt_viz.errors import DataError  # noqa: PLC0415
     from dt_viz.evaluate import avoidance, imitation, latency, places, rollouts, starts  # noqa: PLC0415
     from dt_viz.evaluate.options import InputError, with_negative_values  # noqa: PLC0415
     from dt_viz.imitation import ImitationError  # noqa: PLC0415
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(with_negative_values(sys.argv[1:] if arguments is None else arguments))
     try:
         return options.run(options)
-    except (DemonstrationError, ImitationError, InputError) as error:
+    except (DataError, ImitationError, InputError) as error:
         print(f"{parser.prog} {options.subcommand}: {error}", file=sys.stderr)
         return BAD_INPUT
 

@@ -6,15 +6,17 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from types import UnionType
+from typing import Any
 
 import numpy as np
 import viser
 
+from dt_viz import shapes
 from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
 from dt_viz.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.several import Several
-from dt_viz.shapes import CLOUD_SUFFIXES, MESH_SUFFIXES, ShapeError, read_cloud, read_mesh
+from dt_viz.shapes import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
 from dt_viz.tasks import Task
 from dt_viz.ui.session import Session
 
@@ -30,13 +32,13 @@ ASIDE = 0.4
 """Of its inner radius, by which a new obstacle stands beside the motion: dead ahead no side is the shorter one."""
 MIN_SIZE, MAX_SIZE = 0.03, 0.40
 """Of a box along one axis, and of a cylinder's height, metres."""
-UNITS: Mapping[str, float] = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
-"""Of files, in metres."""
 FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
 NONE: str = "none"
 
 Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Any]
 """Ties a control to the scenario; see `Panel`."""
+Shape = type[Obstacle] | UnionType
+"""What an obstacle may be."""
 
 
 class ObstaclePanel:
@@ -52,36 +54,67 @@ class ObstaclePanel:
         """
         self._bind, self._say = bind, say
         self._session: Session | None = None
-        self._sizes: list[tuple[Any, type[Obstacle]]] = []
+        self._sizes: list[tuple[Any, Shape]] = []
+        self._refused: tuple[bytes, str, str] | None = None  # content and name of a file, and the unit it may be in
         with gui.add_folder("Obstacles"):
             self._choice = gui.add_dropdown("Selected", (NONE,), hint="the one with handles; or click it in the scene")
             self._add = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
             self._change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected one")
             diameters = 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0
-            self._size(gui.add_slider("Diameter [cm]", *diameters), Sphere, "diameter")
-            self._size(gui.add_slider("Diameter [cm]", *diameters), Cylinder, "diameter")
+            for shape in (Sphere, Cylinder):
+                self._size(
+                    gui.add_slider("Diameter [cm]", *diameters),
+                    shape,
+                    lambda o: o.diameter,
+                    lambda o, d: replace(o, diameter=d),
+                )
             lengths = 100 * MIN_SIZE, 100 * MAX_SIZE, 0.5, 15.0
-            self._size(gui.add_slider("Height [cm]", *lengths), Cylinder, "height")
-            for axis, name in enumerate("xyz"):
-                self._size(gui.add_slider(f"Size {name} [cm]", *lengths), Box, "sizes", axis)
+            self._size(
+                gui.add_slider("Height [cm]", *lengths),
+                Cylinder,
+                lambda o: o.height,
+                lambda o, size: replace(o, height=size),
+            )
+            for k, name in enumerate("xyz"):
+                self._size(
+                    gui.add_slider(f"Size {name} [cm]", *lengths),
+                    Box,
+                    lambda o, k=k: o.sizes[k],
+                    lambda o, size, k=k: replace(o, sizes=(*o.sizes[:k], size, *o.sizes[k + 1 :])),
+                )
+            self._size(
+                gui.add_slider(
+                    "Size [cm]",
+                    100 * shapes.MIN_SIZE,
+                    100 * shapes.MAX_SIZE,
+                    0.5,
+                    15.0,
+                    hint="largest side of its bounding box",
+                ),
+                MeshObstacle | CloudObstacle,
+                lambda o: o.size,
+                lambda o, size: o.resized(size),
+            )
             bind(
                 gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
                 lambda s: round(100 * s.margin, 3),
                 lambda _s, value: {"margin": value / 100},
             )
             with gui.add_folder("From a file", expand_by_default=False):
-                unit = gui.add_dropdown("File is in", tuple(UNITS))
+                self._unit = gui.add_dropdown("File is in", tuple(UNITS))
                 self._upload = gui.add_upload_button(
                     "Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=f"{FORMATS}; a mesh must be closed"
                 )
+                self._again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
 
         @self._upload.on_upload
         def _(_event: viser.GuiEvent) -> None:  # in a thread: reading takes a while
-            self._upload.disabled = True
-            try:
-                self.load(self._upload.value.content, self._upload.value.name, UNITS[unit.value])
-            finally:
-                self._upload.disabled = False
+            file = self._upload.value
+            self.load(file.content, file.name, UNITS[self._unit.value])
+
+        @self._again.on_click
+        def _(_event: viser.GuiEvent) -> None:  # in a thread, too
+            self.load_again()
 
         @self._choice.on_update
         async def _(event: viser.GuiEvent) -> None:
@@ -132,14 +165,38 @@ class ObstaclePanel:
 
     def load(self, content: bytes, name: str, scale: float) -> None:
         """Add what a file holds, or say why that cannot be; see `from_file`."""
+        self._upload.disabled = True
         try:
+            self._load(content, name, scale)
+        finally:
+            self._upload.disabled = False
+
+    def load_again(self) -> None:
+        """Add what the file holds that was refused for its size, in the unit that was suggested."""
+        if self._refused is not None:
+            content, name, unit = self._refused
+            self._unit.value = unit
+            self.load(content, name, UNITS[unit])
+
+    def _load(self, content: bytes, name: str, scale: float) -> None:
+        self._refused = None
+        try:
+            if self._session is not None and len(self._session.scenario.obstacles) >= MAX_OBSTACLES:
+                raise ShapeError(
+                    name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
+                )
             obstacle, notes = from_file(content, name, scale)
         except ShapeError as error:
+            if isinstance(error, SizeError) and error.unit is not None:
+                self._refused = content, name, error.unit
+                self._again.label = f"Read it in {error.unit}"
             self._say(str(error), True)
-            return
-        self.add(obstacle)
-        if notes:
-            self._say(f"{name}: {'; '.join(notes)}", False)
+        else:
+            self.add(obstacle)
+            if notes:
+                self._say(f"{name}: {'; '.join(notes)}", False)
+        finally:
+            self._again.visible = self._refused is not None
 
     def duplicate(self) -> None:
         """Add another one like the selected obstacle."""
@@ -161,30 +218,28 @@ class ObstaclePanel:
             session.edit("obstacles", obstacles=tuple(obstacles), view=view)
             session.end_gesture()
 
-    def _size(self, handle: Any, shape: type[Obstacle], field: str, axis: int | None = None) -> None:  # noqa: ANN401
+    def _size(
+        self,
+        handle: Any,  # noqa: ANN401
+        shape: Shape,
+        read: Callable[[Any], float],
+        change: Callable[[Any, float], Obstacle],
+    ) -> None:
         """Tie a slider [cm] to a size of the selected obstacle, metres, while that has this shape."""
 
-        def read(scenario: Scenario) -> float:
+        def shown(scenario: Scenario) -> float:
             chosen = _selected(scenario)
-            if not isinstance(chosen, shape):
-                return handle.value
-            size = getattr(chosen, field)
-            return round(100 * (size if axis is None else size[axis]), 3)
+            return round(100 * read(chosen), 3) if isinstance(chosen, shape) else handle.value
 
-        def change(scenario: Scenario, value: float) -> dict[str, Any]:
+        def changed(scenario: Scenario, value: float) -> dict[str, Any]:
             chosen = _selected(scenario)
             if not isinstance(chosen, shape):
                 return {}
-            size: Any = value / 100
-            if axis is not None:
-                sizes = getattr(chosen, field)
-                size = (*sizes[:axis], size, *sizes[axis + 1 :])
             index, before = scenario.selected or 0, scenario.obstacles
-            changed: Any = replace(cast(Any, chosen), **{field: size})
-            return {"obstacles": (*before[:index], changed, *before[index + 1 :])}
+            return {"obstacles": (*before[:index], change(chosen, value / 100), *before[index + 1 :])}
 
         handle.visible = False
-        self._bind(handle, read, change)
+        self._bind(handle, shown, changed)
         self._sizes.append((handle, shape))
 
 
@@ -214,7 +269,8 @@ def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[
     if suffix not in (*MESH_SUFFIXES, *CLOUD_SUFFIXES):
         raise ShapeError(name, "suffix", repr(suffix) if suffix else "no suffix", FORMATS)
     if suffix == ".ply":
-        is_cloud = re.search(rb"element\s+face\s+0*[1-9]", content.partition(b"end_header")[0]) is None
+        header = content[: shapes.MAX_HEADER].partition(b"end_header")[0]
+        is_cloud = re.search(rb"element\s+face\s+0*[1-9]", header) is None
     else:
         is_cloud = suffix in CLOUD_SUFFIXES
     if is_cloud:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import trimesh
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from dt_viz.engine import Frame
 from dt_viz.fields import Array
-from dt_viz.obstacles import Obstacle, Sphere
+from dt_viz.obstacles import CloudObstacle, MeshObstacle, Obstacle, Sphere
 from dt_viz.scenario import MAX_DIAMETER, Scenario
 from dt_viz.tasks import Slice
 from dt_viz.ui import palette
@@ -105,12 +106,14 @@ class ObstaclePicture:
             self.gizmo.position = obstacle.position
         if np.abs(self.gizmo.wxyz - np.asarray(obstacle.wxyz)).max() > 1e-9:
             self.gizmo.wxyz = obstacle.wxyz
-        look = obstacle.moved((0.0, 0.0, 0.0))
+        look, scale = unscaled(obstacle.moved((0.0, 0.0, 0.0)))
         if look != self._look:
             self._look = look
             self.mesh.vertices, self.mesh.faces = shaded(look)
             self.gizmo.disable_rotations = isinstance(look, Sphere)
-            self._scale = HANDLE_SCALE * (0.5 + min(look.radius / MAX_DIAMETER, 0.8))
+        if self.mesh.scale != scale:
+            self.mesh.scale = scale
+        self._scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
         self._selected = selected
         self.show_handles(selected)
         side = "back" if opened else "front"
@@ -195,6 +198,13 @@ def in_slice(area: Slice | None, camera: Array, grabbed: Sequence[float], pointe
     if abs(slope) < MIN_SLOPE:
         return shift  # the slice is seen on edge: move across the line of sight instead
     return shift - sight * float(shift @ normal) / slope
+
+
+def unscaled(obstacle: Obstacle) -> tuple[Obstacle, float]:
+    """The obstacle as its triangles are kept, and by how much the browser is to scale them."""
+    if isinstance(obstacle, MeshObstacle | CloudObstacle):
+        return replace(obstacle, scale=1.0), obstacle.scale
+    return obstacle, 1.0
 
 
 def shaded(obstacle: Obstacle) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

@@ -10,8 +10,8 @@ from typing import Any
 import viser
 
 from dt_viz.collision import SELF_REACH, CollisionReport
-from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Frame, Stage
+from dt_viz.errors import DataError
 from dt_viz.imitation import ImitationError
 from dt_viz.occupancy import GENERATORS
 from dt_viz.paper_scenes import SCENES
@@ -179,7 +179,7 @@ class Panel:
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
-        expected = isinstance(error, DemonstrationError | ImitationError)
+        expected = isinstance(error, DataError | ImitationError)
         self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
 
     def cancelled(self, task: str) -> None:
@@ -234,7 +234,7 @@ class Panel:
                 return
             try:
                 session.choose_task(names[task.value])
-            except DemonstrationError as error:
+            except DataError as error:
                 self.fail(error)
                 self.adopt(session.scenario)
 
@@ -249,7 +249,7 @@ class Panel:
                 return
             try:
                 session.load(scenes[scene.value].task, scenes[scene.value].scenario)
-            except DemonstrationError as error:
+            except DataError as error:
                 self.fail(error)
                 self.adopt(session.scenario)
 

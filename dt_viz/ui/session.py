@@ -12,8 +12,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.errors import DataError
 from dt_viz.fields import Array
 from dt_viz.imitation import ImitationError
 from dt_viz.paper_scenes import seen_in
@@ -288,7 +288,7 @@ class Session:
             self._show_frames(job, superseded)
         except _UnwantedError:
             pass
-        except (DemonstrationError, ImitationError):
+        except (DataError, ImitationError):
             with self._lock:
                 returned = self._retreat(job[0])
             if returned:
