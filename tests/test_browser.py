@@ -7,12 +7,14 @@ import time
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
 import dt_viz.fits
 from dt_viz.fits import FitStore
 from dt_viz.metrics import maximum_collision_distance
+from dt_viz.obstacles import MeshObstacle
 from dt_viz.scenario import View
 from dt_viz.stacking import bias_points
 from dt_viz.tasks import TASKS
@@ -207,6 +209,43 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     wait_until(lambda: session.scenario.obstacles == (sphere,) and len(pictures.items) == 1, "the box to go")
     click_button(page, "Delete")
     page.get_by_text("no obstacle").first.wait_for(timeout=1000 * PATIENCE)
+
+
+def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
+    page, visitor = visit
+    session = visitor.session
+    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
+    session.edit("test", obstacles=(), view=light, avoidance=False)  # software rendering is slow
+    crate = trimesh.creation.box((150, 100, 50)).export(file_type="stl")
+    page.get_by_text("From a file", exact=True).click()
+    upload = page.locator("input[type=file]").first
+    upload.set_input_files({"name": "crate.stl", "mimeType": "model/stl", "buffer": crate})
+    page.get_by_text("is the file in millimetres").wait_for(timeout=1000 * PATIENCE)
+    assert session.scenario.obstacles == ()
+    click_button(page, "Read it in millimetres")
+    wait_until(lambda: session.scenario.obstacles, "the mesh")
+    (mesh,) = session.scenario.obstacles
+    assert isinstance(mesh, MeshObstacle) and mesh.size == pytest.approx(0.15)
+
+    picture = visitor.pictures.obstacles.items[0]
+    arc = 0.65 * picture.gizmo.scale  # the handles that turn are quarters of circles between the arrows
+    start, end = (
+        project(visitor, mesh.position + arc * np.array([np.cos(turn), 0.0, np.sin(turn)])) for turn in (0.8, 0.1)
+    )
+
+    def turned():
+        return abs(session.scenario.obstacles[0].wxyz[0]) < 0.9999 and session.wait_idle(0.3)
+
+    assert session.wait_idle(PATIENCE)
+    page.mouse.move(*start)
+    time.sleep(3.0)  # until the page has drawn the handles where they belong
+    drag(page, start, end, steps=6)
+    wait_until(turned, "the mesh to be turned")
+    (after,) = session.scenario.obstacles
+    assert after == mesh.moved(mesh.position, after.wxyz)  # in place
+    axis = np.abs(after.wxyz[1:]) / np.linalg.norm(after.wxyz[1:])
+    np.testing.assert_allclose(axis, [0, 1, 0], atol=1e-3)  # across the drawing plane
+    np.testing.assert_allclose(picture.gizmo.wxyz, after.wxyz, atol=1e-9)
 
 
 def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_the_stack(visit):
