@@ -1,4 +1,4 @@
-"""What the occupancy maps believe of the obstacles, on a task's slice, beside their true outline (sec. 4.4)."""
+"""What the occupancy maps believe of the obstacles, on a slice, beside their true outline (sec. 4.4)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dt_viz.fields import Array, Mask
 from dt_viz.obstacles import CloudObstacle, Obstacle
 from dt_viz.occupancy import AvoidanceField, StretchedField
 from dt_viz.several import Several
-from dt_viz.tasks import Slice
+from dt_viz.slices import Slice, level_line
 
 SPACING, COARSE_SPACING = 0.004, 0.010
 """Metres between neighbouring samples."""
@@ -46,17 +46,13 @@ def occupancy_picture(area: Slice, obstacles: Sequence[Obstacle], *, coarse: boo
         obstacles: any number.
         coarse: with fewer samples, for a picture that is replaced at once.
     """
-    spacing = COARSE_SPACING if coarse else SPACING
-    u, v = (np.linspace(-h, h, max(2, round(2 * h / spacing) + 1)) for h in area.half_size)
-    across = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1)
-    points = (area.centre + across @ area.axes.T).reshape(-1, 3)
+    world = area.grid(COARSE_SPACING if coarse else SPACING)
+    points, shape = world.reshape(-1, 3), world.shape[:2]
     free = np.ones(len(points))
     for obstacle in obstacles:
         free *= 1 - believed(obstacle, points)
-    shape = across.shape[:2]
     probability = 1 - free.reshape(shape)
     distance = Several(tuple(obstacles)).signed_distance(points).reshape(shape)
-    world = points.reshape(*shape, 3)
     return OccupancyPicture(
         area,
         probability,
@@ -87,27 +83,3 @@ def believed(obstacle: Obstacle, s: Array) -> Array:
         own, inner = inner.to_frame(own), inner.inner
     assert isinstance(inner, AvoidanceField)
     return inner.occupancy.probability(own)
-
-
-def level_line(points: Array, values: Array) -> Array:
-    """Where a function that is linear between lattice points is zero.
-
-    Args:
-        points: (n, m, 3) of the lattice.
-        values: (n, m) of the function.
-
-    Returns:
-        (K, 2, 3) segments, one at most for each of the two triangles of a cell.
-    """
-    flat, f = points.reshape(-1, 3), values.reshape(-1)
-    index = np.arange(len(f)).reshape(values.shape)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    above = f[triangles] > 0
-    triangles, above = (part[above.any(axis=1) & ~above.all(axis=1)] for part in (triangles, above))
-    # the corner that lies alone on its side of the line, and the two others
-    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), above.argmin(axis=1))
-    tip = np.take_along_axis(triangles, alone[:, None], axis=1)
-    others = np.take_along_axis(triangles, (alone[:, None] + [1, 2]) % 3, axis=1)
-    share = (f[tip] / (f[tip] - f[others]))[..., None]
-    return flat[tip] + share * (flat[others] - flat[tip])

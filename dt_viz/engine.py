@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from dt_viz.behaviours import Behaviour
 from dt_viz.belief import occupancy_picture
 from dt_viz.collision import load_collision_model
 from dt_viz.diffeo import Flow
+from dt_viz.field_layers import Clearance, ColourPicture, det_jacobian, lyapunov_value, streamlines, velocity_arrows
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
 from dt_viz.following import NUM_ARM_SAMPLES, OUT_OF_REACH, ArmMotion, Follower
@@ -30,13 +32,14 @@ from dt_viz.retiming import within_velocity_limits
 from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle
 from dt_viz.scenario import Scenario
-from dt_viz.solving import FINE, LIVE, Checkpoint, Precision, Solution, solve
+from dt_viz.slices import Slice
+from dt_viz.solving import FINE, LIVE, Checkpoint, Precision, Solution, cut_off, solve
+from dt_viz.stacking import levels
+from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
 from dt_viz.whole_arm import ArmSolution, Lift
 
-ARROW_SPACING = 0.030
-"""Of the picture of the vector field, metres."""
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
 
@@ -47,21 +50,11 @@ class Stage(IntEnum):
     ROLLOUTS = 0
     """Rollouts and their clearance."""
     LIVE = 1
-    """Also the vector field and the arm: what follows a drag."""
+    """Also the arm and what lies on the slice: what follows a drag."""
     FINE = 2
     """All of it refined, for a scenario that rests."""
     CERTIFIED = 3
     """Also the certificates."""
-
-
-@dataclass(frozen=True)
-class FieldPicture:
-    """Velocities of the system on the task's slice, outside the obstacle."""
-
-    points: Array
-    """(N, 3), metres."""
-    velocities: Array
-    """(N, 3), m/s."""
 
 
 @dataclass(frozen=True)
@@ -91,16 +84,21 @@ class Frame:
     layer_radii: tuple[float | None, ...] = ()
     """Radius of the region that each layer acts in, in the order of `Scenario.layers`, metres; None where it is off or
     acts everywhere."""
-    field: FieldPicture | None = None
-    """None before stage LIVE."""
+    level: int | None = None
+    """Which of `levels` the view shows, with the pictures that are on that manifold; None is the whole stack."""
     arm: ArmMotion | None = None
     """None before stage LIVE, and where the arm cannot reach the start."""
     pictures: Pictures = NO_PICTURES
-    """Of ψ itself, as far as the view shows them; empty before stage LIVE."""
+    """Of ψ itself and on the slice, as far as the view shows them; empty before stage LIVE."""
     profiles: Profiles | None = None
     """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
     seconds: float = 0.0
     """From the start of the rebuild until this frame."""
+
+    @property
+    def slice(self) -> Slice:
+        """Where the pictures lie."""
+        return self.task.slice.posed(self.scenario.view.slice)
 
 
 @dataclass(frozen=True)
@@ -113,6 +111,21 @@ class _Solved:
     """None where only the end effector avoids."""
     lifted: Lift | None
     """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
+
+
+@dataclass
+class _Kept:
+    """What has been worked out of one motion, which is not again when only the view changes."""
+
+    scenario: Scenario
+    ground: Ground
+    solved: dict[Precision, _Solved] = field(default_factory=dict)
+    rollouts: dict[Precision, Frame] = field(default_factory=dict)
+    """Frames of stage ROLLOUTS."""
+    arms: dict[Precision, Frame] = field(default_factory=dict)
+    """The same with the arm."""
+    health: Health | None = None
+    """Certified."""
 
 
 _turn = threading.Lock()
@@ -134,7 +147,10 @@ class Engine:
         self._follower = Follower(robot)
         self._tasks: dict[str, Task] = {}
         self._learned: dict[tuple[str, bool, str], Learned] = {}
-        self._good: dict[str, Frame] = {}
+        self._good: dict[str, tuple[Frame, Ground, Solution]] = {}
+        """The last motion of each task."""
+        self._kept: _Kept | None = None
+        """Of the newest motion."""
         self._shown: tuple[Scenario, Ground, _Solved] | None = None
         """The last motion that an arm was shown for."""
 
@@ -204,53 +220,75 @@ class Engine:
             return pushed(self._follower, ground, scenario, solved.stack, solved.arm, q, rng)
 
     def _stages(self, ground: Ground, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
-        if _uses_whole_arm(scenario):
-            with _turn:
-                blocked = self._follower.obstructions(ground, scenario.obstacle)
-                admitted = ground if blocked else self._follower.admitted(ground, scenario.obstacle)
-            if blocked:
-                yield from self._stages_without_motion(ground, scenario, blocked)
-                return
-            ground = admitted
+        kept = self._kept
+        if kept is None or not kept.scenario.moves_like(scenario):
+            if _uses_whole_arm(scenario):
+                with _turn:
+                    blocked = self._follower.obstructions(ground, scenario.obstacle)
+                    admitted = ground if blocked else self._follower.admitted(ground, scenario.obstacle)
+                if blocked:
+                    yield from self._stages_without_motion(ground, scenario, blocked)
+                    return
+                ground = admitted
+            kept = self._kept = _Kept(scenario, ground)
+        ground = kept.ground
         with _turn:
-            live = self._solved(ground, scenario, LIVE)
-            frame = self._frame(ground, scenario, live)
-        yield frame
+            live = _once(kept.solved, LIVE, lambda: self._solved(ground, scenario, LIVE))
+            first = _once(kept.rollouts, LIVE, lambda: self._frame(ground, scenario, live))
+            first = replace(first, scenario=scenario, level=_level(scenario, live.stack))
+        yield first
         with _turn:
-            frame = self._with_field_and_arm(frame, ground, live)
-            frame = replace(frame, stage=Stage.LIVE, pictures=_pictures(ground, scenario, live.stack, coarse=True))
-            self._good[scenario.task], self._shown = frame, (scenario, ground, live)
+            frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, ground, live))
+            pictures = _pictures(ground, scenario, live.stack, coarse=True)
+            frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.LIVE, pictures=pictures)
+            self._good[scenario.task] = frame, ground, live.stack
+            self._shown = scenario, ground, live
         yield frame
 
         with _turn:
-            fine = self._solved(ground, scenario, FINE, checkpoint)
+            fine = _once(kept.solved, FINE, lambda: self._solved(ground, scenario, FINE, checkpoint))
         with _turn:
-            frame = self._with_field_and_arm(self._frame(ground, scenario, fine), ground, fine)
+            exact = _once(kept.rollouts, FINE, lambda: self._frame(ground, scenario, fine))
+            frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, ground, fine))
         with _turn:
-            frame = replace(frame, stage=Stage.FINE, pictures=_pictures(ground, scenario, fine.stack, coarse=False))
+            pictures = _pictures(ground, scenario, fine.stack, coarse=False)
+            frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.FINE, pictures=pictures)
             if scenario.view.health_plots and frame.chosen is not None:
                 frame = replace(frame, profiles=self._profiles(frame, ground, fine, frame.chosen))
-            self._good[scenario.task], self._shown = frame, (scenario, ground, fine)
+            self._good[scenario.task] = frame, ground, fine.stack
+            self._shown = scenario, ground, fine
         yield frame
+        if kept.health is None:
+            kept.health = self._certified(frame, fine)
+        yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
+
+    def _certified(self, frame: Frame, fine: _Solved) -> Health:
+        obstacle = frame.scenario.obstacle
         with _turn:
             health = certified(frame.health, fine.stack.system, fine.stack.bundle)
             if fine.arm is not None:
                 health = certified_arm(health, fine.stack.system, fine.arm, self._robot)
         if fine.arm is None:
-            depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
+            depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
             health = replace(health, clearance=-depth if depth > 0 else health.clearance)
         if frame.arm is not None:
-            health = replace(health, collision=load_collision_model().report(frame.arm.q, scenario.obstacle))
-        yield replace(frame, stage=Stage.CERTIFIED, health=health)
+            health = replace(health, collision=load_collision_model().report(frame.arm.q, obstacle))
+        return health
 
     def _stages_without_motion(self, ground: Ground, scenario: Scenario, blocked: tuple[str, ...]) -> Iterator[Frame]:
         """The last good motion at every stage, or the undisturbed one if there is none."""
-        good = self._good.get(scenario.task)
-        if good is None:
-            *_, good = self._stages(ground, replace(scenario, avoidance=False))
+        if scenario.task not in self._good:
+            for _ in self._stages(ground, replace(scenario, avoidance=False)):
+                pass
+        good, ground, stack = self._good[scenario.task]
+        seen = replace(good.scenario, view=scenario.view)
+        changed = not seen.computes_like(good.scenario)
+        good = replace(good, level=_level(seen, stack))
         clearance = float(self._follower.whole_arm.clearance(self._any_arm(good), scenario.obstacle).min())
         health = Health(clearance=clearance)
         for stage in Stage:
+            if changed and stage in (Stage.LIVE, Stage.FINE):
+                good = replace(good, pictures=_pictures(ground, seen, stack, coarse=stage is Stage.LIVE))
             yield replace(good, scenario=scenario, stage=stage, blocked=blocked, health=health)
 
     def _ground(self, scenario: Scenario, progress: Progress | None) -> Ground:
@@ -294,6 +332,7 @@ class Engine:
             chosen=ground.rollout(scenario.arm_rollout),
             times=shown.split(stack.rays.times(index, fraction)),
             levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
+            level=_level(scenario, stack),
             goal=ground.goal,
             reached=reached,
             blocked=(),
@@ -307,10 +346,7 @@ class Engine:
             layer_radii=tuple(_region_radius(stack, layer.behaviour) for layer in scenario.layers),
         )
 
-    def _with_field_and_arm(self, frame: Frame, ground: Ground, solved: _Solved) -> Frame:
-        lattice = frame.task.slice.lattice(ARROW_SPACING)
-        lattice = lattice[frame.scenario.obstacle.signed_distance(lattice) > 0]
-        picture = FieldPicture(lattice, solved.stack.system.velocity(lattice))
+    def _with_arm(self, frame: Frame, ground: Ground, solved: _Solved) -> Frame:
         arm, doubts = None, ()
         try:
             far = self._follower.out_of_reach(ground)
@@ -319,7 +355,7 @@ class Engine:
             doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
         except UnreachableError as error:
             doubts = (f"the arm cannot reach the starts: {error}",)
-        return replace(frame, field=picture, arm=arm, health=frame.health.doubting(*doubts))
+        return replace(frame, arm=arm, health=frame.health.doubting(*doubts))
 
     def _arm(self, frame: Frame, ground: Ground, solved: _Solved, chosen: int) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
@@ -365,6 +401,16 @@ class Engine:
         return self._robot.home[None] if frame.arm is None else frame.arm.q
 
 
+_Made = TypeVar("_Made")
+
+
+def _once(kept: dict[Precision, _Made], precision: Precision, make: Callable[[], _Made]) -> _Made:
+    """What was made at this precision, or is now."""
+    if precision not in kept:
+        kept[precision] = make()
+    return kept[precision]
+
+
 def _uses_whole_arm(scenario: Scenario) -> bool:
     return scenario.avoidance and scenario.space != "task"
 
@@ -382,15 +428,45 @@ def _moves_goal(ground: Ground, stack: Solution) -> bool:
     return any(m and not isinstance(layer, ObstacleAvoidance) for m, (layer, _) in zip(moves, stack.built, strict=True))
 
 
+def _level(scenario: Scenario, stack: Solution) -> int | None:
+    """Which level the view names, if it is in the stack."""
+    names = levels(scenario)[: 1 + len(stack.built)]
+    return names.index(scenario.view.level) if scenario.view.level in names else None
+
+
 def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse: bool) -> Pictures:
-    """Those that the view shows."""
-    view, book = scenario.view, ground.learned.sketchbook
+    """Those that the view shows, on its slice and of its level."""
+    view, book, area = scenario.view, ground.learned.sketchbook, ground.task.slice.posed(scenario.view.slice)
+    level = _level(scenario, solution)
+    built = solution.built[:level]
+    system = solution.system if level is None else cut_off(ground, solution, level)
+    clearance = _clearance(scenario, avoided=any(isinstance(behaviour, ObstacleAvoidance) for behaviour, _ in built))
     return Pictures(
-        generator=book.generator(view.generator_layer) if view.generator else None,
-        grid=book.grid([made.transform for _, made in solution.built], coarse=coarse) if view.grid else None,
+        field=velocity_arrows(system, area, clearance) if view.field else None,
+        streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
+        colour=_colour(scenario, system, area, clearance, coarse=coarse),
+        generator=book.generator(area, view.generator_layer) if view.generator else None,
+        grid=book.grid(area, [made.transform for _, made in built], coarse=coarse) if view.grid else None,
         base=book.base(solution.rays) if view.base else None,
-        occupancy=(occupancy_picture(ground.task.slice, scenario.obstacles, coarse=coarse) if view.occupancy else None),
+        occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
     )
+
+
+def _clearance(scenario: Scenario, *, avoided: bool) -> Clearance:
+    """Distance from where no motion comes: nowhere, or into the obstacle."""
+    return scenario.obstacle.signed_distance if avoided else lambda points: np.full(len(points), np.inf)
+
+
+def _colour(
+    scenario: Scenario, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool
+) -> ColourPicture | None:
+    match scenario.view.colour:
+        case "det":
+            return det_jacobian(system, area, clearance, coarse=coarse)
+        case "lyapunov":
+            return lyapunov_value(system, area, clearance, coarse=coarse)
+        case "none" | "occupancy":
+            return None
 
 
 def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: float, missed: float) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -46,8 +47,8 @@ class PaperScene:
     task: str
     """Name of its task."""
     make: Callable[[Task], Scenario]
-    view: Mapping[str, bool] = field(default_factory=dict)
-    """What it switches on and off to be seen: fields of `View`."""
+    view: Mapping[str, bool | str] = field(default_factory=dict)
+    """What is to be seen of it: fields of `View`."""
 
     def scenario(self, task: Task) -> Scenario:
         """The scenario for its task."""
@@ -143,7 +144,7 @@ SCENES: Mapping[str, PaperScene] = {
             "All that is known of the clover: which points lie in it (dark). Strokes leave what is learned from them.",
             "draw_s",
             _cloud_in_the_letter,
-            view={"occupancy": True, "field": False},
+            view={"colour": "occupancy", "field": False},
         ),
         PaperScene(
             "two_points",
@@ -195,5 +196,5 @@ def seen_in(view: View, scene: str, before: str) -> View:
     return replace(view, **(back | _switched(scene)))
 
 
-def _switched(scene: str) -> dict[str, bool]:
+def _switched(scene: str) -> dict[str, Any]:
     return dict(SCENES[scene].view) if scene in SCENES else {}

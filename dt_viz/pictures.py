@@ -10,8 +10,10 @@ import numpy as np
 
 from dt_viz.belief import OccupancyPicture
 from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Placed
+from dt_viz.field_layers import ColourPicture, FieldPicture
 from dt_viz.fields import Array, Indices, Mask
 from dt_viz.rollouts import Bundle, Rays, refined
+from dt_viz.slices import Slice
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task
 
@@ -74,7 +76,7 @@ class BasePicture:
     velocities: Array
     """(N, 3) m/s in base space."""
     grid: tuple[Array, ...]
-    """(2, 3) lines of the lattice whose image is the warped grid."""
+    """(2, 3) lines of the lattice whose image is the warped grid of the task's slice."""
     border: Array
     """(5, 3) the inset's closed outline."""
     labels: tuple[Array, Array]
@@ -85,6 +87,10 @@ class BasePicture:
 class Pictures:
     """Those that the view asks for; None is what it does not, or what is not worked out yet."""
 
+    field: FieldPicture | None = None
+    streamlines: tuple[Array, ...] | None = None
+    """Each (T_i, 3), metres."""
+    colour: ColourPicture | None = None
     generator: GeneratorPicture | None = None
     grid: GridPicture | None = None
     base: BasePicture | None = None
@@ -92,6 +98,23 @@ class Pictures:
 
 
 NO_PICTURES = Pictures()
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """The pieces of a lattice's lines that lie over a slice before behaviours bend them."""
+
+    area: Slice
+    start: Array
+    """(M, 3) of the line of each piece in base space."""
+    end: Array
+    """(M, 3)"""
+    index: Indices
+    """(N,) which piece a sample belongs to."""
+    fraction: Array
+    """(N,) where on its line it is."""
+    positions: Array
+    """(N, 3) on the manifold of the imitation, metres."""
 
 
 @dataclass(frozen=True)
@@ -124,18 +147,21 @@ class Sketchbook:
             rays: from ψ(starts) to ψ(goal).
         """
         self._task, self._flows, self._system, self._rays = task, flows, system, rays
-        self._generators: dict[int, GeneratorPicture] = {}
+        self._generators: dict[int, tuple[Slice, GeneratorPicture]] = {}
+        self._pieces: _Pieces | None = None
 
-    def generator(self, number: int) -> GeneratorPicture | None:
+    def generator(self, area: Slice, number: int) -> GeneratorPicture | None:
         """The generator of one of the flows: 1 is what ψ applies first, 0 stands for the mean over time of all."""
         if self._flows is None:
             return None
         number = min(number, len(self._flows.parts))
-        if number not in self._generators:
-            self._generators[number] = self._generator(self._flows.parts[::-1], number)
-        return self._generators[number]
+        made = self._generators.get(number)
+        if made is None or not made[0].lies_like(area):
+            made = area, self._generator(area, self._flows.parts[::-1], number)
+            self._generators[number] = made
+        return made[1]
 
-    def _generator(self, flows: Sequence[Diffeomorphism], number: int) -> GeneratorPicture:
+    def _generator(self, area: Slice, flows: Sequence[Diffeomorphism], number: int) -> GeneratorPicture:
         task, chosen = self._task, [flows[number - 1]] if number else flows
         motions: list[Array] = []
         if number:
@@ -146,11 +172,11 @@ class Sketchbook:
                 for flow in flows[: number - 1]:
                     u = flow.forward(u)
                 motions.append(task.to_world(u))
-        lower, upper = -np.array(task.slice.half_size), np.array(task.slice.half_size)
+        lower, upper = -np.array(area.half_size), np.array(area.half_size)
         for motion in motions:
-            across = (motion - task.slice.centre) @ task.slice.axes
+            across = area.across(motion)
             lower, upper = np.minimum(lower, across.min(axis=0)), np.maximum(upper, across.max(axis=0))
-        points = _on_slice(task, _lattice(lower, upper, ARROW_SPACING))
+        points = area.at(_lattice(lower, upper, ARROW_SPACING))
         k = flows[0].dim
         u = ((points - task.origin) @ task.axes / task.scale)[:, :k]
         total = np.zeros_like(u)
@@ -162,15 +188,17 @@ class Sketchbook:
         seen = size > NEGLIGIBLE * size.max(initial=0.0)
         return GeneratorPicture(points[seen], displacements[seen], tuple(motions), len(flows))
 
-    def grid(self, behaviours: Sequence[Diffeomorphism], *, coarse: bool) -> GridPicture:
+    def grid(self, area: Slice, behaviours: Sequence[Diffeomorphism], *, coarse: bool) -> GridPicture:
         """The warped grid.
 
         Args:
+            area: where to look.
             behaviours: what is stacked on the imitation, from the inside out.
             coarse: with fewer points, for a picture that is replaced at once.
         """
-        start, end, index, fraction, positions = self._cut_lines
-
+        pieces = self._pieces
+        if pieces is None or not pieces.area.lies_like(area):
+            pieces = self._pieces = self._cut(area)
         drawn = [replace(b, tolerance=TOLERANCE) if isinstance(b, AdaptiveFlow) else b for b in behaviours]
 
         def lifted(positions: Array) -> Array:
@@ -179,9 +207,11 @@ class Sketchbook:
             return positions
 
         def evaluate(index: Indices, fraction: Array) -> Array:
-            z = start[index] + fraction[:, None] * (end[index] - start[index])
+            start = pieces.start[index]
+            z = start + fraction[:, None] * (pieces.end[index] - start)
             return lifted(self._system.transform.inverse(z))[:, None]
 
+        index, fraction, positions = pieces.index, pieces.fraction, pieces.positions
         if coarse:
             keep = _every_other(index)
             index, fraction, positions = index[keep], fraction[keep], positions[keep]
@@ -194,35 +224,27 @@ class Sketchbook:
         limit = 3 * (COARSE_SPACING if coarse else FINE_SPACING)
         return GridPicture(_runs(bundle.positions, bundle.index, limit))
 
-    @cached_property
-    def _lines(self) -> tuple[Array, Array]:
-        """Ends (M, 3) of the lattice's lines in base space: over all that ψ makes of the slice, through ψ(goal)."""
-        task, goal = self._task, self._system.base.goal
-        across = (self._system.transform.forward(task.slice.lattice(0.02)) - task.slice.centre) @ task.slice.axes
-        middle = (goal - task.slice.centre) @ task.slice.axes
-        offset = goal - _on_slice(task, middle[None])[0]
+    def _lines(self, area: Slice) -> tuple[Array, Array]:
+        """Ends (M, 3) of the lattice's lines in base space, over all that ψ makes of the slice.
+
+        They lie in the plane along the slice that is nearest to what ψ makes of it; ψ(goal) is where two of them cross,
+        or beside that.
+        """
+        images = self._system.transform.forward(area.lattice(0.02))
+        across, middle = area.across(images), area.across(self._system.base.goal)
+        offset = ((images - area.centre) @ area.normal).mean() * area.normal
         lower = middle + LINE_SPACING * np.floor((across.min(axis=0) - middle) / LINE_SPACING)
         upper = middle + LINE_SPACING * np.ceil((across.max(axis=0) - middle) / LINE_SPACING)
         start, end = _lattice_lines(lower, upper, LINE_SPACING)
-        return _on_slice(task, start) + offset, _on_slice(task, end) + offset
+        return area.at(start) + offset, area.at(end) + offset
 
-    @cached_property
-    def _cut_lines(self) -> tuple[Array, Array, Indices, Array, Array]:
-        """The lines' pieces that lie over the slice before behaviours bend them.
-
-        Returns:
-            Of the M pieces the ends (M, 3) of their lines in base space; of the N samples the piece (N,) that they
-            belong to, where (N,) on its line they are, and their positions (N, 3) on the manifold of the imitation.
-        """
-        task, (start, end) = self._task, self._lines
-        normal = np.cross(*task.slice.axes.T)
+    def _cut(self, area: Slice) -> _Pieces:
         indices, fractions, positions, starts, ends = [], [], [], [], []
-        for a, b in zip(start, end, strict=True):
+        for a, b in zip(*self._lines(area), strict=True):
             u = np.linspace(0, 1, 2 + int(np.linalg.norm(b - a) / TRIAL_STEP))
             x = self._system.transform.inverse(a + u[:, None] * (b - a))
-            across = (x - task.slice.centre) @ task.slice.axes
-            inside = (np.abs(across) <= task.slice.half_size).all(axis=1)
-            inside &= np.abs((x - task.slice.centre) @ normal) <= MAX_OFFSET
+            inside = (np.abs(area.across(x)) <= area.half_size).all(axis=1)
+            inside &= np.abs((x - area.centre) @ area.normal) <= MAX_OFFSET
             for piece in _true_runs(inside):
                 if len(piece) < 3:
                     continue
@@ -234,14 +256,14 @@ class Sketchbook:
                 positions.append(x[chosen])
                 starts.append(a)
                 ends.append(b)
-        if not starts:
-            return np.empty((0, 3)), np.empty((0, 3)), np.empty(0, int), np.empty(0), np.empty((0, 3))
-        return (
-            np.stack(starts),
-            np.stack(ends),
-            np.concatenate(indices),
-            np.concatenate(fractions),
-            np.concatenate(positions),
+        none = np.empty((0, 3))
+        return _Pieces(
+            area,
+            np.reshape(starts, (-1, 3)),
+            np.reshape(ends, (-1, 3)),
+            np.concatenate([np.empty(0, int), *indices]),
+            np.concatenate([np.empty(0), *fractions]),
+            np.concatenate([none, *positions]),
         )
 
     def base(self, rays: Rays) -> BasePicture:
@@ -251,22 +273,22 @@ class Sketchbook:
         spacing = 2 * inset.half.max() / INSET_ARROWS
         corner = inset.half - spacing / 2
         z = inset.middle + _lattice(-corner, corner, spacing) @ task.slice.axes.T
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * inset.half
+        border = replace(task.slice, centre=inset.middle, half_size=tuple(inset.half)).border
         above = inset.centre + inset.scale * (task.slice.axes @ np.array([0.0, inset.half[1]]))
         return BasePicture(
             rays=tuple(inset(np.stack([z0, goal])) for z0 in rays.z0),
             points=inset(z),
             velocities=rays.base.velocity(z),
             grid=self._inset_grid,
-            border=inset(inset.middle + corners @ task.slice.axes.T),
-            labels=(above, task.slice.centre + task.slice.axes @ np.array([0.0, task.slice.half_size[1]])),
+            border=inset(border),
+            labels=(above, task.slice.at(np.array([0.0, task.slice.half_size[1]]))),
         )
 
     @cached_property
     def _inset_grid(self) -> tuple[Array, ...]:
         task, inset = self._task, self._inset
         pieces = []
-        for a, b in zip(*self._lines, strict=True):
+        for a, b in zip(*self._lines(task.slice), strict=True):
             ends = (np.stack([a, b]) - inset.middle) @ task.slice.axes
             cut = np.clip(ends, -inset.half, inset.half)
             fixed = np.abs(ends[0] - ends[1]) < 1e-9  # the coordinate along which the line does not run
@@ -280,15 +302,15 @@ class Sketchbook:
         task = self._task
         plane = task.slice.axes
         ends = np.concatenate([self._rays.z0, [self._rays.base.goal]])
-        across = (ends - task.slice.centre) @ plane
+        across = task.slice.across(ends)
         lower, upper = across.min(axis=0), across.max(axis=0)
         half = (upper - lower) / 2
         half = half + INSET_MARGIN * half.max()
         half = np.maximum(half, 0.45 * half.max())
         # the plane of the picture goes through the goal, where all rays meet
-        normal = np.cross(*plane.T)
+        normal = task.slice.normal
         offset = (self._rays.base.goal - task.slice.centre) @ normal
-        middle = _on_slice(task, ((lower + upper) / 2)[None])[0] + offset * normal
+        middle = task.slice.at((lower + upper) / 2) + offset * normal
         scale = min(1.0, INSET_HALF_WIDTH / half[0], task.slice.half_size[1] / half[1])
         eye, target = (np.array(point) for point in task.camera)
         right = np.cross(target - eye, [0.0, 0.0, 1.0])
@@ -300,11 +322,6 @@ class Sketchbook:
 def in_frame(transform: Diffeomorphism) -> Chain | None:
     """The chain of flows inside a placed imitation; None of the identity."""
     return transform.inner if isinstance(transform, Placed) and isinstance(transform.inner, Chain) else None
-
-
-def _on_slice(task: Task, across: Array) -> Array:
-    """World points (N, 3) of coordinates (N, 2) on the slice, metres."""
-    return task.slice.centre + across @ task.slice.axes.T
 
 
 def _lattice(lower: Array, upper: Array, spacing: float) -> Array:

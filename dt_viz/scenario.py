@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from dt_viz.obstacles import Obstacle
 from dt_viz.occupancy import Generator
 from dt_viz.several import Several
+from dt_viz.slices import SlicePose
 
 if TYPE_CHECKING:
     from dt_viz.behaviours import Behaviour
@@ -22,6 +23,10 @@ SPACES: tuple[Space, ...] = ("task", "cspace", "both")
 
 Vector = tuple[float, float, float]
 
+SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
+"""What is shown as colour on the slice: det J of the stack, its Lyapunov value, or what the occupancy maps believe."""
+SLICE_COLOURS: tuple[SliceColour, ...] = ("none", "det", "lyapunov", "occupancy")
+
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
 """Metres."""
 MAX_OBSTACLES = 5
@@ -34,7 +39,7 @@ MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
 MAX_MANUAL_DURATION = 2.0
 
 
-COMPUTED_VIEWS = ("generator", "grid", "base", "occupancy", "health_plots")
+COMPUTED_VIEWS = ("field", "streamlines", "generator", "grid", "base", "health_plots")
 """Fields of `View` whose pictures are computed only while they are shown."""
 
 
@@ -47,7 +52,14 @@ class View:
     ghost: bool = True
     """The undeformed rollouts."""
     field: bool = True
-    """Arrows of the vector field on a slice."""
+    """Arrows of the vector field on the slice."""
+    streamlines: bool = False
+    """Motions through places all over the slice."""
+    slice: SlicePose | None = None
+    """Where the slice lies; None is where the task has it."""
+    move_slice: bool = False
+    """Whether the slice has handles, instead of what else may have some."""
+    colour: SliceColour = "none"
     arm: bool = True
     ghost_arm: bool = False
     """The arm where it would be without avoidance."""
@@ -70,8 +82,6 @@ class View:
     """The warped grid: lines of base space seen through ψ⁻¹."""
     base: bool = False
     """The base attractor beside the learned system."""
-    occupancy: bool = False
-    """What the obstacles' occupancy maps believe, on a slice."""
     playing: bool = True
     """Whether the arm moves along its rollout."""
     speed: float = 1.0
@@ -79,7 +89,8 @@ class View:
     bias: str = ""
     """Name of the bias point that the panel changes and that has the handles."""
     level: str = ""
-    """Name of the level of the stack whose rollouts are shown beside those of all of it; none if empty."""
+    """Name of the level of the stack whose manifold is shown: its rollouts beside those of the whole stack, and all
+    that lies on the slice. The whole stack if empty."""
 
 
 @dataclass(frozen=True)
@@ -149,4 +160,6 @@ class Scenario:
         before, after = other.view, self.view
         shows_no_more = all(getattr(before, name) or not getattr(after, name) for name in COMPUTED_VIEWS)
         same_layer = not after.generator or after.generator_layer == before.generator_layer
-        return self.moves_like(other) and shows_no_more and same_layer
+        same_colour = after.colour in {"none", before.colour}
+        same_place = (after.slice, after.level) == (before.slice, before.level)
+        return self.moves_like(other) and shows_no_more and same_layer and same_colour and same_place

@@ -73,6 +73,12 @@ class Solution:
         return self.transform.inverse(self.rays.at(index, fraction))
 
 
+def cut_off(ground: Ground, solution: Solution, level: int) -> DiffeomorphicSystem:
+    """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
+    stacked = [made.transform for _, made in solution.built[:level]]
+    return DiffeomorphicSystem(Chain([ground.system.transform, *stacked]), solution.rays.base)
+
+
 def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
     """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
     levels = [positions]

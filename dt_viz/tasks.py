@@ -14,6 +14,7 @@ from dt_viz.diffeo import Placed
 from dt_viz.fields import Array
 from dt_viz.imitation import Imitation
 from dt_viz.metrics import resample_by_arc_length
+from dt_viz.slices import Slice
 from dt_viz.systems import DiffeomorphicSystem
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
@@ -51,24 +52,6 @@ class Pot:
 
 POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
 """Of `drop_pots`: left, centre and right for whoever faces the robot."""
-
-
-@dataclass(frozen=True)
-class Slice:
-    """The rectangle on which a picture of the vector field is drawn."""
-
-    centre: Array
-    """(3,), metres."""
-    axes: Array
-    """(3, 2) orthonormal columns."""
-    half_size: tuple[float, float]
-    """Metres."""
-
-    def lattice(self, spacing: float) -> Array:
-        """Points (N, 3) at about this spacing, metres."""
-        u, v = (np.linspace(-h, h, max(2, round(2 * h / spacing) + 1)) for h in self.half_size)
-        grid = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
-        return self.centre + grid @ self.axes.T
 
 
 @dataclass(frozen=True, eq=False)

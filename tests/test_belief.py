@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.belief import MAX_POINTS, NEAR, believed, level_line, occupancy_picture
+from dt_viz.belief import MAX_POINTS, NEAR, believed, occupancy_picture
 from dt_viz.clouds import Cloud
 from dt_viz.engine import Stage
 from dt_viz.obstacles import Box, CloudObstacle, Cylinder, Sphere
 from dt_viz.scenario import View
 from dt_viz.several import Several
-from dt_viz.tasks import Slice
+from dt_viz.slices import Slice
 
 AREA = Slice(np.array([0.0, -0.5, 0.4]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T, (0.2, 0.15))
 SHAPES = [
@@ -19,16 +19,6 @@ SHAPES = [
     Box((0.0, -0.51, 0.38), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3)),
     Cylinder((-0.03, -0.5, 0.4), 0.08, 0.2, (0.8, 0.6, 0.0, 0.0)),
 ]
-
-
-def test_the_level_line_of_a_plane_is_where_the_plane_is_zero():
-    rng = np.random.default_rng(1)
-    normal, offset = rng.normal(size=3), 0.1
-    points = np.stack([*np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 7), indexing="ij")], axis=-1)
-    points = points @ rng.normal(size=(2, 3))
-    segments = level_line(points, points @ normal - offset)
-    assert len(segments) > 5
-    np.testing.assert_allclose(segments @ normal, offset, atol=1e-12)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=["sphere", "box", "cylinder"])
@@ -72,7 +62,7 @@ def test_the_points_beside_the_slice_are_shown_on_it_with_their_labels():
 
 def test_the_picture_is_worked_out_only_while_it_is_shown(engine, initial):
     scenario = initial("draw_s")
-    shown = replace(scenario, view=View(occupancy=True))
+    shown = replace(scenario, view=View(colour="occupancy"))
     assert not shown.computes_like(scenario)
     assert all(frame.pictures.occupancy is None for frame in engine.frames(scenario))
     frames = list(engine.frames(shown))

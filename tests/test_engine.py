@@ -52,8 +52,9 @@ def assert_finite(frame):
     for path, times in zip(frame.rollouts, frame.times, strict=True):
         assert np.isfinite(path).all() and np.isfinite(times).all()
     assert np.isfinite(frame.reached).all() and np.isfinite(frame.health.clearance)
-    if frame.field is not None:
-        assert np.isfinite(frame.field.points).all() and np.isfinite(frame.field.velocities).all()
+    field = frame.pictures.field
+    if field is not None:
+        assert np.isfinite(field.points).all() and np.isfinite(field.velocities).all()
     if frame.arm is not None:
         assert np.isfinite(frame.arm.q).all()
 
@@ -66,7 +67,7 @@ def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(eng
     for frame in frames:
         assert frame.scenario == scenario
         assert len(frame.rollouts) == len(frame.times) == len(frame.ghost) == len(frame.task.demonstrations)
-        assert (frame.field is not None) == (frame.stage >= Stage.LIVE)
+        assert (frame.pictures.field is not None) == (frame.stage >= Stage.LIVE)
         assert (frame.arm is not None) == (frame.stage >= Stage.LIVE)
         assert (frame.health.min_det_jacobian is not None) == (frame.stage >= Stage.CERTIFIED)
         assert_finite(frame)
@@ -179,14 +180,13 @@ def test_without_imitation_motions_are_straight(engine, scenario):
 
 def test_the_field_is_drawn_outside_the_obstacle_and_is_the_velocity_of_the_motion(engine, scenario):
     frame = stage(engine, scenario, Stage.LIVE)
-    assert frame.field is not None
-    assert scenario.obstacle.signed_distance(frame.field.points).min() > 0
-    fine = stage(engine, scenario, Stage.FINE)
-    assert fine.field is not None
-    np.testing.assert_array_equal(fine.field.points, frame.field.points)
-    largest = np.linalg.norm(fine.field.velocities, axis=1).max()
+    live, fine = frame.pictures.field, stage(engine, scenario, Stage.FINE).pictures.field
+    assert live is not None and fine is not None
+    assert scenario.obstacle.signed_distance(live.points).min() > 0
+    np.testing.assert_array_equal(fine.points, live.points)
+    largest = np.linalg.norm(fine.velocities, axis=1).max()
     # the fastest arrows stand where the stack stretches most, and show the tolerance of the live stage most
-    assert np.abs(fine.field.velocities - frame.field.velocities).max() < 0.05 * largest
+    assert np.abs(fine.velocities - live.velocities).max() < 0.05 * largest
 
 
 AWKWARD = {

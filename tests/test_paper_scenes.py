@@ -96,7 +96,7 @@ def test_the_clover_is_known_by_labelled_points_only_and_every_stroke_leaves_it(
     assert undisturbed > 0.02
     assert max(maximum_collision_distance(path, cloud.signed_distance) for path in frame.rollouts) == 0
     assert_only_the_stroke_gives_way(frame, cloud, 0.06)
-    assert SCENES["cloud"].view["occupancy"]
+    assert SCENES["cloud"].view["colour"] == "occupancy"
 
 
 def test_the_clover_is_the_same_every_time():
@@ -120,7 +120,7 @@ def test_every_stroke_of_a_letter_goes_around_the_sphere_and_the_arm_with_it(cer
 def test_what_a_scene_switches_on_is_off_again_once_it_is_left():
     mine = View(arm=False, grid=True)
     there = seen_in(mine, "cloud", "")
-    assert there.occupancy and not there.field and not there.arm and there.grid
+    assert there.colour == "occupancy" and not there.field and not there.arm and there.grid
     assert seen_in(there, "cloud", "cloud") == there
     for after in ("", "cube", "what is none"):
         assert seen_in(there, after, "cloud") == mine

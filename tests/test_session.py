@@ -555,11 +555,11 @@ def test_what_a_scene_shows_goes_with_it_also_when_it_is_undone_or_done_again(op
     opened.engine.task = lambda name: name
     for leave in (session.undo, session.reset, lambda: session.choose_task("lift_box")):
         session.load("draw_s", lambda task: Scenario(task, (), scene="cloud"))
-        assert session.scenario.view == replace(mine, occupancy=True, field=False)
+        assert session.scenario.view == replace(mine, colour="occupancy", field=False)
         leave()
         assert session.scenario.view == mine
     session.undo()
-    assert session.scenario.view.occupancy
+    assert session.scenario.view.colour == "occupancy"
 
 
 def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):

@@ -275,7 +275,7 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 
 def test_every_layer_has_a_checkbox():
-    switches = {f.name for f in fields(View) if f.type == "bool"} - {"playing"}
+    switches = {f.name for f in fields(View) if f.type == "bool"} - {"playing", "move_slice"}
     assert set(VIEW_LABELS) == switches
 
 

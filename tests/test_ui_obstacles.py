@@ -21,8 +21,8 @@ from dt_viz.solids import Solid
 from dt_viz.tasks import TASKS
 from dt_viz.ui.obstacle_panel import SHAPES, ObstaclePanel, name_of, with_room
 from dt_viz.ui.obstacles import Obstacles, in_slice, shaded
-from dt_viz.ui.occupancy import OccupancySlice
 from dt_viz.ui.panel import _clearance, _collision_rows
+from dt_viz.ui.slice_layers import OccupancySlice
 
 BALL = Sphere((0.0, -0.5, 0.4), 0.12)
 BOX = Box((0.1, -0.5, 0.5), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3))
@@ -335,7 +335,7 @@ def test_the_map_is_painted_on_the_slice_the_right_way_up(server):
     ball = Sphere((float(centre[0]), float(centre[1]), float(centre[2])), 0.1)
     made = occupancy_picture(task.slice, (ball,), coarse=True)
     picture.draw(cast(Any, SimpleNamespace(pictures=SimpleNamespace(occupancy=made))))
-    image = picture.image
+    image = picture.image.handle
     assert image is not None
     rows, columns = np.nonzero(image.image[..., 3] > 190)
     height, width = image.image.shape[:2]
@@ -352,5 +352,5 @@ def test_the_map_is_painted_on_the_slice_the_right_way_up(server):
 def test_obstacles_are_open_towards_the_viewer_while_their_map_is_shown(shown):
     shown.adopt(scenario(*ALL))
     assert {item.mesh.side for item in shown.items} == {"front"}
-    shown.adopt(replace(scenario(*ALL), view=View(occupancy=True)))
+    shown.adopt(replace(scenario(*ALL), view=View(colour="occupancy")))
     assert {item.mesh.side for item in shown.items} == {"back"}

@@ -156,16 +156,15 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
     assert len(panel._rows) == 5
 
 
-def test_the_selected_level_is_drawn_without_a_new_frame(scene):
+def test_the_selected_level_is_drawn_and_named(scene):
     picture = LevelRollouts(scene)
-    picture.adopt(SCENARIO)
-    picture.draw(frame())
-    for level, height in ((IMITATION, 0.0), ("Bias 2", 2.0), (AVOIDANCE, 3.0)):
-        picture.adopt(replace(SCENARIO, view=View(level=level)))
+    for name, level in ((IMITATION, 0), ("Bias 2", 2), (AVOIDANCE, 3)):
+        picture.draw(frame(replace(SCENARIO, view=View(level=name)), level=level))
+        assert picture.visible and name.lower() in picture.label.text.lower()
         assert len(picture.lines.node.points) == 4
-        assert (picture.lines.node.points == height).all()
-    picture.adopt(SCENARIO)
-    assert len(picture.lines.node.points) == 0
+        assert (picture.lines.node.points == level).all()
+    picture.draw(frame())
+    assert not picture.visible
 
 
 # --- Bias points ---

@@ -16,8 +16,8 @@ from dt_viz.bias import BiasPoint
 from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.scenario import Scenario
+from dt_viz.slices import Slice
 from dt_viz.stacking import MAX_BIAS_POINTS, bias_points
-from dt_viz.tasks import Slice
 from dt_viz.ui import palette
 from dt_viz.ui.obstacles import HIDDEN, in_slice
 from dt_viz.ui.picture import Picture
@@ -159,8 +159,9 @@ class Biases(Picture):
         points = bias_points(scenario.layers)
         self._points = points
         on = {layer.name for layer in scenario.layers if layer.on}
+        selected = None if scenario.view.move_slice else selected_point(scenario)
         for item, (name, point) in zip(self.items, points.items(), strict=False):
-            item.adopt(name, point, on=name in on, selected=name == selected_point(scenario))
+            item.adopt(name, point, on=name in on, selected=name == selected)
         for item in self.items[len(points) :]:
             item.hide()
 

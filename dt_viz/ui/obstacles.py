@@ -15,7 +15,7 @@ from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.obstacles import CloudObstacle, MeshObstacle, Obstacle, Sphere
 from dt_viz.scenario import MAX_DIAMETER, Scenario
-from dt_viz.tasks import Slice
+from dt_viz.slices import Slice
 from dt_viz.ui import palette
 from dt_viz.ui.links import simplified
 from dt_viz.ui.picture import Picture
@@ -166,9 +166,9 @@ class Obstacles(Picture):
         for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
             item.adopt(
                 obstacle,
-                selected=index == scenario.selected,
+                selected=index == scenario.selected and not scenario.view.move_slice,
                 avoided=scenario.avoidance,
-                opened=scenario.view.occupancy,
+                opened=scenario.view.colour == "occupancy",
             )
 
     @contextmanager

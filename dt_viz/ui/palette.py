@@ -19,6 +19,19 @@ BIAS = (230, 159, 0)
 """Bias points."""
 LEVEL = (0, 114, 178)
 """Rollouts on the selected level of the stack."""
+ROLLOUT_BESIDE = (238, 178, 132)
+"""Those of the whole stack beside them."""
+SLICE = (120, 126, 136)
+"""Frame around a slice that is not where the task has it."""
+STREAMLINE = (92, 108, 138)
+VOLUME = ((118, 42, 131), (194, 165, 207), (247, 247, 247), (166, 219, 160), (27, 120, 55))
+"""det J from small to large; the middle one is 1."""
+FOLDED = (230, 0, 38)
+"""det J that is not above 0: no diffeomorphism."""
+LYAPUNOV = ((255, 250, 210), (160, 215, 185), (65, 160, 190), (45, 80, 160), (30, 20, 90))
+"""Lyapunov value from the goal up."""
+LEVEL_LINE = (255, 255, 255)
+"""Of the Lyapunov value."""
 OCCUPANCY = (230, 159, 0)
 OCCUPANCY_LEVEL = (153, 88, 0)
 """Where the map finds occupied and free equally likely."""

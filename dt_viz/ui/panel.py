@@ -33,6 +33,7 @@ from dt_viz.ui.obstacle_panel import ObstaclePanel
 from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.push import PushButton
 from dt_viz.ui.session import Pace, Session
+from dt_viz.ui.slice_panel import SlicePanel
 from dt_viz.ui.stack_panel import StackPanel
 
 VIEW_LABELS: Mapping[str, str] = {
@@ -40,6 +41,7 @@ VIEW_LABELS: Mapping[str, str] = {
     "ghost": "Without the obstacle (dashed)",
     "demonstrations": "Demonstrations",
     "field": "Vector field",
+    "streamlines": "Streamlines",
     "arm": "Arm",
     "ghost_arm": "Arm without avoidance",
     "onion": "Arms along the motion",
@@ -50,10 +52,10 @@ VIEW_LABELS: Mapping[str, str] = {
     "grid": "Warped grid ψ⁻¹(grid)",
     "base": "Base attractor beside it",
     "generator": "Learned generator",
-    "occupancy": "Learned occupancy",
 }
 VIEW_HINTS: Mapping[str, str] = {
-    "occupancy": "on the slice: what the map believes, its level p = ½ (bold) and the true outline (thin)",
+    "field": "on the slice: longer and darker is faster",
+    "streamlines": "motions from all over the slice: exact, as images of straight rays",
     "ghost_arm": "where it would be at the same moment; left out where both are in one place",
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
@@ -118,6 +120,8 @@ class Panel:
         self._build_stack()
         self._build_arm()
         self._build_view()
+        with gui.add_folder("Slice", expand_by_default=False):
+            self._slice = SlicePanel(gui, self._bind)
         self.joints = JointPlots(gui, robot)
         self.health = HealthPlots(gui)
         self._build_export(save_png)
@@ -128,6 +132,7 @@ class Panel:
         self._obstacles.connect(session)
         self._biases.connect(session)
         self._stack.connect(session)
+        self._slice.connect(session)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
@@ -135,6 +140,7 @@ class Panel:
         self._obstacles.adopt(scenario)
         self._biases.adopt(scenario)
         self._stack.adopt(scenario)
+        self._slice.adopt(scenario)
         self.push.adopt(scenario)
         for control in self._controls:
             value = control.read(scenario)
@@ -158,6 +164,7 @@ class Panel:
         self._hint.content = f"<div style='{_SMALL}'>{html.escape(scene.line if scene else frame.task.hint)}</div>"
         self._biases.report(frame)
         self._stack.report(frame)
+        self._slice.report(frame)
         self.joints.draw(frame.arm)
         self.health.draw(frame.profiles)
         self.push.report(frame)

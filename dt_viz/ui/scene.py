@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import viser
@@ -18,12 +19,11 @@ from dt_viz.ui.bias import Moved as BiasMoved
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
 from dt_viz.ui.obstacles import Moved, Obstacles
-from dt_viz.ui.occupancy import OccupancySlice
-from dt_viz.ui.picture import Arrows, Lines, Picture
+from dt_viz.ui.picture import Lines, Picture
 from dt_viz.ui.pots import Pots
-
-ARROW_LENGTH = 0.024
-"""Of the fastest arrow, metres."""
+from dt_viz.ui.slice import MovableSlice
+from dt_viz.ui.slice import Moved as SliceMoved
+from dt_viz.ui.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
 
 
 class Demonstrations(Picture):
@@ -56,6 +56,8 @@ class Rollouts(Picture):
         chosen = frame.chosen
         if frame.blocked:
             self.lines.show(frame.rollouts, chosen, mark=palette.GHOST, colour=palette.STALE)
+        elif frame.level is not None:
+            self.lines.show(frame.rollouts, colour=palette.ROLLOUT_BESIDE)
         else:
             self.lines.show(frame.rollouts, chosen)
         self._starts.points = np.stack([path[0] for path in frame.rollouts]).astype(np.float32)
@@ -74,19 +76,6 @@ class Ghost(Picture):
         if frame.ghost is not self._shown:
             self._shown = frame.ghost
             self._lines.show(frame.ghost)
-
-
-class FieldArrows(Picture):
-    """The vector field on the task's slice: longer and darker is faster."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._arrows = Arrows(scene, "/field", palette.ARROW_SLOW, palette.ARROW_FAST, ARROW_LENGTH)
-        super().__init__(self._arrows.node)
-
-    def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
-        if frame.field is not None:
-            self._arrows.show(frame.field.points, frame.field.velocities)
 
 
 class Goal(Picture):
@@ -149,24 +138,38 @@ class ScenePictures:
         selected: Callable[[int], None],
         bias_moved: BiasMoved,
         bias_selected: Callable[[str], None],
+        slice_moved: SliceMoved,
     ) -> None:
-        """Build the scene of this robot; the others are told what the user does, see `Obstacles` and `Biases`."""
+        """Build the scene of this robot; the others are told what the user does, see their pictures."""
         set_lights(scene)
         self.obstacles = Obstacles(scene, moved, selected)
         self.biases = Biases(scene, bias_moved, bias_selected)
-        self.level = LevelRollouts(scene)
-        self._always: tuple[Picture, ...] = (self.obstacles, self.biases, self.level, Goal(scene), Pots(scene))
+        self.slice = MovableSlice(scene, slice_moved)
+        self._always: tuple[Picture, ...] = (
+            self.obstacles,
+            self.biases,
+            self.slice,
+            LevelRollouts(scene),
+            Goal(scene),
+            Pots(scene),
+        )
         self._by_view: dict[str, Picture] = {
             "demonstrations": Demonstrations(scene),
             "rollouts": Rollouts(scene),
             "ghost": Ghost(scene),
             "field": FieldArrows(scene),
+            "streamlines": Streamlines(scene),
             "table": Table(scene),
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
             "base": BaseInset(scene),
-            "occupancy": OccupancySlice(scene),
             "onion": Onion(scene, robot),
+        }
+        function = ColourSlice(scene)
+        self._by_colour: dict[str, Picture] = {
+            "det": function,
+            "lyapunov": function,
+            "occupancy": OccupancySlice(scene),
         }
 
     def layer(self, view: str) -> Picture:
@@ -175,13 +178,22 @@ class ScenePictures:
 
     def draw(self, frame: Frame) -> None:
         """Assign fresh arrays to the handles."""
-        for picture in (*self._always, *self._by_view.values()):
+        for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
             picture.draw(frame)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
         self.obstacles.adopt(scenario)
         self.biases.adopt(scenario)
-        self.level.adopt(scenario)
+        self.slice.adopt(scenario)
         for name, picture in self._by_view.items():
             picture.visible = getattr(scenario.view, name)
+        shown = self._by_colour.get(scenario.view.colour)
+        for picture in self._by_colour.values():
+            picture.visible = picture is shown
+
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide all handles for as long as a picture takes."""
+        with self.obstacles.without_handles(), self.biases.without_handles(), self.slice.without_handles():
+            yield

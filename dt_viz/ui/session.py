@@ -64,6 +64,11 @@ def _end_if(superseded: Callable[[], bool]) -> None:
         raise _UnwantedError
 
 
+def _with_own_slice(scenario: Scenario, before: Scenario) -> Scenario:
+    """The scenario; of another task than before, with the slice where that task has it."""
+    return scenario if scenario.task == before.task else replace(scenario, view=replace(scenario.view, slice=None))
+
+
 class Display(Protocol):
     """What a session shows its results on: a page, or a measurement."""
 
@@ -134,7 +139,7 @@ class Session:
         """
         now = time.monotonic()
         with self._lock:
-            edited = replace(self.scenario, **changes)
+            edited = _with_own_slice(replace(self.scenario, **changes), self.scenario)
             if edited == self.scenario:
                 return
             moves = not edited.moves_like(self.scenario)
@@ -204,7 +209,8 @@ class Session:
 
     def _as_seen(self, other: Scenario) -> Scenario:
         """Another scenario, looked at as this one."""
-        return replace(other, view=seen_in(self.scenario.view, other.scene, self.scenario.scene))
+        seen = replace(other, view=seen_in(self.scenario.view, other.scene, self.scenario.scene))
+        return _with_own_slice(seen, self.scenario)
 
     def push(self, q: Array, show: Callable[[Pushed], None]) -> None:
         """Push the hand aside. Nothing is done while another motion than the scenario's is shown.
@@ -323,7 +329,10 @@ class Session:
             now = time.perf_counter()
             if self._learning:
                 edited = now - frame.seconds  # learning is no rebuild
+            drawn = self._shown is not None and scenario.moves_like(self._shown)
             self._learning, self._shown = False, scenario
+            if frame.stage is Stage.ROLLOUTS and drawn:
+                continue  # it is only looked at in another way: the next stage is what changes
             self._complete = frame.stage is Stage.CERTIFIED
             if frame.stage <= Stage.LIVE:
                 self._latency = now - edited

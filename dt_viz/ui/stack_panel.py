@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,6 +13,7 @@ from dt_viz.engine import Frame
 from dt_viz.scenario import Scenario
 from dt_viz.stacking import AVOIDANCE, IMITATION, levels, shifted, switched, visible_names
 from dt_viz.ui import palette
+from dt_viz.ui.levels import manifold
 from dt_viz.ui.session import Session
 
 BASE, ARM = "Base attractor", "Whole arm"
@@ -124,12 +126,11 @@ def legend_html(scenario: Scenario) -> str:
     if scenario.view.level not in levels(scenario):
         return ""
     swatch = f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:rgb{palette.LEVEL}"
-    what = {IMITATION: "the manifold of the imitation"}.get(
-        scenario.view.level, f"the manifold with {scenario.view.level}"
-    )
+    what = manifold(scenario.view.level)
     return (
         "<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em;opacity:0.85'>"
-        f"<span style='{swatch}'></span> rollouts on {what}, without what is stacked on it</div>"
+        f"<span style='{swatch}'></span> {html.escape(what)}, without what is stacked on it: rollouts, "
+        "and all that lies on the slice. Pale: rollouts of the whole stack</div>"
     )
 
 

@@ -13,6 +13,7 @@ from dt_viz.obstacles import Sphere
 from dt_viz.pushing import Pushed
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario
+from dt_viz.slices import SlicePose
 from dt_viz.stacking import bias_points, with_changed_point
 from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
@@ -61,6 +62,7 @@ class Visitor:
                 self._obstacle_selected,
                 self._bias_moved,
                 self._bias_selected,
+                self._slice_moved,
             )
             self.arms = Arms(client.scene, robot)
             self.pushed_path = PushedPath(client.scene)
@@ -146,6 +148,12 @@ class Visitor:
     def _bias_selected(self, name: str) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
 
+    def _slice_moved(self, position: Array, wxyz: Array, _phase: str) -> None:
+        x, y, z = (float(c) for c in position)
+        w, i, j, k = (float(c) for c in wxyz)
+        pose = SlicePose((x, y, z), (w, i, j, k))
+        self.session.edit("slice", view=replace(self.session.scenario.view, slice=pose))
+
     def _push(self) -> None:
         if self._playback.q is not None:
             self.session.push(self._playback.q, self._show_pushed)
@@ -159,7 +167,7 @@ class Visitor:
             self.arms.pose(q, without)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
-        with self.pictures.obstacles.without_handles(), self.pictures.biases.without_handles():
+        with self.pictures.without_handles():
             content = render_png(self.client, RESOLUTIONS[resolution], transparent=transparent)
         name = f"dt-viz-{self.session.scenario.task}.png"
         self.client.send_file_download(name, content, save_immediately=True)

@@ -1,0 +1,82 @@
+"""The slice in the scene: handles that move and tilt it, and a thin frame where the task does not have it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import viser
+
+from dt_viz.engine import Frame
+from dt_viz.fields import Array
+from dt_viz.scenario import Scenario
+from dt_viz.slices import Slice
+from dt_viz.ui import palette
+from dt_viz.ui.obstacles import HIDDEN
+from dt_viz.ui.picture import Lines, Picture
+
+HANDLE_SCALE = 0.24
+"""Metres that the handles stick out, about."""
+
+Moved = Callable[[Array, Array, str], None]
+"""Told the centre (3,) of the slice, metres, its quaternion (4,), and the phase of the drag."""
+
+
+class MovableSlice(Picture):
+    """The frame of the slice, hung on a gizmo: the browser moves both together, without asking the server."""
+
+    def __init__(self, scene: viser.SceneApi, moved: Moved) -> None:
+        """Hidden until `adopt` shows it; `moved` is told of each new pose."""
+        self.gizmo = scene.add_transform_controls(
+            "/slice", scale=HANDLE_SCALE, line_width=3.0, depth_test=False, visible=False
+        )
+        super().__init__(self.gizmo)
+        self.border = Lines(scene, "/slice/border", palette.SLICE, 0.0022)
+        self._home: Slice | None = None
+        self._handles = False
+        self._scenario: Scenario | None = None
+
+        @self.gizmo.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            moved(event.target.position.copy(), event.target.wxyz.copy(), event.phase)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`: remembers where the task has it."""
+        home = frame.task.slice
+        if home is not self._home:
+            self._home = home
+            flat = Slice(np.zeros(3), np.eye(3)[:, :2], home.half_size)
+            self.border.show([flat.border])
+            if self._scenario is not None:
+                self.adopt(self._scenario)
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Lie where the scenario's slice does, unless that is where the browser has put it already."""
+        self._scenario, view = scenario, scenario.view
+        if self._home is None:
+            return
+        pose = view.slice or self._home.pose
+        if np.abs(self.gizmo.position - np.asarray(pose.position)).max() > 1e-9:
+            self.gizmo.position = pose.position
+        if np.abs(self.gizmo.wxyz - np.asarray(pose.wxyz)).max() > 1e-9:
+            self.gizmo.wxyz = pose.wxyz
+        self._handles = view.move_slice
+        self.show_handles(True)
+        self.visible = view.move_slice or view.slice is not None
+
+    def show_handles(self, shown: bool) -> None:
+        """Show the handles if the slice is being moved, or hide them."""
+        # hiding the gizmo itself would hide the frame
+        scale, opacity = (HANDLE_SCALE, 1.0) if shown and self._handles else (HIDDEN, 0.0)
+        if (self.gizmo.scale, self.gizmo.opacity) != (scale, opacity):
+            self.gizmo.scale, self.gizmo.opacity = scale, opacity
+
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide the handles, not the frame, for as long as a picture takes."""
+        self.show_handles(False)
+        try:
+            yield
+        finally:
+            self.show_handles(True)

@@ -1,0 +1,97 @@
+"""Controls of the slice: where it lies, what its colour shows, and the legend."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import viser
+
+from dt_viz.engine import Frame
+from dt_viz.field_layers import ColourPicture
+from dt_viz.scenario import SLICE_COLOURS, Scenario
+from dt_viz.ui import palette
+from dt_viz.ui.session import Session
+from dt_viz.ui.slice_layers import DET_DECADES, scale_of
+
+COLOUR_LABELS: Mapping[str, str] = {
+    "none": "None",
+    "det": "det J",
+    "lyapunov": "Lyapunov value",
+    "occupancy": "Learned occupancy",
+}
+assert set(COLOUR_LABELS) == set(SLICE_COLOURS)
+OCCUPANCY_NOTE = "what the map believes, its level p = ½ (bold) and the true outline (thin)"
+WHOLE_ARM_NOTE = "The slice shows the stack of the hand's path; what the whole arm avoids with is not in it."
+_SMALL = "font-size:0.8em;line-height:1.4;padding:0.1em 0.9em 0.4em;opacity:0.85"
+
+
+class SlicePanel:
+    """What the user chooses for the slice."""
+
+    def __init__(self, gui: viser.GuiApi, bind: Callable[..., Any]) -> None:
+        """Build the controls; `bind` ties one to the scenario, see `Panel`."""
+        self._session: Session | None = None
+        bind(
+            gui.add_checkbox(
+                "Move the slice", False, hint="handles that move and tilt the plane of arrows and colours"
+            ),
+            lambda s: s.view.move_slice,
+            lambda s, value: {"view": replace(s.view, move_slice=value)},
+        )
+        self.back = gui.add_button("Back to the task's slice", visible=False)
+
+        @self.back.on_click
+        async def _(_event: viser.GuiEvent) -> None:
+            if self._session is not None:
+                self._session.edit("slice", view=replace(self._session.scenario.view, slice=None))
+
+        bind(
+            gui.add_dropdown("Colour", tuple(COLOUR_LABELS.values()), hint="of the slice"),
+            lambda s: COLOUR_LABELS[s.view.colour],
+            lambda s, value: {
+                "view": replace(s.view, colour=next(name for name, label in COLOUR_LABELS.items() if label == value))
+            },
+        )
+        self.legend = gui.add_html("", visible=False)
+        self.note = gui.add_html(f"<div style='{_SMALL}'>{WHOLE_ARM_NOTE}</div>", visible=False)
+
+    def connect(self, session: Session) -> None:
+        """Let the controls edit this session."""
+        self._session = session
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's choices."""
+        view = scenario.view
+        self.back.visible = view.slice is not None
+        shown = view.colour != "none" or view.field or view.streamlines or view.grid
+        self.note.visible = shown and scenario.avoidance and scenario.space != "task" and bool(scenario.obstacles)
+        if view.colour in {"none", "occupancy"}:
+            self._say(f"<div style='{_SMALL}'>{OCCUPANCY_NOTE}</div>" if view.colour == "occupancy" else "")
+
+    def report(self, frame: Frame) -> None:
+        """Show the legend of the colours that are shown."""
+        picture = frame.pictures.colour
+        if picture is not None:
+            self._say(legend_html(picture))
+
+    def _say(self, text: str) -> None:
+        if self.legend.content != text:
+            self.legend.content, self.legend.visible = text, bool(text)
+
+
+def legend_html(picture: ColourPicture) -> str:
+    """What the colours of a picture mean."""
+    scale = scale_of(picture)
+    if picture.what == "det":
+        decades = range(-DET_DECADES, DET_DECADES + 1)
+        swatch = f"display:inline-block;width:1.2em;height:0.7em;background:rgb{palette.FOLDED}"
+        note = f"<span style='{swatch}'></span> det J ≤ 0: folded, no diffeomorphism"
+        return scale.legend(
+            "det J: a small volume in base space, times that here", [(d, f"{10.0**d:g}") for d in decades], note
+        )
+    ticks = [k / 4 * scale.high for k in range(5)]
+    return scale.legend(
+        "Lyapunov value Φ(ψ(y)), cm²/s: every motion goes down", [(value, f"{value:g}") for value in ticks]
+    )

@@ -1,0 +1,234 @@
+"""What lies on a slice, by what it promises: streamlines follow the velocity, colours are what they say, levels fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dt_viz.engine import Stage
+from dt_viz.field_layers import MAX_OFFSET, SEPARATION
+from dt_viz.scenario import SLICE_COLOURS, View
+from dt_viz.slices import SlicePose
+from dt_viz.solving import FINE, LIVE, cut_off, solve
+from dt_viz.stacking import levels, place_beside, with_bias_point
+
+TASK_NAMES = ["draw_s", "lift_box"]
+
+
+@pytest.fixture(params=TASK_NAMES, name="scenario")
+def _scenario(request, initial):
+    return initial(request.param)
+
+
+def tilted(task, seed=0):
+    """A pose a little beside the task's, by random numbers."""
+    rng, home = np.random.default_rng(seed), task.slice.pose
+    turn = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)) * Rotation.from_quat(np.roll(home.wxyz, -1))
+    x, y, z = (np.asarray(home.position) + rng.uniform(-0.04, 0.04, 3)).tolist()
+    w, i, j, k = np.roll(turn.as_quat(), 1).tolist()
+    return SlicePose((x, y, z), (w, i, j, k))
+
+
+def shown(engine, scenario, wanted=Stage.FINE, **view):
+    scenario = replace(scenario, view=View(**view))
+    return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+
+
+def solved(engine, scenario, precision=FINE):
+    ground = engine._ground(scenario, None)
+    return ground, solve(ground, scenario, precision)
+
+
+def with_bias(engine, scenario):
+    return replace(scenario, layers=with_bias_point((), place_beside(engine.task(scenario.task), scenario)))
+
+
+# --- The slice ---
+
+
+@pytest.mark.parametrize("colour", ["det", "lyapunov", "occupancy"])
+def test_everything_lies_on_the_slice_wherever_it_is(engine, scenario, colour):
+    pose = tilted(engine.task(scenario.task))
+    frame = shown(engine, scenario, Stage.LIVE, slice=pose, colour=colour)
+    area, pictures = frame.slice, frame.pictures
+    assert area.pose.position == pytest.approx(pose.position)
+    lying = [pictures.field.points]
+    if colour == "occupancy":
+        lying += [pictures.occupancy.level.reshape(-1, 3), pictures.occupancy.outline.reshape(-1, 3)]
+    else:
+        lying.append(pictures.colour.lines.reshape(-1, 3))
+    for points in lying:
+        np.testing.assert_allclose((points - area.centre) @ area.normal, 0, atol=1e-12)
+        assert (np.abs(area.across(points)) <= np.array(area.half_size) + 1e-9).all()
+    made = pictures.occupancy if colour == "occupancy" else pictures.colour
+    assert made.area.lies_like(area)
+
+
+def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, scenario, monkeypatch):
+    engine = new_engine()
+    before = list(engine.frames(scenario))
+    monkeypatch.setattr("dt_viz.engine.solve", lambda *_: pytest.fail("solved again"))
+    monkeypatch.setattr("dt_viz.engine.certified", lambda *_: pytest.fail("certified again"))
+    moved = replace(scenario, view=View(slice=tilted(engine.task(scenario.task)), level="Imitation"))
+    for old, new in zip(before, engine.frames(moved), strict=True):
+        assert new.scenario == moved and new.stage is old.stage and new.level == 0
+        assert new.health == old.health
+        for a, b in zip(old.rollouts, new.rollouts, strict=True):
+            np.testing.assert_array_equal(a, b)
+    x, y, z = scenario.obstacles[0].position
+    with pytest.raises(BaseException, match="solved again"):
+        next(engine.frames(replace(moved, obstacles=(scenario.obstacles[0].moved((x, y, z + 0.01)),))))
+
+
+def test_frames_of_a_changed_view_are_those_of_a_fresh_start(engine, new_engine, scenario):
+    view = {"slice": tilted(engine.task(scenario.task), 1), "colour": "lyapunov", "streamlines": True}
+    list(engine.frames(scenario))
+    again, fresh = (shown(e, scenario, **view).pictures for e in (engine, new_engine()))
+    np.testing.assert_array_equal(again.field.velocities, fresh.field.velocities)
+    np.testing.assert_array_equal(again.colour.values, fresh.colour.values)
+    assert len(again.streamlines) == len(fresh.streamlines)
+
+
+def test_what_is_not_shown_is_not_computed(engine, scenario):
+    nothing = shown(engine, scenario, field=False).pictures
+    assert (nothing.field, nothing.streamlines, nothing.colour, nothing.occupancy, nothing.grid) == (None,) * 5
+    plain, pose = replace(scenario, view=View()), tilted(engine.task(scenario.task))
+    for view in (View(streamlines=True), View(colour="det"), View(slice=pose), View(level="Imitation")):
+        assert not replace(scenario, view=view).computes_like(plain)
+    for colour in SLICE_COLOURS:
+        assert plain.computes_like(replace(scenario, view=View(colour=colour)))
+
+
+# --- Streamlines ---
+
+
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
+def test_streamlines_follow_the_velocity_and_the_lyapunov_value_falls_along_them(engine, scenario, wanted, moved):
+    view = {"slice": tilted(engine.task(scenario.task))} if moved else {}
+    frame = shown(engine, scenario, wanted, streamlines=True, **view)
+    system = solved(engine, scenario, LIVE if wanted is Stage.LIVE else FINE)[1].system
+    lines, obstacle = frame.pictures.streamlines, scenario.obstacle
+    assert len(lines) > 30
+    cosines = []
+    for line in lines:
+        falls = np.diff(system.lyapunov(line)) < 0
+        near = obstacle.signed_distance(line[1:]) < 0.02  # there ψ magnifies what the live picture rounds
+        assert (falls if wanted is Stage.FINE else falls | near).all()
+        step = np.diff(line, axis=0)
+        middle, length = (line[1:] + line[:-1]) / 2, np.linalg.norm(step, axis=1)
+        far = (obstacle.signed_distance(middle) > 0.03) & (length > 1e-4)
+        velocity = system.velocity(middle[far])
+        cosines.append((velocity * step[far]).sum(1) / np.linalg.norm(velocity, axis=1) / length[far])
+    cosines = np.concatenate(cosines)
+    assert np.quantile(cosines, 0.01) > (0.99 if wanted is Stage.LIVE else 0.998)
+    assert np.median(cosines) > 0.9999
+
+
+def test_streamlines_keep_apart_fill_the_slice_and_stay_over_it(engine, scenario):
+    frame = shown(engine, scenario, streamlines=True)
+    area, lines = frame.slice, frame.pictures.streamlines
+    points = np.concatenate(lines)
+    assert (np.abs((points - area.centre) @ area.normal) < 1.2 * MAX_OFFSET).all()
+    starts = np.stack([line[0] for line in lines])
+    for k, start in enumerate(starts):
+        others = np.concatenate([line for j, line in enumerate(lines) if j != k])
+        assert np.linalg.norm(others - start, axis=1).min() > 0.35 * SEPARATION
+    free = area.lattice(0.02)
+    free = free[scenario.obstacle.signed_distance(free) > 0.05]
+    empty = np.array([np.linalg.norm(points - place, axis=1).min() for place in free])
+    assert np.quantile(empty, 0.9) < 1.2 * SEPARATION
+
+
+# --- Colours ---
+
+
+@pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
+def test_colours_are_the_functions_that_they_say(engine, scenario, wanted):
+    pose = tilted(engine.task(scenario.task), 2)
+    system = solved(engine, scenario, LIVE if wanted is Stage.LIVE else FINE)[1].system
+    rng = np.random.default_rng(3)
+    for colour, direct in (
+        ("det", lambda y: np.linalg.det(system.transform.jacobian(y)[1])),
+        ("lyapunov", lambda y: system.base.potential(system.transform.forward(y))),
+    ):
+        frame = shown(engine, scenario, wanted, colour=colour, slice=pose)
+        picture = frame.pictures.colour
+        n, m = picture.values.shape
+        (w, h), area = frame.slice.half_size, frame.slice
+        for i, j in zip(rng.integers(0, n, 12), rng.integers(0, m, 12), strict=True):
+            y = area.at(np.array([np.linspace(-w, w, n)[i], np.linspace(-h, h, m)[j]]))
+            room = float(scenario.obstacle.signed_distance(y[None])[0])
+            assert picture.clearance[i, j] == pytest.approx(room, abs=1e-9)
+            if room > 0:
+                assert picture.values[i, j] == pytest.approx(float(direct(y[None])[0]), rel=1e-6)
+            else:
+                assert np.isnan(picture.values[i, j])
+
+
+def test_det_j_of_the_identity_is_one_and_its_level_lines_are_circles(engine, scenario):
+    plain = replace(scenario, imitation=False, avoidance=False)
+    np.testing.assert_allclose(shown(engine, plain, colour="det").pictures.colour.values, 1, atol=1e-12)
+    frame = shown(engine, plain, colour="lyapunov")
+    radii = np.linalg.norm(frame.pictures.colour.lines - frame.goal, axis=-1)
+    off = np.abs(radii / 0.04 - np.round(radii / 0.04)) * 0.04
+    assert off.max() < 5e-4 and len(np.unique(np.round(radii / 0.04))) > 5
+
+
+# --- Levels ---
+
+
+def test_the_system_of_each_level_has_the_rollouts_of_that_level(engine, scenario):
+    scenario = with_bias(engine, scenario)
+    frame = shown(engine, scenario)
+    ground, solution = solved(engine, scenario)
+    assert len(frame.levels) == len(levels(scenario)) == 3
+    for level, paths in enumerate(frame.levels):
+        system = cut_off(ground, solution, level)
+        for rollout, path in enumerate(paths):
+            times = frame.times[rollout][:-1]
+            expected = system.transform.inverse(solution.rays.base.flow(solution.rays.z0[rollout], times))
+            np.testing.assert_allclose(path[:-1], expected, atol=2e-6)
+            again = system.rollout(path[0], times)  # and from its first point by itself
+            np.testing.assert_allclose(path[:-1], again, atol=2e-6)
+
+
+def test_the_pictures_are_those_of_the_selected_level(engine, scenario):
+    scenario = with_bias(engine, scenario)
+    names = levels(scenario)
+    for level, name in enumerate(names):
+        frame = shown(engine, scenario, Stage.FINE, level=name, colour="lyapunov")
+        system = cut_off(*solved(engine, scenario), level)
+        assert frame.level == level
+        field, colour = frame.pictures.field, frame.pictures.colour
+        np.testing.assert_allclose(field.velocities, system.velocity(field.points), rtol=1e-5, atol=1e-7)
+        known = ~np.isnan(colour.values)
+        assert known.all() == (name != "Avoidance")  # only there the obstacle is in the way
+    top, whole = (shown(engine, scenario, Stage.FINE, level=name, colour="lyapunov") for name in (names[-1], ""))
+    assert whole.level is None
+    np.testing.assert_array_equal(whole.pictures.colour.values, top.pictures.colour.values)
+
+
+def test_the_grid_of_the_imitation_is_that_of_the_stack_without_the_obstacle(engine, scenario):
+    below = shown(engine, scenario, grid=True, level="Imitation").pictures.grid.lines
+    without = shown(engine, replace(scenario, avoidance=False), grid=True).pictures.grid.lines
+    assert len(below) == len(without)
+    for a, b in zip(below, without, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_level_that_is_not_in_the_stack_is_no_level(engine, scenario):
+    assert shown(engine, scenario, Stage.ROLLOUTS, level="Bias 7").level is None
+    assert shown(engine, replace(scenario, avoidance=False), Stage.ROLLOUTS, level="Avoidance").level is None
+
+
+def test_the_slice_can_be_moved_while_there_is_no_motion(new_engine, initial):
+    engine, scenario = new_engine(), replace(initial("draw_s"), space="cspace")
+    list(engine.frames(scenario))
+    base = replace(scenario, obstacles=(scenario.obstacles[0].moved((0.0, 0.0, 0.1)),))
+    blocked = next(engine.frames(base))
+    assert blocked.blocked
+    moved = shown(engine, base, slice=tilted(engine.task("draw_s")))
+    assert moved.blocked
+    np.testing.assert_allclose((moved.pictures.field.points - moved.slice.centre) @ moved.slice.normal, 0, atol=1e-12)
