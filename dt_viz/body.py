@@ -57,12 +57,10 @@ class BodyPoints:
         bounds = np.searchsorted(self.joint, np.arange(-1, NUM_JOINTS + 1))
         return [(j, slice(a, b)) for j, a, b in zip(range(-1, NUM_JOINTS), bounds, bounds[1:], strict=False) if b > a]
 
-    def beyond(self, values: Array) -> Array:
-        """Sums (6, …) of `values` (P, …) of points on moving links: for each joint over the points that it turns."""
-        starts = [points.start for joint, points in self.by_joint if joint >= 0]
-        sums = np.cumsum(np.add.reduceat(values, starts, axis=0)[::-1], axis=0)[::-1]
-        first = np.searchsorted([joint for joint, _ in self.by_joint if joint >= 0], np.arange(NUM_JOINTS))
-        return sums[first]
+    @cached_property
+    def is_beyond(self) -> Array:
+        """(6, P) 1 where a joint turns a point, else 0."""
+        return (self.joint >= np.arange(NUM_JOINTS)[:, None]).astype(float)
 
     def positions(self, robot: Robot, q: Array) -> Array:
         """Positions (*B, P, 3), metres, at configurations q (*B, 6), rad."""

@@ -44,6 +44,9 @@ LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
 PIN = 0.04
 """Size of the region around a pinned posture in which the field fades to nothing, metres of that distance."""
 
+BLOCK = 256
+"""Configurations that a field is worked out for at once: of more, what is worked out on the way leaves the cache."""
+
 SPEED = 0.2
 """Metres that a contact at full strength escapes in a unit of flow time."""
 
@@ -99,15 +102,19 @@ class WholeArmField:
 
     def __call__(self, q: Array) -> Array:
         """V_q at configurations `q` (N, 6), as (N, 6)."""
+        if len(q) > BLOCK:
+            return np.concatenate([self(q[i : i + BLOCK]) for i in range(0, len(q), BLOCK)])
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
         distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        powers = _fading((self.reach - distance) / (self.reach - self._core)) ** SHARPNESS  # (P, N)
-        total = powers.sum(axis=0)
+        close = (distance.real < self.reach).any(axis=1)  # what stays away from the obstacle has no weight
         velocity = np.zeros_like(q)
-        near = np.flatnonzero(total.real > 0)
-        if not len(near):
+        if not close.any():
             return velocity
+        u = (self.reach - distance[close]) / (self.reach - self._core[close])
+        powers, points = _fading(u) ** SHARPNESS, points[close]  # (P', N), (P', 3, N)
+        total = powers.sum(axis=0)
+        near = np.flatnonzero(total.real > 0)
         if len(near) < len(q):
             chain, points, powers, total = _take(chain, near), points[..., near], powers[:, near], total[near]
         weights = powers / total
@@ -120,7 +127,11 @@ class WholeArmField:
         ]
         A = np.concatenate(stays, axis=1).transpose(2, 1, 0)  # (M, 6, 6)
         H = np.eye(NUM_JOINTS) + A.transpose(0, 2, 1) @ A
-        J = self._contact_jacobian(chain, points, weights)  # (M, 3, 6)
+        # J_c = Σ ŵ_b J_b: each joint turns what lies beyond it
+        beyond = self.body.is_beyond[:, close]
+        lever = (beyond @ (weights[:, None] * points).reshape(len(points), -1)).reshape(NUM_JOINTS, 3, -1)
+        lever -= (beyond @ weights)[:, None] * chain.origins
+        J = cross(chain.axes[:, 2], lever).transpose(2, 1, 0)  # (M, 3, 6)
         mobile = np.linalg.solve(H, J.transpose(0, 2, 1))
         pull = np.linalg.solve(J @ mobile + DAMPING**2 * np.eye(3), wanted.T[..., None])
         velocity[near] = -(mobile @ pull)[..., 0] * self._freedom(q[near])[:, None]
@@ -129,11 +140,6 @@ class WholeArmField:
     def with_jacobian(self, q: Array) -> tuple[Array, Array]:
         """V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
         return by_complex_steps(self, q)
-
-    def _contact_jacobian(self, chain: KinematicChain, points: Array, weights: Array) -> Array:
-        """J_c = Σ ŵ_b J_b, (M, 3, 6): each joint turns what lies beyond it."""
-        lever = self.body.beyond(weights[:, None] * points) - self.body.beyond(weights)[:, None] * chain.origins
-        return cross(chain.axes[:, 2], lever).transpose(2, 1, 0)
 
     def _freedom(self, q: Array) -> Array:
         """χ, (N,): 0 at the pins, 1 away from them."""
@@ -167,8 +173,12 @@ class GradientField:
         distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         u = _unit_interval((self.reach - distance) / (self.reach - core))
         force: Array = -30 * (u * u * (1 - u) * (1 - u))[:, None] * self._outward(points)  # the slope of `_fading`
-        moment = self.body.beyond(cross(points, force)) - cross(chain.origins, self.body.beyond(force))
+        moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
         return (chain.axes[:, 2] * moment).sum(axis=1).T
+
+    def _beyond(self, values: Array) -> Array:
+        """Sums (6, 3, N) of `values` (P, 3, N): for each joint over the points that it turns."""
+        return (self.body.is_beyond @ values.reshape(len(values), -1)).reshape(NUM_JOINTS, *values.shape[1:])
 
     def _outward(self, points: Array) -> Array:
         """Slope (P, 3, N) of the obstacle's distance at `points` (P, 3, N), by differences: analytic as it is."""
@@ -233,8 +243,8 @@ def by_complex_steps(field: WholeArmField | GradientField, q: Array) -> tuple[Ar
 
 def squared_lengths(q: Array, pins: Array) -> Array:
     """Squared distances (N, K), m², of the postures `q` (N, 6) from the postures `pins` (K, 6), by `LEVERS`."""
-    offset = (q[:, None] - pins) * LEVERS
-    return (offset * offset).sum(axis=2)
+    offset = LEVERS[:, None, None] * (q.T[:, None] - pins.T[..., None])  # the batch last, for long inner loops
+    return (offset * offset).sum(axis=0).T
 
 
 def _unit_interval(u: Array) -> Array:

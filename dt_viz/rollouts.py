@@ -12,6 +12,8 @@ from dt_viz.systems import Attractor
 
 ARRIVED = 1e-4
 """Metres in base space from the goal at which a motion counts as arrived."""
+OVERSAMPLING = 2
+"""Times as many samples are put into a gap as it lacks: it is stretched unevenly, and another round costs more."""
 MAX_INSERTED = 40
 """Samples put between two neighbours in one round of refinement."""
 
@@ -108,7 +110,8 @@ def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: i
         wide = np.flatnonzero((gap > spacing) & divisible)
         if not len(wide) or round_ == max_rounds:
             break
-        counts = np.clip(np.ceil(gap[wide] / spacing).astype(int) - 1, 1, MAX_INSERTED)
+        lacking = np.ceil(OVERSAMPLING * (gap[wide] / spacing - 1)).astype(int)
+        counts = np.minimum(lacking, MAX_INSERTED)
         within = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in counts])
         before = np.repeat(wide, counts)
         fraction = bundle.fraction[before] + within * (bundle.fraction[before + 1] - bundle.fraction[before])

@@ -34,8 +34,9 @@ MAX_DURATION = 2.0
 """Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
 SNAPSHOT = 0.1
 """Flow time between two looks at the clearance: contacts move by at most two centimetres in it."""
-NUM_DEEPEST = 5
-"""Samples of each rollout that the duration is chosen for at first."""
+STRIDE = 3
+"""Every which sample the duration is chosen for at first: the time that they take to leave changes slowly along a
+rollout, and the deepest are not the last."""
 MAX_ROUNDS = 4
 """Of looking whether samples that refinement finds are clear, too, and going on if not."""
 SLOPE = 0.1
@@ -261,11 +262,8 @@ class _Solver:
         if self._generator is None:
             duration = 0.0
         elif duration is None:
-            q = self._arm.limits.inside(self._lifted.tracked.q.reshape(-1, NUM_JOINTS))
-            lack = self._lack(q)
-            order = np.lexsort([-lack, index])
-            deepest = order[(np.arange(len(order)) % num_samples < NUM_DEEPEST) & (lack[order] > 0)]
-            duration = self._clearing_duration(q[deepest])
+            q = self._arm.limits.inside(self._lifted.tracked.q[:, ::STRIDE].reshape(-1, NUM_JOINTS))
+            duration = self._clearing_duration(q[self._lack(q) > 0])
         return self._with_duration(min(duration, MAX_DURATION), index)
 
     def _with_duration(self, duration: float, index: Indices) -> ArmSolution:

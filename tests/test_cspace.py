@@ -9,7 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dt_viz.body import load_body_points
-from dt_viz.cspace import COMPLEX_STEP, CORE, SHARPNESS, GradientField, JointLimits, WholeArmField, by_complex_steps
+from dt_viz.cspace import (
+    BLOCK,
+    COMPLEX_STEP,
+    CORE,
+    SHARPNESS,
+    GradientField,
+    JointLimits,
+    WholeArmField,
+    by_complex_steps,
+)
 from dt_viz.diffeo import AdaptiveFlow, Chain, Flow, Inverse, round_trip_error
 from dt_viz.obstacles import Box, Sphere
 from dt_viz.robot import HOME, NUM_JOINTS, Robot, load_jaco
@@ -87,6 +96,12 @@ class TestFields:
         np.testing.assert_allclose(field(q)[7:9], field(q[7:9]), rtol=0, atol=1e-13)
         assert field(q[:0]).shape == (0, NUM_JOINTS)
         assert field.dim == NUM_JOINTS
+
+    def test_many_postures_are_worked_out_as_few_are(self, field):
+        """In blocks, and with those parts of the arm left out that are far from the obstacle in all of a block."""
+        q = near(2 * BLOCK + 5, spread=0.4)
+        few = np.concatenate([field(posture[None]) for posture in q])
+        np.testing.assert_allclose(field(q), few, rtol=0, atol=1e-13)
 
     def test_beyond_its_reach_nothing_moves(self, field):
         q = near(3000, spread=0.6)

@@ -77,6 +77,21 @@ def test_refinement_reaches_its_spacing(spacing):
     assert max(gap.max() for gap in gaps(fine)) <= spacing * (1 + 1e-12)
 
 
+def test_refinement_looks_seldom_where_a_gap_is_stretched_unevenly():
+    """A round costs more than a few samples too many."""
+    rounds = []
+
+    def evaluate(index, fraction):
+        rounds.append(len(index))
+        return bent(index, fraction)
+
+    rough = evenly_sampled(bent, 3, 12)
+    fine = refined(rough, evaluate, 0.01)
+    assert len(rounds) == 2
+    needed = sum(np.ceil(gap.sum() / 0.01) for gap in gaps(fine))
+    assert len(fine.index) < 2 * needed
+
+
 def test_refinement_keeps_order_starts_goals_and_all_samples():
     rough = evenly_sampled(bent, 3, 12)
     fine = refined(rough, bent, 0.004)
