@@ -116,7 +116,8 @@ class WholeArmField:
         total = powers.sum(axis=0)
         near = np.flatnonzero(total.real > 0)
         if len(near) < len(q):
-            chain, points, powers, total = _take(chain, near), points[..., near], powers[:, near], total[near]
+            chain = KinematicChain(*(_columns(part, near) for part in chain))
+            points, powers, total = _columns(points, near), _columns(powers, near), total[near]
         weights = powers / total
         outward = points - self._source
         outward = outward / np.sqrt((outward * outward).sum(axis=1, keepdims=True))
@@ -243,7 +244,7 @@ def by_complex_steps(field: WholeArmField | GradientField, q: Array) -> tuple[Ar
 
 def squared_lengths(q: Array, pins: Array) -> Array:
     """Squared distances (N, K), m², of the postures `q` (N, 6) from the postures `pins` (K, 6), by `LEVERS`."""
-    offset = LEVERS[:, None, None] * (q.T[:, None] - pins.T[..., None])  # the batch last, for long inner loops
+    offset = (q * LEVERS).T[:, None] - (pins * LEVERS).T[..., None]  # the batch last, for long inner loops
     return (offset * offset).sum(axis=0).T
 
 
@@ -258,5 +259,6 @@ def _fading(u: Array) -> Array:
     return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
-def _take(chain: KinematicChain, columns: Indices) -> KinematicChain:
-    return KinematicChain(*(part[..., columns] for part in chain))
+def _columns(values: Array, columns: Indices) -> Array:
+    """Some columns of the last axis, which stays the one of the inner loops; indexing would put it first in memory."""
+    return values.take(columns, axis=-1)
