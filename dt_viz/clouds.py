@@ -12,7 +12,8 @@ from scipy.spatial import KDTree
 
 from dt_viz.fields import Array, Indices
 from dt_viz.occupancy import fit_occupancy
-from dt_viz.solids import Solid, grid_nodes
+from dt_viz.solids import Solid
+from dt_viz.triangles import grid_nodes
 
 NUM_NODES = 44**3
 """Of the grid that the surface is found on, about."""

@@ -62,8 +62,8 @@ def test_only_the_robot_talks_to_pinocchio():
     assert importers("pinocchio") == {"robot.py"}
 
 
-def test_only_collision_truth_talks_to_coal():
-    assert importers("coal") == {"collision.py"}
+def test_only_the_distances_of_links_talk_to_coal():
+    assert importers("coal") == {"link_distances.py"}
 
 
 def test_computing_never_imports_the_ui():

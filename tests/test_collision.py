@@ -14,16 +14,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dt_viz.collision import (
-    RESOLUTION,
     SELF_REACH,
     SELF_TOLERANCE,
-    SHAPE_TOLERANCE,
     TOLERANCE,
     CollisionModel,
     CollisionReport,
     Nearest,
     load_collision_model,
 )
+from dt_viz.link_distances import RESOLUTION, SHAPE_TOLERANCE
 from dt_viz.obstacles import Box, Cylinder, MeshObstacle, Quaternion, Sphere
 from dt_viz.robot import LinkMesh, collision_meshes, package_folder, urdf_path
 from dt_viz.solids import Solid
