@@ -80,7 +80,7 @@ def lyapunov_value(system: DiffeomorphicSystem, area: Slice, clearance: Clearanc
     points = area.grid(COARSE_COLOUR if coarse else FINE_COLOUR)
     values, room = _where(clearance, points, system.lyapunov)
     radius, levels = LEVEL_SPACING, []
-    sparse = np.where(_steps(values) < _potential(system, LEVEL_SPACING), values, np.nan)
+    sparse = np.where(_steps(values) < system.base.speed * LEVEL_SPACING, values, np.nan)
     while (level := _potential(system, radius)) < np.nanmax(values, initial=0.0):
         levels.append(level_line(points, sparse - level))
         radius += LEVEL_SPACING

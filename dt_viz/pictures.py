@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from dt_viz.belief import OccupancyPicture
 from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Placed
@@ -23,16 +24,19 @@ NEGLIGIBLE = 0.03
 """Part of the largest arrow below which there is none to see."""
 LINE_SPACING = 0.035
 """Between neighbouring lines of the grid in base space, metres."""
-TRIAL_STEP = 0.004
+TRIAL_STEP, COARSE_TRIAL_STEP = 0.004, 0.012
 """Along a line of the grid, metres of base space: where it lies in the motion's space is looked at so closely."""
 SAMPLE_SPACING = 0.010
 """Along a line of the grid, metres in the motion's space, before the behaviours bend it."""
+STEEPEST = 4.0
+"""Path along a line of the grid in base space, relative to that along the slice, beyond which it is torn."""
 FINE_SPACING, COARSE_SPACING = 0.006, 0.030
 """Metres between neighbouring samples of the drawn grid."""
 TOLERANCE = 1e-6
 """Of the behaviours' flows where they bend the grid, metres: coarser is not faster, and lines would seem to cross."""
-MAX_OFFSET = 0.12
-"""Metres by which a line of the grid may leave the slice before it is cut."""
+MAX_NEWTON, MAX_STEP, MIN_SLOPE, ON_SLICE = 6, 0.05, 0.1, 1e-6
+"""Steps to where the grid lies on the slice, the longest of them, metres, the least rise of the preimage for a rise of
+1 that is believed, and how near counts as on it, metres."""
 INSET_GAP = 0.06
 """Between the slice and the inset, metres."""
 INSET_HALF_WIDTH = 0.21
@@ -59,7 +63,10 @@ class GeneratorPicture:
 
 @dataclass(frozen=True)
 class GridPicture:
-    """A regular lattice of lines of base space, seen through ψ⁻¹ of the whole stack."""
+    """Regular planes of base space where they meet what the imitation's ψ makes of the slice, through ψ⁻¹ of the stack.
+
+    In a drawing's plane they are the images of a lattice of straight lines.
+    """
 
     lines: tuple[Array, ...]
     """(T_i, 3), metres."""
@@ -76,7 +83,7 @@ class BasePicture:
     velocities: Array
     """(N, 3) m/s in base space."""
     grid: tuple[Array, ...]
-    """(2, 3) lines of the lattice whose image is the warped grid of the task's slice."""
+    """(2, 3) lines of the lattice whose image is the warped grid."""
     border: Array
     """(5, 3) the inset's closed outline."""
     labels: tuple[Array, Array]
@@ -102,19 +109,22 @@ NO_PICTURES = Pictures()
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The pieces of a lattice's lines that lie over a slice before behaviours bend them."""
+    """The warped grid on a slice of the manifold of the imitation, before behaviours bend it."""
 
     area: Slice
-    start: Array
-    """(M, 3) of the line of each piece in base space."""
-    end: Array
-    """(M, 3)"""
+    coarse: bool
     index: Indices
     """(N,) which piece a sample belongs to."""
-    fraction: Array
-    """(N,) where on its line it is."""
+    images: Array
+    """(N, 3) of the samples in base space."""
     positions: Array
-    """(N, 3) on the manifold of the imitation, metres."""
+    """(N, 3) of the samples on the slice, metres."""
+
+    def images_at(self, place: Array) -> Array:
+        """Points of base space (M, 3) at places (M,) counted in samples, between them on straight lines."""
+        before = np.minimum(place.astype(int), len(self.images) - 2)
+        start, end = self.images[before], self.images[before + 1]
+        return start + (place - before)[:, None] * (end - start)
 
 
 @dataclass(frozen=True)
@@ -197,8 +207,8 @@ class Sketchbook:
             coarse: with fewer points, for a picture that is replaced at once.
         """
         pieces = self._pieces
-        if pieces is None or not pieces.area.lies_like(area):
-            pieces = self._pieces = self._cut(area)
+        if pieces is None or not pieces.area.lies_like(area) or (pieces.coarse and not coarse):
+            pieces = self._pieces = self._cut(area, coarse=coarse)
         drawn = [replace(b, tolerance=TOLERANCE) if isinstance(b, AdaptiveFlow) else b for b in behaviours]
 
         def lifted(positions: Array) -> Array:
@@ -206,16 +216,12 @@ class Sketchbook:
                 positions = transform.inverse(positions)
             return positions
 
-        def evaluate(index: Indices, fraction: Array) -> Array:
-            start = pieces.start[index]
-            z = start + fraction[:, None] * (pieces.end[index] - start)
-            return lifted(self._system.transform.inverse(z))[:, None]
+        def evaluate(_: Indices, place: Array) -> Array:
+            return lifted(self._system.transform.inverse(pieces.images_at(place)))[:, None]
 
-        index, fraction, positions = pieces.index, pieces.fraction, pieces.positions
-        if coarse:
-            keep = _every_other(index)
-            index, fraction, positions = index[keep], fraction[keep], positions[keep]
-        bundle = Bundle(index, fraction, lifted(positions)[:, None])
+        keep = _every_other(pieces.index) if coarse and not pieces.coarse else np.arange(len(pieces.index))
+        index, place, positions = pieces.index[keep], keep.astype(float), pieces.positions[keep]
+        bundle = Bundle(index, place, lifted(positions)[:, None])
         if not len(index):
             return GridPicture(())
         if not coarse:
@@ -225,46 +231,64 @@ class Sketchbook:
         return GridPicture(_runs(bundle.positions, bundle.index, limit))
 
     def _lines(self, area: Slice) -> tuple[Array, Array]:
-        """Ends (M, 3) of the lattice's lines in base space, over all that ψ makes of the slice.
-
-        They lie in the plane along the slice that is nearest to what ψ makes of it; ψ(goal) is where two of them cross,
-        or beside that.
-        """
-        images = self._system.transform.forward(area.lattice(0.02))
-        across, middle = area.across(images), area.across(self._system.base.goal)
-        offset = ((images - area.centre) @ area.normal).mean() * area.normal
+        """Ends (M, 2), along the slice, of the lattice's lines over all that ψ makes of it; two cross over ψ(goal)."""
+        across, middle = area.across(self._images(area)), area.across(self._system.base.goal)
         lower = middle + LINE_SPACING * np.floor((across.min(axis=0) - middle) / LINE_SPACING)
         upper = middle + LINE_SPACING * np.ceil((across.max(axis=0) - middle) / LINE_SPACING)
-        start, end = _lattice_lines(lower, upper, LINE_SPACING)
-        return area.at(start) + offset, area.at(end) + offset
+        return _lattice_lines(lower, upper, LINE_SPACING)
 
-    def _cut(self, area: Slice) -> _Pieces:
-        indices, fractions, positions, starts, ends = [], [], [], [], []
-        for a, b in zip(*self._lines(area), strict=True):
-            u = np.linspace(0, 1, 2 + int(np.linalg.norm(b - a) / TRIAL_STEP))
-            x = self._system.transform.inverse(a + u[:, None] * (b - a))
-            inside = (np.abs(area.across(x)) <= area.half_size).all(axis=1)
-            inside &= np.abs((x - area.centre) @ area.normal) <= MAX_OFFSET
-            for piece in _true_runs(inside):
+    def _images(self, area: Slice) -> Array:
+        """Of a lattice on the slice in base space, (N, 3)."""
+        return self._system.transform.forward(area.lattice(0.02))
+
+    def _cut(self, area: Slice, *, coarse: bool) -> _Pieces:
+        """The pieces of the lattice's lines, raised to what ψ makes of the slice, that lie on the slice."""
+        start, end = self._lines(area)
+        step = COARSE_TRIAL_STEP if coarse else TRIAL_STEP
+        counts = 2 + (np.linalg.norm(end - start, axis=1) / step).astype(int)
+        line = np.repeat(np.arange(len(start)), counts)
+        u = np.concatenate([np.linspace(0, 1, n) for n in counts])[:, None]
+        x, z, there = self._raised(area, start[line] + u * (end - start)[line])
+        inside = there & (np.abs(area.across(x)) <= area.half_size).all(axis=1)
+        # another line begins, or this one goes on in another fold of what ψ makes of the slice
+        apart = (np.diff(line) > 0) | (np.linalg.norm(np.diff(z, axis=0), axis=1) > STEEPEST * step)
+        samples = []
+        for run in _true_runs(inside):
+            for piece in np.split(run, np.flatnonzero(apart[run[:-1]]) + 1):
                 if len(piece) < 3:
                     continue
                 along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(x[piece], axis=0), axis=1))])
                 even = np.linspace(0, along[-1], 2 + int(along[-1] / SAMPLE_SPACING))
-                chosen = piece[np.unique(np.searchsorted(along, even - 1e-12).clip(0, len(piece) - 1))]
-                indices.append(np.full(len(chosen), len(starts)))
-                fractions.append(u[chosen])
-                positions.append(x[chosen])
-                starts.append(a)
-                ends.append(b)
-        none = np.empty((0, 3))
-        return _Pieces(
-            area,
-            np.reshape(starts, (-1, 3)),
-            np.reshape(ends, (-1, 3)),
-            np.concatenate([np.empty(0, int), *indices]),
-            np.concatenate([np.empty(0), *fractions]),
-            np.concatenate([none, *positions]),
-        )
+                samples.append(piece[np.unique(np.searchsorted(along, even - 1e-12).clip(0, len(piece) - 1))])
+        index = np.repeat(np.arange(len(samples)), [len(piece) for piece in samples])
+        chosen = np.concatenate([np.empty(0, int), *samples])
+        return _Pieces(area, coarse, index, z[chosen], x[chosen])
+
+    def _raised(self, area: Slice, across: Array) -> tuple[Array, Array, Mask]:
+        """Points of base space over the places `across` (N, 2) along the slice whose preimages lie on it.
+
+        By Newton's steps along the normal, from how high the nearest image of a lattice on the slice is.
+
+        Returns:
+            The preimages (N, 3), the points (N, 3), metres, and whether they were found (N,).
+        """
+        images, normal = self._images(area), area.normal
+        nearest = KDTree(area.across(images)).query(across)[1]
+        z = area.at(across) + ((images - area.centre) @ normal)[nearest, None] * normal
+        x, todo = np.empty_like(z), np.arange(len(z))
+        for _ in range(MAX_NEWTON):
+            normals = np.broadcast_to(normal[:, None], (len(todo), 3, 1))
+            x[todo], tangents = self._system.transform.inverse_tangents(z[todo], normals)
+            miss = (x[todo] - area.centre) @ normal
+            step = miss / np.maximum(tangents[..., 0] @ normal, MIN_SLOPE)
+            off = np.abs(miss) > ON_SLICE
+            todo = todo[off]
+            if not len(todo):
+                break
+            z[todo] -= np.clip(step[off], -MAX_STEP, MAX_STEP)[:, None] * normal
+        found = np.ones(len(z), bool)
+        found[todo] = False
+        return x, z, found
 
     def base(self, rays: Rays) -> BasePicture:
         """The base system; `rays` are those of the whole stack."""
@@ -287,9 +311,9 @@ class Sketchbook:
     @cached_property
     def _inset_grid(self) -> tuple[Array, ...]:
         task, inset = self._task, self._inset
-        pieces = []
+        middle, pieces = task.slice.across(inset.middle), []
         for a, b in zip(*self._lines(task.slice), strict=True):
-            ends = (np.stack([a, b]) - inset.middle) @ task.slice.axes
+            ends = np.stack([a, b]) - middle
             cut = np.clip(ends, -inset.half, inset.half)
             fixed = np.abs(ends[0] - ends[1]) < 1e-9  # the coordinate along which the line does not run
             if (np.abs(ends[0] - cut[0])[fixed] < 1e-9).all():

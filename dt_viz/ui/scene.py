@@ -25,6 +25,9 @@ from dt_viz.ui.slice import MovableSlice
 from dt_viz.ui.slice import Moved as SliceMoved
 from dt_viz.ui.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
 
+BOLD, THIN = 0.0048, 0.0026
+"""Of the rollouts of the whole stack, metres: by themselves, and beside those of a level."""
+
 
 class Demonstrations(Picture):
     """What was shown to the robot, thin."""
@@ -42,10 +45,10 @@ class Demonstrations(Picture):
 
 
 class Rollouts(Picture):
-    """What the robot will do, bold, with a dot at each start."""
+    """What the robot will do, bold, with a dot at each start; thin and pale beside those of a level of the stack."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, 0.0048)
+        self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, BOLD)
         super().__init__(self.lines.node)
         self._starts = scene.add_point_cloud(
             "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
@@ -54,6 +57,9 @@ class Rollouts(Picture):
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
         chosen = frame.chosen
+        thickness = BOLD if frame.level is None else THIN
+        if self.lines.node.thickness != thickness:
+            self.lines.node.thickness = thickness
         if frame.blocked:
             self.lines.show(frame.rollouts, chosen, mark=palette.GHOST, colour=palette.STALE)
         elif frame.level is not None:
