@@ -48,16 +48,17 @@ class ObstacleAvoidance:
             if not at_least:
                 points = np.concatenate([_deepest(motion), _crests(field, motion)])
             duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
-        hopeless = duration is None
+        # where the exact flow is clear for longer already, more time is not what a coarse one lacks
+        hopeless = duration is None or (scenario.integration.by_hand and 0 < duration <= at_least)
         if duration is None:
             duration = MAX_DURATION
             doubts.append(
                 "a motion does not leave the obstacle: "
                 + ("∇p is flat inside it" if scenario.generator == "probability" else "it runs through its dead centre")
             )
-        flow = AdaptiveFlow(field, duration, tolerance)
+        flow = scenario.integration.of(AdaptiveFlow(field, duration, tolerance))
         goal = _goal(motion) if motion.keeps_goal else flow.inverse(motion.goal)
-        return Built(flow, duration, goal, hopeless, tuple(doubts))
+        return Built(flow, duration, goal, hopeless, tuple(doubts), scenario.integration)
 
     def satisfied(self, motion: Motion) -> bool:
         """Whether all that can be cleared keeps (almost) the margin, where that is to be seen to."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array, Indices
+from dt_viz.integration import AUTO, Integration
 from dt_viz.scenario import Scenario
 
 
@@ -61,6 +62,8 @@ class Built:
     """Whether no duration does what is wanted, so that trying again is of no use."""
     doubts: tuple[str, ...] = ()
     """Why its result is not to be trusted, in words."""
+    integration: Integration = AUTO
+    """Of its flow; one by hand is checked for what it costs."""
 
 
 class Behaviour(Protocol):

@@ -14,6 +14,7 @@ from dt_viz.behaviours import Built, Motion
 from dt_viz.diffeo import Flow
 from dt_viz.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
 from dt_viz.integrate import integrate, rk4
+from dt_viz.integration import AUTO, Integration
 from dt_viz.scenario import Vector
 
 NUM_SAMPLES = 400
@@ -75,6 +76,8 @@ class BiasPoint:
     """Two orthonormal vectors: the field acts along these only, and alike at every depth. None is in space."""
     moves_goal: bool = False
     """Whether the goal is pulled along, or stays where it is."""
+    integration: Integration = AUTO
+    """Of its flow."""
 
     def axes(self) -> Array:
         """(3, 3) orthonormal columns, those of the plane first."""
@@ -198,8 +201,9 @@ class Biasing:
             hopeless = True  # its ends stay where they are, and no other place of it will be nearer
             doubts.append("a motion has its start or goal nearer to the bias point than its way: it is not led there")
         flow = Flow(field, duration, max(1, math.ceil(duration / (STEP * tolerance**0.25))), sparse=True)
+        flow = point.integration.of(flow)
         goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
-        return Built(flow, duration, goal, hopeless, tuple(doubts))
+        return Built(flow, duration, goal, hopeless, tuple(doubts), point.integration)
 
     def satisfied(self, motion: Motion) -> bool:
         """Whether every motion passes close to the target, where that is to be seen to."""

@@ -87,9 +87,13 @@ class CollisionReport:
     @property
     def problems(self) -> tuple[str, ...]:
         """What is wrong, in words for the page; empty when nothing is."""
+        entered = f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm" if self.depth > 0 else ""
+        return ((entered,) if entered else ()) + self.problems_of_its_own
+
+    @property
+    def problems_of_its_own(self) -> tuple[str, ...]:
+        """Those that have nothing to do with the obstacle."""
         found = []
-        if self.depth > 0:
-            found.append(f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm")
         if self.itself and self.itself.distance < SELF_MARGIN:
             inner, outer = self.itself.links
             gap = self.itself.distance

@@ -7,7 +7,7 @@ complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -214,11 +214,17 @@ class JointLimits(Diffeomorphism):
     """(6,) rad, +inf for continuous joints."""
     zone: float = LIMIT_ZONE
     """m, rad."""
+    fraction: float = 1.0
+    """s, the part of that time that is flown: (e/m)² becomes s·(e/m)² in both formulas."""
 
     @property
     def dim(self) -> int:
         """Dimension of configuration space."""
         return len(self.lower)
+
+    def scaled(self, fraction: float) -> JointLimits:
+        """See `Diffeomorphism`. Less than all of it does not hold joints inside their limits."""
+        return replace(self, fraction=fraction * self.fraction)
 
     def inside(self, q: Array) -> Array:
         """Configurations (*B, 6) kept a little away from the limits, where ψ is finite."""
@@ -228,7 +234,7 @@ class JointLimits(Diffeomorphism):
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         free = np.clip(s.real, self.lower + self.zone, self.upper - self.zone)
         excess = s - free
-        squared = (excess / self.zone) ** 2 * (1 if inverse else -1)
+        squared = (excess / self.zone) ** 2 * (self.fraction if inverse else -self.fraction)
         stretch = 1 / np.sqrt(1 + squared)
         mapped = np.where(excess == 0, s, free + excess * stretch)
         return mapped, None if U is None else (stretch**3)[..., None] * U

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from dt_viz.integrate import Step, integrate, integrate_adaptive, rk4
 class Diffeomorphism(ABC):
     """A smooth bijection of R^d with smooth inverse.
 
-    A subclass defines `_map` for both directions; everything else follows. Points have shape (*B, d).
+    A subclass defines `_map` for both directions, and `scaled`; everything else follows. Points have shape (*B, d).
     """
 
     @property
@@ -29,6 +29,13 @@ class Diffeomorphism(ABC):
     @abstractmethod
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         """Image of points `s` (N, d) under ψ or ψ⁻¹, and of tangents `U` (N, d, k) under its derivative."""
+
+    @abstractmethod
+    def scaled(self, fraction: float) -> Diffeomorphism:
+        """ψ on its way from the identity (0) to itself (1): every flow runs for this fraction of its duration.
+
+        Of a flow that is γ(s·t, ·), so scaled(a)∘scaled(b) = scaled(a + b); of a chain, the chain of the scaled parts.
+        """
 
     def forward(self, y: Array) -> Array:
         """ψ(y), (*B, d)."""
@@ -89,6 +96,24 @@ class Flow(Diffeomorphism):
         """Dimension d of the space."""
         return self.field.dim
 
+    def scaled(self, fraction: float) -> Flow:
+        """See `Diffeomorphism`. The steps are as many, and shorter: what undoes them exactly still does."""
+        return replace(self, duration=fraction * self.duration)
+
+    def min_step_determinant(self, s: Array, *, inverse: bool) -> float:
+        """Smallest det of the derivative of a step of ψ from points `s` (N, d), or of ψ⁻¹.
+
+        Where it is not positive, the step folds space: the method is no diffeomorphism, though the flow is one.
+        """
+        step = (self.inverse_step or self.step) if inverse else self.step
+        h = (-self.duration if inverse else self.duration) / self.steps
+        smallest, identity = np.inf, _identity_like(s)
+        for _ in range(self.steps):
+            s, J = step(self.field, s, identity, h)
+            assert J is not None
+            smallest = min(smallest, float(np.linalg.det(J).min(initial=np.inf)))
+        return smallest
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         if self.sparse and U is None:
             s, moving = s.copy(), self.field(s).any(axis=1)
@@ -119,6 +144,10 @@ class AdaptiveFlow(Diffeomorphism):
         """Dimension d of the space."""
         return self.field.dim
 
+    def scaled(self, fraction: float) -> AdaptiveFlow:
+        """See `Diffeomorphism`."""
+        return replace(self, duration=fraction * self.duration)
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return integrate_adaptive(self.field, s, U, -self.duration if inverse else self.duration, self.tolerance)
 
@@ -140,6 +169,10 @@ class Chain(Diffeomorphism):
         """Dimension d of the space."""
         return self.parts[0].dim
 
+    def scaled(self, fraction: float) -> Chain:
+        """See `Diffeomorphism`."""
+        return Chain([part.scaled(fraction) for part in self.parts])
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         for part in self.parts if inverse else reversed(self.parts):
             s, U = part._map(s, U, inverse=inverse)
@@ -157,6 +190,10 @@ class Inverse(Diffeomorphism):
         """Dimension d of the space."""
         return self.of.dim
 
+    def scaled(self, fraction: float) -> Inverse:
+        """See `Diffeomorphism`."""
+        return Inverse(self.of.scaled(fraction))
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return self.of._map(s, U, inverse=not inverse)
 
@@ -172,8 +209,36 @@ class Identity(Diffeomorphism):
         """Dimension d of the space."""
         return self.dimension
 
+    def scaled(self, fraction: float) -> Identity:
+        """See `Diffeomorphism`."""
+        return self
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return s, U
+
+
+@dataclass(frozen=True)
+class Conjugated(Diffeomorphism):
+    """h⁻¹∘ψ∘h: ψ acts in the coordinates h(y). Scaling it scales ψ and leaves the coordinates as they are."""
+
+    inner: Diffeomorphism
+    """ψ."""
+    by: Diffeomorphism
+    """h."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.by.dim
+
+    def scaled(self, fraction: float) -> Conjugated:
+        """See `Diffeomorphism`."""
+        return replace(self, inner=self.inner.scaled(fraction))
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        s, U = self.by._map(s, U, inverse=False)
+        s, U = self.inner._map(s, U, inverse=inverse)
+        return self.by._map(s, U, inverse=True)
 
 
 @dataclass(frozen=True)
@@ -204,6 +269,10 @@ class Placed(Diffeomorphism):
     def to_frame(self, y: Array) -> Array:
         """Frame coordinates (*B, d) of world points (*B, d)."""
         return (y - self.origin) @ self.axes / self.scale
+
+    def scaled(self, fraction: float) -> Placed:
+        """See `Diffeomorphism`: in place and in size it stays as it is."""
+        return replace(self, inner=self.inner.scaled(fraction))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         k = self.inner.dim

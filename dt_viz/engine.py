@@ -16,16 +16,17 @@ from dt_viz.avoidance import ObstacleAvoidance
 from dt_viz.behaviours import Behaviour
 from dt_viz.belief import occupancy_picture
 from dt_viz.collision import load_collision_model
+from dt_viz.cspace import LEVERS
 from dt_viz.diffeo import Flow
 from dt_viz.field_layers import Clearance, ColourPicture, det_jacobian, lyapunov_value, streamlines, velocity_arrows
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
 from dt_viz.following import NUM_ARM_SAMPLES, OUT_OF_REACH, ArmMotion, Follower
 from dt_viz.ground import Ground, Learned, named_starts
-from dt_viz.health import Health, certified, certified_arm
+from dt_viz.health import Health, certified, certified_arm, integration_doubts
 from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.pictures import NO_PICTURES, Pictures
+from dt_viz.pictures import NO_PICTURES, Pictures, in_frame
 from dt_viz.profiles import Profiles, body_profile, hand_profile
 from dt_viz.pushing import Pushed, pushed
 from dt_viz.retiming import within_velocity_limits
@@ -34,10 +35,11 @@ from dt_viz.rollouts import Bundle
 from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
 from dt_viz.solving import FINE, LIVE, Checkpoint, Precision, Solution, cut_off, solve
-from dt_viz.stacking import levels
+from dt_viz.stacking import WHOLE_ARM, levels
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
+from dt_viz.warping import warped
 from dt_viz.whole_arm import ArmSolution, Lift
 
 MAX_GOAL_MISS = 1e-3
@@ -81,6 +83,8 @@ class Frame:
     health: Health
     chosen: int | None = 0
     """Which rollout the arm follows; None where it cannot begin the one that the scenario asks for."""
+    learned_steps: tuple[int, ...] = ()
+    """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
     layer_radii: tuple[float | None, ...] = ()
     """Radius of the region that each layer acts in, in the order of `Scenario.layers`, metres; None where it is off or
     acts everywhere."""
@@ -111,6 +115,8 @@ class _Solved:
     """None where only the end effector avoids."""
     lifted: Lift | None
     """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
+    ground: Ground
+    """What the stack is built on: the undisturbed motion, warped as far as the stack is."""
 
 
 @dataclass
@@ -151,6 +157,8 @@ class Engine:
         """The last motion of each task."""
         self._kept: _Kept | None = None
         """Of the newest motion."""
+        self._full: dict[Precision, tuple[Scenario, Ground, _Solved]] = {}
+        """The last full stacks: while only the warp changes, nothing of them does."""
         self._shown: tuple[Scenario, Ground, _Solved] | None = None
         """The last motion that an arm was shown for."""
 
@@ -239,9 +247,9 @@ class Engine:
         yield first
         with _turn:
             frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, ground, live))
-            pictures = _pictures(ground, scenario, live.stack, coarse=True)
+            pictures = _pictures(live.ground, scenario, live.stack, coarse=True)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.LIVE, pictures=pictures)
-            self._good[scenario.task] = frame, ground, live.stack
+            self._good[scenario.task] = frame, live.ground, live.stack
             self._shown = scenario, ground, live
         yield frame
 
@@ -251,11 +259,11 @@ class Engine:
             exact = _once(kept.rollouts, FINE, lambda: self._frame(ground, scenario, fine))
             frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, ground, fine))
         with _turn:
-            pictures = _pictures(ground, scenario, fine.stack, coarse=False)
+            pictures = _pictures(fine.ground, scenario, fine.stack, coarse=False)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.FINE, pictures=pictures)
             if scenario.view.health_plots and frame.chosen is not None:
                 frame = replace(frame, profiles=self._profiles(frame, ground, fine, frame.chosen))
-            self._good[scenario.task] = frame, ground, fine.stack
+            self._good[scenario.task] = frame, fine.ground, fine.stack
             self._shown = scenario, ground, fine
         yield frame
         if kept.health is None:
@@ -302,14 +310,33 @@ class Engine:
     def _solved(
         self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint = lambda: None
     ) -> _Solved:
-        stack = solve(ground, scenario, precision, checkpoint)
-        if not _uses_whole_arm(scenario):
-            return _Solved(stack, None, None)
-        follower = self._follower
-        lifted = follower.behaving(ground, stack) if stack.built else follower.undisturbed(ground)
+        full = self._fully_solved(ground, replace(scenario, warp=1.0), precision, checkpoint)
+        if scenario.warp == 1:
+            return full
         checkpoint()
-        arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, checkpoint, coarse=precision is LIVE)
-        return _Solved(stack, arm, lifted)
+        below = ground.warped(scenario.warp)
+        stack = warped(below, full.stack, scenario.warp, precision)
+        if full.arm is None:
+            return _Solved(stack, None, None, below)
+        lifted, whole_arm = self._follower.behaving(ground, stack), self._follower.whole_arm
+        checkpoint()
+        arm = whole_arm.warped(full.arm, lifted, scenario, scenario.warp, precision.spacing)
+        return _Solved(stack, arm, lifted, below)
+
+    def _fully_solved(
+        self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint
+    ) -> _Solved:
+        known = self._full.get(precision)
+        if known is not None and ground.moves_like(known[1]) and scenario.moves_like(known[0]):
+            return known[2]
+        stack, arm, lifted, follower = solve(ground, scenario, precision, checkpoint), None, None, self._follower
+        if _uses_whole_arm(scenario):
+            lifted = follower.behaving(ground, stack) if stack.built else follower.undisturbed(ground)
+            checkpoint()
+            arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, checkpoint, coarse=precision is LIVE)
+        solved = _Solved(stack, arm, lifted, ground)
+        self._full[precision] = scenario, ground, solved
+        return solved
 
     def _frame(self, ground: Ground, scenario: Scenario, solved: _Solved) -> Frame:
         """The frame of stage ROLLOUTS."""
@@ -343,6 +370,7 @@ class Engine:
                 arm_duration=arm.duration if arm else None,
                 doubts=doubts,
             ),
+            learned_steps=_learned_steps(ground),
             layer_radii=tuple(_region_radius(stack, layer.behaviour) for layer in scenario.layers),
         )
 
@@ -415,6 +443,11 @@ def _uses_whole_arm(scenario: Scenario) -> bool:
     return scenario.avoidance and scenario.space != "task"
 
 
+def _learned_steps(ground: Ground) -> tuple[int, ...]:
+    flows = in_frame(ground.system.transform)
+    return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
+
+
 def _region_radius(stack: Solution, behaviour: Behaviour) -> float | None:
     """Radius of the region that a behaviour acts in, if it is on and has one."""
     flow = next((made.transform for layer, made in stack.built if layer == behaviour), None)
@@ -472,6 +505,9 @@ def _colour(
 def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: float, missed: float) -> tuple[str, ...]:
     """Why the motion is not to be trusted, in words."""
     doubts = [*ground.imitation.warnings, *solved.stack.doubts]
+    integration = _integration_doubts(scenario, solved)
+    if scenario.warp < 1:  # what does not do yet what it is made for has not failed
+        return (*doubts, *integration, *ground.doubts)
     if solved.arm is not None:
         if not solved.arm.cleared:
             doubts.append(
@@ -486,6 +522,17 @@ def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: floa
     if not solved.stack.doubts:
         missed_by = [layer.name for layer in scenario.layers if layer.behaviour in solved.stack.unsatisfied]
         doubts += [f"{name or 'a layer'}: not every motion does what it asks for" for name in missed_by]
+    doubts += integration
     if missed > MAX_GOAL_MISS and not doubts and not _moves_goal(ground, solved.stack):
         doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
     return (*doubts, *ground.doubts)
+
+
+def _integration_doubts(scenario: Scenario, solved: _Solved) -> tuple[str, ...]:
+    """What the integrators cost that were chosen by hand, in words."""
+    doubts, bundle = [], solved.stack.bundle
+    for level, (name, (_, made)) in enumerate(zip(levels(scenario)[1:], solved.stack.built, strict=True), 1):
+        doubts += integration_doubts(name, made.transform, made.integration, bundle.levels[:, level])
+    if solved.arm is not None:
+        doubts += integration_doubts(WHOLE_ARM, solved.arm.transform, scenario.integration, solved.arm.p, LEVERS)
+    return tuple(doubts)

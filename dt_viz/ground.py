@@ -72,6 +72,20 @@ class Learned:
         strands = self.demonstrated.strands
         return lru_cache(maxsize=4)(lambda added: Ground(self, strands + tuple(map(self._added, added))))
 
+    def warped(self, fraction: float) -> Learned:
+        """The same with the imitation's flows run for a fraction of their durations."""
+        return self._warps(fraction)
+
+    @cached_property
+    def _warps(self) -> Callable[[float], Learned]:
+        """Only the newest is kept: what it is asked for at every stage of a frame."""
+        return lru_cache(maxsize=1)(self._warped)
+
+    def _warped(self, fraction: float) -> Learned:
+        transform = self.system.transform.scaled(fraction)
+        base = replace(self.system.base, goal=transform.forward(self.goal))
+        return replace(self, system=DiffeomorphicSystem(transform, base))
+
     @cached_property
     def sketchbook(self) -> Sketchbook:
         """Makes the pictures of ψ."""
@@ -150,6 +164,23 @@ class Ground:
         kept = {self.numbers[k] for k in rollouts}
         left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
         return Ground(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(doubts))
+
+    def moves_like(self, other: Ground) -> bool:
+        """Whether both have the same rollouts."""
+        return self.learned is other.learned and self.strands == other.strands
+
+    def warped(self, fraction: float) -> Ground:
+        """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""
+        learned = self.learned.warped(fraction)
+        images, jacobians = learned.system.transform.jacobian(self.starts)
+        bundle = self.bundle
+        samples = Rays(images, learned.system.base).at(bundle.index, bundle.fraction)
+        paths = bundle.split(learned.system.transform.inverse(samples))
+        strands = (
+            replace(strand, image=image, jacobian=jacobian, positions=path)
+            for strand, image, jacobian, path in zip(self.strands, images, jacobians, paths, strict=True)
+        )
+        return replace(self, learned=learned, strands=tuple(strands))
 
     @cached_property
     def starts(self) -> Array:

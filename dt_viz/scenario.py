@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
+from dt_viz.integration import AUTO, Integration
 from dt_viz.obstacles import Obstacle
 from dt_viz.occupancy import Generator
 from dt_viz.several import Several
@@ -88,6 +89,8 @@ class View:
     """Of the playback, times real time."""
     bias: str = ""
     """Name of the bias point that the panel changes and that has the handles."""
+    tuned: str = ""
+    """Name of the transform of the stack whose settings the panel shows; the outermost if empty."""
     level: str = ""
     """Name of the level of the stack whose manifold is shown: its rollouts beside those of the whole stack, and all
     that lies on the slice. The whole stack if empty."""
@@ -125,6 +128,10 @@ class Scenario:
     """Clearance that `auto` keeps, metres."""
     duration: float | None = None
     """t of the avoidance flow; None is `auto`, the shortest that clears the obstacle by the margin."""
+    integration: Integration = AUTO
+    """Of the avoidance flow."""
+    warp: float = 1.0
+    """s, from 0 to 1: every flow of the stack, the imitation's too, runs for this fraction of its duration."""
     layers: tuple[Layer, ...] = ()
     """What else the end effector's motion is to do, from the inside out."""
     avoidance_level: int | None = None

@@ -79,7 +79,7 @@ def cut_off(ground: Ground, solution: Solution, level: int) -> DiffeomorphicSyst
     return DiffeomorphicSystem(Chain([ground.system.transform, *stacked]), solution.rays.base)
 
 
-def _climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
+def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
     """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
     levels = [positions]
     for transform in transforms:
@@ -140,9 +140,9 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
                 rays, ends_below = Rays(np.stack(z0), replace(ground.system.base, goal=z_e)), below
                 positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
                 bundle = replace(bundle, levels=positions[:, None])
-            bundle = replace(bundle, levels=_climb(bundle.levels[:, 0], outer))
+            bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
             stack = [ground.system.transform, *outer]
-            bundle = refined(bundle, lambda i, u, r=rays, s=stack: _climb(r.at(i, u), s)[:, 1:], precision.spacing)
+            bundle = refined(bundle, lambda i, u, r=rays, s=stack: climb(r.at(i, u), s)[:, 1:], precision.spacing)
             unsatisfied = _unsatisfied(layers, built, above, bundle)
             on = tuple((layer, made) for layer, (_, made) in zip(layers, built, strict=True) if made)
             solution = Solution(Chain(stack), rays, bundle, on, unsatisfied)

@@ -20,8 +20,8 @@ ROOM = 0.04
 """Metres that it keeps from obstacles."""
 PLACES = (0.50, 0.30, 0.70, 0.15, 0.85, 0.40, 0.60)
 """Along the mean path, beside which new bias points are placed, as fractions of its length."""
-IMITATION, AVOIDANCE = "Imitation", "Avoidance"
-"""Names of the levels that are no layers."""
+IMITATION, AVOIDANCE, WHOLE_ARM = "Imitation", "Avoidance", "Whole arm"
+"""Names of the transforms that are no layers."""
 
 
 class Stacked(TypedDict):

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from dt_viz.body import BodyPoints
 from dt_viz.cspace import LEVERS, REACH_PER_TEMPERATURE, GradientField, JointLimits, WholeArmField, squared_lengths
-from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity, Inverse
+from dt_viz.diffeo import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.escape import escape_directions
 from dt_viz.fields import Array, Indices, Sum, VectorField
 from dt_viz.integrate import rk4
@@ -180,6 +180,21 @@ class WholeArm:
                 break
         return best or self.undisturbed(lifted, scenario, spacing)
 
+    def warped(
+        self, full: ArmSolution, lifted: Lift, scenario: Scenario, fraction: float, spacing: float
+    ) -> ArmSolution:
+        """The motions with the transform of a solution run for a fraction of its duration.
+
+        Args:
+            full: whose transform it is.
+            lifted: the motions below, warped as far.
+            scenario: with obstacle and margin.
+            fraction: s, from 0 to 1.
+            spacing: as in `avoiding`.
+        """
+        solver = _Solver(self, lifted, scenario, None, spacing, coarse=True)
+        return solver.through(full.transform.scaled(fraction), full.duration)
+
     def clearance(self, q: Array, obstacle: Several | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
         points = self.body.of_chain(self.robot.chain(q.T))
@@ -256,20 +271,17 @@ class _Solver:
 
     def solution(self) -> ArmSolution:
         """See `WholeArm.avoiding`."""
-        num_rollouts, num_samples = self._lifted.fractions.shape
-        index = np.repeat(np.arange(num_rollouts), num_samples)
         duration = self._scenario.duration
         if self._generator is None:
             duration = 0.0
         elif duration is None:
             q = self._arm.limits.inside(self._lifted.tracked.q[:, ::STRIDE].reshape(-1, NUM_JOINTS))
             duration = self._clearing_duration(q[self._lack(q) > 0])
-        return self._with_duration(min(duration, MAX_DURATION), index)
+        return self._with_duration(min(duration, MAX_DURATION))
 
-    def _with_duration(self, duration: float, index: Indices) -> ArmSolution:
+    def _with_duration(self, duration: float) -> ArmSolution:
         transform = self._transform(duration)
-        fraction = self._lifted.fractions.ravel()
-        bundle = self._refined(Bundle(index, fraction, self._evaluate(transform, index, fraction)), transform)
+        bundle = self._sampled(transform)
         p = bundle.positions / LEVERS
         lack = self._lack(p)
         chosen = self._generator is not None and self._scenario.duration is None
@@ -280,24 +292,43 @@ class _Solver:
             more = min(self._clearing_duration(p[lack > 0]), MAX_DURATION - duration)
             duration += more
             transform = self._transform(duration)
-            p = self._transform(more).inverse(p)
-            bundle = self._refined(replace(bundle, levels=(p * LEVERS)[:, None]), transform)
+            if self._scenario.integration.by_hand:  # a few coarse steps are no such group
+                levels = self._evaluate(transform, bundle.index, bundle.fraction)
+            else:
+                levels = (self._transform(more).inverse(p) * LEVERS)[:, None]
+            bundle = self._refined(replace(bundle, levels=levels), transform)
             p = bundle.positions / LEVERS
             lack = self._lack(p)
+        return self._along(bundle, transform, duration, lack)
+
+    def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
+        """The motions of a transform that is there already, of which that is the full duration."""
+        bundle = self._sampled(transform)
+        return self._along(bundle, transform, duration, self._lack(bundle.positions / LEVERS))
+
+    def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float, lack: Array) -> ArmSolution:
+        p = bundle.positions / LEVERS
         clearance = float(self._arm.clearance(p, self._scenario.obstacle).min())
         q = self._lifted.at(bundle.index, bundle.fraction)
         cleared = not (lack > ROUNDING).any()
         return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, cleared)
 
+    def _sampled(self, transform: Diffeomorphism) -> Bundle:
+        num_rollouts, num_samples = self._lifted.fractions.shape
+        index, fraction = np.repeat(np.arange(num_rollouts), num_samples), self._lifted.fractions.ravel()
+        return self._refined(Bundle(index, fraction, self._evaluate(transform, index, fraction)), transform)
+
     def _transform(self, duration: float) -> Diffeomorphism:
         limits = self._arm.limits
         if self._generator is None or duration == 0:
             return Identity(NUM_JOINTS)
-        if self._coarse:
+        if self._scenario.integration.by_hand:
+            flow = self._scenario.integration.of(Flow(self._generator, duration))
+        elif self._coarse:
             flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP), sparse=True)
         else:
             flow = AdaptiveFlow(self._generator, duration, TOLERANCE)
-        return Chain([Inverse(limits), flow, limits])
+        return Conjugated(flow, limits)
 
     def _evaluate(self, transform: Diffeomorphism, index: Indices, fraction: Array) -> Array:
         """Levels (N, 1, 6) of the samples: postures by their `LEVERS`, so that distances are metres."""

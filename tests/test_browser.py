@@ -416,6 +416,8 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
             time.sleep(0.02)
 
     monkeypatch.setattr(dt_viz.fits, "fit", endless)
+    page.get_by_role("textbox", name="Settings of").or_(page.locator("input[value='Avoidance']")).first.click()
+    page.get_by_role("option", name="Imitation").click()
     page.get_by_role("textbox", name="Learn").or_(page.locator("input[value='trajectory']")).first.click()
     page.get_by_role("option", name="velocity").click()
     page.get_by_text("Learning the motion: without end").wait_for(timeout=1000 * PATIENCE)

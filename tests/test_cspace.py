@@ -232,6 +232,13 @@ class TestJointLimits:
             np.testing.assert_array_equal(J[away], np.broadcast_to(np.eye(NUM_JOINTS), J.shape)[away])
             assert (image[~away] != q[~away]).all()
 
+    @given(seeds, st.floats(0, 1))
+    def test_scaled_it_is_the_same_flow_for_a_part_of_its_time(self, seed, part):
+        q = inside(50, seed)
+        np.testing.assert_array_equal(LIMITS.scaled(0.0).forward(q), q)
+        split = LIMITS.scaled(1 - part).inverse(LIMITS.scaled(part).inverse(q))
+        np.testing.assert_allclose(split, LIMITS.inverse(q), rtol=0, atol=1e-12)
+
     @given(seeds)
     def test_jacobians_are_derivatives(self, seed):
         q = inside(20, seed, closest=0.01)

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from dt_viz.diffeo import (
     AdaptiveFlow,
     Chain,
+    Conjugated,
     Flow,
     Identity,
     Inverse,
@@ -16,7 +17,7 @@ from dt_viz.diffeo import (
     round_trip_error,
 )
 from dt_viz.fields import GaussianGrid, GridRBF, PlacedField
-from dt_viz.integrate import euler, implicit_euler
+from dt_viz.integrate import euler, implicit_euler, rk4
 
 
 def field(dim, seed=0, strength=0.3):
@@ -51,6 +52,7 @@ INSTANCES = {
     "placed, space in space": (Placed(Flow(field(3), 0.5), np.ones(3), tilted_axes(), 2.0), 1e-6),
     "chain with a placed": (Chain([PLANE, Identity(3), AdaptiveFlow(field(3, 4), 0.4)]), 1e-6),
     "identity": (Identity(3), 1e-15),
+    "conjugated": (Conjugated(Flow(field(2, 5), 0.6, 12), Flow(field(2, 6), 0.8, 6, euler, implicit_euler)), 1e-6),
 }
 
 
@@ -103,6 +105,22 @@ def test_orientation_is_kept(case):
     y = points(transform, 100)
     assert np.linalg.det(transform.jacobian(y)[1]).min() > 0
     assert min_det_jacobian(transform.jacobian, y) == np.linalg.det(transform.jacobian(y)[1]).min()
+
+
+def test_scaled_it_goes_from_the_identity_to_itself_through_diffeomorphisms(case):
+    transform, tolerance = case
+    y = points(transform, 60)
+    np.testing.assert_allclose(transform.scaled(0.0).forward(y), y, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(transform.scaled(0.0).inverse(y), y, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(transform.scaled(1.0).forward(y), transform.forward(y))
+    np.testing.assert_array_equal(transform.scaled(1.0).inverse(y), transform.inverse(y))
+    moved = [0.0]
+    for fraction in (0.2, 0.5, 0.8, 1.0):
+        scaled = transform.scaled(fraction)
+        assert min_det_jacobian(scaled.jacobian, y) > 0
+        assert round_trip_error(scaled, y) <= tolerance * np.sqrt(transform.dim)
+        moved.append(np.linalg.norm(scaled.forward(y) - y, axis=1).mean())
+    assert moved == sorted(moved) and (moved[1] > 0 or isinstance(transform, Identity))
 
 
 def test_tangents_are_jacobian_products(case):
@@ -160,6 +178,33 @@ def test_flows_are_a_one_parameter_group(s, t, kind):
     np.testing.assert_allclose(flow(-t).forward(y), flow(t).inverse(y), rtol=0, atol=1e-12)
 
 
+def group_defect(flow, a, b):
+    """How far scaled(a)∘scaled(b) is from scaled(a + b)."""
+    y = points(flow, 40)
+    return np.abs(flow.scaled(a).forward(flow.scaled(b).forward(y)) - flow.scaled(a + b).forward(y)).max()
+
+
+@pytest.mark.parametrize(("step", "order"), [(euler, 1), (implicit_euler, 1), (rk4, 4)])
+def test_scaled_flows_are_a_one_parameter_group_up_to_the_order_of_their_steps(step, order):
+    coarse, fine = (group_defect(Flow(field(2), 1.0, steps, step), 0.3, 0.5) for steps in (16, 32))
+    assert coarse / fine == pytest.approx(2**order, rel=0.15)
+
+
+def test_scaled_adaptive_and_conjugated_flows_are_a_one_parameter_group():
+    flow = AdaptiveFlow(field(3), 1.2, 1e-10)
+    by = Flow(field(3, 6), 0.8, 6, euler, implicit_euler)
+    for transform in (flow, Conjugated(flow, by), Placed(flow, np.ones(3), tilted_axes(), 0.6)):
+        assert group_defect(transform, 0.25, 0.6) < 1e-7
+
+
+def test_a_conjugated_flow_is_the_chain_of_its_parts():
+    by, flow = Flow(field(2, 6), 0.8, 6, euler, implicit_euler), Flow(field(2, 5), 0.6)
+    y = points(flow, 20)
+    chain = Chain([Inverse(by), flow, by])
+    np.testing.assert_array_equal(Conjugated(flow, by).forward(y), chain.forward(y))
+    np.testing.assert_array_equal(Conjugated(flow, by).inverse(y), chain.inverse(y))
+
+
 def test_the_last_of_a_chain_acts_first():
     f, g = Flow(field(2, 1), 0.9), Flow(field(2, 2), 0.9)
     y = points(f, 10)
@@ -214,3 +259,18 @@ def test_a_coarse_euler_flow_that_folds_is_recognised():
     assert min_det_jacobian(folding.jacobian, y) < 0
     assert min_det_jacobian(Flow(field(2, strength=8.0), 1.0, 400).jacobian, y) > 0
     assert round_trip_error(folding, y) > 0.1
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_the_smallest_determinant_of_a_step_is_that_of_every_step(inverse):
+    flow, y = Flow(field(2, strength=1.5), 1.0, 3, euler), points(PLANE.inner, 200)
+    smallest, one = np.inf, Flow(flow.field, -1 / 3 if inverse else 1 / 3, 1, euler)
+    s = y
+    for _ in range(3):
+        s, J = one.jacobian(s)
+        smallest = min(smallest, np.linalg.det(J).min())
+    assert flow.min_step_determinant(y, inverse=inverse) == pytest.approx(smallest, rel=1e-12)
+    twice = Flow(field(2, strength=20.0), 1.0, 2, euler)  # a fold of a fold may keep its orientation, where it began
+    assert twice.min_step_determinant(y, inverse=inverse) < 0
+    exact = Flow(field(2), 1.0, 6, implicit_euler, euler)
+    assert exact.min_step_determinant(y, inverse=inverse) > 0

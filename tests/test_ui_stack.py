@@ -13,14 +13,15 @@ from dt_viz.health import Health
 from dt_viz.obstacles import Sphere
 from dt_viz.paper_scenes import SCENES
 from dt_viz.scenario import Scenario, View
-from dt_viz.stacking import AVOIDANCE, IMITATION, MAX_BIAS_POINTS, bias_points, names, with_bias_point
+from dt_viz.stacking import AVOIDANCE, IMITATION, MAX_BIAS_POINTS, WHOLE_ARM, bias_points, names, with_bias_point
 from dt_viz.tasks import POTS, TASKS
 from dt_viz.ui.bias import Biases, selected_point
 from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.pots import Pots, surface
 from dt_viz.ui.session import Session
-from dt_viz.ui.stack_panel import ARM, BASE, StackPanel, durations, legend_html, rows
+from dt_viz.ui.stack_panel import BASE, StackPanel, legend_html, rows
+from dt_viz.ui.transform_settings import durations
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 SCENARIO = Scenario(
@@ -85,8 +86,8 @@ def listed(scenario):
 
 def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
     assert list(listed(SCENARIO)) == [AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
-    assert list(listed(replace(SCENARIO, space="both"))) == [ARM, AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
-    assert list(listed(replace(SCENARIO, space="cspace"))) == [ARM, "Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(replace(SCENARIO, space="both"))) == [WHOLE_ARM, AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(replace(SCENARIO, space="cspace"))) == [WHOLE_ARM, "Bias 2", "Bias 1", IMITATION, BASE]
     assert list(listed(replace(SCENARIO, obstacles=()))) == ["Bias 2", "Bias 1", IMITATION, BASE]
 
 
@@ -104,7 +105,7 @@ def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done
 
 @pytest.fixture
 def panel(server):
-    panel, session = StackPanel(server.gui), Edited()
+    panel, session = StackPanel(server.gui, lambda handle, *_: handle), Edited()
     panel.connect(cast(Session, session))
     return panel, session
 
@@ -141,7 +142,7 @@ def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(panel):
     assert "Bias 1" in legend_html(session.scenario)
     panel.press("Bias 1", "seen")
     panel.press(BASE, "see")
-    assert session.scenario.view == View(base=True)
+    assert session.scenario.view == View(base=True, tuned="Bias 1")  # and its settings stay in sight
 
 
 def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
@@ -215,8 +216,8 @@ def test_the_panel_shows_what_auto_chose(server):
     panel = BiasPanel(server.gui, lambda handle, *_: handle)
     panel.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
     panel.report(frame())
-    assert (panel._radius.value, panel._strength.value) == (20.0, 0.8)
-    assert panel._radius.disabled and panel._strength.disabled
+    assert panel._radius.value == 20.0
+    assert panel._radius.disabled
 
 
 # --- Pots ---

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,14 +13,11 @@ from dt_viz.scenario import Scenario
 from dt_viz.stacking import MAX_BIAS_POINTS, bias_points, place_beside, with_bias_point, with_changed_point, without
 from dt_viz.ui.bias import selected_point
 from dt_viz.ui.session import Session
+from dt_viz.ui.transform_settings import Bind
 
 MIN_RADIUS, MAX_RADIUS = 4.0, 40.0
 """Of a region, centimetres."""
-MAX_STRENGTH = 4.0
 NONE = "–"
-
-Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Any]
-"""Ties a control to the scenario: how its value is read, and which fields a new value replaces."""
 
 
 class BiasPanel:
@@ -56,18 +52,6 @@ class BiasPanel:
                 lambda s: self._radius.value if (r := _selected(s).radius) is None else round(100 * r, 1),
                 lambda s, value: {} if _selected(s).radius is None else _changed(s, radius=value / 100),
             )
-            strength_is_auto = bind(
-                gui.add_checkbox(
-                    "Strength: auto", True, visible=False, hint="the shortest flow that leads every motion there"
-                ),
-                lambda s: _selected(s).strength is None,
-                lambda s, value: _changed(s, strength=None if value else self._strength.value),
-            )
-            self._strength = bind(
-                gui.add_slider("Strength t", 0.0, MAX_STRENGTH, 0.02, 0.5, visible=False),
-                lambda s: self._strength.value if (t := _selected(s).strength) is None else round(t, 2),
-                lambda s, value: {} if _selected(s).strength is None else _changed(s, strength=value),
-            )
             moves_goal = bind(
                 gui.add_checkbox(
                     "Moves the goal", False, visible=False, hint="motions end here instead of at the goal"
@@ -75,7 +59,7 @@ class BiasPanel:
                 lambda s: _selected(s).moves_goal,
                 lambda s, value: _changed(s, moves_goal=value),
             )
-        self._settings = (self._which, radius_is_auto, self._radius, strength_is_auto, self._strength, moves_goal)
+        self._settings = (self._which, radius_is_auto, self._radius, moves_goal)
 
         @self._buttons.on_click
         async def _(_event: viser.GuiEvent) -> None:
@@ -120,21 +104,16 @@ class BiasPanel:
             shown = bool(names) and (handle is not self._which or len(names) > 1)
             if handle.visible != shown:
                 handle.visible = shown
-        self._radius.disabled, self._strength.disabled = point.radius is None, point.strength is None
+        self._radius.disabled = point.radius is None
 
     def report(self, frame: Frame) -> None:
         """Show what `auto` chose for the selected one, to go on from by hand."""
         if self._adopted is None:
             return
         name, point = selected_point(self._adopted), _selected(self._adopted)
-        for layer, radius, strength in zip(
-            frame.scenario.layers, frame.layer_radii, frame.health.layer_durations, strict=False
-        ):
-            if layer.name == name:
-                if point.radius is None and radius is not None:
-                    self._radius.value = round(100 * min(max(radius, MIN_RADIUS / 100), MAX_RADIUS / 100), 1)
-                if point.strength is None and strength is not None:
-                    self._strength.value = round(min(strength, MAX_STRENGTH), 2)
+        for layer, radius in zip(frame.scenario.layers, frame.layer_radii, strict=False):
+            if layer.name == name and point.radius is None and radius is not None:
+                self._radius.value = round(100 * min(max(radius, MIN_RADIUS / 100), MAX_RADIUS / 100), 1)
 
 
 def _selected(scenario: Scenario) -> BiasPoint:

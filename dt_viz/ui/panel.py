@@ -13,18 +13,9 @@ from dt_viz.collision import SELF_REACH, CollisionReport
 from dt_viz.engine import Frame, Stage
 from dt_viz.errors import DataError
 from dt_viz.imitation import ImitationError
-from dt_viz.occupancy import GENERATORS
 from dt_viz.paper_scenes import SCENES
 from dt_viz.robot import Robot
-from dt_viz.scenario import (
-    MAX_MANUAL_DURATION,
-    MAX_TEMPERATURE,
-    MIN_TEMPERATURE,
-    OBJECTIVES,
-    SPACES,
-    Scenario,
-    View,
-)
+from dt_viz.scenario import Scenario, View
 from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.export import RESOLUTIONS
@@ -62,10 +53,6 @@ VIEW_HINTS: Mapping[str, str] = {
     "joint_plots": "angles and speeds over time, with their limits",
     "health_plots": "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
 }
-SPACE_LABELS: Mapping[str, str] = {"task": "End effector", "cspace": "Whole arm", "both": "Both"}
-assert set(SPACE_LABELS) == set(SPACES)
-GENERATOR_LABELS = {"free-space": "Free space (−∇log(1−p))", "probability": "Probability (∇p, the paper's)"}
-assert set(GENERATOR_LABELS) == set(GENERATORS)
 _NO_SCENE = "–"
 MAX_FLOWS = 3
 """That ψ is composed of, for a start: each picture brings its own number."""
@@ -116,8 +103,7 @@ class Panel:
             gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
         )
         self._biases = BiasPanel(gui, self._bind)
-        self._stack = StackPanel(gui)
-        self._build_stack()
+        self._stack = StackPanel(gui, self._bind)
         self._build_arm()
         self._build_view()
         with gui.add_folder("Slice", expand_by_default=False):
@@ -134,6 +120,10 @@ class Panel:
         self._stack.connect(session)
         self._slice.connect(session)
 
+    def close(self) -> None:
+        """The visitor has left: stop what plays."""
+        self._stack.close()
+
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
         self._adopted = scenario
@@ -146,7 +136,6 @@ class Panel:
             value = control.read(scenario)
             if control.handle.value != value:
                 control.handle.value = value
-        self._duration.disabled = scenario.duration is None
         self._flow.visible = scenario.view.generator
         self.joints.visible = scenario.view.joint_plots
         self.health.visible = scenario.view.health_plots
@@ -171,11 +160,6 @@ class Panel:
         _set_max(self._rollout, len(frame.rollouts))
         if frame.pictures.generator is not None:
             _set_max(self._flow, frame.pictures.generator.num_flows)
-        health = frame.health
-        chosen = health.arm_duration if health.duration is None else health.duration
-        if frame.scenario.duration is None and chosen is not None:
-            # what `auto` chose, to go on from by hand
-            self._duration.value = round(min(chosen, MAX_MANUAL_DURATION), 2)
         self._status.content = status_html(frame, pace)
 
     def learning(self, fraction: float, message: str) -> None:
@@ -214,7 +198,7 @@ class Panel:
             self._session.edit(gesture, **changes)
 
     def _bind(
-        self, handle: Any, read: Callable[[Scenario], Any], change: Callable[[Scenario, Any], dict[str, Any]]
+        self, handle: Any, read: Callable[[Scenario], Any], change: Callable[[Scenario, Any], Mapping[str, Any]]
     ) -> Any:
         """Tie a control to the scenario: `read` gives its value, `change` the fields that a new value replaces."""
         self._controls.append(_Control(handle, read))
@@ -266,64 +250,6 @@ class Panel:
         async def _(_event: viser.GuiEvent) -> None:
             if self._session is not None:
                 {"Undo": self._session.undo, "Redo": self._session.redo, "Reset": self._session.reset}[history.value]()
-
-    def _build_stack(self) -> None:
-        gui = self._gui
-        with gui.add_folder("Transforms"):
-            self._bind(
-                gui.add_checkbox("Avoid", True, hint="the obstacle's transform; off: the motion as learned"),
-                lambda s: s.avoidance,
-                lambda _s, value: {"avoidance": value},
-            )
-            self._bind(
-                gui.add_dropdown(
-                    "Avoid with",
-                    tuple(SPACE_LABELS.values()),
-                    hint="what gives way: the hand's path, or the whole arm by a transform of its joint angles",
-                ),
-                lambda s: SPACE_LABELS[s.space],
-                lambda _s, value: {"space": next(name for name, label in SPACE_LABELS.items() if label == value)},
-            )
-            self._bind(
-                gui.add_checkbox("Imitate", True, hint="off: straight to the goal"),
-                lambda s: s.imitation,
-                lambda _s, value: {"imitation": value},
-            )
-            self._bind(
-                gui.add_dropdown(
-                    "Learn", OBJECTIVES, hint="what is fitted to the demonstrations: the motions or eq. (3)"
-                ),
-                lambda s: s.objective,
-                lambda _s, value: {"objective": value},
-            )
-            labels = GENERATOR_LABELS
-            self._bind(
-                gui.add_dropdown("Generator", tuple(labels.values()), hint="the vector field whose flow avoids"),
-                lambda s: labels[s.generator],
-                lambda _s, value: {"generator": next(name for name, label in labels.items() if label == value)},
-            )
-            self._bind(
-                gui.add_slider(
-                    "Reach T",
-                    MIN_TEMPERATURE,
-                    MAX_TEMPERATURE,
-                    0.5,
-                    6.0,
-                    hint="temperature: higher bends more gently, from farther away",
-                ),
-                lambda s: s.temperature,
-                lambda _s, value: {"temperature": value},
-            )
-            self._bind(
-                gui.add_checkbox("Flow time: auto", True, hint="the shortest flow that clears the obstacle"),
-                lambda s: s.duration is None,
-                lambda _s, value: {"duration": None if value else self._duration.value},
-            )
-            self._duration = self._bind(
-                gui.add_slider("Flow time t", 0.0, MAX_MANUAL_DURATION, 0.01, 0.5, disabled=True),
-                lambda s: self._duration.value if s.duration is None else round(s.duration, 2),
-                lambda s, value: {} if s.duration is None else {"duration": value},
-            )
 
     def _build_arm(self) -> None:
         gui = self._gui
@@ -391,6 +317,8 @@ def _set_max(slider: Any, value: int) -> None:
         slider.max = value
 
 
+WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
+_BLUE = ("#1d4f7c", "#e8f1fa")
 _AMBER = ("#8a4b00", "#fff4e0")
 _RED = ("#b3261e", "#fdecea")
 _SMALL = "font-size:0.8em;line-height:1.45;padding:0.1em 0.9em 0.35em;opacity:0.85"
@@ -412,8 +340,8 @@ def status_html(frame: Frame, pace: Pace) -> str:
         ("Clearance", _clearance(health.clearance, "body points" if of_spheres else "end effector")),
         *_collision_rows(health.collision, unknown),
         ("Flow time t", " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None) or off),
-        ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.1e}"),
-        ("There and back", unknown if health.round_trip_error is None else f"{1e3 * health.round_trip_error:.0e} mm"),
+        ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.2g}"),
+        ("There and back", unknown if health.round_trip_error is None else _tiny(health.round_trip_error)),
         ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[health.lyapunov_falls]),
     )
     cells = "".join(
@@ -422,14 +350,21 @@ def status_html(frame: Frame, pace: Pace) -> str:
         for name, value in rows
     )
     warnings = list(health.doubts)
-    if health.clearance < 0 and scenario.avoidance and not (warnings or frame.blocked):
+    if health.clearance < 0 and scenario.avoidance and scenario.warp == 1 and not (warnings or frame.blocked):
         warnings.append("the motions go through the obstacle at this flow time")
     if health.collision is not None:
-        warnings += [problem for problem in health.collision.problems if not any(problem in w for w in warnings)]
+        problems = health.collision.problems if scenario.warp == 1 else health.collision.problems_of_its_own
+        warnings += [problem for problem in problems if not any(problem in w for w in warnings)]
     blocked = ""
     if frame.blocked:
         blocked = _alarm(f"no motion: {'; '.join(frame.blocked)}. What is shown is the last good one.", *_RED)
-    return f"{blocked}<table style='{_SMALL}'>{cells}</table>{''.join(_alarm(w, *_AMBER) for w in warnings)}"
+    hint = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
+    return f"{blocked}<table style='{_SMALL}'>{cells}</table>{hint}{''.join(_alarm(w, *_AMBER) for w in warnings)}"
+
+
+def _tiny(length: float) -> str:
+    """A length in metres that should be next to nothing."""
+    return f"{1e3 * length:.0e} mm" if 0 < length < 1e-4 else f"{1e3 * length:.1f} mm"
 
 
 def _clearance(clearance: float, whose: str) -> str:

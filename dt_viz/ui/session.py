@@ -163,8 +163,10 @@ class Session:
             self._gesture, self._held = ("", 0.0), True
 
     def end_gesture(self) -> None:
-        """The user let go: the next edit is a step of its own for undo."""
+        """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
         with self._lock:
+            if self._held and self._gesture[0] and self._past and self.scenario.moves_like(self._past[-1]):
+                self._past.pop()
             self._gesture, self._held = ("", 0.0), False
 
     def choose_task(self, name: str) -> None:

@@ -1,4 +1,4 @@
-"""The stack of transforms as a list, the outermost on top: each is switched, moved and looked at."""
+"""The stack of transforms as a list, the outermost on top: each is switched, moved, looked at and tuned."""
 
 from __future__ import annotations
 
@@ -11,12 +11,17 @@ import viser
 
 from dt_viz.engine import Frame
 from dt_viz.scenario import Scenario
-from dt_viz.stacking import AVOIDANCE, IMITATION, levels, shifted, switched, visible_names
+from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, levels, shifted, switched, visible_names
+from dt_viz.tuning import avoids, transforms
 from dt_viz.ui import palette
 from dt_viz.ui.levels import manifold
 from dt_viz.ui.session import Session
+from dt_viz.ui.transform_settings import Bind, TransformSettings, durations
+from dt_viz.ui.warp import WarpControls
 
-BASE, ARM = "Base attractor", "Whole arm"
+BASE = "Base attractor"
+BELOW = 1e9
+"""Order of what stands below the rows in their folder."""
 ON, OFF, UP, DOWN, SEE, SEEN = "on", "off", "↑", "↓", "see", "seen"
 
 
@@ -32,8 +37,8 @@ class Row:
 class StackPanel:
     """The stack, a row for each transform."""
 
-    def __init__(self, gui: viser.GuiApi) -> None:
-        """Build an empty list; it acts once `connect` has given it a session."""
+    def __init__(self, gui: viser.GuiApi, bind: Bind) -> None:
+        """Build an empty list, the warp and the settings; they act once `connect` has given them a session."""
         self._gui = gui
         self._session: Session | None = None
         self._folder = gui.add_folder("Stack, the outermost on top")
@@ -42,11 +47,18 @@ class StackPanel:
         self._scenario: Scenario | None = None
         self._durations: dict[str, float | None] = {}
         with self._folder:
-            self._legend = gui.add_html("", order=1e9, visible=False)
+            self._legend = gui.add_html("", order=BELOW, visible=False)
+            self._warp = WarpControls(gui, bind, BELOW + 1)
+            self._settings = TransformSettings(gui, bind, BELOW + 3)
 
     def connect(self, session: Session) -> None:
         """Let the rows edit this session."""
         self._session = session
+        self._warp.connect(session)
+
+    def close(self) -> None:
+        """Stop what plays."""
+        self._warp.close()
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's stack."""
@@ -55,12 +67,14 @@ class StackPanel:
         text = legend_html(scenario)
         if self._legend.content != text:
             self._legend.content, self._legend.visible = text, bool(text)
+        self._settings.adopt(scenario)
 
     def report(self, frame: Frame) -> None:
         """Show which durations were chosen."""
         self._durations = durations(frame)
         if self._scenario is not None:
             self._show(rows(self._scenario, self._durations))
+        self._settings.report(frame)
 
     def _show(self, wanted: tuple[Row, ...]) -> None:
         """Reuse the rows that there are, from the top; those that are not needed are hidden."""
@@ -97,13 +111,6 @@ class StackPanel:
         session.end_gesture()
 
 
-def durations(frame: Frame) -> dict[str, float | None]:
-    """T of the flow of each level, by name; None where it is off."""
-    health, layers = frame.health, frame.scenario.layers
-    chosen = dict(zip((layer.name for layer in layers), health.layer_durations, strict=False))
-    return {**chosen, AVOIDANCE: health.duration, ARM: health.arm_duration}
-
-
 def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row, ...]:
     """The list from the top down, with the durations that the last frame had."""
     on = {layer.name for layer in scenario.layers if layer.on} | ({AVOIDANCE} if scenario.avoidance else set())
@@ -114,8 +121,9 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row
         moves = (UP,) * (k < len(order) - 1) + (DOWN,) * (k > 0)
         look = (_look(scenario, name),) * (name in seen)
         listed.append(Row(name, _label(name, durations.get(name)), (ON if name in on else OFF, *moves, *look)))
-    if scenario.space != "task" and scenario.obstacles:
-        listed.append(Row(ARM, _label(ARM, durations.get(ARM)), (ON if scenario.avoidance else OFF,)))
+    if WHOLE_ARM in transforms(scenario):
+        label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
+        listed.append(Row(WHOLE_ARM, label, (ON if scenario.avoidance else OFF,)))
     imitation = Row(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
     base = Row(BASE, BASE, (SEEN if scenario.view.base else SEE,))
     return (*reversed(listed), imitation, base)
@@ -145,7 +153,7 @@ def _look(scenario: Scenario, name: str) -> str:
 def _switch(scenario: Scenario, name: str) -> dict[str, Any]:
     if name == IMITATION:
         return {"imitation": not scenario.imitation}
-    if name in {AVOIDANCE, ARM}:
+    if avoids(name):
         return {"avoidance": not scenario.avoidance}
     return {"layers": switched(scenario.layers, name)}
 
@@ -154,7 +162,7 @@ def _select(scenario: Scenario, name: str) -> dict[str, Any]:
     view = scenario.view
     if name == BASE:
         return {"view": replace(view, base=not view.base)}
-    return {"view": replace(view, level="" if view.level == name else name)}
+    return {"view": replace(view, level="" if view.level == name else name, tuned=name)}
 
 
 _ACTIONS: dict[str, Callable[[Scenario, str], dict[str, Any]]] = {

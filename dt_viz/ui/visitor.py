@@ -115,6 +115,7 @@ class Visitor:
 
     def close(self) -> None:
         """The visitor has left: stop all threads."""
+        self._panel.close()
         self.session.close()
         self._playback.close()
 

@@ -1,0 +1,252 @@
+"""The warp and the settings of the transforms in the page, without a browser."""
+
+import time
+from dataclasses import replace
+from typing import Any, cast
+
+import pytest
+import viser  # noqa: TID251 - a page of its own
+
+from dt_viz.bias import BiasPoint
+from dt_viz.collision import CollisionReport, Nearest
+from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.health import Health
+from dt_viz.integration import Integration
+from dt_viz.obstacles import Sphere
+from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import AVOIDANCE, IMITATION, bias_points, with_bias_point
+from dt_viz.ui.panel import status_html
+from dt_viz.ui.session import Pace, Session
+from dt_viz.ui.transform_settings import TransformSettings, learned_html
+from dt_viz.ui.warp import WarpPlayer
+
+LAYERS = with_bias_point((), BiasPoint((0.2, -0.5, 0.4)))
+SCENARIO = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), layers=LAYERS)
+PACE = Pace(0.02, 30.0, 0)
+
+
+def frame(scenario=SCENARIO, **changes):
+    nothing: Any = None
+    health = Health(0.01, duration=0.4, layer_durations=(0.8,))
+    empty = Frame(
+        scenario=scenario,
+        task=nothing,
+        stage=Stage.CERTIFIED,
+        ghost=(),
+        rollouts=(),
+        times=(),
+        levels=(),
+        goal=nothing,
+        reached=nothing,
+        blocked=(),
+        health=health,
+        learned_steps=(4, 4, 4),
+    )
+    return replace(empty, **changes)
+
+
+@pytest.fixture(scope="module")
+def server():
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+class Controls:
+    """The settings, and what was bound, by label; it acts on a scenario as the panel does."""
+
+    def __init__(self, gui):
+        self.bound: dict[str, Any] = {}
+        self.scenario = SCENARIO
+        self.settings = TransformSettings(gui, self.bind, 0)
+        self.adopt(SCENARIO)
+
+    def bind(self, handle, read, change):
+        self.bound[handle.label] = handle, read, change
+        return handle
+
+    def adopt(self, scenario):
+        self.scenario = scenario
+        self.settings.adopt(scenario)
+        for handle, read, _ in self.bound.values():
+            handle.value = read(scenario)
+
+    def set(self, label, value):
+        self.adopt(replace(self.scenario, **self.bound[label][2](self.scenario, value)))
+
+    @property
+    def visible(self):
+        return {label for label, (handle, *_) in self.bound.items() if handle.visible}
+
+    def value(self, label):
+        return self.bound[label][0].value
+
+
+@pytest.fixture
+def controls(server):
+    yield Controls(server.gui)
+    server.gui.reset()
+
+
+FLOW = {"Settings of", "Flow time: auto", "Flow time t", "Integrator"}
+
+
+def test_only_what_the_chosen_transform_has_is_shown(controls):
+    assert controls.visible == FLOW | {"Avoid with", "Generator", "Reach T"}  # the outermost is the avoidance
+    controls.set("Settings of", "Bias 1")
+    assert controls.visible == FLOW
+    controls.set("Integrator", "Euler (the paper's)")
+    assert controls.visible == FLOW | {"Steps"}
+    controls.set("Settings of", IMITATION)
+    assert controls.visible == {"Settings of", "Learn"}
+    assert controls.settings._note.visible
+
+
+def test_settings_change_the_transform_that_they_are_shown_for(controls):
+    controls.set("Settings of", "Bias 1")
+    controls.set("Integrator", "Euler (the paper's)")
+    controls.set("Steps", 3)
+    assert bias_points(controls.scenario.layers)["Bias 1"].integration == Integration("euler", 3)
+    assert controls.scenario.integration == SCENARIO.integration
+    controls.set("Settings of", AVOIDANCE)
+    assert (controls.value("Integrator"), controls.value("Steps")) == ("auto", 8)
+    controls.set("Reach T", 9.0)
+    assert controls.scenario.temperature == 9.0
+
+
+def test_a_duration_by_hand_goes_on_from_what_auto_chose(controls):
+    for name, chosen in ((AVOIDANCE, 0.4), ("Bias 1", 0.8)):
+        controls.set("Settings of", name)
+        controls.settings.report(frame(controls.scenario))
+        slider = controls.bound["Flow time t"][0]
+        assert slider.disabled and slider.value == chosen
+        assert controls.bound["Flow time t"][2](controls.scenario, 1.5) == {}  # it is `auto` that chooses
+        controls.set("Flow time: auto", False)
+        assert not slider.disabled and slider.value == chosen
+        controls.set("Flow time t", 1.5)
+    assert controls.scenario.duration == 1.5
+    assert bias_points(controls.scenario.layers)["Bias 1"].strength == 1.5
+    controls.set("Flow time: auto", True)
+    assert bias_points(controls.scenario.layers)["Bias 1"].strength is None
+
+
+def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choose(controls):
+    controls.settings.report(frame())
+    assert "3 flows of 4 Euler steps" in controls.settings._note.content
+    assert "nothing to choose" in controls.settings._note.content
+    assert "One flow of 12 Euler steps" in learned_html((12,))
+    assert "straight" in learned_html(())
+
+
+# --- The warp ---
+
+
+def report(obstacle):
+    return CollisionReport(
+        obstacle=Nearest(obstacle, ("finger 1",), 0), itself=None, table=Nearest(-0.02, ("link 5",), 0)
+    )
+
+
+def test_a_warp_is_a_hint_and_what_it_enters_no_alarm():
+    health = Health(-0.03, collision=report(-0.04))
+    half = status_html(frame(replace(SCENARIO, warp=0.5), health=health), PACE)
+    assert "Warp at 0.50" in half and "-30.0 mm" in half
+    assert "finger 1 enters" not in half.lower() and "go through the obstacle" not in half
+    assert "Link 5 is 20 mm below the table" in half  # that is none of the obstacle's
+    full = status_html(frame(health=health), PACE)
+    assert "Warp at" not in full and "Finger 1 enters" in full
+
+
+def test_what_is_lost_is_a_number_that_can_be_read():
+    lost = [status_html(frame(health=Health(0.01, round_trip_error=e)), PACE) for e in (0.0, 3e-8, 0.2471)]
+    for text, expected in zip(lost, (">0.0 mm<", ">3e-05 mm<", ">247.1 mm<"), strict=True):
+        assert expected in text
+
+
+class Sketches:
+    """Stands in for an engine."""
+
+    def frames(self, scenario, progress=None, checkpoint=None):
+        yield frame(scenario)
+
+
+class Quiet:
+    """A display that shows nothing."""
+
+    def __getattr__(self, name):
+        return lambda *_: None
+
+
+@pytest.fixture
+def session():
+    session = Session(cast(Engine, Sketches()), lambda _: SCENARIO, "draw_s", cast(Any, Quiet()))
+    yield session
+    session.close()
+
+
+def wait_until(condition):
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(session, monkeypatch):
+    edit = session.edit
+    session.edit("Warp", warp=0.7)
+    session.end_gesture()
+    told = []
+    player = WarpPlayer(told.append, seconds=0.3)
+    warps = []
+    monkeypatch.setattr(session, "edit", lambda name, warp: warps.append(warp) or edit(name, warp=warp))
+    player.toggle(session)
+    wait_until(lambda: told == [True, False])
+    assert warps == sorted(warps) and warps[0] < 0.3 and warps[-1] == 1
+    assert session.scenario == SCENARIO
+    session.undo()
+    assert session.scenario.warp == 0.7
+    session.undo()
+    assert session.scenario == SCENARIO
+
+
+def test_playing_that_ends_as_it_began_leaves_nothing_to_undo(session):
+    session.edit("T", temperature=9.0)
+    session.end_gesture()
+    told = []
+    player = WarpPlayer(told.append, seconds=0.2)
+    player.toggle(session)
+    wait_until(lambda: told == [True, False])
+    session.undo()
+    assert session.scenario == SCENARIO
+
+
+def test_playing_stops_when_it_is_told_to_or_something_else_is_moved(session):
+    told = []
+    player = WarpPlayer(told.append, seconds=1000.0)
+    player.toggle(session)
+    wait_until(lambda: session.scenario.warp < 0.5)
+    session.edit("view", view=View(grid=True))  # moves nothing
+    assert player.playing
+    player.toggle(session)
+    wait_until(lambda: not player.playing)
+    assert told == [True, False]
+    player.toggle(session)
+    wait_until(lambda: told == [True, False, True])
+    session.edit("obstacle", obstacles=(), warp=0.9)
+    wait_until(lambda: not player.playing)
+    assert session.scenario.warp == 0.9
+
+
+def test_closing_ends_playing(session):
+    player = WarpPlayer(lambda _: None, seconds=1000.0)
+    player.toggle(session)
+    player.close()
+    assert not player.playing
+
+
+def test_a_reset_and_another_task_begin_with_the_full_stack(session):
+    session.edit("Warp", warp=0.4)
+    session.reset()
+    assert session.scenario.warp == 1.0
+    session.undo()
+    assert session.scenario.warp == 0.4

@@ -1,0 +1,156 @@
+"""The warp from straight rays to the whole stack: a diffeomorphism with its goal all the way, full at the end."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dt_viz.engine
+from dt_viz.bias import BiasPoint
+from dt_viz.engine import Stage
+from dt_viz.metrics import maximum_collision_distance
+from dt_viz.obstacles import Sphere
+from dt_viz.paper_scenes import SCENES
+from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import place_beside, with_bias_point
+
+WARPS = (0.0, 0.15, 0.5, 0.85)
+
+
+def stacked(engine, task, **changes):
+    """An obstacle on the path and a bias point beside it."""
+    task = engine.task(task)
+    plain = Scenario(task.name, (Sphere(task.obstacle_position),))
+    return replace(plain, layers=with_bias_point((), place_beside(task, plain)), **changes)
+
+
+def stage(engine, scenario, wanted):
+    return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+
+
+def aside(path):
+    """Distances (T,) of a path from the straight line between its ends."""
+    along = (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
+    offset = path - path[0]
+    return np.linalg.norm(offset - np.outer(offset @ along, along), axis=1)
+
+
+@pytest.mark.parametrize("warp", WARPS)
+@pytest.mark.parametrize(("task", "space"), [("draw_s", "task"), ("lift_box", "task"), ("push_box", "cspace")])
+def test_motions_begin_and_end_where_they_should_and_certificates_hold_at_every_warp(engine, task, space, warp):
+    scenario = stacked(engine, task, space=space, warp=warp)
+    frames = list(engine.frames(scenario))
+    for frame in frames:
+        tolerance = 1e-5 if frame.stage >= Stage.FINE else 5e-4
+        for path, start in zip(frame.rollouts, frame.task.starts, strict=True):
+            np.testing.assert_allclose(path[0], start, rtol=0, atol=tolerance)
+            np.testing.assert_allclose(path[-1], frame.goal, rtol=0, atol=tolerance)
+        for times in frame.times:
+            assert (np.diff(times) > 0).all()
+    health = frames[-1].health
+    assert health.min_det_jacobian > 0
+    assert health.round_trip_error < 1e-6
+    assert health.lyapunov_falls
+
+
+@pytest.mark.parametrize("task", ["draw_s", "lift_box"])
+def test_without_any_warp_motions_are_straight_and_so_is_space(engine, task):
+    scenario = stacked(engine, task, warp=0.0, view=View(grid=True))
+    frame = stage(engine, scenario, Stage.FINE)
+    for path in frame.rollouts:
+        assert aside(path).max() < 1e-9
+    assert frame.pictures.grid is not None and len(frame.pictures.grid.lines) > 10
+    for line in frame.pictures.grid.lines:
+        assert aside(line).max() < 1e-9
+    to_goal = frame.goal - frame.pictures.field.points
+    cosine = (to_goal * frame.pictures.field.velocities).sum(axis=1)
+    cosine /= np.linalg.norm(to_goal, axis=1) * np.linalg.norm(frame.pictures.field.velocities, axis=1)
+    assert cosine.min() > 1 - 1e-9
+
+
+def test_motions_bend_more_and_more_and_the_grid_with_them(engine):
+    bends = []
+    for warp in (*WARPS, 1.0):
+        frame = stage(engine, replace(stacked(engine, "draw_s"), warp=warp, view=View(grid=True)), Stage.LIVE)
+        bends.append(
+            [max(aside(path).max() for path in lines) for lines in (frame.rollouts, frame.pictures.grid.lines)]
+        )
+    rollouts, lines = np.transpose(bends)
+    assert (np.diff(rollouts) > 0).all()
+    assert (np.diff(lines[:-1]) > 0).all()  # at last they leave the picture, and are cut shorter
+
+
+@pytest.mark.parametrize("space", ["task", "cspace"])
+def test_a_nearly_full_warp_is_nearly_the_stack_and_a_full_one_is_the_stack(engine, new_engine, space):
+    scenario = stacked(engine, "push_box", space=space)
+    fresh = stage(new_engine(), scenario, Stage.FINE)
+    used = new_engine()
+    for warp in (1.0, 0.3, 1 - 1e-9):
+        frame = stage(used, replace(scenario, warp=warp), Stage.FINE)
+    for path, full in zip(frame.rollouts, fresh.rollouts, strict=True):
+        distance = np.linalg.norm(path[:, None] - full, axis=2)
+        assert distance.min(axis=0).max() < 0.006 and distance.min(axis=1).max() < 0.006
+    again = stage(used, scenario, Stage.FINE)
+    for path, full in zip(again.rollouts, fresh.rollouts, strict=True):
+        np.testing.assert_array_equal(path, full)
+
+
+def test_what_auto_chose_for_the_full_stack_stays_and_is_worked_out_once(new_engine, engine, monkeypatch):
+    solved = []
+    solve = dt_viz.engine.solve
+    monkeypatch.setattr(dt_viz.engine, "solve", lambda *args: solved.append(args) or solve(*args))
+    fresh, scenario = new_engine(), stacked(engine, "draw_s")
+    full = stage(fresh, scenario, Stage.FINE)
+    for warp in (0.9, 0.4, 0.0, 1.0):
+        frame = stage(fresh, replace(scenario, warp=warp), Stage.FINE)
+        assert frame.health.duration == full.health.duration
+        assert frame.health.layer_durations == full.health.layer_durations
+    assert len(solved) == 2  # live and fine
+    stage(fresh, replace(scenario, warp=0.4, temperature=3.0), Stage.LIVE)
+    assert len(solved) == 3
+
+
+def test_where_the_warp_passes_through_the_obstacle_that_is_told_and_not_doubted(engine):
+    for space in ("task", "cspace"):
+        scenario = replace(stacked(engine, "draw_s", space=space, warp=0.1), layers=())
+        *_, frame = engine.frames(scenario)
+        depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
+        assert depth > 0.02 and frame.health.clearance < -0.02
+        assert frame.health.doubts == ()
+
+
+def test_no_warp_of_the_whole_arm_leaves_the_joint_limits(engine, robot):
+    for warp in WARPS:
+        frame = stage(engine, replace(stacked(engine, "push_box", space="cspace"), warp=warp), Stage.LIVE)
+        assert (frame.arm.q > robot.lower).all() and (frame.arm.q < robot.upper).all()
+
+
+def test_a_goal_that_the_stack_moves_moves_along(engine):
+    scene = SCENES["left_pot"]
+    full = scene.scenario(engine.task(scene.task))
+    goal = stage(engine, replace(full, warp=0.0), Stage.FINE).reached
+    there = stage(engine, full, Stage.FINE).reached
+    for warp in (0.25, 0.5):
+        frame = stage(engine, replace(full, warp=warp), Stage.FINE)
+        np.testing.assert_allclose(frame.reached, goal + warp * (there - goal), rtol=0, atol=1e-6)
+        for path in frame.rollouts:
+            np.testing.assert_allclose(path[-1], frame.reached, rtol=0, atol=1e-6)
+
+
+def test_the_undeformed_rollouts_and_their_joints_stay_those_of_the_demonstrations(engine):
+    scenario = stacked(engine, "draw_s")
+    full, half = (stage(engine, replace(scenario, warp=warp), Stage.LIVE) for warp in (1.0, 0.5))
+    for a, b in zip(full.ghost, half.ghost, strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_allclose(half.arm.without[[0, -1]], full.arm.without[[0, -1]], rtol=0, atol=1e-6)
+
+
+def test_a_bias_point_pulls_less_the_less_it_is_warped(engine):
+    task = engine.task("draw_s")
+    target = place_beside(task, Scenario("draw_s", ())).position
+    scenario = Scenario("draw_s", (), imitation=False, layers=with_bias_point((), BiasPoint(target)))
+    nearest = []
+    for warp in (0.0, 0.5, 1.0):
+        frame = stage(engine, replace(scenario, warp=warp), Stage.FINE)
+        nearest.append(max(np.linalg.norm(path - target, axis=1).min() for path in frame.rollouts))
+    assert nearest == sorted(nearest, reverse=True) and nearest[-1] < 0.0101
