@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,6 +47,8 @@ class Pushed:
     """(T, 3) the end effector at the times of the motion, metres."""
     begins: int
     """The sample where the push is over and the system's own motion begins."""
+    doubt: str = ""
+    """Why the arm is not where it should be, or its motion not to be trusted, in words."""
 
 
 def pushed(
@@ -94,7 +97,7 @@ def _places(
     rng: np.random.Generator,
 ) -> Iterator[Array]:
     """Places (3,), metres, to push the end effector to, the farthest first."""
-    hand = follower.robot.end_effector(_below(follower, arm, q))
+    hand = follower.robot.end_effector(below(follower, arm, q))
     directions = _across(stack.system, hand, rng)
     for distance in DISTANCES:
         yield from hand + distance * directions
@@ -109,8 +112,8 @@ def _across(system: DiffeomorphicSystem, hand: Array, rng: np.random.Generator) 
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _below(follower: Follower, arm: ArmSolution | None, q: Array) -> Array:
-    """The configuration (6,) of the motion that the whole arm's avoidance is made for."""
+def below(follower: Follower, arm: ArmSolution | None, q: Array) -> Array:
+    """The configuration (6,) of the motion that the whole arm's avoidance is made for, rad."""
     return q if arm is None else arm.transform.forward(follower.whole_arm.limits.inside(q))
 
 
@@ -124,17 +127,57 @@ def _motion(
     place: Array,
 ) -> tuple[Pushed, float]:
     """The motion by way of `place` (3,), and how much room it has, metres; below 0 there is too little."""
-    robot, below = follower.robot, _below(follower, arm, q)
-    rays = Rays(stack.system.transform.forward(place[None]), stack.rays.base)
-    bundle = evenly_sampled(lambda i, u: stack.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
-
+    posture = below(follower, arm, q)
     u = np.linspace(0, 1, NUM_PUSH_SAMPLES)
-    hand = robot.end_effector(below)
+    hand = follower.robot.end_effector(posture)
     aside = hand + (u * u * (3 - 2 * u))[:, None] * (place - hand)
-    path = np.concatenate([aside[:-1], bundle.positions])
-    times = np.concatenate([PUSH_SECONDS * u[:-1], PUSH_SECONDS + rays.times(bundle.index, bundle.fraction)])
+    found, room = onwards(follower, ground, scenario, stack, arm, posture, aside, PUSH_SECONDS * u)
+    return found, min(room)
 
-    tracked = track(robot, path, below, reference=follower.reference(ground))
+
+class Room(NamedTuple):
+    """What a motion has, metres; below 0 there is too little."""
+
+    table: float
+    """Height above the table."""
+    tracking: float
+    """Exactness with which the joints follow."""
+    obstacle: float
+    """Distance of what avoids the obstacle."""
+
+
+def onwards(
+    follower: Follower,
+    ground: Ground,
+    scenario: Scenario,
+    stack: Solution,
+    arm: ArmSolution | None,
+    posture: Array,
+    aside: Array,
+    seconds: Array,
+) -> tuple[Pushed, Room]:
+    """The motion along a path and on from its end to the goal, and how much room it has.
+
+    Args:
+        follower: lifts paths to the joints.
+        ground: the undisturbed motion.
+        scenario: what is shown.
+        stack: its system of the end effector.
+        arm: its whole-arm avoidance, None where only the end effector avoids.
+        posture: (6,) joints near the beginning of the path, rad, as those of `below`.
+        aside: (K, 3) the path, metres, of the end effector of the motion below the whole arm's avoidance.
+        seconds: (K,) times on the path.
+
+    Raises:
+        UnreachableError: the arm cannot get to where the motions start.
+    """
+    robot = follower.robot
+    rays = Rays(stack.system.transform.forward(aside[-1:]), stack.rays.base)
+    bundle = evenly_sampled(lambda i, u: stack.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
+    path = np.concatenate([aside[:-1], bundle.positions])
+    times = np.concatenate([seconds[:-1], seconds[-1] + rays.times(bundle.index, bundle.fraction)])
+
+    tracked = track(robot, path, posture, reference=follower.reference(ground))
     joints = tracked.q
     if arm is not None:
         joints = arm.transform.inverse(follower.whole_arm.limits.inside(joints))
@@ -142,10 +185,9 @@ def _motion(
     motion = ArmMotion(within_velocity_limits(times, joints, robot.velocity_limits), joints, tracked.q)
 
     lowest = min(TABLE_ROOM, float(stack.bundle.positions[:, 2].min())) - LOWER
-    room = min(float(path[:, 2].min()) - lowest, MAX_TRACKING_ERROR - float(tracked.error.max()))
     if arm is not None:
-        room = min(room, float(follower.whole_arm.clearance(joints, scenario.obstacle).min()))
+        clearance = float(follower.whole_arm.clearance(joints, scenario.obstacle).min())
     else:
-        avoiding = path if scenario.avoidance else aside
-        room = min(room, float(scenario.obstacle.signed_distance(avoiding).min()))
-    return Pushed(scenario, motion, path, NUM_PUSH_SAMPLES - 1), room
+        clearance = float(scenario.obstacle.signed_distance(path if scenario.avoidance else aside).min())
+    room = Room(float(path[:, 2].min()) - lowest, MAX_TRACKING_ERROR - float(tracked.error.max()), clearance)
+    return Pushed(scenario, motion, path, len(aside) - 1), room

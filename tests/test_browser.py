@@ -15,6 +15,7 @@ import dt_viz.fits
 from dt_viz.fits import FitStore
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles import MeshObstacle
+from dt_viz.robot import load_jaco
 from dt_viz.scenario import View
 from dt_viz.stacking import bias_points
 from dt_viz.tasks import TASKS
@@ -427,3 +428,30 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
     page.get_by_text("Smallest det J").wait_for(timeout=1000 * PATIENCE)
     assert page.get_by_role("button", name="Cancel").count() == 0
+
+
+def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_go(visit):
+    page, visitor = visit
+    session = visitor.session
+    session.edit("test", obstacles=(), view=View(playing=False, field=False, table=False, demonstrations=False))
+    wait_until(
+        lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion without obstacle"
+    )
+    assert visitor.grip.ball.visible
+    robot, deadline = load_jaco(), time.monotonic() + PATIENCE
+    before = visitor._hand()
+    while visitor.pushed_path.pushed is None:  # again, if the page had not drawn the ball yet
+        assert time.monotonic() < deadline
+        x, y = project(visitor, before)
+        drag(page, (x, y), (x - 50, y - 40), steps=8)
+        time.sleep(0.5)
+    wait_until(lambda: session.wait_idle(0.3), "the last event")
+    pushed, hand = visitor.pushed_path.pushed, visitor._hand()
+    np.testing.assert_allclose(pushed.path[0], hand, atol=1e-3)
+    assert np.linalg.norm(hand - before) > 0.05
+    assert abs(hand[1] - before[1]) < 5e-3  # parallel to the drawing plane, y = const
+    np.testing.assert_allclose(project(visitor, hand), (x - 50, y - 40), atol=12)
+    np.testing.assert_allclose(robot.end_effector(pushed.motion.q[-1]), visitor.shown.goal, atol=1e-3)
+    session.edit("play", view=View(speed=3.0, field=False, table=False, demonstrations=False))
+    wait_until(lambda: np.linalg.norm(visitor._hand() - visitor.shown.goal) < 5e-3, "the goal")
+    wait_until(lambda: visitor.pushed_path.pushed is None, "the loop to begin again")

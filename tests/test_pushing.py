@@ -173,3 +173,29 @@ def test_a_pause_holds_a_detour(player):
     assert recorder.poses[-1] == held
     playback.set_pace(True, 1.0)
     recorder.wait(lambda place: place == 4.0)
+
+
+def test_a_held_arm_stays_where_it_is_held_also_while_it_is_played_and_goes_on_when_it_is_let_go(player):
+    playback, recorder = player
+    ended = []
+    playback.hold(None, lambda: ended.append("before there is a motion"))
+    playback.follow(ramp(0.0, 1.0, 0.5))
+    recorder.wait(lambda place: place > 0.3)
+    playback.hold(None, lambda: ended.append("stopped"))
+    time.sleep(0.1)
+    held = recorder.poses[-1]
+    time.sleep(0.2)
+    assert recorder.poses[-1] == held
+    for place in (5.0, 6.0, 7.0):
+        playback.hold(ramp(place, 8.0, 0.5), lambda: ended.append("held"))
+        recorder.wait(lambda posed, place=place: posed == place)
+    time.sleep(0.1)
+    assert recorder.poses[-1] == 7.0 and ended == []
+    playback.take_detour(ramp(7.0, 8.0, 0.3), lambda: ended.append("over"))
+    recorder.wait(lambda place: place == 8.0)
+    recorder.wait(lambda place: place <= 1.0)
+    assert ended == ["over"]
+    playback.hold(ramp(5.0, 8.0, 0.5), lambda: ended.append("held"))
+    playback.end_detour()
+    recorder.wait(lambda place: place <= 1.0)
+    assert ended == ["over", "held"]

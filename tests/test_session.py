@@ -36,6 +36,7 @@ class FakeEngine:
         self.begun, self.gate = threading.Event(), None
         self.unlearned, self.learning = set(), threading.Event()
         self.pushes, self.pushable = [], True
+        self.holds = []
 
     def frames(self, scenario, progress=None, checkpoint=None):
         self.asked.append(scenario)
@@ -57,6 +58,11 @@ class FakeEngine:
     def pushed(self, scenario, q, rng):
         self.pushes.append((scenario, q, rng.random(), threading.current_thread().name))
         return ("pushed", scenario) if self.pushable else None
+
+    def held(self, scenario, q, place):
+        self.holds.append(tuple(place))
+        time.sleep(0.002)
+        return ("held", tuple(place)) if self.pushable else None
 
 
 class Page:
@@ -627,3 +633,80 @@ def test_a_motion_that_cannot_be_pushed_shows_nothing(opened):
     shown = push(opened)
     opened.settle()
     assert shown == [] and opened.page.errors == []
+
+
+# --- Holding the hand ---
+
+
+def hold(opened, x, shown, *, last=False):
+    return opened.session.hold(np.zeros(6), np.array([x, 0.0, 0.0]), shown.append, last=last)
+
+
+def test_a_hand_that_is_held_is_followed_without_new_frames(opened):
+    num_frames, shown = len(opened.page.frames), []
+    for x in (1.0, 2.0):
+        assert hold(opened, x, shown)
+        opened.settle()
+    assert hold(opened, 3.0, shown, last=True)
+    opened.settle()
+    assert shown == [("held", (x, 0.0, 0.0)) for x in (1.0, 2.0, 3.0)]
+    assert len(opened.page.frames) == num_frames
+    opened.session.undo()
+    assert opened.session.scenario == fresh("draw_s")
+
+
+def test_only_the_newest_place_of_several_threads_is_done_next_and_the_last_one_always(opened):
+    shown, lock, count = [], threading.Lock(), iter(range(1, 1000))
+
+    def storm():
+        for _ in range(40):
+            with lock:
+                hold(opened, float(next(count)), shown)
+
+    threads = [threading.Thread(target=storm) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    opened.settle()
+    places = [place[0] for _, place in shown]
+    assert places == sorted(places) and places[-1] == 160.0
+    assert len(opened.engine.holds) == len(places) < 160
+
+
+def test_frames_wait_while_the_hand_is_held_and_are_completed_when_it_is_let_go(opened):
+    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
+    opened.session.edit("grid", view=View(grid=True))
+    assert opened.engine.begun.wait(PATIENCE)
+    shown = []
+    assert hold(opened, 1.0, shown)
+    opened.engine.gate.set()
+    opened.settle()
+    assert len(shown) == 1 and opened.page.frames[-1].stage is not max(Stage)
+    hold(opened, 1.0, shown, last=True)
+    opened.settle()
+    assert opened.shown.view.grid and opened.page.frames[-1].stage is max(Stage)
+
+
+def test_a_view_that_is_edited_while_the_hand_is_held_is_shown_and_loses_no_release(opened):
+    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
+    opened.session.edit("grid", view=View(grid=True))
+    assert opened.engine.begun.wait(PATIENCE)
+    shown = []
+    hold(opened, 1.0, shown, last=True)
+    opened.session.edit("grid", view=View(grid=True, base=True))  # overtakes it in the worker's slot
+    opened.engine.gate.set()
+    opened.settle()
+    assert shown == [("held", (1.0, 0.0, 0.0))]
+    assert opened.shown.view.base and opened.page.frames[-1].stage is max(Stage)
+
+
+def test_nothing_is_held_while_another_motion_is_computed(opened):
+    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    assert opened.engine.begun.wait(PATIENCE)
+    shown = []
+    assert not hold(opened, 1.0, shown)
+    opened.engine.gate.set()
+    opened.settle()
+    assert shown == [] and opened.shown.obstacles[0] == at(1.0)

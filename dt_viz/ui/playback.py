@@ -36,6 +36,8 @@ class _Detour:
     ended: Callable[[], None]
     offsets: tuple[Array, Array] | None
     """(6,) each: from the motion's first postures to those of the arms when it began, rad."""
+    held: bool = False
+    """Whether the arm stays at its beginning."""
     clock: float = 0.0
 
     @property
@@ -87,6 +89,19 @@ class Playback:
         with self._changing:
             self._detour = _Detour(motion, ended, offsets)
 
+    def hold(self, motion: ArmMotion | None, ended: Callable[[], None]) -> None:
+        """Keep the arm at the beginning of a motion, or where it is if that is None, until a detour begins or ends.
+
+        `ended` is called when it ends, not when another detour begins.
+        """
+        if motion is None:
+            if self._posed is None:
+                return
+            q, without = (np.stack([posed, posed]) for posed in self._posed)
+            motion = ArmMotion(np.array([0.0, 1.0]), q, without)
+        with self._changing:
+            self._detour = _Detour(motion, ended, None, held=True)
+
     def end_detour(self) -> None:
         """Go on with the loop now."""
         detour = self._detour
@@ -116,7 +131,7 @@ class Playback:
             step = self._speed * (now - before) if self._playing else 0.0
             before, motion, detour = now, self._motion, self._detour
             if detour is not None:
-                detour.clock += step
+                detour.clock += 0.0 if detour.held else step
                 if detour.over:
                     self._clock = 0.0
                     self._leave(detour)

@@ -22,7 +22,8 @@ class PushButton:
             "Push the hand",
             icon=viser.Icon.HAND_FINGER,
             disabled=True,
-            hint="a few centimetres to a side, while the arm moves: it goes on from there, and still reaches the goal",
+            hint="a few centimetres to a side, while the arm moves: it goes on from there, and still reaches the goal; "
+            "or drag the ball at the hand",
         )
         self._moves, self._plays = False, True
 

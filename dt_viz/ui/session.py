@@ -44,15 +44,18 @@ class Pace:
 
 
 @dataclass(frozen=True)
-class _Push:
-    """What a push needs."""
+class _Request:
+    """Something to do with the arm, which is no edit."""
 
-    q: Array
-    show: Callable[[Pushed], None]
+    compute: Callable[[Scenario], Pushed | None]
+    show: Callable[[Pushed | None], None]
+    """Given what the arm does then; None where another motion than the scenario's is shown."""
+    goes_on: bool = False
+    """Whether more such requests follow soon, so that refining the frames would be in vain."""
 
 
-_Job = tuple[Scenario, float, _Push | None]
-"""What to compute, when it was asked for, and what to do before."""
+_Job = tuple[Scenario, float]
+"""What to compute, and when it was asked for."""
 
 
 class _UnwantedError(Exception):
@@ -118,6 +121,8 @@ class Session:
         self._learning = self._stopped = self._closed = False
         self._shown: Scenario | None = None
         self._complete = False
+        self._request: _Request | None = None
+        """The newest one, until the worker comes to it; edits do not replace it."""
         self._rng = np.random.default_rng(0)
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
@@ -221,9 +226,36 @@ class Session:
             q: (6,) joint angles when the push begins, rad.
             show: given what the arm does then. Called on the worker thread.
         """
+
+        def shown(pushed: Pushed | None) -> None:
+            if pushed is not None:
+                show(pushed)
+
+        self._ask(_Request(lambda scenario: self._engine.pushed(scenario, q, self._rng), shown))
+
+    def hold(self, q: Array, place: Array, show: Callable[[Pushed | None], None], *, last: bool) -> bool:
+        """Hold the hand at a place. Of several that are waiting only the newest is done.
+
+        Args:
+            q: (6,) joint angles now, rad.
+            place: (3,) where the hand should be, metres.
+            show: given where the arm is then, and how it would go on; None where another motion than the scenario's is
+                shown. Called on the worker thread.
+            last: whether the hand is let go there.
+
+        Returns:
+            Whether `show` will be called, unless a newer request comes first: not while another motion than the
+            scenario's is shown.
+        """
+        return self._ask(_Request(lambda scenario: self._engine.held(scenario, q, place), show, goes_on=not last))
+
+    def _ask(self, request: _Request) -> bool:
         with self._lock:
-            if self._shown is not None and self.scenario.moves_like(self._shown):
-                self._submit(_Push(q, show))
+            possible = self._shown is not None and self.scenario.moves_like(self._shown)
+            if possible:
+                self._request = request
+                self._submit()
+        return possible
 
     def undo(self) -> None:
         """Take the last gesture back."""
@@ -287,9 +319,9 @@ class Session:
         self._submit()
         return True
 
-    def _submit(self, push: _Push | None = None) -> None:
+    def _submit(self) -> None:
         self._stopped = False
-        self._worker.submit((self.scenario, time.perf_counter(), push))
+        self._worker.submit((self.scenario, time.perf_counter()))
 
     def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:
         try:
@@ -313,17 +345,18 @@ class Session:
             self._learning = True
         self._display.learning(fraction, message)
 
-    def _pushed(self, scenario: Scenario, push: _Push) -> bool:
-        """Show the push; whether the frames of the scenario, which it may have interrupted, are complete."""
-        pushed = self._engine.pushed(scenario, push.q, self._rng)
-        if pushed is not None:
-            push.show(pushed)
-        return self._complete and self._shown is not None and scenario.computes_like(self._shown)
+    def _serve(self, scenario: Scenario, request: _Request) -> bool:
+        """Do what is asked for; whether the frames of the scenario, which it may have interrupted, can wait."""
+        request.show(request.compute(scenario))
+        can_wait = self._complete or request.goes_on
+        return can_wait and self._shown is not None and scenario.computes_like(self._shown)
 
     def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
-        scenario, edited, push = job
-        if push is not None:
-            if self._pushed(scenario, push):
+        scenario, edited = job
+        with self._lock:
+            request, self._request = self._request, None
+        if request is not None:
+            if self._serve(scenario, request):
                 return
             edited = time.perf_counter()
         wanted = partial(_end_if, superseded)

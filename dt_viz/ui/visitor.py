@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import viser
 
@@ -19,6 +20,7 @@ from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
 from dt_viz.ui.arm_layers import Arms
 from dt_viz.ui.export import RESOLUTIONS, render_png
+from dt_viz.ui.grip import Grip
 from dt_viz.ui.panel import Panel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.push import PushedPath
@@ -66,6 +68,8 @@ class Visitor:
             )
             self.arms = Arms(client.scene, robot)
             self.pushed_path = PushedPath(client.scene)
+            self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
+        self._robot = robot
         self._playback = Playback(self._pose)
         self._panel = Panel(client.gui, titles, robot, self._save_png)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
@@ -89,6 +93,7 @@ class Visitor:
             if self.pushed_path.is_of_another(frame.scenario):
                 self._playback.end_detour()
             self._playback.follow(frame.arm)
+            self.grip.draw(frame)
             self._panel.report(frame, pace)
         self.client.flush()
         self.shown = frame
@@ -161,14 +166,44 @@ class Visitor:
 
     def _show_pushed(self, pushed: Pushed) -> None:
         self.pushed_path.show(pushed)
-        self._playback.take_detour(pushed.motion, self.pushed_path.hide)
+        self._playback.take_detour(pushed.motion, self._detour_ended)
+
+    def _detour_ended(self) -> None:
+        self.pushed_path.hide()
+        self.grip.say("")
+
+    def _hand(self) -> Array | None:
+        q = self._playback.q
+        return None if q is None else self._robot.end_effector(q)
+
+    def _hand_held(self, place: Array, phase: str) -> None:
+        q, last = self._playback.q, phase == "end"
+        if q is None:
+            return
+        if phase == "start":
+            self._playback.hold(None, self._detour_ended)
+        if not self.session.hold(q, place, partial(self._show_held, last=last), last=last) and last:
+            self._playback.end_detour()
+
+    def _show_held(self, pushed: Pushed | None, *, last: bool) -> None:
+        if pushed is None:
+            if last:
+                self._playback.end_detour()
+            return
+        with self.client.atomic():
+            self.pushed_path.show(pushed)
+            self.grip.say(pushed.doubt)
+        if last:
+            self._playback.take_detour(pushed.motion, self._detour_ended)
+        else:
+            self._playback.hold(pushed.motion, self._detour_ended)
 
     def _pose(self, q: Array, without: Array) -> None:
         with self.client.atomic():
             self.arms.pose(q, without)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
-        with self.pictures.without_handles():
+        with self.pictures.without_handles(), self.grip.without_handles():
             content = render_png(self.client, RESOLUTIONS[resolution], transparent=transparent)
         name = f"dt-viz-{self.session.scenario.task}.png"
         self.client.send_file_download(name, content, save_immediately=True)
