@@ -440,9 +440,9 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
     assert visitor.grip.ball.visible
     robot, deadline = load_jaco(), time.monotonic() + PATIENCE
     before = visitor._hand()
+    x, y = project(visitor, before)
     while visitor.pushed_path.pushed is None:  # again, if the page had not drawn the ball yet
         assert time.monotonic() < deadline
-        x, y = project(visitor, before)
         drag(page, (x, y), (x - 50, y - 40), steps=8)
         time.sleep(0.5)
     wait_until(lambda: session.wait_idle(0.3), "the last event")
