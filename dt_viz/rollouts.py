@@ -12,8 +12,10 @@ from dt_viz.systems import Attractor
 
 ARRIVED = 1e-4
 """Metres in base space from the goal at which a motion counts as arrived."""
+UNEVEN = 1.5
+"""How much wider than one of its neighbours a gap is that is stretched unevenly itself."""
 OVERSAMPLING = 2
-"""Times as many samples are put into a gap as it lacks: it is stretched unevenly, and another round costs more."""
+"""Times as many samples are put into such a gap as it lacks: another round costs more."""
 MAX_INSERTED = 40
 """Samples put between two neighbours in one round of refinement."""
 
@@ -104,14 +106,17 @@ def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: i
         The refined bundle.
     """
     for round_ in range(max_rounds + 1):
-        gap = np.linalg.norm(np.diff(bundle.positions, axis=0), axis=1) * (np.diff(bundle.index) == 0)
+        same = np.diff(bundle.index) == 0
+        gap = np.linalg.norm(np.diff(bundle.positions, axis=0), axis=1) * same
         # a gap that rounding cannot divide any more stays: two neighbouring floats on either side of the centre
         divisible = np.diff(bundle.fraction) > 1e-13
         wide = np.flatnonzero((gap > spacing) & divisible)
         if not len(wide) or round_ == max_rounds:
             break
-        lacking = np.ceil(OVERSAMPLING * (gap[wide] / spacing - 1)).astype(int)
-        counts = np.minimum(lacking, MAX_INSERTED)
+        inside = np.r_[np.inf, np.where(same, gap, np.inf), np.inf]
+        uneven = gap[wide] > UNEVEN * np.minimum(inside[:-2], inside[2:])[wide]
+        lacking = (gap[wide] / spacing - 1) * np.where(uneven, OVERSAMPLING, 1)
+        counts = np.minimum(np.ceil(lacking).astype(int), MAX_INSERTED)
         within = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in counts])
         before = np.repeat(wide, counts)
         fraction = bundle.fraction[before] + within * (bundle.fraction[before + 1] - bundle.fraction[before])

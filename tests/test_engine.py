@@ -277,8 +277,8 @@ def test_the_same_scenario_gives_the_same_frame_whatever_was_shown_before(new_en
     for first, second in ((a.rollouts, b.rollouts), (a.times, b.times), (a.ghost, b.ghost)):
         for left, right in zip(first, second, strict=True):
             np.testing.assert_array_equal(left, right)
-    assert a.field is not None and b.field is not None
-    np.testing.assert_array_equal(a.field.velocities, b.field.velocities)
+    assert a.pictures.field is not None and b.pictures.field is not None
+    np.testing.assert_array_equal(a.pictures.field.velocities, b.pictures.field.velocities)
     assert a.health == b.health
     assert (a.arm is None) == (b.arm is None)
 

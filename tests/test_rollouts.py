@@ -92,6 +92,13 @@ def test_refinement_looks_seldom_where_a_gap_is_stretched_unevenly():
     assert len(fine.index) < 2 * needed
 
 
+def test_refinement_puts_no_more_samples_than_needed_where_gaps_are_alike():
+    rough = evenly_sampled(straight, 3, 12)
+    fine = refined(rough, straight, 0.01)
+    lengths = np.concatenate(gaps(rough))
+    assert len(fine.index) == len(rough.index) + (np.ceil(lengths / 0.01) - 1).sum()
+
+
 def test_refinement_keeps_order_starts_goals_and_all_samples():
     rough = evenly_sampled(bent, 3, 12)
     fine = refined(rough, bent, 0.004)
