@@ -19,8 +19,9 @@ from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
 from dt_viz.several import Several
 from dt_viz.solids import Solid
 from dt_viz.tasks import TASKS
+from dt_viz.ui.handles import in_slice
 from dt_viz.ui.obstacle_panel import SHAPES, ObstaclePanel, name_of, with_room
-from dt_viz.ui.obstacles import Obstacles, in_slice, shaded
+from dt_viz.ui.obstacles import Obstacles, shaded
 from dt_viz.ui.panel import _clearance, _collision_rows
 from dt_viz.ui.slice_layers import OccupancySlice
 

@@ -5,10 +5,8 @@ In a drawing the handles move it in the drawing's plane.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 
-import numpy as np
 import viser
 import viser.transforms
 
@@ -16,11 +14,9 @@ from dt_viz.bias import BiasPoint
 from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.scenario import Scenario
-from dt_viz.slices import Slice
 from dt_viz.stacking import MAX_BIAS_POINTS, bias_points
 from dt_viz.ui import palette
-from dt_viz.ui.obstacles import HIDDEN, in_slice
-from dt_viz.ui.picture import Picture
+from dt_viz.ui.handles import Dragged, Handles
 
 BALL_RADIUS = 0.011
 """Of the marker, metres."""
@@ -59,8 +55,9 @@ class BiasPicture:
         """Of the bias point."""
         node = f"/bias/{number}"
         self.gizmo = scene.add_transform_controls(
-            node, scale=HANDLE_SCALE, line_width=3.0, disable_rotations=True, depth_test=False, visible=False
+            node, line_width=3.0, disable_rotations=True, depth_test=False, visible=False
         )
+        self.handles = Handles(self.gizmo, HANDLE_SCALE)
         self.ball = scene.add_icosphere(f"{node}/ball", radius=BALL_RADIUS, color=palette.BIAS)
         # a hidden node is not hit by the pointer, so the region never keeps it from what lies inside
         self.region = scene.add_icosphere(
@@ -73,7 +70,6 @@ class BiasPicture:
             anchor="top-left",
             font_screen_scale=0.8,
         )
-        self._selected = False
 
         @self.gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
@@ -92,14 +88,10 @@ class BiasPicture:
 
     def adopt(self, name: str, point: BiasPoint, *, on: bool, selected: bool) -> None:
         """Stand where the bias point does, unless that is where the browser has put it already."""
-        if np.abs(self.gizmo.position - np.asarray(point.position)).max() > 1e-9:
-            self.gizmo.position = point.position
+        self.handles.stand(point.position, viser.transforms.SO3.from_matrix(point.axes()).wxyz)
         flat = point.plane is not None
         if self.gizmo.active_axes[2] == flat:
             self.gizmo.active_axes = (True, True, not flat)
-        wxyz = viser.transforms.SO3.from_matrix(point.axes()).wxyz
-        if np.abs(self.gizmo.wxyz - wxyz).max() > 1e-9:
-            self.gizmo.wxyz = wxyz
         if self.name != name:
             self.name = name
             self._label.text = name.lower()
@@ -107,8 +99,7 @@ class BiasPicture:
         if tuple(self.ball.color) != colour:
             self.ball.color = self.region.color = colour
             self.region.opacity = OPACITY if on else OPACITY_OFF
-        self._selected = selected
-        self.show_handles(selected)
+        self.handles.show(selected)
         if not self.gizmo.visible:
             self.gizmo.visible = True
 
@@ -124,32 +115,29 @@ class BiasPicture:
         if self.region.visible != shown:
             self.region.visible = shown
 
-    def show_handles(self, shown: bool) -> None:
-        """Show the handles if this is the selected bias point, or hide them."""
-        # hiding the gizmo itself would hide what hangs on it
-        scale, opacity = (HANDLE_SCALE, 1.0) if shown and self._selected else (HIDDEN, 0.0)
-        if (self.gizmo.scale, self.gizmo.opacity) != (scale, opacity):
-            self.gizmo.scale, self.gizmo.opacity = scale, opacity
-
     def hide(self) -> None:
         """There is no such bias point."""
         if self.gizmo.visible:
             self.gizmo.visible = False
 
 
-class Biases(Picture):
+class Biases(Dragged):
     """All bias points of a scenario."""
 
     def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[str], None]) -> None:
         """Begin with none; see `BiasPicture`."""
         super().__init__(scene.add_frame("/bias", show_axes=False))
-        self._slice: Slice | None = None
         self._points: Mapping[str, BiasPoint] = {}
-        self.items = tuple(BiasPicture(scene, k, moved, selected, self._along) for k in range(MAX_BIAS_POINTS))
+        self.items = tuple(BiasPicture(scene, k, moved, selected, self.along) for k in range(MAX_BIAS_POINTS))
+
+    @property
+    def handles(self) -> Iterable[Handles]:
+        """See `Dragged`."""
+        return [item.handles for item in self.items]
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`: the regions, and the slice to be dragged in."""
-        self._slice = frame.task.slice
+        super().draw(frame)
         radii = dict(zip((layer.name for layer in frame.scenario.layers), frame.layer_radii, strict=False))
         for item, (name, point) in zip(self.items, self._points.items(), strict=False):
             item.show_region(point, radii.get(name))
@@ -164,20 +152,6 @@ class Biases(Picture):
             item.adopt(name, point, on=name in on, selected=name == selected)
         for item in self.items[len(points) :]:
             item.hide()
-
-    @contextmanager
-    def without_handles(self) -> Iterator[None]:
-        """Hide the handles, not the bias points, for as long as a picture takes."""
-        for item in self.items:
-            item.show_handles(False)
-        try:
-            yield
-        finally:
-            for item in self.items:
-                item.show_handles(True)
-
-    def _along(self, event: viser.SceneNodeDragEvent) -> Array:
-        return in_slice(self._slice, np.asarray(event.client.camera.position), event.start_position, event.end_position)
 
 
 def selected_point(scenario: Scenario) -> str | None:

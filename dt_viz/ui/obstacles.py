@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,23 +10,17 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.obstacles import CloudObstacle, MeshObstacle, Obstacle, Sphere
 from dt_viz.scenario import MAX_DIAMETER, Scenario
-from dt_viz.slices import Slice
 from dt_viz.ui import palette
+from dt_viz.ui.handles import Dragged, Handles
 from dt_viz.ui.links import simplified
-from dt_viz.ui.picture import Picture
 
 HANDLE_SCALE = 0.2
 """Metres that the handles stick out, about."""
-HIDDEN = 1e-6
-"""Size of handles that are not shown: hiding their node would hide what hangs on it."""
 OPACITY, OPACITY_FAINT = 0.8, 0.3
 """The path that an obstacle blocks shines through; more so while it is not avoided, or its map is shown."""
-MIN_SLOPE = 0.2
-"""Of the line of sight to the slice, below which the slice counts as seen on edge."""
 CREASE = 0.6
 """Angle between neighbouring faces above which their edge is drawn sharp, rad."""
 MAX_FACES = 30_000
@@ -59,9 +52,8 @@ class ObstaclePicture:
             selected: told that this obstacle was clicked.
             along: how far (3,) an event drags what it has grabbed, metres.
         """
-        self.gizmo = scene.add_transform_controls(
-            f"/obstacles/{index}", scale=HIDDEN, opacity=0.0, line_width=3.0, depth_test=False
-        )
+        self.gizmo = scene.add_transform_controls(f"/obstacles/{index}", line_width=3.0, depth_test=False)
+        self.handles = Handles(self.gizmo, HANDLE_SCALE)
         self.mesh = scene.add_mesh_simple(
             f"/obstacles/{index}/surface",
             np.zeros((3, 3), np.float32),
@@ -70,8 +62,6 @@ class ObstaclePicture:
             opacity=OPACITY,
         )
         self._look: Obstacle | None = None
-        self._scale = HIDDEN
-        self._selected = False
 
         @self.gizmo.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
@@ -91,7 +81,7 @@ class ObstaclePicture:
     @property
     def has_handles(self) -> bool:
         """Whether handles are shown."""
-        return self.gizmo.opacity > 0
+        return self.handles.shown
 
     def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool, opened: bool) -> None:
         """Look like the obstacle and stand where it does, unless that is where the browser has put it already.
@@ -102,10 +92,7 @@ class ObstaclePicture:
             avoided: whether motions avoid it.
             opened: whether its nearer half is left out, to show what is inside.
         """
-        if np.abs(self.gizmo.position - np.asarray(obstacle.position)).max() > 1e-9:
-            self.gizmo.position = obstacle.position
-        if np.abs(self.gizmo.wxyz - np.asarray(obstacle.wxyz)).max() > 1e-9:
-            self.gizmo.wxyz = obstacle.wxyz
+        self.handles.stand(obstacle.position, obstacle.wxyz)
         look, scale = unscaled(obstacle.moved((0.0, 0.0, 0.0)))
         if look != self._look:
             self._look = look
@@ -113,9 +100,8 @@ class ObstaclePicture:
             self.gizmo.disable_rotations = isinstance(look, Sphere)
         if self.mesh.scale != scale:
             self.mesh.scale = scale
-        self._scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
-        self._selected = selected
-        self.show_handles(selected)
+        self.handles.scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
+        self.handles.show(selected)
         side = "back" if opened else "front"
         if self.mesh.side != side:
             self.mesh.side = side
@@ -123,18 +109,12 @@ class ObstaclePicture:
         if self.mesh.opacity != opacity:
             self.mesh.opacity = opacity
 
-    def show_handles(self, shown: bool) -> None:
-        """Show the handles if this is the selected obstacle, or hide them."""
-        scale, opacity = (self._scale, 1.0) if shown and self._selected else (HIDDEN, 0.0)
-        if (self.gizmo.scale, self.gizmo.opacity) != (scale, opacity):
-            self.gizmo.scale, self.gizmo.opacity = scale, opacity
-
     def remove(self) -> None:
         """Take it out of the scene."""
         self.gizmo.remove()
 
 
-class Obstacles(Picture):
+class Obstacles(Dragged):
     """All obstacles of a scenario."""
 
     def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[int], None]) -> None:
@@ -148,13 +128,13 @@ class Obstacles(Picture):
         super().__init__(scene.add_frame("/obstacles", show_axes=False))
         self._scene = scene
         self._moved, self._selected = moved, selected
-        self._slice: Slice | None = None
         self.items: list[ObstaclePicture] = []
         """In the order of the scenario."""
 
-    def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers the slice to be dragged in."""
-        self._slice = frame.task.slice
+    @property
+    def handles(self) -> Iterable[Handles]:
+        """See `Dragged`."""
+        return [item.handles for item in self.items]
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's obstacles where they stand."""
@@ -162,7 +142,7 @@ class Obstacles(Picture):
             self.items.pop().remove()
         while len(self.items) < len(scenario.obstacles):
             index = len(self.items)
-            self.items.append(ObstaclePicture(self._scene, index, self._moved, self._selected, self._along))
+            self.items.append(ObstaclePicture(self._scene, index, self._moved, self._selected, self.along))
         for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
             item.adopt(
                 obstacle,
@@ -170,34 +150,6 @@ class Obstacles(Picture):
                 avoided=scenario.avoidance,
                 opened=scenario.view.colour == "occupancy",
             )
-
-    @contextmanager
-    def without_handles(self) -> Iterator[None]:
-        """Hide the handles, not the obstacles, for as long as a picture takes."""
-        for item in self.items:
-            item.show_handles(False)
-        try:
-            yield
-        finally:
-            for item in self.items:
-                item.show_handles(True)
-
-    def _along(self, event: viser.SceneNodeDragEvent) -> Array:
-        return in_slice(self._slice, np.asarray(event.client.camera.position), event.start_position, event.end_position)
-
-
-def in_slice(area: Slice | None, camera: Array, grabbed: Sequence[float], pointer: Sequence[float]) -> Array:
-    """How far (3,) the grabbed point must move, parallel to the slice, to lie under the pointer, metres."""
-    shift = np.asarray(pointer) - np.asarray(grabbed)
-    if area is None:
-        return shift
-    normal = np.cross(*area.axes.T)
-    sight = np.asarray(pointer) - camera
-    sight /= np.linalg.norm(sight)
-    slope = float(sight @ normal)
-    if abs(slope) < MIN_SLOPE:
-        return shift  # the slice is seen on edge: move across the line of sight instead
-    return shift - sight * float(shift @ normal) / slope
 
 
 def unscaled(obstacle: Obstacle) -> tuple[Obstacle, float]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import numpy as np
 import viser
@@ -13,7 +13,7 @@ from dt_viz.fields import Array
 from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
 from dt_viz.ui import palette
-from dt_viz.ui.obstacles import HIDDEN
+from dt_viz.ui.handles import Handles
 from dt_viz.ui.picture import Lines, Picture
 
 HANDLE_SCALE = 0.24
@@ -28,13 +28,11 @@ class MovableSlice(Picture):
 
     def __init__(self, scene: viser.SceneApi, moved: Moved) -> None:
         """Hidden until `adopt` shows it; `moved` is told of each new pose."""
-        self.gizmo = scene.add_transform_controls(
-            "/slice", scale=HANDLE_SCALE, line_width=3.0, depth_test=False, visible=False
-        )
+        self.gizmo = scene.add_transform_controls("/slice", line_width=3.0, depth_test=False, visible=False)
         super().__init__(self.gizmo)
         self.border = Lines(scene, "/slice/border", palette.SLICE, 0.0022)
         self._home: Slice | None = None
-        self._handles = False
+        self._handles = Handles(self.gizmo, HANDLE_SCALE)
         self._scenario: Scenario | None = None
 
         @self.gizmo.on_update
@@ -57,26 +55,10 @@ class MovableSlice(Picture):
         if self._home is None:
             return
         pose = view.slice or self._home.pose
-        if np.abs(self.gizmo.position - np.asarray(pose.position)).max() > 1e-9:
-            self.gizmo.position = pose.position
-        if np.abs(self.gizmo.wxyz - np.asarray(pose.wxyz)).max() > 1e-9:
-            self.gizmo.wxyz = pose.wxyz
-        self._handles = view.move_slice
-        self.show_handles(True)
+        self._handles.stand(pose.position, pose.wxyz)
+        self._handles.show(view.move_slice)
         self.visible = view.move_slice or view.slice is not None
 
-    def show_handles(self, shown: bool) -> None:
-        """Show the handles if the slice is being moved, or hide them."""
-        # hiding the gizmo itself would hide the frame
-        scale, opacity = (HANDLE_SCALE, 1.0) if shown and self._handles else (HIDDEN, 0.0)
-        if (self.gizmo.scale, self.gizmo.opacity) != (scale, opacity):
-            self.gizmo.scale, self.gizmo.opacity = scale, opacity
-
-    @contextmanager
-    def without_handles(self) -> Iterator[None]:
+    def without_handles(self) -> AbstractContextManager[None]:
         """Hide the handles, not the frame, for as long as a picture takes."""
-        self.show_handles(False)
-        try:
-            yield
-        finally:
-            self.show_handles(True)
+        return self._handles.hidden()
