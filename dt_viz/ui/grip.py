@@ -13,7 +13,7 @@ from dt_viz.fields import Array
 from dt_viz.robot import Robot
 from dt_viz.slices import Slice
 from dt_viz.ui import palette
-from dt_viz.ui.obstacles import in_slice
+from dt_viz.ui.handles import in_slice
 
 RADIUS = 0.016
 """Metres: easy to hit, hardly wider than the fingers."""
