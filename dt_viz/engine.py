@@ -18,7 +18,7 @@ from dt_viz.belief import occupancy_picture
 from dt_viz.collision import load_collision_model
 from dt_viz.cspace import LEVERS
 from dt_viz.diffeo import Flow
-from dt_viz.field_layers import Clearance, ColourPicture, det_jacobian, lyapunov_value, streamlines, velocity_arrows
+from dt_viz.field_layers import Clearance, arrows_and_colour, streamlines
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
 from dt_viz.following import NUM_ARM_SAMPLES, OUT_OF_REACH, ArmMotion, Follower
@@ -37,7 +37,6 @@ from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
 from dt_viz.solving import FINE, LIVE, Checkpoint, Precision, Solution, cut_off, solve
 from dt_viz.stacking import WHOLE_ARM, levels
-from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
 from dt_viz.warping import warped
@@ -495,10 +494,11 @@ def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse:
     built = solution.built[:level]
     system = solution.system if level is None else cut_off(ground, solution, level)
     clearance = _clearance(scenario, avoided=any(isinstance(behaviour, ObstacleAvoidance) for behaviour, _ in built))
+    field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
     return Pictures(
-        field=velocity_arrows(system, area, clearance) if view.field else None,
+        field=field,
         streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
-        colour=_colour(scenario, system, area, clearance, coarse=coarse),
+        colour=colour,
         generator=book.generator(area, view.generator_layer) if view.generator else None,
         grid=book.grid(area, [made.transform for _, made in built], coarse=coarse) if view.grid else None,
         base=book.base(solution.rays) if view.base else None,
@@ -509,18 +509,6 @@ def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse:
 def _clearance(scenario: Scenario, *, avoided: bool) -> Clearance:
     """Distance from where no motion comes: nowhere, or into the obstacle."""
     return scenario.obstacle.signed_distance if avoided else lambda points: np.full(len(points), np.inf)
-
-
-def _colour(
-    scenario: Scenario, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool
-) -> ColourPicture | None:
-    match scenario.view.colour:
-        case "det":
-            return det_jacobian(system, area, clearance, coarse=coarse)
-        case "lyapunov":
-            return lyapunov_value(system, area, clearance, coarse=coarse)
-        case "none" | "occupancy":
-            return None
 
 
 def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: float, missed: float) -> tuple[str, ...]:

@@ -27,8 +27,8 @@ MAX_OFFSET = 0.10
 """Metres from the slice at which a streamline ends."""
 FINE_LINE, COARSE_LINE = 0.006, 0.014
 """Metres between neighbouring samples of a drawn streamline."""
-FINE_COLOUR, COARSE_COLOUR = 0.008, 0.025
-"""Metres between neighbouring samples of a function."""
+FINE_COLOUR = 0.008
+"""Metres between neighbouring samples of a function; while a hand moves it is sampled as the arrows are."""
 LEVEL_SPACING = 0.04
 """Between the base attractor's circles that level lines of the Lyapunov value are images of, metres."""
 
@@ -61,30 +61,88 @@ class ColourPicture:
     """(K, 2, 3) segments of level lines, metres."""
 
 
-def velocity_arrows(system: DiffeomorphicSystem, area: Slice, clearance: Clearance) -> FieldPicture:
-    """Velocities on a lattice over the slice."""
-    points = area.lattice(ARROW_SPACING)
-    points = points[clearance(points) > 0]
-    return FieldPicture(points, system.velocity(points))
+class Samples:
+    """A system at the lattice points of a slice that motions come to: what several pictures need is worked out once."""
+
+    def __init__(
+        self, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, spacing: float, *, jacobian: bool
+    ) -> None:
+        """Evaluate ψ.
+
+        Args:
+            system: whose ψ.
+            area: the slice.
+            clearance: from where no motion comes.
+            spacing: of the lattice, metres.
+            jacobian: whether to work out J, too; velocities are then had from it.
+        """
+        self.system, self.area = system, area
+        self.grid = area.grid(spacing)
+        """(n, m, 3), metres."""
+        self.clearance = clearance(self.grid.reshape(-1, 3)).reshape(self.grid.shape[:2])
+        """(n, m), metres."""
+        self.free = self.clearance > 0
+        self.points = self.grid[self.free]
+        """(N, 3) where motions come, metres."""
+        transform, self.jacobians = system.transform, None
+        if jacobian:
+            self.images, self.jacobians = transform.jacobian(self.points)
+        else:
+            self.images = transform.forward(self.points)
+
+    @property
+    def velocities(self) -> Array:
+        """(N, 3), m/s."""
+        f = self.system.base.velocity(self.images)[..., None]
+        if self.jacobians is not None:
+            return np.linalg.solve(self.jacobians, f)[..., 0]
+        return self.system.transform.inverse_tangents(self.images, f)[1][..., 0]
+
+    def spread(self, values: Array) -> Array:
+        """Values (N,) on the whole lattice (n, m), NaN where no motion comes."""
+        spread = np.full(self.free.shape, np.nan)
+        spread[self.free] = values
+        return spread
 
 
-def det_jacobian(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool) -> ColourPicture:
+def arrows_and_colour(
+    system: DiffeomorphicSystem, area: Slice, clearance: Clearance, colour: SliceColour, *, arrows: bool, coarse: bool
+) -> tuple[FieldPicture | None, ColourPicture | None]:
+    """Velocities on the slice, if `arrows` are wanted, and a function of it, if the `colour` is one.
+
+    Both are worked out on one lattice for a `coarse` picture, which is replaced at once.
+    """
+    function, det = colour in {"det", "lyapunov"}, colour == "det"
+    field, samples = None, None
+    if arrows or (function and coarse):
+        samples = Samples(system, area, clearance, ARROW_SPACING, jacobian=det and coarse)
+        field = FieldPicture(samples.points, samples.velocities) if arrows else None
+    if not function:
+        return field, None
+    if samples is None or not coarse:
+        samples = Samples(system, area, clearance, FINE_COLOUR, jacobian=det)
+    return field, det_jacobian(samples) if det else lyapunov_value(samples)
+
+
+def det_jacobian(samples: Samples) -> ColourPicture:
     """The determinant of ψ's Jacobian: how much larger a small volume is in base space. Not above 0 where ψ folds."""
-    points = area.grid(COARSE_COLOUR if coarse else FINE_COLOUR)
-    values, room = _where(clearance, points, lambda y: np.linalg.det(system.transform.jacobian(y)[1]))
-    return ColourPicture("det", area, values, room, np.empty((0, 2, 3)))
+    assert samples.jacobians is not None
+    values = samples.spread(np.linalg.det(samples.jacobians))
+    return ColourPicture("det", samples.area, values, samples.clearance, np.empty((0, 2, 3)))
 
 
-def lyapunov_value(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool) -> ColourPicture:
+def lyapunov_value(samples: Samples) -> ColourPicture:
     """Φ(ψ(y)), which falls along every motion; its level lines are images of evenly spaced circles around the goal."""
-    points = area.grid(COARSE_COLOUR if coarse else FINE_COLOUR)
-    values, room = _where(clearance, points, system.lyapunov)
+    base = samples.system.base
+    values = samples.spread(base.potential(samples.images))
     radius, levels = LEVEL_SPACING, []
-    sparse = np.where(_steps(values) < system.base.speed * LEVEL_SPACING, values, np.nan)
-    while (level := _potential(system, radius)) < np.nanmax(values, initial=0.0):
-        levels.append(level_line(points, sparse - level))
+    # where there would be more than one line for a cell of the lattice there is none
+    sparse = np.where(_steps(values) < base.speed * LEVEL_SPACING, values, np.nan)
+    while (level := _potential(samples.system, radius)) < np.nanmax(values, initial=0.0):
+        levels.append(level_line(samples.grid, sparse - level))
         radius += LEVEL_SPACING
-    return ColourPicture("lyapunov", area, values, room, np.concatenate([np.empty((0, 2, 3)), *levels]))
+    lines = np.concatenate([np.empty((0, 2, 3)), *levels])
+    return ColourPicture("lyapunov", samples.area, values, samples.clearance, lines)
 
 
 def streamlines(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool) -> tuple[Array, ...]:
@@ -167,15 +225,6 @@ class _Marks:
 def _num_leading(mask: Mask) -> int:
     """How many are true before the first that is not."""
     return len(mask) if mask.all() else int(mask.argmin())
-
-
-def _where(clearance: Clearance, points: Array, function: Callable[[Array], Array]) -> tuple[Array, Array]:
-    """A function of points (n, m, 3), (n, m), NaN where no motion comes, and the clearance there, (n, m)."""
-    flat, shape = points.reshape(-1, 3), points.shape[:2]
-    room = clearance(flat)
-    values, free = np.full(len(flat), np.nan), room > 0
-    values[free] = function(flat[free])
-    return values.reshape(shape), room.reshape(shape)
 
 
 def _steps(values: Array) -> Array:

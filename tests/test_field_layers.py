@@ -154,7 +154,10 @@ def test_colours_are_the_functions_that_they_say(engine, scenario, wanted):
         ("lyapunov", lambda y: system.base.potential(system.transform.forward(y))),
     ):
         frame = shown(engine, scenario, wanted, colour=colour, slice=pose)
-        picture = frame.pictures.colour
+        picture, field = frame.pictures.colour, frame.pictures.field
+        far = scenario.obstacle.signed_distance(field.points) > 0.02
+        velocity = system.velocity(field.points[far])  # where one lattice serves both, it comes from J
+        np.testing.assert_allclose(field.velocities[far], velocity, rtol=0.01, atol=1e-3 * np.abs(velocity).max())
         n, m = picture.values.shape
         (w, h), area = frame.slice.half_size, frame.slice
         for i, j in zip(rng.integers(0, n, 12), rng.integers(0, m, 12), strict=True):
