@@ -455,3 +455,13 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
     session.edit("play", view=View(speed=3.0, field=False, table=False, demonstrations=False))
     wait_until(lambda: np.linalg.norm(visitor._hand() - visitor.shown.goal) < 5e-3, "the goal")
     wait_until(lambda: visitor.pushed_path.pushed is None, "the loop to begin again")
+
+
+def test_the_warp_is_played_in_the_page(visit):
+    page, visitor = visit
+    page.get_by_text("0 → 1").click()
+    wait_until(lambda: visitor.shown.scenario.warp < 1, "a picture on its way")
+    wait_until(lambda: visitor.session.scenario.warp == visitor.shown.scenario.warp == 1, "the full stack")
+    page.get_by_text("0 → 1").wait_for(timeout=1000 * PATIENCE)
+    visitor.session.undo()
+    assert visitor.session.scenario.warp == 1  # it ended as it began
