@@ -83,6 +83,8 @@ class View:
     """The warped grid: lines of base space seen through ψ⁻¹."""
     base: bool = False
     """The base attractor beside the learned system."""
+    click_to_start: bool = False
+    """Whether a click on the slice adds a start."""
     playing: bool = True
     """Whether the arm moves along its rollout."""
     speed: float = 1.0

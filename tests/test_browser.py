@@ -465,3 +465,24 @@ def test_the_warp_is_played_in_the_page(visit):
     page.get_by_text("0 → 1").wait_for(timeout=1000 * PATIENCE)
     visitor.session.undo()
     assert visitor.session.scenario.warp == 1  # it ended as it began
+
+
+def test_a_click_on_the_slice_starts_a_rollout_and_a_drag_of_the_camera_does_not(visit):
+    page, visitor = visit
+    session, area = visitor.session, visitor.shown.slice
+    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False, click_to_start=True)
+    session.edit("test", obstacles=(), view=light)
+    wait_until(lambda: session.wait_idle(0.3), "the mode")
+    place = area.at(np.array([-0.6, 0.6]) * area.half_size)
+    deadline = time.monotonic() + PATIENCE
+    while not session.scenario.starts:  # again, if the page was not listening yet
+        assert time.monotonic() < deadline
+        page.mouse.click(*project(visitor, place))
+        time.sleep(0.5)
+    wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its rollout")
+    np.testing.assert_allclose(session.scenario.starts[0], place, atol=0.01)
+    np.testing.assert_allclose(visitor.shown.rollouts[-1][0], session.scenario.starts[0], atol=1e-6)
+    np.testing.assert_allclose(visitor.shown.rollouts[-1][-1], visitor.shown.goal, atol=1e-4)
+    drag(page, (60, 60), (90, 80), steps=4)
+    time.sleep(0.5)
+    assert len(session.scenario.starts) == 1

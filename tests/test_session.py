@@ -710,3 +710,22 @@ def test_nothing_is_held_while_another_motion_is_computed(opened):
     opened.engine.gate.set()
     opened.settle()
     assert shown == [] and opened.shown.obstacles[0] == at(1.0)
+
+
+# --- Starts ---
+
+
+def test_starts_are_added_and_removed_step_by_step_for_undo_and_another_task_has_none(opened):
+    a, b = (0.1, -0.5, 0.4), (0.2, -0.5, 0.4)
+    for starts in ((a,), (a, b), (b,)):
+        opened.session.edit("starts", starts=starts)
+        opened.session.end_gesture()
+    for expected in ((a, b), (a,), ()):
+        opened.session.undo()
+        assert opened.session.scenario.starts == expected
+    opened.session.redo()
+    opened.session.redo()
+    opened.settle()
+    assert opened.shown.starts == (a, b)
+    opened.session.choose_task("lift_box")
+    assert opened.session.scenario.starts == ()

@@ -16,6 +16,7 @@ from dt_viz.health import Health
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Scenario, View
+from dt_viz.tasks import TASKS
 from dt_viz.ui.arm import PEDESTAL
 from dt_viz.ui.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.links import CELL, bodies, light_shells, simplified
@@ -215,7 +216,7 @@ def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
     paths = tuple(np.linspace([x, 0.0, 0.0], [x, 1.0, 0.0], 5) for x in (0.0, 0.1))
 
     def colours(blocked):
-        rollouts.draw(replace(frame(blocked=blocked), rollouts=paths))
+        rollouts.draw(replace(frame(blocked=blocked), task=TASKS["draw_s"](), rollouts=paths))
         return rollouts.lines.node.colors.reshape(-1, 3).astype(int)
 
     fresh, stale = colours(()), colours(("the obstacle touches the base",))
@@ -275,7 +276,7 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 
 def test_every_layer_has_a_checkbox():
-    switches = {f.name for f in fields(View) if f.type == "bool"} - {"playing", "move_slice"}
+    switches = {f.name for f in fields(View) if f.type == "bool"} - {"playing", "move_slice", "click_to_start"}
     assert set(VIEW_LABELS) == switches
 
 

@@ -26,6 +26,7 @@ from dt_viz.ui.push import PushButton
 from dt_viz.ui.session import Pace, Session
 from dt_viz.ui.slice_panel import SlicePanel
 from dt_viz.ui.stack_panel import StackPanel
+from dt_viz.ui.starts_panel import StartsPanel
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -103,6 +104,7 @@ class Panel:
             gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
         )
         self._biases = BiasPanel(gui, self._bind)
+        self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER))
         self._stack = StackPanel(gui, self._bind)
         self._build_arm()
         self._build_view()
@@ -117,6 +119,7 @@ class Panel:
         self._session = session
         self._obstacles.connect(session)
         self._biases.connect(session)
+        self._starts.connect(session)
         self._stack.connect(session)
         self._slice.connect(session)
 
@@ -157,7 +160,7 @@ class Panel:
         self.joints.draw(frame.arm)
         self.health.draw(frame.profiles)
         self.push.report(frame)
-        _set_max(self._rollout, len(frame.rollouts))
+        _set_max(self._rollout, len(frame.task.demonstrations) + len(frame.scenario.starts))
         if frame.pictures.generator is not None:
             _set_max(self._flow, frame.pictures.generator.num_flows)
         self._status.content = status_html(frame, pace)

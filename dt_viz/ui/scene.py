@@ -24,9 +24,14 @@ from dt_viz.ui.pots import Pots
 from dt_viz.ui.slice import MovableSlice
 from dt_viz.ui.slice import Moved as SliceMoved
 from dt_viz.ui.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
+from dt_viz.ui.starts import Starts
 
 BOLD, THIN = 0.0048, 0.0026
 """Of the rollouts of the whole stack, metres: by themselves, and beside those of a level."""
+
+
+ADDED = 0.0022
+"""Thickness of rollouts from added starts, metres."""
 
 
 class Demonstrations(Picture):
@@ -45,28 +50,34 @@ class Demonstrations(Picture):
 
 
 class Rollouts(Picture):
-    """What the robot will do, bold, with a dot at each start; thin and pale beside those of a level of the stack."""
+    """What the robot will do, bold, with a dot at each start; thin and pale beside those of a level of the stack.
+
+    Motions that begin at added starts are thin.
+    """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, BOLD)
         super().__init__(self.lines.node)
+        self.added = Lines(scene, "/rollouts/added", palette.ROLLOUT, ADDED)
         self._starts = scene.add_point_cloud(
             "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
         )
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        chosen = frame.chosen
+        num = len(frame.task.demonstrations)
+        for lines, paths, first in ((self.lines, frame.rollouts[:num], 0), (self.added, frame.rollouts[num:], num)):
+            chosen = None if frame.chosen is None else frame.chosen - first
+            if frame.blocked:
+                lines.show(paths, chosen, mark=palette.GHOST, colour=palette.STALE)
+            elif frame.level is not None:
+                lines.show(paths, colour=palette.ROLLOUT_BESIDE)
+            else:
+                lines.show(paths, chosen)
         thickness = BOLD if frame.level is None else THIN
         if self.lines.node.thickness != thickness:
             self.lines.node.thickness = thickness
-        if frame.blocked:
-            self.lines.show(frame.rollouts, chosen, mark=palette.GHOST, colour=palette.STALE)
-        elif frame.level is not None:
-            self.lines.show(frame.rollouts, colour=palette.ROLLOUT_BESIDE)
-        else:
-            self.lines.show(frame.rollouts, chosen)
-        self._starts.points = np.stack([path[0] for path in frame.rollouts]).astype(np.float32)
+        self._starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
 
 
 class Ghost(Picture):
@@ -81,7 +92,7 @@ class Ghost(Picture):
         """See `Picture`."""
         if frame.ghost is not self._shown:
             self._shown = frame.ghost
-            self._lines.show(frame.ghost)
+            self._lines.show(frame.ghost[: len(frame.task.demonstrations)])
 
 
 class Goal(Picture):
@@ -145,16 +156,19 @@ class ScenePictures:
         bias_moved: BiasMoved,
         bias_selected: Callable[[str], None],
         slice_moved: SliceMoved,
+        starts: Starts,
     ) -> None:
         """Build the scene of this robot; the others are told what the user does, see their pictures."""
         set_lights(scene)
         self.obstacles = Obstacles(scene, moved, selected)
         self.biases = Biases(scene, bias_moved, bias_selected)
         self.slice = MovableSlice(scene, slice_moved)
+        self.starts = starts
         self._always: tuple[Picture, ...] = (
             self.obstacles,
             self.biases,
             self.slice,
+            self.starts,
             LevelRollouts(scene),
             Goal(scene),
             Pots(scene),
@@ -192,6 +206,7 @@ class ScenePictures:
         self.obstacles.adopt(scenario)
         self.biases.adopt(scenario)
         self.slice.adopt(scenario)
+        self.starts.adopt(scenario)
         for name, picture in self._by_view.items():
             picture.visible = getattr(scenario.view, name)
         shown = self._by_colour.get(scenario.view.colour)

@@ -16,6 +16,7 @@ from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario
 from dt_viz.slices import SlicePose
 from dt_viz.stacking import bias_points, with_changed_point
+from dt_viz.starts import with_moved_start, with_start
 from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
 from dt_viz.ui.arm_layers import Arms
@@ -26,6 +27,7 @@ from dt_viz.ui.playback import Playback
 from dt_viz.ui.push import PushedPath
 from dt_viz.ui.scene import ScenePictures
 from dt_viz.ui.session import Pace, Session
+from dt_viz.ui.starts import Starts
 
 FIELD_OF_VIEW = 0.75
 """Vertical, rad."""
@@ -65,6 +67,7 @@ class Visitor:
                 self._bias_moved,
                 self._bias_selected,
                 self._slice_moved,
+                Starts(client.scene, self._start_moved, self._start_chosen, self._start_clicked),
             )
             self.arms = Arms(client.scene, robot)
             self.pushed_path = PushedPath(client.scene)
@@ -150,6 +153,20 @@ class Visitor:
             self.session.edit(name, layers=moved)
         if phase == "end":
             self.session.end_gesture()
+
+    def _start_moved(self, index: int, position: Array, phase: str) -> None:
+        if phase == "start":
+            self.session.begin_gesture()
+        self.session.edit(f"start {index}", starts=with_moved_start(self.session.scenario, index, position))
+        if phase == "end":
+            self.session.end_gesture()
+
+    def _start_chosen(self, index: int) -> None:
+        self.session.edit("Follows rollout", arm_rollout=len(self.session.task.demonstrations) + index)
+
+    def _start_clicked(self, place: Array) -> None:
+        self.session.edit("add start", starts=with_start(self.session.scenario, place))
+        self.session.end_gesture()
 
     def _bias_selected(self, name: str) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))

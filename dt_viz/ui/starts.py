@@ -1,0 +1,117 @@
+"""Added starts in the scene: small balls that are dragged, and places on the slice that are clicked to add one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from dt_viz.engine import Frame
+from dt_viz.fields import Array
+from dt_viz.scenario import Scenario
+from dt_viz.slices import Slice
+from dt_viz.starts import struck
+from dt_viz.ui import palette
+from dt_viz.ui.obstacles import in_slice
+from dt_viz.ui.picture import Picture
+
+RADIUS = 0.010
+"""Of a ball, metres."""
+
+Moved = Callable[[int, Array, str], None]
+"""Told which start was moved, its position (3,), metres, and the phase of the drag."""
+
+
+class StartBall:
+    """One added start."""
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        index: int,
+        moved: Moved,
+        chosen: Callable[[int], None],
+        area: Callable[[], Slice | None],
+    ) -> None:
+        """Stand nowhere yet.
+
+        Args:
+            scene: of the visitor.
+            index: in the scenario.
+            moved: told of each new position.
+            chosen: told that it was clicked.
+            area: what it is dragged parallel to.
+        """
+        self.ball = scene.add_icosphere(
+            f"/starts/{index}", radius=RADIUS, color=palette.START, subdivisions=2, cast_shadow=False
+        )
+        self._grabbed, self._from = np.zeros(3), np.zeros(3)
+
+        @self.ball.on_drag
+        async def _(event: viser.SceneNodeDragEvent) -> None:
+            if event.phase == "start":
+                self._grabbed, self._from = np.asarray(event.start_position), np.array(self.ball.position)
+            camera = np.asarray(event.client.camera.position)
+            shift = in_slice(area(), camera, tuple(self._grabbed), event.end_position)
+            moved(index, self._from + shift, event.phase)
+
+        @self.ball.on_click
+        async def _(_event: viser.SceneNodePointerEvent) -> None:
+            chosen(index)
+
+
+class Starts(Picture):
+    """All added starts of a scenario."""
+
+    def __init__(
+        self, scene: viser.SceneApi, moved: Moved, chosen: Callable[[int], None], clicked: Callable[[Array], None]
+    ) -> None:
+        """Begin with none.
+
+        Args:
+            scene: of the visitor.
+            moved: told of a new position of one of them.
+            chosen: told which one was clicked.
+            clicked: told of a place (3,), metres, on the slice that was clicked to add one.
+        """
+        super().__init__(scene.add_frame("/starts", show_axes=False))
+        self._scene, self._moved, self._chosen, self._clicked = scene, moved, chosen, clicked
+        self._slice: Slice | None = None
+        self._listens = False
+        self.items: list[StartBall] = []
+        """In the order of the scenario."""
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`: remembers the slice."""
+        self._slice = frame.slice
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's starts, and listen to clicks on the slice while it says so."""
+        while len(self.items) > len(scenario.starts):
+            self.items.pop().ball.remove()
+        while len(self.items) < len(scenario.starts):
+            ball = StartBall(self._scene, len(self.items), self._moved, self._chosen, lambda: self._slice)
+            self.items.append(ball)
+        for item, start in zip(self.items, scenario.starts, strict=True):
+            if np.abs(np.asarray(item.ball.position) - start).max() > 1e-9:
+                item.ball.position = start
+        if scenario.view.click_to_start != self._listens:
+            self._listens = scenario.view.click_to_start
+            listener: Any = self.click  # viser takes coroutines, too, and does not say so
+            if self._listens:
+                self._scene.on_click()(listener)
+            else:
+                self._scene.remove_click_callback(listener)
+
+    async def click(self, event: viser.SceneClickEvent) -> None:
+        """Add a start where the slice was clicked, unless one that is there already was."""
+        origin, direction = np.asarray(event.ray_origin), np.asarray(event.ray_direction)
+        place = None if self._slice is None else struck(self._slice, origin, direction)
+        if place is not None and not any(self._hits(item, origin, direction) for item in self.items):
+            self._clicked(place)
+
+    def _hits(self, item: StartBall, origin: Array, direction: Array) -> bool:
+        away = np.cross(item.ball.position - origin, direction / np.linalg.norm(direction))
+        return bool(np.linalg.norm(away) <= 1.1 * RADIUS)

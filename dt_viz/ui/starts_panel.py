@@ -1,0 +1,80 @@
+"""Controls of the added starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import viser
+
+from dt_viz.scenario import MAX_STARTS, Scenario
+from dt_viz.starts import with_grid
+from dt_viz.ui.bias_panel import Bind
+from dt_viz.ui.session import Session
+
+
+class StartsPanel:
+    """Adds starts by clicks and in a grid, and removes them."""
+
+    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str], None]) -> None:
+        """Build the controls; they act once `connect` has given them a session. `say` shows a message."""
+        self._session: Session | None = None
+        self._say = say
+        with gui.add_folder("Starts", expand_by_default=False):
+            bind(
+                gui.add_checkbox(
+                    "Click to start a rollout", False, hint=f"on the slice, up to {MAX_STARTS}; drag a ball to move it"
+                ),
+                lambda s: s.view.click_to_start,
+                lambda s, value: {"view": replace(s.view, click_to_start=value)},
+            )
+            self._buttons = gui.add_button_group(
+                "Starts", ("Grid", "Remove", "Clear"), hint="Remove: the one that the arm follows, or else the newest"
+            )
+
+        @self._buttons.on_click
+        async def _(_event: viser.GuiEvent) -> None:
+            if self._session is not None:
+                {"Grid": self.add_grid, "Remove": self.remove, "Clear": self.clear}[self._buttons.value]()
+
+    def connect(self, session: Session) -> None:
+        """Let the controls edit this session."""
+        self._session = session
+
+    def add_grid(self) -> None:
+        """Starts all over the slice."""
+        if self._session is None:
+            return
+        scenario = self._session.scenario
+        grid = with_grid(scenario, self._session.task.slice.posed(scenario.view.slice))
+        self._session.edit("grid of starts", starts=grid.starts)
+        self._session.end_gesture()
+        reasons = ((grid.num_blocked, "at or inside an obstacle"), (grid.num_far, "where the hand cannot be"))
+        left_out = [f"{num} {why}" for num, why in reasons if num]
+        if left_out:
+            self._say(f"places of the grid left out: {', '.join(left_out)}")
+
+    def remove(self) -> None:
+        """The one that the arm follows, or else the newest."""
+        if self._session is not None and self._session.scenario.starts:
+            scenario = self._session.scenario
+            index = _followed(scenario, len(self._session.task.demonstrations))
+            starts = list(scenario.starts)
+            del starts[-1 if index is None else index]
+            arm_rollout = scenario.arm_rollout if index is None else 0
+            self._session.edit("remove start", starts=tuple(starts), arm_rollout=arm_rollout)
+            self._session.end_gesture()
+
+    def clear(self) -> None:
+        """All."""
+        if self._session is not None:
+            index = _followed(self._session.scenario, len(self._session.task.demonstrations))
+            arm_rollout = self._session.scenario.arm_rollout if index is None else 0
+            self._session.edit("clear starts", starts=(), arm_rollout=arm_rollout)
+            self._session.end_gesture()
+
+
+def _followed(scenario: Scenario, num_demonstrated: int) -> int | None:
+    """Which added start the arm begins at, if it does."""
+    index = scenario.arm_rollout - num_demonstrated
+    return index if 0 <= index < len(scenario.starts) else None

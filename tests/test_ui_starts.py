@@ -1,0 +1,141 @@
+"""Added starts in the page: clicks on the slice, grids, and the balls in the scene."""
+
+import asyncio
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from dt_viz.engine import Frame
+from dt_viz.obstacles import Sphere
+from dt_viz.scenario import MAX_STARTS
+from dt_viz.starts import APART, INNER, struck, with_grid, with_moved_start, with_start
+from dt_viz.ui.starts import Starts
+
+
+def test_a_ray_meets_the_slice_where_it_is_seen(engine):
+    area, rng = engine.task("drop_pots").slice, np.random.default_rng(0)
+    for _ in range(20):
+        place = area.at(rng.uniform(-1, 1, 2) * area.half_size)
+        eye = place + rng.normal(size=3)
+        hit = struck(area, eye, 3.0 * (place - eye))
+        assert hit is not None
+        np.testing.assert_allclose(hit, place, atol=1e-9)
+        assert struck(area, eye, eye - place) is None  # behind the eye
+        outside = area.at(np.array([1.2, 0.0]) * area.half_size)
+        assert struck(area, eye, outside - eye) is None
+    assert struck(area, area.centre + area.normal, area.axes[:, 0]) is None  # along the slice
+
+
+def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_that_are_taken(engine, initial):
+    area = engine.task("draw_s").slice
+    x, y, z = area.at(np.array([INNER, INNER / 3]) * area.half_size)
+    scenario = replace(initial("draw_s"), obstacles=(Sphere((float(x), float(y), float(z))),))
+    grid = with_grid(scenario, area)
+    assert len(grid.starts) + grid.num_blocked + grid.num_far == 16 and grid.num_blocked > 0
+    assert (scenario.obstacle.signed_distance(np.array(grid.starts)) >= scenario.margin).all()
+    np.testing.assert_allclose((np.array(grid.starts) - area.centre) @ area.normal, 0, atol=1e-9)
+    again = with_grid(replace(scenario, starts=grid.starts), area)
+    assert again.starts == grid.starts
+    far = with_grid(scenario, replace(area, centre=area.centre + np.array([0.0, -2.0, 0.0])))
+    assert far.starts == () and far.num_far == 16
+
+
+def test_starts_are_added_up_to_a_limit_apart_from_each_other_and_moved(initial):
+    scenario = initial("draw_s")
+    for k in range(MAX_STARTS + 5):
+        scenario = replace(scenario, starts=with_start(scenario, np.array([0.03 * k, -0.5, 0.4])))
+    assert len(scenario.starts) == MAX_STARTS
+    one = replace(scenario, starts=scenario.starts[:1])
+    assert with_start(one, np.array(one.starts[0]) + APART / 2) == one.starts
+    assert with_moved_start(one, 0, np.ones(3)) == ((1.0, 1.0, 1.0),)
+    assert with_moved_start(one, 5, np.ones(3)) == one.starts  # it was removed a moment ago
+
+
+class Scene:
+    """Stands in for viser's: remembers nodes and the callbacks of clicks anywhere."""
+
+    def __init__(self):
+        self.clicks = []
+
+    def add_frame(self, _name, **_look):
+        return SimpleNamespace(visible=True)
+
+    def add_icosphere(self, name, **_look):
+        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False)
+
+        def keep(callback, what):
+            setattr(node, what, callback)
+            return callback
+
+        node.on_drag = lambda callback: keep(callback, "dragged")
+        node.on_click = lambda callback: keep(callback, "clicked")
+        node.remove = lambda: setattr(node, "removed", True)
+        return node
+
+    def on_click(self):
+        return self.clicks.append
+
+    def remove_click_callback(self, callback):
+        self.clicks.remove(callback)
+
+
+@pytest.fixture
+def opened(engine):
+    told = SimpleNamespace(moved=[], chosen=[], clicked=[])
+    scene: Any = Scene()
+    starts = Starts(scene, lambda *what: told.moved.append(what), told.chosen.append, told.clicked.append)
+    starts.draw(cast(Frame, SimpleNamespace(slice=engine.task("draw_s").slice)))
+    return scene, starts, told
+
+
+def looking_at(place, eye=(0.8, -1.6, 0.8)):
+    return SimpleNamespace(ray_origin=eye, ray_direction=tuple(np.asarray(place) - eye))
+
+
+def test_a_click_adds_a_start_only_while_it_is_asked_for_and_not_on_a_ball(opened, initial, engine):
+    scene, starts, told = opened
+    scenario, area = initial("draw_s"), engine.task("draw_s").slice
+    starts.adopt(scenario)
+    assert scene.clicks == []
+    first = tuple(float(c) for c in area.at(np.array([0.05, 0.1])))
+    asked = replace(scenario, starts=(first,), view=replace(scenario.view, click_to_start=True))
+    starts.adopt(asked)
+    starts.adopt(asked)
+    (click,) = scene.clicks
+    place = area.at(np.array([-0.1, -0.05]))
+    asyncio.run(click(looking_at(place)))
+    asyncio.run(click(looking_at(first)))
+    asyncio.run(click(looking_at(area.centre + np.array([2.0, 0.0, 0.0]))))
+    (added,) = told.clicked
+    np.testing.assert_allclose(added, place, atol=1e-9)
+    starts.adopt(scenario)
+    assert scene.clicks == []
+
+
+def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(opened, initial, engine):
+    _, starts, told = opened
+    area = engine.task("draw_s").slice
+    places = [area.at(np.array(across)) for across in ((0.0, 0.1), (0.1, 0.0))]
+    scenario = replace(initial("draw_s"), starts=tuple(tuple(float(c) for c in place) for place in places))
+    starts.adopt(scenario)
+    for item, place in zip(starts.items, places, strict=True):
+        np.testing.assert_allclose(item.ball.position, place)
+    ball, eye = starts.items[1].ball, np.array([0.8, -1.6, 0.8])
+    camera = SimpleNamespace(camera=SimpleNamespace(position=eye))
+    target = area.at(np.array([0.02, -0.12]))
+    for phase, pointer in (("start", places[1]), ("update", target), ("end", eye + 0.7 * (target - eye))):
+        event = SimpleNamespace(
+            phase=phase, client=camera, start_position=tuple(places[1]), end_position=tuple(pointer)
+        )
+        asyncio.run(ball.dragged(event))
+    assert [(index, phase) for index, _, phase in told.moved] == [(1, "start"), (1, "update"), (1, "end")]
+    np.testing.assert_allclose(told.moved[1][1], target, atol=1e-9)
+    np.testing.assert_allclose(told.moved[2][1], target, atol=1e-9)  # whatever the depth of the pointer
+    asyncio.run(ball.clicked(None))
+    assert told.chosen == [1]
+    second = starts.items[1].ball
+    starts.adopt(replace(scenario, starts=scenario.starts[:1]))
+    assert len(starts.items) == 1 and second.removed
