@@ -14,7 +14,7 @@ from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
 from dt_viz.starts import struck
 from dt_viz.ui import palette
-from dt_viz.ui.obstacles import in_slice
+from dt_viz.ui.handles import in_slice
 from dt_viz.ui.picture import Picture
 
 RADIUS = 0.010
