@@ -1,6 +1,7 @@
 """What several test modules share: a robot, learned tasks in a temporary cache, scenarios."""
 
 import pytest
+import viser  # noqa: TID251 - a page for tests of pictures and controls
 from hypothesis import settings
 
 from dt_viz.engine import Engine
@@ -50,3 +51,17 @@ def engine(new_engine) -> Engine:
 def initial(engine):
     """The scenario that a task begins with."""
     return lambda task: Scenario(task, (Sphere(engine.task(task).obstacle_position),))
+
+
+@pytest.fixture(scope="module")
+def server():
+    """A page that nobody looks at: its scene and controls take handles all the same."""
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def scene(server):
+    yield server.scene
+    server.scene.reset()

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import viser  # noqa: TID251 - a panel of its own
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -127,26 +126,22 @@ def test_a_motion_that_rests_on_its_way_has_a_profile():
 # --- In the panel ---
 
 
-def test_the_plots_show_what_the_profiles_hold(shown):
+def test_the_plots_show_what_the_profiles_hold(shown, server):
     _, profiles = shown
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        plots = HealthPlots(server.gui)
-        assert not plots.visible
-        plots.draw(profiles)
-        for plot in (plots.lyapunov, plots.distance, plots.clearance):
-            assert len(plot.data) == len(plot.series) and all(len(column) == NUM_SAMPLES for column in plot.data)
-        np.testing.assert_allclose(plots.clearance.data[1], 1e3 * profiles.shown.clearance)
-        np.testing.assert_allclose(plots.distance.data[2], 1e3 * profiles.undisturbed.distance)
-        before = plots.lyapunov.data
-        plots.draw(None)
-        assert plots.lyapunov.data is before and plots.clearance.visible
-        nowhere = replace(profiles.shown, clearance=np.full(NUM_SAMPLES, np.inf))
-        plots.draw(replace(profiles, shown=nowhere, undisturbed=nowhere))
-        assert not plots.clearance.visible
-        assert plots.table.content.count("–") == 2
-    finally:
-        server.stop()
+    plots = HealthPlots(server.gui)
+    assert not plots.visible
+    plots.draw(profiles)
+    for plot in (plots.lyapunov, plots.distance, plots.clearance):
+        assert len(plot.data) == len(plot.series) and all(len(column) == NUM_SAMPLES for column in plot.data)
+    np.testing.assert_allclose(plots.clearance.data[1], 1e3 * profiles.shown.clearance)
+    np.testing.assert_allclose(plots.distance.data[2], 1e3 * profiles.undisturbed.distance)
+    before = plots.lyapunov.data
+    plots.draw(None)
+    assert plots.lyapunov.data is before and plots.clearance.visible
+    nowhere = replace(profiles.shown, clearance=np.full(NUM_SAMPLES, np.inf))
+    plots.draw(replace(profiles, shown=nowhere, undisturbed=nowhere))
+    assert not plots.clearance.visible
+    assert plots.table.content.count("–") == 2
 
 
 def test_the_table_has_both_motions_side_by_side(shown):

@@ -1,17 +1,17 @@
 """What the page shows of the whole arm, without a browser: a scene takes handles also while nobody looks."""
 
 from dataclasses import fields, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
 import trimesh
-import viser  # noqa: TID251 - a scene of its own
+from pages import frame_of
 from viser import transforms  # noqa: TID251
 
 from dt_viz.body import load_body_points
 from dt_viz.collision import CollisionReport, Nearest
-from dt_viz.engine import ArmMotion, Frame, Stage
+from dt_viz.engine import ArmMotion, Stage
 from dt_viz.health import Health
 from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
@@ -38,35 +38,8 @@ def motion(num=60, seconds=4.0, *, sway=0.0):
     return ArmMotion(seconds * u, q, without)
 
 
-def frame(arm=None, *, blocked=(), health=None, stage=Stage.CERTIFIED, scenario=None):
-    nothing: Any = None
-    return Frame(
-        scenario=scenario or Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),)),
-        task=nothing,
-        stage=stage,
-        ghost=(),
-        rollouts=(),
-        times=(),
-        goal=nothing,
-        levels=(),
-        reached=nothing,
-        blocked=blocked,
-        health=health or Health(0.01),
-        arm=arm,
-    )
-
-
-@pytest.fixture(scope="module")
-def server():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
-
-
-@pytest.fixture
-def scene(server):
-    yield server.scene
-    server.scene.reset()
+def frame(arm=None, *, scenario=None, **changes):
+    return frame_of(scenario or Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),)), arm=arm, **changes)
 
 
 # --- Along the motion ---

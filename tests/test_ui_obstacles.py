@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import trimesh
-import viser  # noqa: TID251 - a scene of its own
+from pages import Edited
 
 from dt_viz import shapes
 from dt_viz.belief import occupancy_picture
@@ -33,13 +33,6 @@ CRATE = trimesh.creation.box((0.15, 0.1, 0.05))
 MESH = MeshObstacle((0.1, -0.5, 0.4), Solid(CRATE.vertices, CRATE.faces), (0.9, 0.1, 0.3, -0.3))
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3))
 CLOUD = CloudObstacle((-0.1, -0.5, 0.4), Cloud(POINTS, np.linalg.norm(POINTS, axis=1) < 0.06))
-
-
-@pytest.fixture(scope="module")
-def server():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
 
 
 @pytest.fixture
@@ -123,22 +116,6 @@ def test_what_is_dragged_stays_in_the_slice_and_under_the_pointer():
 # --- The panel ---
 
 
-class FakeSession:
-    """Keeps the scenario of its edits."""
-
-    def __init__(self, scenario, panel):
-        self.scenario, self.task, self._panel = scenario, TASKS["draw_s"](), panel
-        self.steps = 0
-        panel.adopt(scenario)
-
-    def edit(self, _gesture, **changes):
-        self.scenario = replace(self.scenario, **changes)
-        self._panel.adopt(self.scenario)
-
-    def end_gesture(self):
-        self.steps += 1
-
-
 @pytest.fixture
 def opened(server):
     controls = {}
@@ -148,7 +125,7 @@ def opened(server):
 
     said = []
     panel = ObstaclePanel(server.gui, bind, lambda text, wrong: said.append((text, wrong)))
-    session: Any = FakeSession(scenario(BALL), panel)
+    session: Any = Edited(scenario(BALL), panel)
     panel.connect(session)
     yield SimpleNamespace(panel=panel, session=session, controls=controls, said=said)
     server.gui.reset()

@@ -6,11 +6,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import viser  # noqa: TID251 - a scene of its own
+from pages import frame_of
 
-from dt_viz.engine import Frame, Stage
+from dt_viz.engine import Stage
 from dt_viz.field_layers import ColourPicture, FieldPicture
-from dt_viz.health import Health
 from dt_viz.obstacles import Sphere, rotation
 from dt_viz.pictures import Pictures
 from dt_viz.scenario import Scenario, View
@@ -31,40 +30,13 @@ TASK = TASKS["draw_s"]()
 
 
 def frame(scenario=SCENARIO, **changes):
-    nothing: Any = None
     line = np.linspace([0.0, 0, 0], [0, 0, 1.0], 5)
-    empty = Frame(
-        scenario=scenario,
-        task=TASK,
-        stage=Stage.LIVE,
-        ghost=(),
-        rollouts=(line, line + 0.1),
-        chosen=0,
-        times=(),
-        levels=(),
-        goal=nothing,
-        reached=nothing,
-        blocked=(),
-        health=Health(0.01),
-    )
-    return replace(empty, **changes)
+    given: dict[str, Any] = {"task": TASK, "stage": Stage.LIVE, "rollouts": (line, line + 0.1), "chosen": 0}
+    return frame_of(scenario, **(given | changes))
 
 
 def seen(**view):
     return replace(SCENARIO, view=View(**view))
-
-
-@pytest.fixture(scope="module")
-def server():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
-
-
-@pytest.fixture
-def scene(server):
-    yield server.scene
-    server.scene.reset()
 
 
 # --- Moving it ---

@@ -5,10 +5,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import viser  # noqa: TID251 - a page of its own
+from pages import Edited, frame_of
 
 from dt_viz.bias import BiasPoint
-from dt_viz.engine import Frame, Stage
 from dt_viz.health import Health
 from dt_viz.obstacles import Sphere
 from dt_viz.paper_scenes import SCENES
@@ -32,49 +31,13 @@ SCENARIO = Scenario(
 
 
 def frame(scenario=SCENARIO, **changes):
-    nothing: Any = None
-    empty = Frame(
-        scenario=scenario,
-        task=TASKS[scenario.task](),
-        stage=Stage.CERTIFIED,
-        ghost=(),
-        rollouts=(),
-        times=(),
-        levels=tuple((np.full((5, 3), float(k)),) for k in range(4)),
-        goal=nothing,
-        reached=nothing,
-        blocked=(),
-        health=Health(0.01, duration=0.4, layer_durations=(0.8, None)),
-        layer_radii=(0.2, None),
-    )
-    return replace(empty, **changes)
-
-
-class Edited:
-    """Stands in for a session: keeps the scenario."""
-
-    def __init__(self, scenario=SCENARIO):
-        self.scenario = scenario
-        self.task = TASKS[scenario.task]()
-
-    def edit(self, _gesture, **changes):
-        self.scenario = replace(self.scenario, **changes)
-
-    def end_gesture(self):
-        pass
-
-
-@pytest.fixture(scope="module")
-def server():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
-
-
-@pytest.fixture
-def scene(server):
-    yield server.scene
-    server.scene.reset()
+    given: dict[str, Any] = {
+        "task": TASKS[scenario.task](),
+        "levels": tuple((np.full((5, 3), float(k)),) for k in range(4)),
+        "health": Health(0.01, duration=0.4, layer_durations=(0.8, None)),
+        "layer_radii": (0.2, None),
+    }
+    return frame_of(scenario, **(given | changes))
 
 
 # --- The list ---
@@ -105,7 +68,7 @@ def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done
 
 @pytest.fixture
 def panel(server):
-    panel, session = StackPanel(server.gui, lambda handle, *_: handle), Edited()
+    panel, session = StackPanel(server.gui, lambda handle, *_: handle), Edited(SCENARIO)
     panel.connect(cast(Session, session))
     return panel, session
 

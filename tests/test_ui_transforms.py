@@ -5,11 +5,11 @@ from dataclasses import replace
 from typing import Any, cast
 
 import pytest
-import viser  # noqa: TID251 - a page of its own
+from pages import frame_of
 
 from dt_viz.bias import BiasPoint
 from dt_viz.collision import CollisionReport, Nearest
-from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.engine import Engine
 from dt_viz.health import Health
 from dt_viz.integration import Integration
 from dt_viz.obstacles import Sphere
@@ -26,30 +26,11 @@ PACE = Pace(0.02, 30.0, 0)
 
 
 def frame(scenario=SCENARIO, **changes):
-    nothing: Any = None
-    health = Health(0.01, duration=0.4, layer_durations=(0.8,))
-    empty = Frame(
-        scenario=scenario,
-        task=nothing,
-        stage=Stage.CERTIFIED,
-        ghost=(),
-        rollouts=(),
-        times=(),
-        levels=(),
-        goal=nothing,
-        reached=nothing,
-        blocked=(),
-        health=health,
-        learned_steps=(4, 4, 4),
-    )
-    return replace(empty, **changes)
-
-
-@pytest.fixture(scope="module")
-def server():
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield server
-    server.stop()
+    given: dict[str, Any] = {
+        "health": Health(0.01, duration=0.4, layer_durations=(0.8,)),
+        "learned_steps": (4, 4, 4),
+    }
+    return frame_of(scenario, **(given | changes))
 
 
 class Controls:
