@@ -44,9 +44,11 @@ class ObstacleAvoidance:
         duration = scenario.duration
         if duration is None:
             # the deepest samples leave last, or nearly so; where they did not tell the whole story, take all
-            points = motion.positions[_avoidable(motion)]
-            if not at_least:
-                points = np.concatenate([_deepest(motion), _crests(field, motion)])
+            depth = np.where(_avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
+            if at_least:
+                points = motion.positions[np.isfinite(depth)]
+            else:
+                points = np.concatenate([_deepest(motion, depth), _crests(motion, depth, field)])
             duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
         # where the exact flow is clear for longer already, more time is not what a coarse one lacks
         hopeless = duration is None or (scenario.integration.by_hand and 0 < duration <= at_least)
@@ -87,24 +89,21 @@ def _margin(motion: Motion) -> float:
     return max(0.0, float(room))
 
 
-def _deepest(motion: Motion) -> Array:
-    """(M, 3) the deepest few samples of each rollout that can be kept out."""
-    avoidable = _avoidable(motion)
-    depth = np.where(avoidable, motion.scenario.obstacle.signed_distance(motion.positions), np.inf)
+def _deepest(motion: Motion, depth: Array) -> Array:
+    """(M, 3) the deepest few samples of each rollout; `depth` (N,), metres, is infinite for those that do not count."""
     order = np.lexsort([depth, motion.index])
     rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
-    return motion.positions[order[(rank < NUM_DEEPEST) & avoidable[order]]]
+    return motion.positions[order[(rank < NUM_DEEPEST) & np.isfinite(depth[order])]]
 
 
-def _crests(field: VectorField, motion: Motion) -> Array:
+def _crests(motion: Motion, depth: Array, field: VectorField) -> Array:
     """(M, 3) places between the samples of the rollouts where the field stops leading onwards and starts leading back.
 
     The field is a gradient, or nearly so: its potential is largest there, and what is there leaves last.
     """
     s, step = motion.positions, np.diff(motion.positions, axis=0)
-    avoidable = _avoidable(motion) & (motion.scenario.obstacle.signed_distance(s) < _margin(motion))
-    same = np.diff(motion.index) == 0
-    k = np.flatnonzero(same & avoidable[:-1] & avoidable[1:])
+    near, same = depth < _margin(motion), np.diff(motion.index) == 0
+    k = np.flatnonzero(same & near[:-1] & near[1:])
     here, there = (field(np.concatenate([s[k], s[k + 1]])) * np.tile(step[k], (2, 1))).sum(axis=1).reshape(2, -1)
     turns = (here > 0) & (there < 0)
     k, part = k[turns], (here / np.where(turns, here - there, 1))[turns, None]
