@@ -100,19 +100,24 @@ class Panel:
                 self._session.cancel()
 
         self._build_task()
-        self._obstacles = ObstaclePanel(
-            gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
-        )
-        self._biases = BiasPanel(gui, self._bind)
-        self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER))
-        self._stack = StackPanel(gui, self._bind)
-        self._build_arm()
-        self._build_view()
-        with gui.add_folder("Slice", expand_by_default=False):
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("World"):
+            self._obstacles = ObstaclePanel(
+                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
+            )
+            self._biases = BiasPanel(gui, self._bind)
+            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER))
+        with tabs.add_tab("Stack"):
+            self._stack = StackPanel(gui, self._bind)
+        with tabs.add_tab("Show"):
+            self._build_view()
             self._slice = SlicePanel(gui, self._bind)
+        with tabs.add_tab("Arm"):
+            self._build_arm()
+        with tabs.add_tab("Picture"):
+            self._build_export(save_png)
         self.joints = JointPlots(gui, robot)
         self.health = HealthPlots(gui)
-        self._build_export(save_png)
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
