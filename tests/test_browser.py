@@ -174,6 +174,11 @@ def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
     assert_shows_the_obstacle_where_it_is(visitor)
 
 
+def open_tab(page, name):
+    """A tab of the panel."""
+    page.get_by_role("tab", name=name, exact=True).click()
+
+
 def click_button(page, name):
     page.get_by_role("button", name=name, exact=True).evaluate("button => button.click()")  # wherever it is scrolled to
 
@@ -271,6 +276,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     np.testing.assert_allclose(pictures.items[0].gizmo.position, place(), atol=1e-9)
     assert all(np.linalg.norm(path - place(), axis=1).min() < 0.015 for path in visitor.shown.rollouts)
 
+    open_tab(page, "Stack")
     page.get_by_role("button", name="on", exact=True).first.evaluate("button => button.click()")  # of the outermost
     wait_until(lambda: not session.scenario.layers[0].on and session.wait_idle(0.3), "the switch")
     for path, undisturbed in zip(visitor.shown.rollouts, visitor.shown.ghost, strict=True):
@@ -279,7 +285,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
 
 def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     page, _ = visit
-    page.get_by_role("button", name="Picture").or_(page.get_by_text("Picture", exact=True)).first.click()
+    open_tab(page, "Picture")
     with page.expect_download(timeout=1000 * PATIENCE) as download:
         page.get_by_text("Save PNG").click()
     image = Image.open(io.BytesIO(download.value.path().read_bytes()))
@@ -328,7 +334,7 @@ SHOWN = {  # the layer's label in the page, the picture's name, and its handles 
 
 def test_each_layer_of_the_transform_is_drawn_once_it_is_switched_on(visit):
     page, visitor = visit
-    page.get_by_role("button", name="Show").or_(page.get_by_text("Show", exact=True)).first.click()
+    open_tab(page, "Show")
     for label, (name, handles) in SHOWN.items():
         picture = visitor.pictures.layer(name)
         assert not picture.visible
@@ -377,7 +383,7 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
     time.sleep(0.2)  # for the playback to rest
     q = visitor.shown.arm.q[50]
     visitor.arms.pose(q, q + 0.6 * np.eye(6)[0])
-    page.get_by_role("button", name="Show").or_(page.get_by_text("Show", exact=True)).first.click()
+    open_tab(page, "Show")
     time.sleep(1.0)
     before = pixels(page)
     for label, (name, coloured) in ARM_LAYERS.items():
@@ -402,6 +408,7 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
 
 def test_who_avoids_is_chosen_in_the_page(visit):
     page, visitor = visit
+    open_tab(page, "Stack")
     page.get_by_role("textbox", name="Avoid with").or_(page.locator("input[value='End effector']")).first.click()
     page.get_by_role("option", name="Whole arm").click()
     wait_until(lambda: visitor.session.scenario.space == "cspace", "the choice to arrive")
@@ -417,6 +424,7 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
             time.sleep(0.02)
 
     monkeypatch.setattr(dt_viz.fits, "fit", endless)
+    open_tab(page, "Stack")
     page.get_by_role("textbox", name="Settings of").or_(page.locator("input[value='Avoidance']")).first.click()
     page.get_by_role("option", name="Imitation").click()
     page.get_by_role("textbox", name="Learn").or_(page.locator("input[value='trajectory']")).first.click()

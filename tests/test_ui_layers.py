@@ -271,6 +271,13 @@ def test_the_status_says_what_the_arm_comes_near_to():
     assert "touches, link 2 – hand" in status_html(frame(health=Health(0.01, collision=hit)), PACE)
 
 
+@pytest.mark.parametrize(("space", "hinted"), [("task", True), ("both", False)])
+def test_an_arm_in_the_obstacle_is_told_how_to_give_way(space, hinted):
+    scenario = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space)
+    said = status_html(frame(scenario=scenario, health=Health(0.01, collision=CLOSE)), PACE)
+    assert ("Avoid with" in said) == hinted
+
+
 @pytest.mark.parametrize(
     ("hand", "arm", "said"),
     [(0.85, None, ">0.85<"), (None, 0.5, ">0.50 arm<"), (0.85, 0.5, ">0.85 hand · 0.50 arm<"), (None, None, ">off<")],

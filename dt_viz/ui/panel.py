@@ -261,63 +261,60 @@ class Panel:
 
     def _build_arm(self) -> None:
         gui = self._gui
-        with gui.add_folder("Arm"):
-            self._play = gui.add_button("Pause")
+        self._play = gui.add_button("Pause")
 
-            @self._play.on_click
-            async def _(_event: viser.GuiEvent) -> None:
-                session = self._session
-                if session is not None:
-                    view = session.scenario.view
-                    session.edit("play", view=replace(view, playing=not view.playing))
+        @self._play.on_click
+        async def _(_event: viser.GuiEvent) -> None:
+            session = self._session
+            if session is not None:
+                view = session.scenario.view
+                session.edit("play", view=replace(view, playing=not view.playing))
 
-            self._bind(
-                gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
-                lambda s: s.view.speed,
-                lambda s, value: {"view": replace(s.view, speed=value)},
-            )
-            self.push = PushButton(gui)
-            self._rollout = self._bind(
-                gui.add_slider("Follows rollout", 1, 8, 1, 1),
-                lambda s: s.arm_rollout + 1,
-                lambda _s, value: {"arm_rollout": int(value) - 1},
-            )
+        self._bind(
+            gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
+            lambda s: s.view.speed,
+            lambda s, value: {"view": replace(s.view, speed=value)},
+        )
+        self.push = PushButton(gui)
+        self._rollout = self._bind(
+            gui.add_slider("Follows rollout", 1, 8, 1, 1),
+            lambda s: s.arm_rollout + 1,
+            lambda _s, value: {"arm_rollout": int(value) - 1},
+        )
 
     def _build_view(self) -> None:
-        with self._gui.add_folder("Show", expand_by_default=False):
-            for name, label in VIEW_LABELS.items():
-                self._bind(
-                    self._gui.add_checkbox(label, getattr(View(), name), hint=VIEW_HINTS.get(name)),
-                    lambda s, name=name: getattr(s.view, name),
-                    lambda s, value, name=name: {"view": replace(s.view, **{name: value})},
-                )
-            self._flow = self._bind(
-                self._gui.add_slider(
-                    "Of flow",
-                    0,
-                    MAX_FLOWS,
-                    1,
-                    0,
-                    visible=False,
-                    hint="ψ is several flows, 1 is the first; 0: their mean",
-                ),
-                lambda s: s.view.generator_layer,
-                lambda s, value: {"view": replace(s.view, generator_layer=int(value))},
+        for name, label in VIEW_LABELS.items():
+            self._bind(
+                self._gui.add_checkbox(label, getattr(View(), name), hint=VIEW_HINTS.get(name)),
+                lambda s, name=name: getattr(s.view, name),
+                lambda s, value, name=name: {"view": replace(s.view, **{name: value})},
             )
+        self._flow = self._bind(
+            self._gui.add_slider(
+                "Of flow",
+                0,
+                MAX_FLOWS,
+                1,
+                0,
+                visible=False,
+                hint="ψ is several flows, 1 is the first; 0: their mean",
+            ),
+            lambda s: s.view.generator_layer,
+            lambda s, value: {"view": replace(s.view, generator_layer=int(value))},
+        )
 
     def _build_export(self, save_png: Callable[[str, bool], None]) -> None:
-        with self._gui.add_folder("Picture", expand_by_default=False):
-            resolution = self._gui.add_dropdown("Resolution", tuple(RESOLUTIONS))
-            transparent = self._gui.add_checkbox("Transparent", False)
-            save = self._gui.add_button("Save PNG", icon=viser.Icon.CAMERA)
+        resolution = self._gui.add_dropdown("Resolution", tuple(RESOLUTIONS))
+        transparent = self._gui.add_checkbox("Transparent", False)
+        save = self._gui.add_button("Save PNG", icon=viser.Icon.CAMERA)
 
-            @save.on_click
-            def _(_event: viser.GuiEvent) -> None:  # in a thread: waiting for a render would block the event loop
-                save.disabled = True
-                try:
-                    save_png(resolution.value, transparent.value)
-                finally:
-                    save.disabled = False
+        @save.on_click
+        def _(_event: viser.GuiEvent) -> None:  # in a thread: waiting for a render would block the event loop
+            save.disabled = True
+            try:
+                save_png(resolution.value, transparent.value)
+            finally:
+                save.disabled = False
 
 
 def _set_max(slider: Any, value: int) -> None:
@@ -326,10 +323,11 @@ def _set_max(slider: Any, value: int) -> None:
 
 
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
+HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
 _BLUE = ("#1d4f7c", "#e8f1fa")
 _AMBER = ("#8a4b00", "#fff4e0")
 _RED = ("#b3261e", "#fdecea")
-_SMALL = "font-size:0.8em;line-height:1.45;padding:0.1em 0.9em 0.35em;opacity:0.85"
+_SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
 
 
 def status_html(frame: Frame, pace: Pace) -> str:
@@ -343,8 +341,7 @@ def status_html(frame: Frame, pace: Pace) -> str:
     if None not in durations.values():
         durations = {" hand": health.duration, " arm": health.arm_duration}
     rows = (
-        ("Rebuild", f"{1e3 * pace.latency:.0f} ms" + (f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else "")),
-        ("Skipped edits", f"{pace.num_skipped}"),
+        ("Rebuild", _rebuild(pace)),
         ("Clearance", _clearance(health.clearance, "body points" if of_spheres else "end effector")),
         *_collision_rows(health.collision, unknown),
         ("Flow time t", " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None) or off),
@@ -361,13 +358,24 @@ def status_html(frame: Frame, pace: Pace) -> str:
     if health.clearance < 0 and scenario.avoidance and scenario.warp == 1 and not (warnings or frame.blocked):
         warnings.append("the motions go through the obstacle at this flow time")
     if health.collision is not None:
-        problems = health.collision.problems if scenario.warp == 1 else health.collision.problems_of_its_own
-        warnings += [problem for problem in problems if not any(problem in w for w in warnings)]
+        own = health.collision.problems_of_its_own
+        entered = [problem for problem in health.collision.problems if problem not in own]
+        told = {problem: problem for problem in own}
+        if scenario.warp == 1:
+            hint = HAND_ONLY if scenario.avoidance and scenario.space == "task" else ""
+            told = {**{problem: problem + hint for problem in entered}, **told}
+        warnings += [text for problem, text in told.items() if not any(problem in w for w in warnings)]
     blocked = ""
     if frame.blocked:
         blocked = _alarm(f"no motion: {'; '.join(frame.blocked)}. What is shown is the last good one.", *_RED)
-    hint = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
-    return f"{blocked}<table style='{_SMALL}'>{cells}</table>{hint}{''.join(_alarm(w, *_AMBER) for w in warnings)}"
+    warp = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
+    return f"{blocked}<table style='{_SMALL}'>{cells}</table>{warp}{''.join(_alarm(w, *_AMBER) for w in warnings)}"
+
+
+def _rebuild(pace: Pace) -> str:
+    """How fast it goes."""
+    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
+    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} edits skipped"
 
 
 def _tiny(length: float) -> str:
