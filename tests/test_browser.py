@@ -467,6 +467,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
 
 def test_the_warp_is_played_in_the_page(visit):
     page, visitor = visit
+    open_tab(page, "Stack")
     page.get_by_text("0 → 1").click()
     wait_until(lambda: visitor.shown.scenario.warp < 1, "a picture on its way")
     wait_until(lambda: visitor.session.scenario.warp == visitor.shown.scenario.warp == 1, "the full stack")
