@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from dt_viz.diffeo import AdaptiveFlow, Chain
 from dt_viz.fields import Array
 from dt_viz.following import MAX_TRACKING_ERROR, Follower
 from dt_viz.ground import Ground
@@ -22,8 +21,6 @@ from dt_viz.solving import Solution
 from dt_viz.tracking import track
 from dt_viz.whole_arm import ArmSolution
 
-TOLERANCE = 1e-6
-"""Of the whole arm's flow while the place below is looked for, rad a step."""
 ARRIVED = 2e-4
 """Metres from the pointer at which the hand counts as there."""
 MAX_STEPS = 8
@@ -91,13 +88,11 @@ def held(
 
 def _hands(follower: Follower, arm: ArmSolution, posture: Array, reference: Array) -> Hands:
     """Where the hand of the whole arm is when that of the motion below is somewhere near `posture` (6,)."""
-    parts = arm.transform.parts if isinstance(arm.transform, Chain) else (arm.transform,)
-    transform = Chain([replace(p, tolerance=TOLERANCE) if isinstance(p, AdaptiveFlow) else p for p in parts])
 
     def hands(x: Array) -> Array:
         start = np.broadcast_to(posture, (len(x), NUM_JOINTS))
         q = track(follower.robot, x[:, None], start, reference=np.broadcast_to(reference, start.shape)).q[:, 0]
-        return follower.robot.end_effector(transform.inverse(follower.whole_arm.limits.inside(q)))
+        return follower.robot.end_effector(arm.transform.inverse(follower.whole_arm.limits.inside(q)))
 
     return hands
 

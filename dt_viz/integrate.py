@@ -82,9 +82,9 @@ def integrate_adaptive(
     """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` with the Dormand–Prince 5(4) pair.
 
     Every point has its own step length, chosen so that the estimated error of each step is below `tolerance` (in the
-    unit of `s`) and, for motions as small as that and for tangents, below `RELATIVE_TOLERANCE` of them: points that the
-    field hardly moves take one step, only those in its stiff core take many. The first step is short where the field
-    changes quickly along it: the estimated error of a step far too long may be small by chance.
+    unit of `s`), in proportion less for motions shorter than `SHORT`, and for tangents below `TANGENT_TOLERANCE` of
+    them: points that the field hardly moves take one step, only those in its stiff core take many. The first step is
+    short where the field changes quickly along it: the estimated error of a step far too long may be small by chance.
 
     Raises:
         ArithmeticError: if some point needs more than `max_rounds` steps.
@@ -115,11 +115,11 @@ def integrate_adaptive(
             stages[i] = rate(end)
         defect = step * _combined(_DP_ERROR, stages)
         # beside a rest point a small error is a large part of the motion, which grows with the motion
-        allowed = np.clip(RELATIVE_TOLERANCE * np.abs(end - start)[:, :d].max(axis=1), ROUNDING, tolerance)
+        allowed = _allowed(np.abs(end - start)[:, :d].max(axis=1), tolerance)
         error = np.abs(defect[:, :d]).max(axis=1) / allowed
         if U is not None:
             largest = np.maximum(np.abs(end[:, d:]).max(axis=1), np.finfo(float).tiny)
-            error = np.maximum(error, np.abs(defect[:, d:]).max(axis=1) / (RELATIVE_TOLERANCE * largest))
+            error = np.maximum(error, np.abs(defect[:, d:]).max(axis=1) / (TANGENT_TOLERANCE * largest))
         accepted = error <= 1
         start = np.where(accepted[:, None], end, start)
         first = np.where(accepted[:, None], stages[-1], first)
@@ -146,15 +146,18 @@ _DP_STAGES = np.array(
 _DP_ERROR = np.array((71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40))
 
 
-RELATIVE_TOLERANCE = 3e-4
-"""Of the motion of a step, and of a tangent."""
+SHORT = 1 / 15
+"""Motion of a step, in the unit of the points, that is allowed the whole tolerance. What is squeezed into the core of
+an obstacle comes back magnified ten thousand times, and so does its error: the relative error counts there."""
+TANGENT_TOLERANCE = 3e-4
+"""Of a tangent, in a step."""
 ROUNDING = 1e-15
 """Below which differences of coordinates mean nothing, in their unit."""
 STRAIGHT = 0.1
 """Part of a velocity that may change along a motion that counts as straight."""
-LONGEST_TURN = 0.8
-"""Largest first step, in the time in which a velocity changes by as much as it is: where `RELATIVE_TOLERANCE` is what
-is asked for, about the longest that is accepted."""
+LONGEST_TURN, TURN_ERROR = 0.8, 3e-4
+"""First step, in the time in which a velocity changes by as much as it is, and the part of the motion by which it is
+wrong, about."""
 
 
 def _combined(coefficients: Array, stages: Array) -> Array:
@@ -191,17 +194,22 @@ def _still(state: Array, rate: Array, turning: Array, d: int, total: float, tole
     if rate.shape[1] == d:
         return still & (turning * total <= STRAIGHT)
     changing = np.abs(rate[:, d:]).max(axis=1)
-    return still & (changing * total <= RELATIVE_TOLERANCE * np.abs(state[:, d:]).max(axis=1))
+    return still & (changing * total <= TANGENT_TOLERANCE * np.abs(state[:, d:]).max(axis=1))
 
 
 def _first_step(velocity: Array, turning: Array, total: float, tolerance: float) -> Array:
     """Length (N,) of the first step of points with a `velocity` (N, d) that changes at the rate `turning` (N,).
 
-    The error of a step h grows as its fifth power, and `tolerance` allows less of a fast motion than of a slow one.
+    The error of a step h grows as its fifth power.
     """
-    asked = RELATIVE_TOLERANCE * total * np.abs(velocity).max(axis=1, initial=0.0)
-    caution = (np.clip(asked, ROUNDING, tolerance) / np.maximum(asked, ROUNDING)) ** 0.2
+    motion = total * np.abs(velocity).max(axis=1, initial=0.0)
+    caution = (_allowed(motion, tolerance) / np.maximum(TURN_ERROR * motion, ROUNDING)) ** 0.2
     return np.minimum(total, LONGEST_TURN * caution / np.maximum(turning, ROUNDING))
+
+
+def _allowed(motion: Array, tolerance: float) -> Array:
+    """Error (N,) that a step of this `motion` (N,) may have."""
+    return np.clip(tolerance / SHORT * motion, ROUNDING, tolerance)
 
 
 def _augment(field: VectorField, s: Array, U: Array | None) -> tuple[Array, Callable[[Array], Array]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dt_viz.arm_system import ArmSystem, Section
-from dt_viz.diffeo import AdaptiveFlow, Chain, Flow, Identity, Inverse
+from dt_viz.diffeo import AdaptiveFlow, Conjugated, Flow, Identity
 from dt_viz.following import Follower
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Sphere
@@ -33,10 +33,11 @@ class Case:
         base = Attractor(self.ground.system.base.goal, speed=0.2, smoothing=0.05)
         hand = DiffeomorphicSystem(self.ground.system.transform, base)
         solution = follower.whole_arm.avoiding(self.lifted, scenario, LIVE.spacing, coarse=True)
-        limits, flow, _ = solution.transform.parts  # pyright: ignore[reportAttributeAccessIssue]
-        self.field, self.duration = flow.field, flow.duration
+        avoids = solution.transform
+        assert isinstance(avoids, Conjugated) and isinstance(avoids.inner, Flow)
+        self.field, self.duration = avoids.inner.field, avoids.inner.duration
         # equal steps: their Jacobian is their derivative to rounding, the adaptive flow's to 3e-4 of itself
-        avoiding = Chain([limits, Flow(self.field, self.duration, 8), limits.of])
+        avoiding = Conjugated(Flow(self.field, self.duration, 8), avoids.by)
         self.systems = {
             "nothing": ArmSystem(hand, self.section, Identity(6)),
             "an obstacle": ArmSystem(hand, self.section, avoiding),
@@ -144,8 +145,8 @@ class TestSystem:
         np.testing.assert_allclose(robot.end_effector(goal), case.ground.goal, rtol=0, atol=1e-6)
 
     def test_with_the_learned_pace_too_and_the_flow_that_the_page_shows(self, case):
-        limits = case.systems["an obstacle"].transform.parts[-1]
-        flow = Chain([Inverse(limits), AdaptiveFlow(case.field, case.duration, 3e-8), limits])
+        avoids = case.systems["an obstacle"].transform
+        flow = replace(avoids, inner=AdaptiveFlow(case.field, case.duration, 3e-8))
         system = ArmSystem(case.ground.system, case.section, flow)
         p0, h = case.starts(system, 7), 1e-3
         before, at, after = np.moveaxis(system.rollout(p0, np.array([1.0 - h, 1.0, 1.0 + h])), -2, 0)

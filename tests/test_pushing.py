@@ -120,7 +120,7 @@ def ramp(begin, end, seconds):
 @pytest.fixture
 def player(monkeypatch):
     monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
-    monkeypatch.setattr(playback_module, "REST", 0.05)
+    monkeypatch.setattr(playback_module, "REST", 0.3)
     monkeypatch.setattr(playback_module, "CATCH_UP", 0.1)
     recorder = Recorder()
     player = Playback(recorder)

@@ -56,16 +56,15 @@ def check(engine, seed):
     may_move = scenario.obstacles or any(point.moves_goal for point in points)
     assert moved < 1e-3 or may_move
     assert health.min_det_jacobian > 0
-    assert health.round_trip_error < 1e-6 or any("there and back" in doubt for doubt in health.doubts)
-    return health.round_trip_error < 1e-6
+    assert health.round_trip_error < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_random_stack_is_a_diffeomorphism_that_leads_to_its_goal_or_says_what_it_loses(engine, seed):
+@pytest.mark.parametrize("seed", [*range(5), 1122])  # the last one is squeezed most
+def test_a_random_stack_is_a_diffeomorphism_that_leads_to_its_goal(engine, seed):
     check(engine, seed)
 
 
 @pytest.mark.slow
-def test_so_are_nearly_all_of_two_hundred(engine):
-    exact = [check(engine, seed) for seed in range(1000, 1200)]
-    assert np.mean(exact) >= 0.97  # squeezed between obstacles, a few lose digits, and say so
+@pytest.mark.parametrize("seed", range(1000, 1200))
+def test_so_are_two_hundred(engine, seed):
+    check(engine, seed)
