@@ -57,7 +57,7 @@ class Controls:
 
     @property
     def visible(self):
-        return {label for label, (handle, *_) in self.bound.items() if handle.visible}
+        return {handle.label for handle, *_ in self.bound.values() if handle.visible}
 
     def value(self, label):
         return self.bound[label][0].value
@@ -69,15 +69,18 @@ def controls(server):
     server.gui.reset()
 
 
+STRENGTH = {"Settings of", "Strength: auto", "Strength t", "Integrator"}
 FLOW = {"Settings of", "Flow time: auto", "Flow time t", "Integrator"}
 
 
 def test_only_what_the_chosen_transform_has_is_shown(controls):
     assert controls.visible == FLOW | {"Avoid with", "Generator", "Reach T"}  # the outermost is the avoidance
     controls.set("Settings of", "Bias 1")
-    assert controls.visible == FLOW
+    assert controls.visible == STRENGTH  # as the paper calls the t of a bias point
     controls.set("Integrator", "Euler (the paper's)")
-    assert controls.visible == FLOW | {"Steps"}
+    assert controls.visible == STRENGTH | {"Steps"}
+    controls.set("Settings of", AVOIDANCE)
+    assert controls.visible == FLOW | {"Avoid with", "Generator", "Reach T"}
     controls.set("Settings of", IMITATION)
     assert controls.visible == {"Settings of", "Learn"}
     assert controls.settings._note.visible

@@ -13,7 +13,7 @@ from dt_viz.engine import Frame
 from dt_viz.integration import MAX_STEPS, METHODS, Method
 from dt_viz.occupancy import GENERATORS
 from dt_viz.scenario import MAX_TEMPERATURE, MIN_TEMPERATURE, OBJECTIVES, SPACES, Scenario
-from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM
+from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points
 from dt_viz.tuning import FlowSettings, avoids, flow_settings, transforms, tuned, with_flow
 
 Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], Mapping[str, Any]]], Any]
@@ -116,6 +116,7 @@ class TransformSettings:
         )
         self._of_imitation = (learn, self._note)
         self._of_avoidance = (space, generator, reach)
+        self._auto = auto
         self._of_flow = (auto, self._duration, method)
 
     def adopt(self, scenario: Scenario) -> None:
@@ -135,6 +136,9 @@ class TransformSettings:
             for handle in handles:
                 if handle.visible != visible:
                     handle.visible = visible
+        for handle, label in zip((self._auto, self._duration), flow_labels(scenario, name), strict=True):
+            if handle.label != label:
+                handle.label = label
         if flow is not None:
             if self._duration.max != flow.max_duration:
                 self._duration.max = flow.max_duration
@@ -156,6 +160,12 @@ class TransformSettings:
         text = learned_html(self._learned)
         if self._note.content != text:
             self._note.content = text
+
+
+def flow_labels(scenario: Scenario, name: str) -> tuple[str, str]:
+    """What the switch of `auto` and t are called: of a bias point, t is its strength."""
+    what = "Strength" if name in bias_points(scenario.layers) else "Flow time"
+    return f"{what}: auto", f"{what} t"
 
 
 def durations(frame: Frame) -> dict[str, float | None]:
