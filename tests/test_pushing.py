@@ -199,3 +199,17 @@ def test_a_held_arm_stays_where_it_is_held_also_while_it_is_played_and_goes_on_w
     playback.end_detour()
     recorder.wait(lambda place: place <= 1.0)
     assert ended == ["over", "held"]
+
+
+def test_letting_go_ends_what_is_held_and_no_detour_that_is_under_way(player):
+    playback, recorder = player
+    ended = []
+    playback.follow(ramp(0.0, 1.0, 0.5))
+    recorder.wait(lambda place: place > 0)
+    playback.hold(ramp(3.0, 4.0, 30.0), lambda: ended.append("held"))
+    playback.let_go()
+    playback.let_go()
+    assert ended == ["held"]
+    playback.take_detour(ramp(5.0, 6.0, 30.0), lambda: ended.append("detour"))
+    playback.let_go()
+    assert ended == ["held"]

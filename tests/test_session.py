@@ -14,6 +14,7 @@ from dt_viz.engine import Engine, Stage
 from dt_viz.imitation import ImitationError
 from dt_viz.obstacles import Box, Sphere
 from dt_viz.scenario import Layer, Scenario, View
+from dt_viz.tracking import UnreachableError
 from dt_viz.ui import session as session_module
 from dt_viz.ui.session import GESTURE_PAUSE, MAX_UNDO, Session
 
@@ -36,7 +37,7 @@ class FakeEngine:
         self.begun, self.gate = threading.Event(), None
         self.unlearned, self.learning = set(), threading.Event()
         self.pushes, self.pushable = [], True
-        self.holds = []
+        self.holds, self.beyond = [], set()
 
     def frames(self, scenario, progress=None, checkpoint=None):
         self.asked.append(scenario)
@@ -62,6 +63,8 @@ class FakeEngine:
     def held(self, scenario, q, place):
         self.holds.append(tuple(place))
         time.sleep(0.002)
+        if place[0] in self.beyond:
+            raise UnreachableError("too far")
         return ("held", tuple(place)) if self.pushable else None
 
 
@@ -669,7 +672,8 @@ def test_only_the_newest_place_of_several_threads_is_done_next_and_the_last_one_
     for thread in threads:
         thread.join(PATIENCE)
     opened.settle()
-    places = [place[0] for _, place in shown]
+    assert len(shown) == 160  # each is answered, with nothing where a newer one came first
+    places = [answer[1][0] for answer in shown if answer is not None]
     assert places == sorted(places) and places[-1] == 160.0
     assert len(opened.engine.holds) == len(places) < 160
 
@@ -699,6 +703,34 @@ def test_a_view_that_is_edited_while_the_hand_is_held_is_shown_and_loses_no_rele
     opened.settle()
     assert shown == [("held", (1.0, 0.0, 0.0))]
     assert opened.shown.view.base and opened.page.frames[-1].stage is max(Stage)
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_hold_that_fails_is_said_and_answered_and_the_frames_go_on(opened, last):
+    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
+    opened.engine.beyond.add(9.0)
+    opened.session.edit("grid", view=View(grid=True))
+    assert opened.engine.begun.wait(PATIENCE)
+    shown = []
+    assert hold(opened, 9.0, shown, last=last)
+    opened.engine.gate.set()
+    opened.settle()
+    assert shown == [None]
+    assert [str(error) for error in opened.page.errors] == ["too far"]
+    assert opened.shown.view.grid and opened.page.frames[-1].stage is max(Stage)
+
+
+def test_a_release_that_a_push_replaces_is_answered_before_the_push_is_shown(opened):
+    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
+    opened.session.edit("grid", view=View(grid=True))
+    assert opened.engine.begun.wait(PATIENCE)
+    shown = []
+    assert hold(opened, 1.0, shown, last=True)
+    opened.session.push(np.zeros(6), shown.append)
+    opened.engine.gate.set()
+    opened.settle()
+    assert shown == [None, ("pushed", opened.session.scenario)]
+    assert opened.engine.holds == [] and opened.page.frames[-1].stage is max(Stage)
 
 
 def test_nothing_is_held_while_another_motion_is_computed(opened):

@@ -108,6 +108,12 @@ class Playback:
         if detour is not None:
             self._leave(detour)
 
+    def let_go(self) -> None:
+        """Go on with the loop if the arm is held; a detour that is under way goes on."""
+        detour = self._detour
+        if detour is not None and detour.held:
+            self._leave(detour)
+
     def set_pace(self, playing: bool, speed: float) -> None:
         """Play or pause, and how many times faster than real time."""
         self._playing, self._speed = playing, speed

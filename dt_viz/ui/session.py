@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -21,6 +22,8 @@ from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
 from dt_viz.tasks import Task
 from dt_viz.ui.worker import LatestWorker
+
+logger = logging.getLogger(__name__)
 
 GESTURE_PAUSE = 1.0
 """Seconds without an edit after which the next edit of the same control is a step of its own for undo."""
@@ -49,7 +52,7 @@ class _Request:
 
     compute: Callable[[Scenario], Pushed | None]
     show: Callable[[Pushed | None], None]
-    """Given what the arm does then; None where another motion than the scenario's is shown."""
+    """Given what the arm does then; None where it does nothing: see `Session.hold`."""
     goes_on: bool = False
     """Whether more such requests follow soon, so that refining the frames would be in vain."""
 
@@ -121,8 +124,8 @@ class Session:
         self._learning = self._stopped = self._closed = False
         self._shown: Scenario | None = None
         self._complete = False
-        self._request: _Request | None = None
-        """The newest one, until the worker comes to it; edits do not replace it."""
+        self._requests: list[_Request] = []
+        """Until the worker comes to them: only the newest is done, the others are told so; edits replace none."""
         self._rng = np.random.default_rng(0)
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
@@ -240,12 +243,11 @@ class Session:
             q: (6,) joint angles now, rad.
             place: (3,) where the hand should be, metres.
             show: given where the arm is then, and how it would go on; None where another motion than the scenario's is
-                shown. Called on the worker thread.
+                shown, where a newer request came first, and where it failed. Called on the worker thread.
             last: whether the hand is let go there.
 
         Returns:
-            Whether `show` will be called, unless a newer request comes first: not while another motion than the
-            scenario's is shown.
+            Whether `show` will be called: not while another motion than the scenario's is shown.
         """
         return self._ask(_Request(lambda scenario: self._engine.held(scenario, q, place), show, goes_on=not last))
 
@@ -253,7 +255,7 @@ class Session:
         with self._lock:
             possible = self._shown is not None and self.scenario.moves_like(self._shown)
             if possible:
-                self._request = request
+                self._requests.append(request)
                 self._submit()
         return possible
 
@@ -345,18 +347,26 @@ class Session:
             self._learning = True
         self._display.learning(fraction, message)
 
-    def _serve(self, scenario: Scenario, request: _Request) -> bool:
+    def _serve(self, scenario: Scenario, request: _Request, replaced: list[_Request]) -> bool:
         """Do what is asked for; whether the frames of the scenario, which it may have interrupted, can wait."""
-        request.show(request.compute(scenario))
-        can_wait = self._complete or request.goes_on
+        try:
+            pushed, failed = request.compute(scenario), False
+        except Exception as error:  # as in `LatestWorker`, but the frames go on
+            logger.exception("the arm could not do what it was asked for")
+            pushed, failed = None, True
+            self._display.fail(error)
+        for other in replaced:
+            other.show(None)
+        request.show(pushed)
+        can_wait = self._complete or (request.goes_on and not failed)
         return can_wait and self._shown is not None and scenario.computes_like(self._shown)
 
     def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
         scenario, edited = job
         with self._lock:
-            request, self._request = self._request, None
-        if request is not None:
-            if self._serve(scenario, request):
+            requests, self._requests = self._requests, []
+        if requests:
+            if self._serve(scenario, requests[-1], requests[:-1]):
                 return
             edited = time.perf_counter()
         wanted = partial(_end_if, superseded)

@@ -97,6 +97,8 @@ class Visitor:
                 self._playback.end_detour()
             self._playback.follow(frame.arm)
             self.grip.draw(frame)
+            if not self.grip.ball.visible:  # in a drag: nobody says any more that it ends
+                self._playback.let_go()
             self._panel.report(frame, pace)
         self.client.flush()
         self.shown = frame
@@ -115,6 +117,7 @@ class Visitor:
 
     def fail(self, error: Exception) -> None:
         """See `Display`."""
+        self._playback.let_go()
         self._panel.fail(error)
 
     def cancelled(self, task: str) -> None:
