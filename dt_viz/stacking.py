@@ -16,9 +16,11 @@ from dt_viz.tasks import Task
 MAX_BIAS_POINTS = 4
 BESIDE = 0.08
 """Metres from the mean path at which a new bias point is placed."""
+APART = 0.25
+"""Metres that it keeps from other bias points, where that is possible: regions are about that large."""
 ROOM = 0.04
 """Metres that it keeps from obstacles."""
-PLACES = (0.50, 0.30, 0.70, 0.15, 0.85, 0.40, 0.60)
+PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
 """Along the mean path, beside which new bias points are placed, as fractions of its length."""
 IMITATION, AVOIDANCE, WHOLE_ARM = "Imitation", "Avoidance", "Whole arm"
 """Names of the transforms that are no layers."""
@@ -136,6 +138,8 @@ def place_beside(task: Task, scenario: Scenario) -> BiasPoint:
         places += sorted(sides, key=lambda place: -np.linalg.norm(mean - place, axis=1).min())
     taken = [np.asarray(other.position) for other in bias_points(scenario.layers).values()]
     free = [place for place in places if np.linalg.norm(mean - place, axis=1).min() > BESIDE / 2]  # of other strokes
-    free = [place for place in free if all(np.linalg.norm(place - other) > BESIDE for other in taken)]
-    room = (place for place in free if scenario.obstacle.signed_distance(place) > ROOM)
-    return BiasPoint(vector(next(room, (free or places)[0])), plane=plane)
+    room = [place for place in free if scenario.obstacle.signed_distance(place) > ROOM] or free or places
+    # two whose regions overlap pull against each other: first where no other one is near, then as far as there is
+    apart = [min((float(np.linalg.norm(place - other)) for other in taken), default=np.inf) for place in room]
+    far = [place for place, distance in zip(room, apart, strict=True) if distance > APART]
+    return BiasPoint(vector(far[0] if far else room[int(np.argmax(apart))]), plane=plane)

@@ -5,6 +5,7 @@ import pytest
 
 from dt_viz.avoidance import ObstacleAvoidance
 from dt_viz.bias import Biasing, BiasPoint
+from dt_viz.engine import Stage
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Layer, Scenario
 from dt_viz.stacking import (
@@ -139,3 +140,16 @@ def test_new_bias_points_lie_beside_the_motion_apart_from_each_other_and_in_the_
             assert abs(np.cross(*plane) @ (np.asarray(point.position) - task.slice.centre)) < 1e-9
         assert point.position[2] > 0
         scenario = edited(scenario, layers=with_bias_point(scenario.layers, point))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_two_new_bias_points_do_not_pull_against_each_other(task, engine, initial):
+    scenario = initial(task)
+    for _ in range(2):
+        point = place_beside(engine.task(task), scenario)
+        scenario = edited(scenario, layers=with_bias_point(scenario.layers, point))
+    frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.FINE)
+    assert frame.health.doubts == ()
+    for point in bias_points(scenario.layers).values():
+        for path in frame.rollouts:
+            assert np.linalg.norm(path - point.position, axis=1).min() <= 0.0105  # between samples, too
