@@ -142,8 +142,9 @@ four sessions that drag at once get twice as many frames this way."""
 class Engine:
     """Computes frames for one visitor. Not thread-safe: one worker thread calls it.
 
-    The same scenario always gives the same frame, except where there is no motion for it: then the last one that there
-    was for the task is shown, marked by `Frame.blocked`.
+    The same scenario always gives the same frame, with two exceptions. Where there is no motion for it the last one
+    that there was for the task is shown, marked by `Frame.blocked`. And up to stage LIVE joints are looked for from
+    those shown before: they differ by less than a milliradian.
     """
 
     def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot) -> None:
@@ -207,7 +208,7 @@ class Engine:
         frame = self._frame(ground, scenario, fine)
         arms, health = [], frame.health
         for rollout in range(len(frame.rollouts)):
-            arm, doubts = self._arm(frame, ground, fine, rollout)
+            arm, doubts = self._arm(frame, ground, fine, rollout, exact=True)
             arms.append(arm)
             health = health.doubting(*doubts)
         return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
@@ -265,7 +266,7 @@ class Engine:
             first = replace(first, scenario=scenario, level=_level(scenario, live.stack))
         yield first
         with _turn:
-            frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, ground, live))
+            frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, ground, live, exact=False))
             pictures = _pictures(live.ground, scenario, live.stack, coarse=True)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.LIVE, pictures=pictures)
             self._good[scenario.task] = frame, live.ground, live.stack
@@ -277,7 +278,7 @@ class Engine:
             fine = _once(kept.solved, FINE, lambda: self._solved(ground, scenario, FINE, checkpoint))
         with _turn:
             exact = _once(kept.rollouts, FINE, lambda: self._frame(ground, scenario, fine))
-            frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, ground, fine))
+            frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, ground, fine, exact=True))
         with _turn:
             pictures = _pictures(fine.ground, scenario, fine.stack, coarse=False)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.FINE, pictures=pictures)
@@ -338,7 +339,8 @@ class Engine:
         stack = warped(below, full.stack, scenario.warp, precision)
         if full.arm is None:
             return _Solved(stack, None, None, below)
-        lifted, whole_arm = self._follower.behaving(ground, stack), self._follower.whole_arm
+        exact = precision is not LIVE
+        lifted, whole_arm = self._follower.behaving(ground, stack, exact=exact), self._follower.whole_arm
         checkpoint()
         arm = whole_arm.warped(full.arm, lifted, scenario, scenario.warp, precision.spacing)
         return _Solved(stack, arm, lifted, below)
@@ -351,7 +353,8 @@ class Engine:
             return known[2]
         stack, arm, lifted, follower = solve(ground, scenario, precision, checkpoint), None, None, self._follower
         if _uses_whole_arm(scenario):
-            lifted = follower.behaving(ground, stack) if stack.built else follower.undisturbed(ground)
+            exact = precision is not LIVE
+            lifted = follower.behaving(ground, stack, exact=exact) if stack.built else follower.undisturbed(ground)
             checkpoint()
             arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, checkpoint, coarse=precision is LIVE)
         solved = _Solved(stack, arm, lifted, ground)
@@ -394,18 +397,20 @@ class Engine:
             layer_radii=tuple(_region_radius(stack, layer.behaviour) for layer in scenario.layers),
         )
 
-    def _with_arm(self, frame: Frame, ground: Ground, solved: _Solved) -> Frame:
+    def _with_arm(self, frame: Frame, ground: Ground, solved: _Solved, *, exact: bool) -> Frame:
         arm, doubts = None, ()
         try:
             far = self._follower.out_of_reach(ground)
             if frame.chosen is not None and not far[frame.chosen]:
-                arm, doubts = self._arm(frame, ground, solved, frame.chosen)
+                arm, doubts = self._arm(frame, ground, solved, frame.chosen, exact=exact)
             doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
         except UnreachableError as error:
             doubts = (f"the arm cannot reach the starts: {error}",)
         return replace(frame, arm=arm, health=frame.health.doubting(*doubts))
 
-    def _arm(self, frame: Frame, ground: Ground, solved: _Solved, chosen: int) -> tuple[ArmMotion, tuple[str, ...]]:
+    def _arm(
+        self, frame: Frame, ground: Ground, solved: _Solved, chosen: int, *, exact: bool
+    ) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
         times = frame.times[chosen]
         if solved.arm is not None and solved.lifted is not None:
@@ -416,7 +421,7 @@ class Engine:
             bundle = solved.stack.bundle
             path, fraction = frame.rollouts[chosen], bundle.split(bundle.fraction)[chosen]
             keep = np.linspace(0, len(path) - 1, NUM_ARM_SAMPLES).round().astype(int)
-            joints = self._follower.along(ground, chosen, path[keep])
+            joints = self._follower.along(ground, chosen, path[keep], exact=exact)
             q, times, fraction = joints.q, times[keep], fraction[keep]
             doubts = self._follower.doubts(joints, chosen)
         without = self._follower.undisturbed(ground.only([chosen])).at(np.zeros(len(fraction), int), fraction)

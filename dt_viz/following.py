@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from dt_viz.body import load_body_points
 from dt_viz.collision import load_collision_model
-from dt_viz.fields import Array, Mask
+from dt_viz.fields import Array, Indices, Mask
 from dt_viz.ground import Ground, Learned, Strand, named_starts
 from dt_viz.metrics import arc_length
 from dt_viz.obstacles import Obstacle
@@ -17,9 +17,11 @@ from dt_viz.robot import Robot
 from dt_viz.scenario import MAX_STARTS
 from dt_viz.several import Several
 from dt_viz.solving import Solution
-from dt_viz.tracking import JointPath, UnreachableError, inverse_kinematics, track
+from dt_viz.tracking import JointPath, UnreachableError, drawn_onto, inverse_kinematics, track
 from dt_viz.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
 
+BY_FRACTION = 0.3
+"""Part of the even spacing of postures that goes by the fraction of the base ray, not by the length of the path."""
 MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
 NUM_ARM_SAMPLES = 200
@@ -78,25 +80,44 @@ class Follower:
         """
         return self.undisturbed(ground.learned.demonstrated).reference
 
-    def behaving(self, ground: Ground, solution: Solution) -> Lift:
-        """The joints along the motion with the behaviours of the end effector."""
+    def behaving(self, ground: Ground, solution: Solution, *, exact: bool) -> Lift:
+        """The joints along the motion with the behaviours of the end effector.
+
+        Args:
+            ground: what it begins from.
+            solution: that motion.
+            exact: whether the end effector is on that motion between the samples, too, whatever was shown before; else
+                it may be off by millimetres where the stack stretches space, and begins from what was shown before.
+        """
         fraction = []
         for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
             length = arc_length(path)
-            fraction.append(np.interp(np.linspace(0, length[-1], NUM_CONFIGURATIONS), length, fractions))
+            # where the stack stretches a path, samples by its length alone lie far apart in its fraction
+            place = (1 - BY_FRACTION) * length / length[-1] + BY_FRACTION * fractions
+            fraction.append(np.interp(np.linspace(0, 1, NUM_CONFIGURATIONS), place, fractions))
         index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
         paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)
-        initial = self._before.get((ground.learned, None))
-        if initial is not None and len(initial) != len(paths):
+        reference, initial = self.reference(ground), self._before.get((ground.learned, None))
+        if exact or (initial is not None and len(initial) != len(paths)):
             initial = None  # starts have come or gone
-        lifted = lift(self.robot, np.stack(fraction), paths, self.reference(ground), initial)
+        lifted = lift(self.robot, np.stack(fraction), paths, reference, initial)
         self._before[ground.learned, None] = lifted.tracked.q
-        return lifted
+        if not exact:
+            return lifted
 
-    def along(self, ground: Ground, rollout: int, path: Array) -> JointPath:
-        """The joints along one path (T, 3) of the end effector, metres, T being `NUM_ARM_SAMPLES`."""
+        def exactly(q: Array, index: Indices, fraction: Array) -> Array:
+            return drawn_onto(self.robot, q, solution.positions_at(index, fraction), reference)
+
+        return replace(lifted, exactly=exactly)
+
+    def along(self, ground: Ground, rollout: int, path: Array, *, exact: bool) -> JointPath:
+        """The joints along one path (T, 3) of the end effector, metres, T being `NUM_ARM_SAMPLES`.
+
+        They begin from what was shown before, unless `exact`.
+        """
         number = ground.numbers[rollout]
-        joints = track(self.robot, path, self.reference(ground), self._before.get((ground.learned, number)))
+        before = None if exact else self._before.get((ground.learned, number))
+        joints = track(self.robot, path, self.reference(ground), before)
         self._before[ground.learned, number] = joints.q
         return joints
 

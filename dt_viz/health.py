@@ -76,7 +76,7 @@ def certified_arm(health: Health, system: DiffeomorphicSystem, arm: ArmSolution,
     keep = np.unique(np.linspace(0, len(arm.index) - 1, NUM_CHECKED_POSTURES).astype(int))
     p, (q, J) = arm.p[keep], arm.transform.jacobian(arm.p[keep])
     round_trip = float(np.linalg.norm((arm.transform.inverse(q) - p) * LEVERS, axis=1).max())
-    falls = _falls(system.lyapunov(robot.end_effector(q)), arm.index[keep])
+    falls = _falls(system.lyapunov(robot.end_effector(arm.q)), arm.index)  # of all: samples far apart hide a rise
     return _judged(health, float(np.linalg.det(J).min()), round_trip, falls)
 
 

@@ -57,6 +57,8 @@ NUM_RESTARTS = 24
 IK_ITERATIONS = 60
 IK_TOLERANCE = 1e-5
 """Miss, metres, below which a target counts as reached."""
+NUM_CORRECTIONS = 3
+"""Steps that take millimetres to rounding: their convergence is quadratic."""
 FLOOR_WEIGHT = 100.0
 """Cost per metre of a joint below the table, where inverse kinematics chooses among its solutions."""
 
@@ -231,6 +233,25 @@ def track(
         part = posture.take(lost)
         q[lost] = _sweep(robot, _walk(robot, paths[lost], starts[lost], part, stride), paths[lost], part)
     return _report(robot, q.reshape(shape), path)
+
+
+def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Array:
+    """Postures next to others whose end effector is where it should be.
+
+    Args:
+        robot: the arm.
+        q: (N, 6) postures a few millimetres off, rad.
+        positions: (N, 3) of the end effector, metres.
+        reference: (6,) as in `track`, rad.
+
+    Returns:
+        (N, 6) rad, inside the limits; of positions out of reach, towards the nearest place.
+    """
+    posture = _posture(robot, reference[:, None], robot.hand_direction(reference)[:, None], at_reference=True)
+    columns, target = q.T, np.ascontiguousarray(positions.T)
+    for _ in range(NUM_CORRECTIONS):
+        columns, _ = _newton(robot, columns, target, posture, gain=0.0)
+    return columns.T
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:

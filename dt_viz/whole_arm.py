@@ -65,6 +65,9 @@ class Lift:
     """At these fractions; its q has shape (R, T, 6)."""
     reference: Array
     """(6,) posture that the arm stays near to, rad."""
+    exactly: Callable[[Array, Indices, Array], Array] | None = None
+    """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
+    fractions (N,); None is content with the spline."""
 
     @cached_property
     def _splines(self) -> tuple[CubicSpline, ...]:
@@ -76,7 +79,7 @@ class Lift:
         for rollout, spline in enumerate(self._splines):
             rows = index == rollout
             q[rows] = spline(fraction[rows])
-        return q
+        return q if self.exactly is None else self.exactly(q, index, fraction)
 
     def only(self, rollout: int) -> Lift:
         """One of the rollouts."""
