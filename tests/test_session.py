@@ -9,11 +9,13 @@ from typing import cast
 import numpy as np
 import pytest
 
+from dt_viz.bias import BiasPoint
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Stage
 from dt_viz.imitation import ImitationError
 from dt_viz.obstacles import Box, Sphere
 from dt_viz.scenario import Layer, Scenario, View
+from dt_viz.stacking import AVOIDANCE, IMITATION, with_bias_point, without
 from dt_viz.tracking import UnreachableError
 from dt_viz.ui import session as session_module
 from dt_viz.ui.session import GESTURE_PAUSE, MAX_UNDO, Session
@@ -579,6 +581,28 @@ def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_wi
     session.edit("scene", obstacles=(), space="cspace", scene="somewhere")
     session.choose_task("draw_s")
     assert session.scenario == fresh("draw_s")
+
+
+# --- Levels of the stack ---
+
+
+@pytest.mark.parametrize("back", ["delete", "undo"])
+def test_a_level_that_is_gone_is_not_looked_at_when_another_gets_its_name(opened, back):
+    session, layers = opened.session, with_bias_point((), BiasPoint((0.2, -0.5, 0.4)))
+    session.edit("add", layers=layers)
+    session.end_gesture()
+    for level in (IMITATION, AVOIDANCE, "Bias 1"):
+        session.edit("see", view=View(level=level))
+        assert session.scenario.view.level == level
+    if back == "undo":
+        session.undo()
+    else:
+        session.edit("delete", **without(session.scenario, "Bias 1"))
+        session.end_gesture()
+    assert session.scenario.view.level == ""
+    session.edit("add", layers=layers)
+    opened.settle()
+    assert opened.shown.layers == layers and opened.shown.view.level == ""
 
 
 # --- Pushing the hand ---

@@ -20,6 +20,7 @@ from dt_viz.imitation import ImitationError
 from dt_viz.paper_scenes import seen_in
 from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
+from dt_viz.stacking import IMITATION, names
 from dt_viz.tasks import Task
 from dt_viz.ui.worker import LatestWorker
 
@@ -70,9 +71,14 @@ def _end_if(superseded: Callable[[], bool]) -> None:
         raise _UnwantedError
 
 
-def _with_own_slice(scenario: Scenario, before: Scenario) -> Scenario:
-    """The scenario; of another task than before, with the slice where that task has it."""
-    return scenario if scenario.task == before.task else replace(scenario, view=replace(scenario.view, slice=None))
+def _with_own_view(scenario: Scenario, before: Scenario) -> Scenario:
+    """The scenario, its view naming no level that is gone; of another task than before, with its slice."""
+    view = scenario.view
+    if scenario.task != before.task:
+        view = replace(view, slice=None)
+    if view.level and view.level not in (IMITATION, *names(scenario)):  # another layer may get its name
+        view = replace(view, level="")
+    return scenario if view is scenario.view else replace(scenario, view=view)
 
 
 class Display(Protocol):
@@ -147,7 +153,7 @@ class Session:
         """
         now = time.monotonic()
         with self._lock:
-            edited = _with_own_slice(replace(self.scenario, **changes), self.scenario)
+            edited = _with_own_view(replace(self.scenario, **changes), self.scenario)
             if edited == self.scenario:
                 return
             moves = not edited.moves_like(self.scenario)
@@ -220,7 +226,7 @@ class Session:
     def _as_seen(self, other: Scenario) -> Scenario:
         """Another scenario, looked at as this one."""
         seen = replace(other, view=seen_in(self.scenario.view, other.scene, self.scenario.scene))
-        return _with_own_slice(seen, self.scenario)
+        return _with_own_view(seen, self.scenario)
 
     def push(self, q: Array, show: Callable[[Pushed], None]) -> None:
         """Push the hand aside. Nothing is done while another motion than the scenario's is shown.
