@@ -137,7 +137,8 @@ class AdaptiveFlow(Diffeomorphism):
     field: VectorField
     duration: float
     tolerance: float = 1e-8
-    """Largest estimated error of a step, in the unit of the points."""
+    """Largest estimated error of a step of the points, in their unit. Tangents obey `TANGENT_TOLERANCE`, whatever this
+    is: where space is squeezed strongly, det J may be off by some per cent."""
 
     @property
     def dim(self) -> int:

@@ -23,7 +23,7 @@ from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
 from dt_viz.following import NUM_ARM_SAMPLES, OUT_OF_REACH, ArmMotion, Follower
 from dt_viz.ground import Ground, Learned, named_starts
-from dt_viz.health import Health, certified, certified_arm, integration_doubts
+from dt_viz.health import Health, certified, certified_arm, fold_doubts, integration_doubts
 from dt_viz.holding import held
 from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
@@ -292,11 +292,16 @@ class Engine:
         yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
 
     def _certified(self, frame: Frame, fine: _Solved) -> Health:
-        obstacle = frame.scenario.obstacle
+        obstacle, stack, arm = frame.scenario.obstacle, fine.stack, fine.arm
+        by_hand = any(made.integration.by_hand for _, made in stack.built)
         with _turn:
-            health = certified(frame.health, fine.stack.system, fine.stack.bundle)
-            if fine.arm is not None:
-                health = certified_arm(health, fine.stack.system, fine.arm, self._robot)
+            drawn_from = stack.rays.at(stack.bundle.index, stack.bundle.fraction) if by_hand else None
+            health = certified(frame.health, stack.system, stack.bundle, drawn_from)
+            if arm is not None:
+                integration = frame.scenario.integration
+                q = self._follower.whole_arm.limits.inside(arm.q)
+                health = health.doubting(*fold_doubts(WHOLE_ARM, arm.transform, integration, arm.p, q))
+                health = certified_arm(health, stack.system, arm, self._robot, q if integration.by_hand else None)
         if fine.arm is None:
             depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
             health = replace(health, clearance=-depth if depth > 0 else health.clearance)
@@ -546,7 +551,10 @@ def _integration_doubts(scenario: Scenario, solved: _Solved) -> tuple[str, ...]:
     """What the integrators cost that were chosen by hand, in words."""
     doubts, bundle = [], solved.stack.bundle
     for level, (name, (_, made)) in enumerate(zip(levels(scenario)[1:], solved.stack.built, strict=True), 1):
-        doubts += integration_doubts(name, made.transform, made.integration, bundle.levels[:, level])
+        doubts += integration_doubts(
+            name, made.transform, made.integration, bundle.levels[:, level], bundle.levels[:, level - 1]
+        )
     if solved.arm is not None:
-        doubts += integration_doubts(WHOLE_ARM, solved.arm.transform, scenario.integration, solved.arm.p, LEVERS)
+        arm = solved.arm
+        doubts += integration_doubts(WHOLE_ARM, arm.transform, scenario.integration, arm.p, arm.q, LEVERS)
     return tuple(doubts)

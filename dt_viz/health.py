@@ -8,7 +8,7 @@ import numpy as np
 
 from dt_viz.collision import CollisionReport
 from dt_viz.cspace import LEVERS
-from dt_viz.diffeo import Diffeomorphism, Flow
+from dt_viz.diffeo import Conjugated, Diffeomorphism, Flow
 from dt_viz.fields import Array, Indices
 from dt_viz.integration import Integration
 from dt_viz.robot import Robot
@@ -40,11 +40,14 @@ class Health:
     duration: float | None = None
     """t of the end effector's avoidance flow; None where it is off."""
     layer_durations: tuple[float | None, ...] = ()
-    """t of each layer's flow, in the order of `Scenario.layers`; None for those that are off."""
+    """t of each layer's flow, in the order of `Scenario.layers`, under a warp of the full one; None for those that are
+    off."""
     arm_duration: float | None = None
     """t of the whole arm's avoidance flow; None where it is off."""
     min_det_jacobian: float | None = None
-    """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism."""
+    """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism. Where ψ⁻¹,
+    integrated by hand, folds what is drawn, its det is taken. It is as exact as tangents are: where space is squeezed
+    strongly, off by some per cent (see `AdaptiveFlow.tolerance`)."""
     round_trip_error: float | None = None
     """Largest ‖ψ⁻¹(ψ(y)) − y‖ along the rollouts, metres."""
     lyapunov_falls: bool | None = None
@@ -61,52 +64,100 @@ class Health:
         return replace(self, doubts=self.doubts + doubts)
 
 
-def certified(health: Health, system: DiffeomorphicSystem, bundle: Bundle) -> Health:
-    """Add the certificates of a stack along its rollouts, and a doubt for each that fails."""
+def certified(health: Health, system: DiffeomorphicSystem, bundle: Bundle, drawn_from: Array | None = None) -> Health:
+    """Add the certificates of a stack along its rollouts, and a doubt for each that fails.
+
+    Args:
+        health: what is known already.
+        system: whose transform the stack is.
+        bundle: its rollouts.
+        drawn_from: (N, 3) the base points that ψ⁻¹ leads to the samples, where it is integrated by hand: coarse steps
+            there and back are no inverses, and ψ⁻¹, which is what is drawn, may fold space where ψ does not.
+    """
     keep = np.unique(np.linspace(0, len(bundle.index) - 1, NUM_CHECKED).astype(int))
     y, (z, J) = bundle.positions[keep], system.transform.jacobian(bundle.positions[keep])
-    det = np.linalg.det(J)
+    det = _determinant(system.transform, J, None if drawn_from is None else drawn_from[keep])
     round_trip = float(np.linalg.norm(system.transform.inverse(z) - y, axis=1).max())
     falls = _falls(system.base.potential(z), bundle.index[keep])
-    return _judged(health, float(det.min()), round_trip, falls)
+    return _judged(health, det, round_trip, falls)
 
 
-def certified_arm(health: Health, system: DiffeomorphicSystem, arm: ArmSolution, robot: Robot) -> Health:
-    """Add the certificates of the whole arm's transform to those of the end effector's stack below it."""
+def certified_arm(
+    health: Health, system: DiffeomorphicSystem, arm: ArmSolution, robot: Robot, drawn_from: Array | None = None
+) -> Health:
+    """Add the certificates of the whole arm's transform to those of the end effector's stack below it.
+
+    Args:
+        health: of that stack.
+        system: the end effector's.
+        arm: the arm's motions.
+        robot: whose arm it is.
+        drawn_from: (N, 6) postures that ψ_q⁻¹ leads to the samples, where it is integrated by hand.
+    """
     keep = np.unique(np.linspace(0, len(arm.index) - 1, NUM_CHECKED_POSTURES).astype(int))
     p, (q, J) = arm.p[keep], arm.transform.jacobian(arm.p[keep])
+    det = _determinant(arm.transform, J, None if drawn_from is None else drawn_from[keep])
     round_trip = float(np.linalg.norm((arm.transform.inverse(q) - p) * LEVERS, axis=1).max())
     falls = _falls(system.lyapunov(robot.end_effector(arm.q)), arm.index)  # of all: samples far apart hide a rise
-    return _judged(health, float(np.linalg.det(J).min()), round_trip, falls)
+    return _judged(health, det, round_trip, falls)
 
 
 def integration_doubts(
-    name: str, flow: Diffeomorphism, integration: Integration, y: Array, unit: Array | float = 1.0
+    name: str, flow: Diffeomorphism, integration: Integration, y: Array, x: Array, unit: Array | float = 1.0
 ) -> tuple[str, ...]:
     """What it costs that the integration of a transform's flow was chosen by hand, in words; nothing if it was not.
 
-    Quick enough for a drag. Of the whole arm's flow folds are not looked for: the certificates find them.
+    Quick enough for a drag. A flow in other coordinates, as the whole arm's, is too slow to be looked at for folds
+    here: see `fold_doubts`.
 
     Args:
         name: of the transform.
         flow: its ψ.
         integration: of that flow.
         y: (N, d) samples of the motions with the transform.
+        x: (N, d) the samples below, which ψ⁻¹ leads to `y`.
         unit: metres for one unit of each coordinate.
     """
     if not integration.by_hand:
         return ()
-    y = y[np.unique(np.linspace(0, len(y) - 1, NUM_CHECKED_LIVE).astype(int))]
-    x = flow.forward(y)
-    lost = float(np.linalg.norm((flow.inverse(x) - y) * unit, axis=1).max())
-    doubts = []
-    if isinstance(flow, Flow):
-        det = min(flow.min_step_determinant(y, inverse=False), flow.min_step_determinant(x, inverse=True))
-        if not det > 0:
-            doubts.append(f"{name}: a step of {integration} {FOLDS} (det {det:.2g}); take more steps or less time")
+    keep = np.unique(np.linspace(0, len(y) - 1, NUM_CHECKED_LIVE).astype(int))
+    lost = float(np.linalg.norm((flow.inverse(flow.forward(y[keep])) - y[keep]) * unit, axis=1).max())
+    doubts = fold_doubts(name, flow, integration, y[keep], x[keep]) if isinstance(flow, Flow) else ()
     if not lost <= MAX_ROUND_TRIP:
-        doubts.append(f"{name}: {integration} loses {_millimetres(lost)} {THERE_AND_BACK}")
-    return tuple(doubts)
+        doubts += (f"{name}: {integration} loses {_millimetres(lost)} {THERE_AND_BACK}",)
+    return doubts
+
+
+def fold_doubts(name: str, flow: Diffeomorphism, integration: Integration, y: Array, x: Array) -> tuple[str, ...]:
+    """Whether a step of a flow whose integration was chosen by hand folds space, in words.
+
+    Only the steps that start from or lead to these samples are looked at: what folds beside them is not found.
+
+    Args:
+        name: of the transform.
+        flow: its ψ, if it has steps in these or other coordinates; nothing is said of others.
+        integration: of that flow.
+        y: (N, d) samples of the motions with the transform.
+        x: (N, d) the samples below, which ψ⁻¹ leads to `y`.
+    """
+    while isinstance(flow, Conjugated):
+        flow, y, x = flow.inner, flow.by.forward(y), flow.by.forward(x)
+    if not integration.by_hand or not isinstance(flow, Flow):
+        return ()
+    # ψ⁻¹ is looked at on its way to the samples: after a coarse ψ it starts elsewhere
+    det = min(flow.min_step_determinant(y, inverse=False), flow.min_step_determinant(x, inverse=True))
+    if det > 0:
+        return ()
+    return (f"{name}: a step of {integration} {FOLDS} (det {det:.2g}); take more steps or less time",)
+
+
+def _determinant(transform: Diffeomorphism, J: Array, drawn_from: Array | None) -> float:
+    """Smallest det J, or of ψ⁻¹'s derivative where that is not positive at what the samples are `drawn_from`."""
+    det = np.linalg.det(J)
+    if drawn_from is not None:
+        inverse = np.linalg.det(transform.inverse_jacobian(drawn_from)[1])
+        det = np.append(det, inverse[~(inverse > 0)])
+    return float(det.min())
 
 
 def _judged(health: Health, det: float, round_trip: float, falls: bool) -> Health:

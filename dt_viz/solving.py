@@ -61,11 +61,11 @@ class Solution:
 
     @property
     def avoidance_duration(self) -> float | None:
-        """T of the end effector's avoidance; None where it is off."""
+        """T of the end effector's avoidance, under a warp that of the full one; None where it is off."""
         return next((made.duration for layer, made in self.built if isinstance(layer, ObstacleAvoidance)), None)
 
     def duration_of(self, behaviour: Behaviour) -> float | None:
-        """T of the flow of a behaviour; None where it is off."""
+        """T of the flow of a behaviour, under a warp that of the full one; None where it is off."""
         return next((made.duration for layer, made in self.built if layer == behaviour), None)
 
     def positions_at(self, index: Indices, fraction: Array) -> Array:

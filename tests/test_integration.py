@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_stacks import random_scenario
 
-from dt_viz.diffeo import AdaptiveFlow, Flow
+from dt_viz.diffeo import AdaptiveFlow, Conjugated, Flow
 from dt_viz.engine import Stage
 from dt_viz.fields import GaussianGrid, GridRBF
-from dt_viz.health import integration_doubts
+from dt_viz.health import fold_doubts, integration_doubts
 from dt_viz.integrate import euler, rk4
 from dt_viz.integration import AUTO, METHODS, Integration
 from dt_viz.scenario import Scenario
@@ -40,18 +41,42 @@ def test_what_euler_loses_there_and_back_is_said_in_millimetres(steps):
     chosen = Integration("euler", steps)
     flow = chosen.of(Flow(field(0.2), 1.0))
     lost = 1e3 * np.linalg.norm(flow.inverse(flow.forward(Y)) - Y, axis=1).max()
-    assert integration_doubts("It", flow, AUTO, Y) == ()
-    (doubt,) = integration_doubts("It", flow, chosen, Y)
+    X = flow.forward(Y)
+    assert integration_doubts("It", flow, AUTO, Y, X) == ()
+    (doubt,) = integration_doubts("It", flow, chosen, Y, X)
     assert doubt == f"It: Euler in {steps} steps loses {lost:.0f} mm there and back"
-    (small,) = integration_doubts("It", flow, chosen, Y, unit=1e-3)
+    (small,) = integration_doubts("It", flow, chosen, Y, X, unit=1e-3)
     assert f"{1e-3 * lost:.2g} mm" in small
 
 
 def test_a_step_that_folds_is_said_and_enough_steps_are_not_doubted():
     coarse, fine = Integration("euler", 1), Integration("rk4", 50)
-    doubts = integration_doubts("It", coarse.of(Flow(field(8.0), 1.0)), coarse, Y)
+    folding, exact = coarse.of(Flow(field(8.0), 1.0)), fine.of(Flow(field(), 1.0))
+    doubts = integration_doubts("It", folding, coarse, folding.inverse(Y), Y)
     assert "a step of Euler in 1 step folds space (det -" in doubts[0]
-    assert integration_doubts("It", fine.of(Flow(field(), 1.0)), fine, Y) == ()
+    assert integration_doubts("It", exact, fine, exact.inverse(Y), Y) == ()
+
+
+def test_a_fold_of_what_is_drawn_is_found_where_there_is_none_on_the_way_back():
+    """A coarse ψ leads drawn samples elsewhere: there ψ⁻¹ may be as it should."""
+    coarse = Integration("euler", 1)
+    flow = coarse.of(Flow(field(2.0), 1.0))
+    x = np.random.default_rng(2).uniform(-0.8, 0.8, (4000, 3))
+    y, drawn = flow.inverse_jacobian(x)
+    back, forward = flow.jacobian(y)
+    elsewhere = flow.inverse_jacobian(back)[1]
+    sound = (np.linalg.det(forward) > 0) & (np.linalg.det(elsewhere) > 0)
+    folded = np.linalg.det(drawn) <= 0
+    missed, fine = sound & folded, sound & ~folded
+    assert missed.sum() > 5 and fine.sum() > 5
+    for row in np.flatnonzero(missed)[:5]:
+        (doubt,) = fold_doubts("It", flow, coarse, y[[row]], x[[row]])
+        assert f"(det {np.linalg.det(drawn[row]):.2g})" in doubt
+    assert fold_doubts("It", flow, coarse, y[fine], x[fine]) == ()
+    by = Flow(field(0.2), 1.0, 20)  # the same in other coordinates
+    conjugated = Conjugated(flow, by)
+    assert fold_doubts("It", conjugated, coarse, by.inverse(y[missed]), by.inverse(x[missed]))
+    assert fold_doubts("It", conjugated, coarse, by.inverse(y[fine]), by.inverse(x[fine])) == ()
 
 
 def certified(engine, scenario):
@@ -72,6 +97,15 @@ def test_euler_in_few_steps_is_doubted_while_the_hand_moves_and_certificates_agr
     for words in ("folds", "there and back"):  # a certificate does not repeat what has a cause
         assert sum(words in doubt for doubt in last.health.doubts) == sum(words in doubt for doubt in live)
     assert not any("no way to the goal" in doubt for doubt in last.health.doubts)
+
+
+def test_a_fold_of_what_is_drawn_is_said_and_certified(engine):
+    """Here ψ keeps its orientation along the rollouts, and ψ⁻¹, which draws them, does not."""
+    scenario = replace(random_scenario(engine, 300), integration=Integration("euler", 1))
+    live, last = certified(engine, scenario)
+    assert any(f"{AVOIDANCE}: a step of Euler in 1 step folds space" in doubt for doubt in live)
+    assert last.health.min_det_jacobian < 0
+    assert sum("folds" in doubt for doubt in last.health.doubts) == 1
 
 
 def test_rk4_with_many_steps_of_a_mild_flow_is_as_good_as_auto(engine, initial):
@@ -101,6 +135,15 @@ def test_the_whole_arm_says_what_euler_loses(engine, initial):
     live, last = certified(engine, replace(scenario, integration=Integration("euler", 2)))
     assert any(f"{WHOLE_ARM}: Euler in 2 steps loses" in doubt for doubt in live)
     assert last.health.round_trip_error > 1e-3
+
+
+@pytest.mark.parametrize(("steps", "folds"), [(1, True), (8, False)])
+def test_certificates_find_folds_of_the_whole_arm(engine, initial, steps, folds):
+    scenario = replace(initial("push_box"), space="cspace", temperature=3.0, integration=Integration("euler", steps))
+    live, last = certified(engine, scenario)
+    assert not any("folds" in doubt for doubt in live)  # too slow to be looked for while the hand moves
+    assert any(f"{WHOLE_ARM}: a step of Euler" in doubt and "folds" in doubt for doubt in last.health.doubts) == folds
+    assert (last.health.min_det_jacobian < 0) == folds
 
 
 def test_a_place_that_auto_would_choose_for_is_not_searched_for_without_end(engine, initial):
