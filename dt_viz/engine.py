@@ -534,6 +534,10 @@ def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: floa
                 if scenario.duration is None
                 else "a motion of the arm comes too near to the obstacle at this flow time"
             )
+        numbers, num = np.array(ground.numbers), ground.num_demonstrated
+        doubts += named_starts(numbers[solved.arm.too_near], num, "without a way around the obstacle for the arm")
+        beside = np.setdiff1d(solved.arm.moved, solved.arm.too_near)
+        doubts += named_starts(numbers[beside], num, "so near to the obstacle that the arm begins elsewhere")
     elif scenario.avoidance and clearance < 0 and not doubts:
         doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
     elif any(isinstance(layer, ObstacleAvoidance) for layer in solved.stack.unsatisfied) and not doubts:

@@ -100,7 +100,7 @@ class Follower:
         reference, initial = self.reference(ground), self._before.get((ground.learned, None))
         if exact or (initial is not None and len(initial) != len(paths)):
             initial = None  # starts have come or gone
-        lifted = lift(self.robot, np.stack(fraction), paths, reference, initial)
+        lifted = replace(lift(self.robot, np.stack(fraction), paths, reference, initial), num_guests=ground.num_added)
         self._before[ground.learned, None] = lifted.tracked.q
         if not exact:
             return lifted
@@ -207,7 +207,8 @@ class Follower:
         learned, num_demonstrated = ground.learned, ground.num_demonstrated
         whole = self.undisturbed(learned.demonstrated)
         parts = zip(ground.numbers, ground.strands, strict=True)
-        return joined([whole.only(n) if n < num_demonstrated else self._added(learned, strand) for n, strand in parts])
+        lifts = [whole.only(n) if n < num_demonstrated else self._added(learned, strand) for n, strand in parts]
+        return joined(lifts, ground.num_added)
 
     def _lift_added(self, learned: Learned, strand: Strand) -> Lift:
         path, fraction = strand.positions, strand.fraction

@@ -148,6 +148,11 @@ class Ground:
         """How many of the rollouts have a demonstration: the first ones."""
         return len(self.task.demonstrations)
 
+    @property
+    def num_added(self) -> int:
+        """How many of the rollouts have none: the last ones."""
+        return sum(number >= self.num_demonstrated for number in self.numbers)
+
     @cached_property
     def numbers(self) -> tuple[int, ...]:
         """Of the start of each rollout, among all of the scenario's, the task's first."""

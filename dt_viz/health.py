@@ -34,7 +34,7 @@ class Health:
 
     clearance: float
     """Smallest distance from the obstacle of what avoids it, metres, negative inside: of the end effector, or of the
-    spheres that cover the arm."""
+    spheres that cover the arm on the motions from the task's starts."""
     collision: CollisionReport | None = None
     """What the arm's meshes come near to on the motion that it shows."""
     duration: float | None = None

@@ -19,7 +19,7 @@ from dt_viz.body import BodyPoints
 from dt_viz.cspace import LEVERS, REACH_PER_TEMPERATURE, GradientField, JointLimits, WholeArmField, squared_lengths
 from dt_viz.diffeo import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.escape import escape_directions
-from dt_viz.fields import Array, Indices, Sum, VectorField
+from dt_viz.fields import Array, Indices, Mask, Sum, VectorField
 from dt_viz.integrate import rk4
 from dt_viz.obstacles import Obstacle
 from dt_viz.robot import NUM_JOINTS, Robot
@@ -43,6 +43,8 @@ SLOPE = 0.1
 """Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
 OVERSHOOT = 7e-3
 """Metres by which the covering spheres stick out of the arm, about: so much less of the margin is asked of them."""
+MOVED = 5e-3
+"""Metres beside its start where a guest's hand may begin before it is said."""
 ROUNDING = 1e-3
 """Metres of clearance that do not count."""
 COARSE_STEP = 0.2
@@ -68,6 +70,13 @@ class Lift:
     exactly: Callable[[Array, Indices, Array], Array] | None = None
     """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
     fractions (N,); None is content with the spline."""
+    num_guests: int = 0
+    """How many of the rollouts, the last ones, no avoidance is made for: they are carried along."""
+
+    @property
+    def num_hosts(self) -> int:
+        """How many of the rollouts, the first ones, an avoidance is made for."""
+        return len(self.fractions) - self.num_guests
 
     @cached_property
     def _splines(self) -> tuple[CubicSpline, ...]:
@@ -91,16 +100,17 @@ class Lift:
 
     @cached_property
     def pins(self) -> Array:
-        """(R + 1, 6) postures at the starts and at the goal, rad."""
-        return np.concatenate([self.tracked.q[:, 0], self.tracked.q[:1, -1]])
+        """(R' + 1, 6) postures at the starts of the R' hosts and at the goal, rad."""
+        return np.concatenate([self.tracked.q[: self.num_hosts, 0], self.tracked.q[:1, -1]])
 
 
-def joined(lifts: Sequence[Lift]) -> Lift:
-    """The rollouts of several, one after the other, with the reference of the first."""
+def joined(lifts: Sequence[Lift], num_guests: int) -> Lift:
+    """The rollouts of several, one after the other, the last ones guests, with the reference of the first."""
     tracked = JointPath(
         *(np.concatenate([getattr(part.tracked, name) for part in lifts]) for name in JointPath.__dataclass_fields__)
     )
-    return Lift(np.concatenate([part.fractions for part in lifts]), tracked, lifts[0].reference)
+    fractions = np.concatenate([part.fractions for part in lifts])
+    return Lift(fractions, tracked, lifts[0].reference, num_guests=num_guests)
 
 
 def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:
@@ -134,9 +144,13 @@ class ArmSolution:
     duration: float
     """t of the avoidance flow."""
     clearance: float
-    """Smallest distance of the covering spheres from the obstacle, metres."""
+    """Smallest distance of the covering spheres from the obstacle along the hosts, metres."""
     cleared: bool
-    """Whether all samples keep the clearance that is asked for."""
+    """Whether all samples of the hosts keep the clearance that is asked for."""
+    too_near: Indices
+    """Guests, counted among all rollouts, that do not keep it."""
+    moved: Indices
+    """Guests that begin more than `MOVED` away from their start."""
 
 
 class WholeArm:
@@ -164,7 +178,7 @@ class WholeArm:
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
         scenario's margin, or what the start or goal beside it has. Of several ways out the first is taken that works,
-        or the one that comes nearest to it.
+        or the one that comes nearest to it. All this looks at the hosts only: guests do not change their motions.
 
         Args:
             lifted: the motions below.
@@ -206,7 +220,7 @@ class WholeArm:
     def _generators(self, lifted: Lift, scenario: Scenario) -> Iterator[VectorField]:
         """The fields to try, the most promising first; none where nothing comes too near an obstacle."""
         reach = REACH_PER_TEMPERATURE * scenario.temperature
-        q = lifted.tracked.q
+        q = lifted.tracked.q[: lifted.num_hosts]
         points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
@@ -278,7 +292,8 @@ class _Solver:
         if self._generator is None:
             duration = 0.0
         elif duration is None:
-            q = self._arm.limits.inside(self._lifted.tracked.q[:, ::STRIDE].reshape(-1, NUM_JOINTS))
+            hosts = self._lifted.tracked.q[: self._lifted.num_hosts]
+            q = self._arm.limits.inside(hosts[:, ::STRIDE].reshape(-1, NUM_JOINTS))
             duration = self._clearing_duration(q[self._lack(q) > 0])
         return self._with_duration(min(duration, MAX_DURATION))
 
@@ -287,12 +302,13 @@ class _Solver:
         bundle = self._sampled(transform)
         p = bundle.positions / LEVERS
         lack = self._lack(p)
+        hosts = self._of_hosts(bundle)
         chosen = self._generator is not None and self._scenario.duration is None
         for _ in range(MAX_ROUNDS if chosen else 0):
-            if duration >= MAX_DURATION or not (lack > ROUNDING).any():
+            if duration >= MAX_DURATION or not (lack[hosts] > ROUNDING).any():
                 break
             # the flow is a one-parameter group: go on from where the samples are
-            more = min(self._clearing_duration(p[lack > 0]), MAX_DURATION - duration)
+            more = min(self._clearing_duration(p[hosts][lack[hosts] > 0]), MAX_DURATION - duration)
             duration += more
             transform = self._transform(duration)
             if self._scenario.integration.by_hand:  # a few coarse steps are no such group
@@ -302,6 +318,7 @@ class _Solver:
             bundle = self._refined(replace(bundle, levels=levels), transform)
             p = bundle.positions / LEVERS
             lack = self._lack(p)
+            hosts = self._of_hosts(bundle)
         return self._along(bundle, transform, duration, lack)
 
     def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
@@ -311,10 +328,18 @@ class _Solver:
 
     def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float, lack: Array) -> ArmSolution:
         p = bundle.positions / LEVERS
-        clearance = float(self._arm.clearance(p, self._scenario.obstacle).min())
+        hosts, near = self._of_hosts(bundle), lack > ROUNDING
+        clearance = float(self._arm.clearance(p[hosts], self._scenario.obstacle).min())
         q = self._lifted.at(bundle.index, bundle.fraction)
-        cleared = not (lack > ROUNDING).any()
-        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, cleared)
+        cleared, too_near = not near[hosts].any(), np.unique(bundle.index[near & ~hosts])
+        away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
+        moved = np.unique(bundle.index[away & ~hosts & (bundle.fraction == 0)])
+        return ArmSolution(
+            transform, bundle.index, bundle.fraction, q, p, duration, clearance, cleared, too_near, moved
+        )
+
+    def _of_hosts(self, bundle: Bundle) -> Mask:
+        return bundle.index < self._lifted.num_hosts
 
     def _sampled(self, transform: Diffeomorphism) -> Bundle:
         num_rollouts, num_samples = self._lifted.fractions.shape

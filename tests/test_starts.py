@@ -1,5 +1,6 @@
 """Motions that begin where the user wants: rollouts of the same system, which disturb nothing."""
 
+import re
 from dataclasses import replace
 from typing import cast
 
@@ -15,6 +16,8 @@ from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Layer
 from dt_viz.solving import FINE, LIVE, solve
 from dt_viz.stacking import plane_of
+from dt_viz.starts import with_grid
+from dt_viz.whole_arm import MOVED
 
 NUM = 5
 
@@ -93,6 +96,27 @@ def test_the_whole_arm_begins_at_added_starts_and_keeps_clear(engine, initial, r
         np.testing.assert_allclose(path[0], start, atol=2e-3)
         np.testing.assert_allclose(path[-1], frame.goal, atol=2e-3)
         assert scenario.obstacle.signed_distance(path).min() > 0
+
+
+@pytest.mark.parametrize("space", ["cspace", "both"])
+def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it_does_not_suit(engine, initial, space):
+    scenario = replace(initial("draw_s"), space=space)
+    grid = with_grid(scenario, engine.task("draw_s").slice)
+    alone, frame = (frame_of(engine, replace(scenario, starts=starts), Stage.LIVE) for starts in ((), grid.starts))
+    assert frame.health.arm_duration == pytest.approx(alone.health.arm_duration, rel=1e-3)
+    assert frame.health.clearance == pytest.approx(alone.health.clearance, abs=1e-4)
+    for path, other in zip(alone.rollouts, frame.rollouts, strict=False):
+        assert max(np.linalg.norm(other - point, axis=1).min() for point in path) < 5e-3
+    assert not any("finds no way" in doubt for doubt in frame.health.doubts)
+    named = " ".join(frame.health.doubts)
+    numbers, arm = engine._kept.ground.numbers, engine._kept.solved[LIVE].arm
+    doubtful = np.union1d(arm.too_near, arm.moved)
+    assert len(doubtful)
+    for guest in doubtful:
+        assert re.search(rf"added starts? [\d, ]*\b{numbers[guest] - 6}\b", named)
+    for guest in np.setdiff1d(np.arange(7, len(frame.rollouts)), doubtful):
+        np.testing.assert_allclose(frame.rollouts[guest][0], grid.starts[numbers[guest] - 7], atol=MOVED)
+        assert engine._follower.whole_arm.clearance(arm.p[arm.index == guest], scenario.obstacle).min() > 0
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
