@@ -77,5 +77,10 @@ def with_grid(scenario: Scenario, area: Slice) -> Grid:
     return Grid(starts, blocked, far)
 
 
+def followed(scenario: Scenario, num_demonstrated: int) -> int:
+    """Which rollout the arm follows, less than there are: the same one when starts are added."""
+    return scenario.arm_rollout % (num_demonstrated + len(scenario.starts))
+
+
 def _is_taken(starts: tuple[Vector, ...], place: Array) -> bool:
     return any(np.linalg.norm(place - np.array(start)) < APART for start in starts)

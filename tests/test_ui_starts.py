@@ -11,7 +11,7 @@ import pytest
 from dt_viz.engine import Frame
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import MAX_STARTS
-from dt_viz.starts import APART, INNER, struck, with_grid, with_moved_start, with_start
+from dt_viz.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
 from dt_viz.ui.starts import Starts
 
 
@@ -54,14 +54,28 @@ def test_starts_are_added_up_to_a_limit_apart_from_each_other_and_moved(initial)
     assert with_moved_start(one, 5, np.ones(3)) == one.starts  # it was removed a moment ago
 
 
+@pytest.mark.parametrize("arm_rollout", [0, 3, 6, 7, 9, 40])
+def test_the_arm_follows_the_same_rollout_when_starts_are_added(engine, initial, arm_rollout):
+    """Also where the scenario counts round, as after starts have gone."""
+    scenario = replace(initial("draw_s"), arm_rollout=arm_rollout)
+    before = engine._ground(scenario, None).rollout(scenario.arm_rollout)
+    added = with_start(scenario, np.array([0.1, -0.5, 0.4]))
+    after = replace(scenario, starts=added, arm_rollout=followed(scenario, 7))
+    assert engine._ground(after, None).rollout(after.arm_rollout) == before < 7
+    assert followed(after, 7) == before
+
+
 class Scene:
     """Stands in for viser's: remembers nodes and the callbacks of clicks anywhere."""
 
     def __init__(self):
-        self.clicks = []
+        self.clicks, self.labels = [], {}
 
     def add_frame(self, _name, **_look):
         return SimpleNamespace(visible=True)
+
+    def add_label(self, name, text, **_look):
+        self.labels[name] = text
 
     def add_icosphere(self, name, **_look):
         node = SimpleNamespace(name=name, position=np.zeros(3), removed=False)
@@ -116,13 +130,14 @@ def test_a_click_adds_a_start_only_while_it_is_asked_for_and_not_on_a_ball(opene
 
 
 def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(opened, initial, engine):
-    _, starts, told = opened
+    scene, starts, told = opened
     area = engine.task("draw_s").slice
     places = [area.at(np.array(across)) for across in ((0.0, 0.1), (0.1, 0.0))]
     scenario = replace(initial("draw_s"), starts=tuple(tuple(float(c) for c in place) for place in places))
     starts.adopt(scenario)
     for item, place in zip(starts.items, places, strict=True):
         np.testing.assert_allclose(item.ball.position, place)
+    assert scene.labels == {"/starts/0/label": "1", "/starts/1/label": "2"}
     ball, eye = starts.items[1].ball, np.array([0.8, -1.6, 0.8])
     camera = SimpleNamespace(camera=SimpleNamespace(position=eye))
     target = area.at(np.array([0.02, -0.12]))

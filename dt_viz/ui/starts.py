@@ -25,7 +25,7 @@ Moved = Callable[[int, Array, str], None]
 
 
 class StartBall:
-    """One added start."""
+    """One added start, with its number as doubts name it."""
 
     def __init__(
         self,
@@ -46,6 +46,13 @@ class StartBall:
         """
         self.ball = scene.add_icosphere(
             f"/starts/{index}", radius=RADIUS, color=palette.START, subdivisions=2, cast_shadow=False
+        )
+        scene.add_label(
+            f"/starts/{index}/label",
+            str(index + 1),
+            position=(0.0, 0.0, RADIUS),
+            anchor="bottom-center",
+            font_screen_scale=0.6,
         )
         self._grabbed, self._from = np.zeros(3), np.zeros(3)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import viser
 
 from dt_viz.scenario import MAX_STARTS, Scenario
-from dt_viz.starts import with_grid
+from dt_viz.starts import followed, with_grid
 from dt_viz.ui.bias_panel import Bind
 from dt_viz.ui.session import Session
 
@@ -47,7 +47,8 @@ class StartsPanel:
             return
         scenario = self._session.scenario
         grid = with_grid(scenario, self._session.task.slice.posed(scenario.view.slice))
-        self._session.edit("grid of starts", starts=grid.starts)
+        arm_rollout = followed(scenario, len(self._session.task.demonstrations))
+        self._session.edit("grid of starts", starts=grid.starts, arm_rollout=arm_rollout)
         self._session.end_gesture()
         reasons = ((grid.num_blocked, "at or inside an obstacle"), (grid.num_far, "where the hand cannot be"))
         left_out = [f"{num} {why}" for num, why in reasons if num]
@@ -61,20 +62,20 @@ class StartsPanel:
             index = _followed(scenario, len(self._session.task.demonstrations))
             starts = list(scenario.starts)
             del starts[-1 if index is None else index]
-            arm_rollout = scenario.arm_rollout if index is None else 0
+            arm_rollout = followed(scenario, len(self._session.task.demonstrations)) if index is None else 0
             self._session.edit("remove start", starts=tuple(starts), arm_rollout=arm_rollout)
             self._session.end_gesture()
 
     def clear(self) -> None:
         """All."""
         if self._session is not None:
-            index = _followed(self._session.scenario, len(self._session.task.demonstrations))
-            arm_rollout = self._session.scenario.arm_rollout if index is None else 0
+            number = followed(self._session.scenario, len(self._session.task.demonstrations))
+            arm_rollout = number if number < len(self._session.task.demonstrations) else 0
             self._session.edit("clear starts", starts=(), arm_rollout=arm_rollout)
             self._session.end_gesture()
 
 
 def _followed(scenario: Scenario, num_demonstrated: int) -> int | None:
     """Which added start the arm begins at, if it does."""
-    index = scenario.arm_rollout - num_demonstrated
-    return index if 0 <= index < len(scenario.starts) else None
+    index = followed(scenario, num_demonstrated) - num_demonstrated
+    return index if index >= 0 else None

@@ -16,7 +16,7 @@ from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario
 from dt_viz.slices import SlicePose
 from dt_viz.stacking import bias_points, with_changed_point
-from dt_viz.starts import with_moved_start, with_start
+from dt_viz.starts import followed, with_moved_start, with_start
 from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
 from dt_viz.ui.arm_layers import Arms
@@ -165,10 +165,13 @@ class Visitor:
             self.session.end_gesture()
 
     def _start_chosen(self, index: int) -> None:
-        self.session.edit("Follows rollout", arm_rollout=len(self.session.task.demonstrations) + index)
+        if index < len(self.session.scenario.starts):  # or it was removed a moment ago
+            self.session.edit("Follows rollout", arm_rollout=len(self.session.task.demonstrations) + index)
 
     def _start_clicked(self, place: Array) -> None:
-        self.session.edit("add start", starts=with_start(self.session.scenario, place))
+        scenario = self.session.scenario
+        arm_rollout = followed(scenario, len(self.session.task.demonstrations))
+        self.session.edit("add start", starts=with_start(scenario, place), arm_rollout=arm_rollout)
         self.session.end_gesture()
 
     def _bias_selected(self, name: str) -> None:
