@@ -33,6 +33,7 @@ SCENARIO = Scenario(
 def frame(scenario=SCENARIO, **changes):
     given: dict[str, Any] = {
         "task": TASKS[scenario.task](),
+        "goal": np.zeros(3),
         "levels": tuple((np.full((5, 3), float(k)),) for k in range(4)),
         "health": Health(0.01, duration=0.4, layer_durations=(0.8, None)),
         "layer_radii": (0.2, None),
@@ -129,6 +130,22 @@ def test_the_selected_level_is_drawn_and_named(scene):
         assert (picture.lines.node.points == level).all()
     picture.draw(frame())
     assert not picture.visible
+
+
+def test_without_imitation_the_lowest_level_is_called_what_it_is():
+    seen = replace(SCENARIO, view=View(level=IMITATION))
+    assert "manifold of the imitation" in legend_html(seen)
+    without = legend_html(replace(seen, imitation=False))
+    assert "base attractor: straight motions" in without and "of the imitation" not in without
+
+
+def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
+    picture = LevelRollouts(scene)
+    seen = replace(SCENARIO, view=View(level="Bias 2"))
+    for goal, marked in ((2.0, False), (2.1, True), (2.0, False)):
+        picture.draw(frame(seen, level=2, goal=np.full(3, goal)))
+        assert picture._end.visible == marked
+        np.testing.assert_array_equal(picture._end.position, np.full(3, 2.0))
 
 
 # --- Bias points ---

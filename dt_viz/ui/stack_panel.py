@@ -134,7 +134,7 @@ def legend_html(scenario: Scenario) -> str:
     if scenario.view.level not in levels(scenario):
         return ""
     swatch = f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:rgb{palette.LEVEL}"
-    what = manifold(scenario.view.level)
+    what = manifold(scenario)
     return (
         "<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em;opacity:0.85'>"
         f"<span style='{swatch}'></span> {html.escape(what)}, without what is stacked on it: rollouts, "
