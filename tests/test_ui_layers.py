@@ -17,14 +17,16 @@ from dt_viz.obstacles import Sphere
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Scenario, View
 from dt_viz.tasks import TASKS
+from dt_viz.ui import palette
 from dt_viz.ui.arm import PEDESTAL
 from dt_viz.ui.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.links import CELL, bodies, light_shells, simplified
 from dt_viz.ui.panel import VIEW_LABELS, status_html
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
-from dt_viz.ui.scene import Rollouts
+from dt_viz.ui.scene import OF_A_MOTION, Rollouts, ScenePictures
 from dt_viz.ui.session import Pace
+from dt_viz.ui.starts import Starts
 
 ROBOT = load_jaco()
 REACHING = np.array([0.9, 3.6, 1.6, 0.4, 2.9, -0.3])
@@ -195,6 +197,36 @@ def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
     fresh, stale = colours(()), colours(("the obstacle touches the base",))
     assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
     np.testing.assert_array_equal(colours(()), fresh)
+    starts = rollouts._starts
+    rollouts.draw(replace(frame(blocked=("no way",)), task=TASKS["draw_s"](), rollouts=paths))
+    np.testing.assert_array_equal(np.reshape(starts.colors, (-1, 3))[0], palette.STALE)
+    colours(())
+    np.testing.assert_array_equal(np.reshape(starts.colors, (-1, 3))[0], palette.START)
+
+
+def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(engine, initial, scene):
+    def ignored(*_what):
+        pass
+
+    starts = Starts(scene, ignored, ignored, ignored)
+    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, starts)
+    view = View(field=True, streamlines=True, grid=True, onion=True, colour="det")
+    good = replace(initial("draw_s"), space="cspace", view=view)
+    base = replace(good, obstacles=(Sphere((0.0, 0.0, 0.2)),))
+
+    def shown():
+        on = {name for name in OF_A_MOTION if pictures.layer(name).visible}
+        return on | ({"colour"} if pictures._by_colour["det"].visible else set())
+
+    for scenario, blocked, expected in ((good, False, {*OF_A_MOTION, "colour"}), (base, True, set())):
+        frame = next(engine.frames(scenario))
+        assert bool(frame.blocked) == blocked
+        pictures.draw(frame)
+        pictures.adopt(scenario)
+        assert shown() == expected
+        assert pictures.layer("rollouts").visible
+    pictures.draw(next(engine.frames(good)))
+    assert shown() == {*OF_A_MOTION, "colour"}
 
 
 # --- Joint plots ---
@@ -313,4 +345,6 @@ def test_a_scenario_without_motion_says_why_and_what_is_shown_instead():
     said = status_html(frame(blocked=reasons), PACE)
     assert "start 3 is inside the obstacle; the obstacle touches the &lt;base&gt;" in said
     assert "last good" in said
+    row = said.split("Clearance")[1].split("</tr>")[0]
+    assert "–" in row and "mm" not in row
     assert "last good" not in status_html(frame(), PACE)

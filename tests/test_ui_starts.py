@@ -12,6 +12,7 @@ from dt_viz.engine import Frame
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import MAX_STARTS
 from dt_viz.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
+from dt_viz.ui import palette
 from dt_viz.ui.starts import Starts
 
 
@@ -78,7 +79,7 @@ class Scene:
         self.labels[name] = text
 
     def add_icosphere(self, name, **_look):
-        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False)
+        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False, color=palette.START)
 
         def keep(callback, what):
             setattr(node, what, callback)
@@ -101,7 +102,7 @@ def opened(engine):
     told = SimpleNamespace(moved=[], chosen=[], clicked=[])
     scene: Any = Scene()
     starts = Starts(scene, lambda *what: told.moved.append(what), told.chosen.append, told.clicked.append)
-    starts.draw(cast(Frame, SimpleNamespace(slice=engine.task("draw_s").slice)))
+    starts.draw(cast(Frame, SimpleNamespace(slice=engine.task("draw_s").slice, blocked=())))
     return scene, starts, told
 
 
@@ -154,3 +155,12 @@ def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(
     second = starts.items[1].ball
     starts.adopt(replace(scenario, starts=scenario.starts[:1]))
     assert len(starts.items) == 1 and second.removed
+
+
+def test_balls_are_grey_while_nothing_moves_from_them(opened, initial, engine):
+    _, starts, _ = opened
+    starts.adopt(replace(initial("draw_s"), starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))))
+    area = engine.task("draw_s").slice
+    for blocked, colour in ((("no way",), palette.STALE), ((), palette.START)):
+        starts.draw(cast(Frame, SimpleNamespace(slice=area, blocked=blocked)))
+        assert [item.ball.color for item in starts.items] == [colour] * 2

@@ -34,7 +34,7 @@ class LevelRollouts(Picture):
         shown = frame.level is not None
         if frame.level is not None:
             paths = frame.levels[frame.level]
-            self.lines.show(paths)
+            self.lines.show(paths, colour=palette.STALE if frame.blocked else None)
             self._mark(paths[0][-1], frame.goal)
             area, text = frame.slice, manifold(frame.scenario)
             if self.label.text != text:

@@ -336,13 +336,13 @@ def status_html(frame: Frame, pace: Pace) -> str:
     # what is not known after the last stage never will be
     unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
     off = "–" if frame.blocked else "off"
-    of_spheres = scenario.avoidance and scenario.space != "task"
+    of = "body points" if scenario.avoidance and scenario.space != "task" else "end effector"
     durations = {"": health.duration, " arm": health.arm_duration}
     if None not in durations.values():
         durations = {" hand": health.duration, " arm": health.arm_duration}
     rows = (
         ("Rebuild", _rebuild(pace)),
-        ("Clearance", _clearance(health.clearance, "body points" if of_spheres else "end effector")),
+        ("Clearance", off if frame.blocked else _clearance(health.clearance, of)),
         *_collision_rows(health.collision, unknown),
         ("Flow time t", " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None) or off),
         ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.2g}"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -10,7 +11,7 @@ import viser
 
 from dt_viz.engine import MAX_GOAL_MISS, Frame
 from dt_viz.robot import Robot
-from dt_viz.scenario import Scenario
+from dt_viz.scenario import Scenario, View
 from dt_viz.tasks import Task
 from dt_viz.ui import palette
 from dt_viz.ui.arm_layers import Onion
@@ -28,10 +29,10 @@ from dt_viz.ui.starts import Starts
 
 BOLD, THIN = 0.0048, 0.0026
 """Of the rollouts of the whole stack, metres: by themselves, and beside those of a level."""
-
-
 ADDED = 0.0022
 """Thickness of rollouts from added starts, metres."""
+OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
+"""What the view shows of a motion, and nothing says that it may be of another one: rollouts are grey then."""
 
 
 class Demonstrations(Picture):
@@ -78,6 +79,7 @@ class Rollouts(Picture):
         if self.lines.node.thickness != thickness:
             self.lines.node.thickness = thickness
         self._starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
+        self._starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
 
 
 class Ghost(Picture):
@@ -185,6 +187,8 @@ class ScenePictures:
             "base": BaseInset(scene),
             "onion": Onion(scene, robot),
         }
+        self._view, self._blocked = View(), False
+        self._showing = threading.Lock()  # whoever changes the view is not who draws
         function = ColourSlice(scene)
         self._by_colour: dict[str, Picture] = {
             "det": function,
@@ -200,6 +204,10 @@ class ScenePictures:
         """Assign fresh arrays to the handles."""
         for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
             picture.draw(frame)
+        if bool(frame.blocked) != self._blocked:
+            with self._showing:
+                self._blocked = bool(frame.blocked)
+                self._show()
 
     def adopt(self, scenario: Scenario) -> None:
         """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
@@ -207,9 +215,15 @@ class ScenePictures:
         self.biases.adopt(scenario)
         self.slice.adopt(scenario)
         self.starts.adopt(scenario)
+        with self._showing:
+            self._view = scenario.view
+            self._show()
+
+    def _show(self) -> None:
+        """Show what the view says; nothing that belongs to another motion while the scenario has none."""
         for name, picture in self._by_view.items():
-            picture.visible = getattr(scenario.view, name)
-        shown = self._by_colour.get(scenario.view.colour)
+            picture.visible = getattr(self._view, name) and not (self._blocked and name in OF_A_MOTION)
+        shown = None if self._blocked else self._by_colour.get(self._view.colour)
         for picture in self._by_colour.values():
             picture.visible = picture is shown
 

@@ -91,8 +91,12 @@ class Starts(Picture):
         """In the order of the scenario."""
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers the slice."""
+        """See `Picture`: remembers the slice; grey are starts from which nothing moves."""
         self._slice = frame.slice
+        colour = palette.STALE if frame.blocked else palette.START
+        for item in self.items:
+            if item.ball.color != colour:
+                item.ball.color = colour
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's starts, and listen to clicks on the slice while it says so."""
