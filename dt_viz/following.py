@@ -13,10 +13,11 @@ from dt_viz.fields import Array, Indices, Mask
 from dt_viz.ground import Ground, Learned, Strand, named_starts
 from dt_viz.metrics import arc_length
 from dt_viz.obstacles import Obstacle
-from dt_viz.robot import Robot
+from dt_viz.robot import NUM_JOINTS, Robot
 from dt_viz.scenario import MAX_STARTS
 from dt_viz.several import Several
 from dt_viz.solving import Solution
+from dt_viz.tasks import Task
 from dt_viz.tracking import JointPath, UnreachableError, drawn_onto, inverse_kinematics, track
 from dt_viz.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
 
@@ -218,6 +219,18 @@ class Follower:
     def _gets_to(self, learned: Learned, strand: Strand) -> bool:
         reached = track(self.robot, strand.start[None], self.reference(learned.demonstrated))
         return bool(reached.error[0] <= MAX_TRACKING_ERROR)
+
+
+def room_at_rest(robot: Robot, task: Task, obstacle: Several, places: Array) -> Array:
+    """Distance (N,), metres, of the arm's covering spheres from the obstacle where the hand rests at `places` (N, 3).
+
+    Raises:
+        UnreachableError: the arm cannot get to the task's starts, near whose posture it stays.
+    """
+    reference = inverse_kinematics(robot, task.starts.mean(axis=0))
+    start = np.broadcast_to(reference, (len(places), NUM_JOINTS))
+    postures = track(robot, places[:, None], start, reference=start).q[:, 0]
+    return WholeArm(robot, load_body_points()).clearance(postures, obstacle)
 
 
 PEDESTAL = ("base", "link 1")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +29,7 @@ class Grid:
     starts: tuple[Vector, ...]
     """All of the scenario's, the new ones last."""
     num_blocked: int = 0
-    """Places inside an obstacle."""
+    """Places at or inside an obstacle, or where the arm is that is to avoid it."""
     num_far: int = 0
     """Places where the hand cannot be."""
 
@@ -63,12 +64,23 @@ def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Vect
     return tuple(starts)
 
 
-def with_grid(scenario: Scenario, area: Slice) -> Grid:
-    """The scenario's starts with a grid over the slice, without places where no motion of the hand can begin."""
+def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array]) -> Grid:
+    """The scenario's starts with a grid over the slice, without places where no motion can begin.
+
+    Args:
+        scenario: with obstacles and starts.
+        area: the slice.
+        arm_room: distance (N,) of the arm from the obstacles with its hand at places (N, 3), metres; asked where the
+            whole arm avoids them.
+    """
     u, v = (np.linspace(-INNER * half, INNER * half, num) for half, num in zip(area.half_size, GRID, strict=True))
     starts, blocked, far = scenario.starts, 0, 0
-    for place in area.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)):
-        if float(scenario.obstacle.signed_distance(place)) < scenario.margin:
+    places = area.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
+    rooms = scenario.obstacle.signed_distance(places)
+    if scenario.avoidance and scenario.space != "task":
+        rooms = np.minimum(rooms, arm_room(places))
+    for place, room in zip(places, rooms, strict=True):
+        if room < scenario.margin:
             blocked += 1
         elif place[2] < MIN_HEIGHT or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
             far += 1

@@ -101,7 +101,7 @@ def test_the_whole_arm_begins_at_added_starts_and_keeps_clear(engine, initial, r
 @pytest.mark.parametrize("space", ["cspace", "both"])
 def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it_does_not_suit(engine, initial, space):
     scenario = replace(initial("draw_s"), space=space)
-    grid = with_grid(scenario, engine.task("draw_s").slice)
+    grid = with_grid(replace(scenario, space="task"), engine.task("draw_s").slice, lambda places: np.zeros(len(places)))
     alone, frame = (frame_of(engine, replace(scenario, starts=starts), Stage.LIVE) for starts in ((), grid.starts))
     assert frame.health.arm_duration == pytest.approx(alone.health.arm_duration, rel=1e-3)
     assert frame.health.clearance == pytest.approx(alone.health.clearance, abs=1e-4)

@@ -2,6 +2,7 @@
 
 import asyncio
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from dt_viz.engine import Frame
+from dt_viz.following import room_at_rest
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import MAX_STARTS
 from dt_viz.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
@@ -30,17 +32,35 @@ def test_a_ray_meets_the_slice_where_it_is_seen(engine):
     assert struck(area, area.centre + area.normal, area.axes[:, 0]) is None  # along the slice
 
 
+def no_arm(_places):
+    raise AssertionError("the hand alone avoids")
+
+
+@pytest.mark.parametrize("space", ["cspace", "both"])
+def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_it(engine, initial, robot, space):
+    task, scenario = engine.task("draw_s"), replace(initial("draw_s"), space=space)
+    arm_room = partial(room_at_rest, robot, task, scenario.obstacle)
+    grid = with_grid(scenario, task.slice, arm_room)
+    hand_only = with_grid(replace(scenario, space="task"), task.slice, no_arm)
+    assert set(grid.starts) < set(hand_only.starts) and grid.num_blocked > hand_only.num_blocked
+    ground = engine._ground(replace(scenario, starts=grid.starts), None)
+    assert not engine._follower.admitted(ground, scenario.obstacle).left_out
+    postures = engine._follower.undisturbed(ground).tracked.q[7:, 0]
+    room = engine._follower.whole_arm.clearance(postures, scenario.obstacle)
+    np.testing.assert_allclose(room, arm_room(np.array(grid.starts)), atol=1e-3)
+
+
 def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_that_are_taken(engine, initial):
     area = engine.task("draw_s").slice
     x, y, z = area.at(np.array([INNER, INNER / 3]) * area.half_size)
     scenario = replace(initial("draw_s"), obstacles=(Sphere((float(x), float(y), float(z))),))
-    grid = with_grid(scenario, area)
+    grid = with_grid(scenario, area, no_arm)
     assert len(grid.starts) + grid.num_blocked + grid.num_far == 16 and grid.num_blocked > 0
     assert (scenario.obstacle.signed_distance(np.array(grid.starts)) >= scenario.margin).all()
     np.testing.assert_allclose((np.array(grid.starts) - area.centre) @ area.normal, 0, atol=1e-9)
-    again = with_grid(replace(scenario, starts=grid.starts), area)
+    again = with_grid(replace(scenario, starts=grid.starts), area, no_arm)
     assert again.starts == grid.starts
-    far = with_grid(scenario, replace(area, centre=area.centre + np.array([0.0, -2.0, 0.0])))
+    far = with_grid(scenario, replace(area, centre=area.centre + np.array([0.0, -2.0, 0.0])), no_arm)
     assert far.starts == () and far.num_far == 16
 
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import viser
 
+from dt_viz.following import room_at_rest
+from dt_viz.robot import load_jaco
 from dt_viz.scenario import MAX_STARTS, Scenario
 from dt_viz.starts import followed, with_grid
+from dt_viz.tracking import UnreachableError
 from dt_viz.ui.bias_panel import Bind
 from dt_viz.ui.session import Session
 
@@ -46,11 +50,20 @@ class StartsPanel:
         if self._session is None:
             return
         scenario = self._session.scenario
-        grid = with_grid(scenario, self._session.task.slice.posed(scenario.view.slice))
-        arm_rollout = followed(scenario, len(self._session.task.demonstrations))
+        task = self._session.task
+        arm_room = partial(room_at_rest, load_jaco(), task, scenario.obstacle)
+        try:
+            grid = with_grid(scenario, task.slice.posed(scenario.view.slice), arm_room)
+        except UnreachableError as error:
+            self._say(f"the arm cannot reach the starts: {error}")
+            return
+        arm_rollout = followed(scenario, len(task.demonstrations))
         self._session.edit("grid of starts", starts=grid.starts, arm_rollout=arm_rollout)
         self._session.end_gesture()
-        reasons = ((grid.num_blocked, "at or inside an obstacle"), (grid.num_far, "where the hand cannot be"))
+        reasons = (
+            (grid.num_blocked, "at or inside an obstacle, or the arm is there"),
+            (grid.num_far, "where the hand cannot be"),
+        )
         left_out = [f"{num} {why}" for num, why in reasons if num]
         if left_out:
             self._say(f"places of the grid left out: {', '.join(left_out)}")
