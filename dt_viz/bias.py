@@ -209,15 +209,17 @@ class Biasing:
         """Whether every motion passes close to the target, where that is to be seen to."""
         if self.point.strength is not None:
             return True
+        return bool((self.distances(motion) <= ACCEPTED).all())
+
+    def distances(self, motion: Motion) -> Array:
+        """(R,) metres from the target: of the motions that have a demonstration, or of their ends if the goal moves."""
         motion = motion.demonstrated
         if motion.top is not None:
             motion = replace(motion, positions=motion.top)
         if self.point.moves_goal:
             last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
-            distances = np.linalg.norm(self.point.offsets(motion.positions[last]), axis=1)
-        else:
-            distances = closest_distances(self.point, motion)
-        return bool((distances <= ACCEPTED).all())
+            return np.linalg.norm(self.point.offsets(motion.positions[last]), axis=1)
+        return closest_distances(self.point, motion)
 
     def _auto_radius(self, motion: Motion, least: float, distance: float) -> float:
         """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""

@@ -13,8 +13,9 @@ from typing import TypeVar
 import numpy as np
 
 from dt_viz.avoidance import ObstacleAvoidance
-from dt_viz.behaviours import Behaviour
+from dt_viz.behaviours import Behaviour, Motion
 from dt_viz.belief import occupancy_picture
+from dt_viz.bias import Biasing
 from dt_viz.collision import load_collision_model
 from dt_viz.cspace import LEVERS
 from dt_viz.diffeo import Flow
@@ -44,6 +45,9 @@ from dt_viz.whole_arm import ArmSolution, Lift
 
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
+MAX_TARGET_MISS = 0.013
+"""Metres by which motions that avoid may miss a bias point before it is said: a centimetre, and what the arm's joints,
+interpolated between samples, are off by while a hand moves."""
 
 
 class Stage(IntEnum):
@@ -378,6 +382,8 @@ class Engine:
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
         doubts = _doubts(ground, scenario, solved, clearance, float(np.linalg.norm(reached - ground.goal)))
+        if scenario.avoidance and scenario.obstacles and scenario.warp == 1 and not stack.doubts:
+            doubts = (*doubts, *_missed_targets(ground, scenario, solved, self._robot))
         return Frame(
             scenario=scenario,
             task=ground.task,
@@ -549,6 +555,35 @@ def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: floa
     if missed > MAX_GOAL_MISS and not doubts and not _moves_goal(ground, solved.stack):
         doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
     return (*doubts, *ground.doubts)
+
+
+def _missed_targets(ground: Ground, scenario: Scenario, solved: _Solved, robot: Robot) -> list[str]:
+    """Which bias points the stack leads the motion to, but giving way to the obstacle leads past, in words.
+
+    In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
+    """
+    stack, arm = solved.stack, solved.arm
+    bundle = stack.bundle if arm is None else arm
+    positions = stack.bundle.positions if arm is None else robot.end_effector(arm.p)
+    motion = Motion(
+        scenario, ground.starts, ground.goal, bundle.index, positions, num_demonstrated=ground.num_demonstrated
+    )
+    doubts = []
+    for layer in scenario.layers:
+        bias = layer.behaviour
+        if (
+            not layer.on
+            or not isinstance(bias, Biasing)
+            or bias in stack.unsatisfied
+            or bias.point.strength is not None
+        ):
+            continue
+        in_space = replace(bias, point=replace(bias.point, plane=None))
+        missed = float(in_space.distances(motion).max())
+        if missed > MAX_TARGET_MISS:
+            who = "a motion" if arm is None else "the arm"
+            doubts.append(f"{layer.name}: {who} gives way to the obstacle and passes {1e3 * missed:.0f} mm from it")
+    return doubts
 
 
 def _integration_doubts(scenario: Scenario, solved: _Solved) -> tuple[str, ...]:

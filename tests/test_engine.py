@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dt_viz.bias import BiasPoint, vector
 from dt_viz.demos import Demonstration
-from dt_viz.engine import Stage
+from dt_viz.engine import MAX_TARGET_MISS, Stage
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles import Sphere
 from dt_viz.retiming import used_fraction
 from dt_viz.scenario import Scenario
+from dt_viz.stacking import plane_of, switched, with_bias_point
 
 TASK_NAMES = ["draw_s", "lift_box"]
 MARGIN_KEPT = 0.9
@@ -313,3 +315,22 @@ def test_random_starts_around_the_demonstrations_all_reach_the_goal(engine, fits
 def test_a_task_is_loaded_once(engine):
     assert engine.task("draw_s") is engine.task("draw_s")
     assert all(isinstance(d, Demonstration) for d in engine.task("draw_s").demonstrations)
+
+
+@pytest.mark.parametrize("space", ["task", "cspace", "both"])
+def test_a_bias_point_that_motions_pass_giving_way_is_said_with_the_distance(engine, initial, space):
+    scenario = initial("draw_s")
+    target = np.add(scenario.obstacles[0].position, (0.10, 0.0, 0.0))
+    point = BiasPoint(vector(target), plane=plane_of(engine.task("draw_s")))
+    scenario = replace(scenario, space=space, layers=with_bias_point((), point))
+    frame = stage(engine, scenario, Stage.ROLLOUTS)
+    missed = max(np.linalg.norm(path - target, axis=1).min() for path in frame.rollouts)
+    told = [doubt for doubt in frame.health.doubts if "gives way to the obstacle and passes" in doubt]
+    assert len(told) == 1
+    assert missed > MAX_TARGET_MISS
+    assert told[0].startswith("Bias 1: the arm" if space != "task" else "Bias 1: a motion")
+    said = float(told[0].split()[-4])
+    assert said == pytest.approx(1e3 * missed, abs=2)  # the samples are that far beside the motion between them
+    off = replace(scenario, layers=switched(scenario.layers, "Bias 1"))
+    for quiet in (off, replace(scenario, warp=0.5), replace(scenario, avoidance=False)):
+        assert not any("Bias 1" in doubt for doubt in stage(engine, quiet, Stage.ROLLOUTS).health.doubts)
