@@ -21,6 +21,8 @@ TOLERANCE = 1e-5
 """Of the integration up to the duration that is known to be needed, metres a step."""
 NUM_DEEPEST = 8
 """Samples of each rollout that the duration is chosen for at first."""
+TINY = 1e-12
+"""Metres between samples that are the same."""
 ROUNDING = 1e-6
 """Metres that do not count: a motion may end on the surface."""
 ACCEPTED_MARGIN = 0.9
@@ -107,10 +109,11 @@ def _crests(motion: Motion, depth: Array, field: VectorField) -> Array:
     here, there = (field(np.concatenate([s[k], s[k + 1]])) * np.tile(step[k], (2, 1))).sum(axis=1).reshape(2, -1)
     turns = (here > 0) & (there < 0)
     k, part = k[turns], (here / np.where(turns, here - there, 1))[turns, None]
-    # between two samples a path bends like the parabolas through them and the ones beside them
-    bend = np.zeros_like(s)
-    bend[1:-1] = np.diff(step, axis=0) * (same[:-1] & same[1:])[:, None]
-    return s[k] + part * step[k] - part * (1 - part) * (bend[k] + bend[k + 1]) / 4
+    # between two samples a path bends like the parabolas through them and the ones beside them; lengths tell them apart
+    length = np.maximum(np.linalg.norm(step, axis=1, keepdims=True), TINY)
+    bend, inner = np.zeros_like(s), (same[:-1] & same[1:])[:, None]
+    bend[1:-1] = np.diff(step / length, axis=0) / (length[:-1] + length[1:]) * inner
+    return s[k] + part * step[k] - part * (1 - part) * length[k] ** 2 * (bend[k] + bend[k + 1]) / 2
 
 
 def _avoidable(motion: Motion) -> Mask:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.avoidance import ACCEPTED_MARGIN, MAX_DURATION, ObstacleAvoidance, clearing_duration
+from dt_viz.avoidance import ACCEPTED_MARGIN, MAX_DURATION, ObstacleAvoidance, _crests, clearing_duration
 from dt_viz.behaviours import Motion
 from dt_viz.integrate import integrate_adaptive
 from dt_viz.obstacles import Sphere
@@ -99,10 +99,11 @@ def test_the_built_transform_clears_the_motion_it_was_built_for():
     assert ObstacleAvoidance().satisfied(after)
 
 
-@given(seeds, st.floats(0.0005, 0.02), st.floats(0, 1), st.floats(0.05, 0.5))
-def test_the_duration_hardly_depends_on_where_a_path_is_sampled(seed, miss, phase, bend):
+@given(seeds, st.floats(0.0005, 0.02), st.floats(0, 1), st.floats(0.05, 0.5), st.floats(1, 6))
+def test_the_duration_hardly_depends_on_where_a_path_is_sampled(seed, miss, phase, bend, uneven):
     """What leaves last lies between samples, mostly: there the path is closest to where the field vanishes."""
-    along, aside, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    rng = np.random.default_rng(seed)
+    along, aside, _ = np.linalg.qr(rng.normal(size=(3, 3)))[0]
 
     def path(u):
         u = u[:, None]
@@ -113,8 +114,23 @@ def test_the_duration_hardly_depends_on_where_a_path_is_sampled(seed, miss, phas
         assert built is not None
         return built.duration
 
-    coarse = np.linspace(-1, 1, 80) + phase / 40
+    gaps = uneven ** rng.uniform(-0.5, 0.5, 80)  # refinement leaves neighbours of very different length
+    coarse = 2 * np.cumsum(gaps) / gaps.sum() - 1 + phase / 40
     assert duration(coarse) == pytest.approx(duration(np.linspace(coarse[0], coarse[-1], 8000)), rel=0.02)
+
+
+@given(seeds, st.floats(1, 6))
+def test_crests_lie_on_a_bent_path_however_unevenly_it_is_sampled(seed, uneven):
+    """Chords miss the arc by up to 0.4 mm, and so would its bend if samples were taken to be evenly spaced."""
+    rng, radius = np.random.default_rng(seed), 0.15
+    along, aside, _ = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    gaps = uneven ** rng.uniform(-0.5, 0.5, 40)
+    turn = 1.2 * (2 * np.cumsum(gaps) / gaps.sum() - 1)[:, None]
+    centre = np.array(SPHERE.position) + (radius + 0.004) * aside
+    before = motion([centre + radius * (np.sin(turn) * along - np.cos(turn) * aside)])
+    found = _crests(before, SPHERE.signed_distance(before.positions), SPHERE.field("free-space", 6.0))
+    assert len(found)
+    np.testing.assert_allclose(np.linalg.norm(found - centre, axis=1), radius, rtol=0, atol=3e-6)
 
 
 def test_nothing_is_built_when_avoidance_is_off():
