@@ -38,12 +38,12 @@ class Health:
     collision: CollisionReport | None = None
     """What the arm's meshes come near to on the motion that it shows."""
     duration: float | None = None
-    """t of the end effector's avoidance flow; None where it is off."""
+    """t of the end effector's avoidance flow, under a warp that of the full one; None where it is off."""
     layer_durations: tuple[float | None, ...] = ()
     """t of each layer's flow, in the order of `Scenario.layers`, under a warp of the full one; None for those that are
     off."""
     arm_duration: float | None = None
-    """t of the whole arm's avoidance flow; None where it is off."""
+    """t of the whole arm's avoidance flow, under a warp that of the full one; None where it is off."""
     min_det_jacobian: float | None = None
     """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism. Where ψ⁻¹,
     integrated by hand, folds what is drawn, its det is taken. It is as exact as tangents are: where space is squeezed
