@@ -112,7 +112,6 @@ class _Pieces:
     """The warped grid on a slice of the manifold of the imitation, before behaviours bend it."""
 
     area: Slice
-    coarse: bool
     index: Indices
     """(N,) which piece a sample belongs to."""
     images: Array
@@ -158,7 +157,8 @@ class Sketchbook:
         """
         self._task, self._flows, self._system, self._rays = task, flows, system, rays
         self._generators: dict[int, tuple[Slice, GeneratorPicture]] = {}
-        self._pieces: _Pieces | None = None
+        self._pieces: dict[bool, _Pieces] = {}
+        """Coarse and fine ones."""
 
     def generator(self, area: Slice, number: int) -> GeneratorPicture | None:
         """The generator of one of the flows: 1 is what ψ applies first, 0 stands for the mean over time of all."""
@@ -206,9 +206,9 @@ class Sketchbook:
             behaviours: what is stacked on the imitation, from the inside out.
             coarse: with fewer points, for a picture that is replaced at once.
         """
-        pieces = self._pieces
-        if pieces is None or not pieces.area.lies_like(area) or (pieces.coarse and not coarse):
-            pieces = self._pieces = self._cut(area, coarse=coarse)
+        pieces = self._pieces.get(coarse)
+        if pieces is None or not pieces.area.lies_like(area):
+            pieces = self._pieces[coarse] = self._cut(area, coarse=coarse)
         drawn = [replace(b, tolerance=TOLERANCE) if isinstance(b, AdaptiveFlow) else b for b in behaviours]
 
         def lifted(positions: Array) -> Array:
@@ -219,11 +219,9 @@ class Sketchbook:
         def evaluate(_: Indices, place: Array) -> Array:
             return lifted(self._system.transform.inverse(pieces.images_at(place)))[:, None]
 
-        keep = _every_other(pieces.index) if coarse and not pieces.coarse else np.arange(len(pieces.index))
-        index, place, positions = pieces.index[keep], keep.astype(float), pieces.positions[keep]
-        bundle = Bundle(index, place, lifted(positions)[:, None])
-        if not len(index):
+        if not len(pieces.index):
             return GridPicture(())
+        bundle = Bundle(pieces.index, np.arange(float(len(pieces.index))), lifted(pieces.positions)[:, None])
         if not coarse:
             bundle = refined(bundle, evaluate, FINE_SPACING, max_rounds=3)
         # where ψ⁻¹ tears neighbours far apart a straight stroke would be a lie
@@ -262,7 +260,7 @@ class Sketchbook:
                 samples.append(piece[np.unique(np.searchsorted(along, even - 1e-12).clip(0, len(piece) - 1))])
         index = np.repeat(np.arange(len(samples)), [len(piece) for piece in samples])
         chosen = np.concatenate([np.empty(0, int), *samples])
-        return _Pieces(area, coarse, index, z[chosen], x[chosen])
+        return _Pieces(area, index, z[chosen], x[chosen])
 
     def _raised(self, area: Slice, across: Array) -> tuple[Array, Array, Mask]:
         """Points of base space over the places `across` (N, 2) along the slice whose preimages lie on it.
@@ -369,13 +367,6 @@ def _lattice_lines(lower: Array, upper: Array, spacing: float) -> tuple[Array, A
 def _true_runs(mask: Mask) -> list[Indices]:
     """Indices of each run of neighbours that are true."""
     return [run for run in np.split(np.arange(len(mask)), np.flatnonzero(np.diff(mask)) + 1) if mask[run[0]]]
-
-
-def _every_other(index: Indices) -> Indices:
-    """Every other sample of each piece, and its last."""
-    rank = np.arange(len(index)) - np.searchsorted(index, index)
-    last = np.append(np.diff(index) > 0, [True] * (len(index) > 0))
-    return np.flatnonzero((rank % 2 == 0) | last)
 
 
 def _runs(positions: Array, index: Indices, limit: float) -> tuple[Array, ...]:

@@ -76,6 +76,17 @@ def test_the_warped_grid_is_made_of_images_of_points_of_planes(engine, scenario,
     assert straightness(middle) < close
 
 
+def test_the_live_grid_is_the_same_before_and_after_the_fine_one(new_engine, initial):
+    """And so it does not jump between the first drag and the next."""
+    engine, scenario = new_engine(), replace(initial("draw_s"), view=View(grid=True))
+    first, again = (picture_at(engine, scenario, stage)[1].grid.lines for stage in (Stage.LIVE, Stage.FINE))
+    assert sum(map(len, first)) < sum(map(len, again))
+    again = picture_at(engine, scenario, Stage.LIVE)[1].grid.lines
+    assert len(first) == len(again)
+    for line, same in zip(first, again, strict=True):
+        np.testing.assert_allclose(line, same, atol=1e-9)
+
+
 def test_the_grid_lies_over_the_slice_and_is_smooth(engine, scenario):
     frame, pictures = picture_at(engine, replace(scenario, avoidance=False))
     points = on_slice(frame.task, np.concatenate(pictures.grid.lines))
