@@ -67,12 +67,10 @@ def _known(area: Slice, obstacles: Sequence[Obstacle]) -> tuple[Array, Mask]:
     clouds = [obstacle.labelled() for obstacle in obstacles if isinstance(obstacle, CloudObstacle)]
     points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in clouds)])
     occupied = np.concatenate([np.zeros(0, dtype=bool), *(labels for _, labels in clouds)])
-    offset = points - area.centre
-    normal = np.cross(*area.axes.T)
-    across = offset @ normal
-    near = np.flatnonzero((np.abs(across) < NEAR) & (np.abs(offset @ area.axes) < area.half_size).all(axis=1))
+    above, across = (points - area.centre) @ area.normal, area.across(points)
+    near = np.flatnonzero((np.abs(above) < NEAR) & (np.abs(across) < area.half_size).all(axis=1))
     near = near[:: -(-len(near) // MAX_POINTS) or 1]
-    return points[near] - across[near, None] * normal, occupied[near]
+    return area.at(across[near]), occupied[near]
 
 
 def believed(obstacle: Obstacle, s: Array) -> Array:
