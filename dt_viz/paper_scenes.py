@@ -32,6 +32,8 @@ STROKE_SPHERE = 0.10
 """Diameter of the sphere in the strokes of fig. 5, metres."""
 J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
 """Of the two points beside the J: fraction of its length, and metres to the right and up as seen from the front."""
+ARM_ONLY = {"field": False}
+"""Where only the whole arm gives way: the vector field is the hand's, and goes through the obstacle."""
 ABOVE = 0.16
 """Metres over a pot's opening where the object is let go, as the demonstrations do over the centre pot."""
 
@@ -120,16 +122,18 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "lift",
             "Fig. 1, 7: lift, a bottle in the way",
-            "The whole arm gives way to the bottle, and still reaches into the box and lifts.",
+            "The whole arm gives way to the bottle, and still dips to where the box is and lifts.",
             "lift_box",
             _bottle_in_the_way,
+            view=ARM_ONLY,
         ),
         PaperScene(
             "push",
             "Fig. 1, 7: push, a bottle in the way",
-            "The whole arm gives way to the bottle, and still ends where the box was pushed to.",
+            "The whole arm gives way to the bottle, and still ends where the demonstrations do.",
             "push_box",
             _bottle_in_the_way,
+            view=ARM_ONLY,
         ),
         PaperScene(
             "cube",
@@ -157,7 +161,7 @@ SCENES: Mapping[str, PaperScene] = {
             PaperScene(
                 f"letter_{character.lower()}",
                 f"Fig. 5: the letter {character}",
-                "Every stroke goes around the sphere, and the whole arm with it; the letter stays legible.",
+                "Every stroke goes around the sphere, and the arm with it. Far from it the letter hardly changes.",
                 f"draw_{character.lower()}",
                 _sphere_in_the_stroke,
             )

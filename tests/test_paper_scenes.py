@@ -51,6 +51,7 @@ def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certi
     assert isinstance(bottle, Cylinder)
     assert bottle.position[2] == pytest.approx(bottle.height / 2)  # stands on the table
     assert frame.scenario.space == "cspace"
+    assert not seen_in(View(), name, "").field  # arrows of the hand's stack would go through the bottle
     undisturbed = max(maximum_collision_distance(path, bottle.signed_distance) for path in frame.ghost)
     assert undisturbed > 0.01  # it is in the way
     assert frame.health.clearance > 0

@@ -375,7 +375,7 @@ def status_html(frame: Frame, pace: Pace) -> str:
 def _rebuild(pace: Pace) -> str:
     """How fast it goes."""
     rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
-    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} edits skipped"
+    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
 
 
 def _tiny(length: float) -> str:
