@@ -123,9 +123,10 @@ def integration_doubts(
     keep = np.unique(np.linspace(0, len(y) - 1, NUM_CHECKED_LIVE).astype(int))
     lost = float(np.linalg.norm((flow.inverse(flow.forward(y[keep])) - y[keep]) * unit, axis=1).max())
     doubts = fold_doubts(name, flow, integration, y[keep], x[keep]) if isinstance(flow, Flow) else ()
-    if not lost <= MAX_ROUND_TRIP:
-        doubts += (f"{name}: {integration} loses {_millimetres(lost)} {THERE_AND_BACK}",)
-    return doubts
+    if lost <= MAX_ROUND_TRIP:
+        return doubts
+    loses = f"loses {_millimetres(lost)} {THERE_AND_BACK}"
+    return tuple(f"{doubt}. It {loses}" for doubt in doubts) or (f"{name}: {integration} {loses}",)
 
 
 def fold_doubts(name: str, flow: Diffeomorphism, integration: Integration, y: Array, x: Array) -> tuple[str, ...]:
@@ -161,12 +162,16 @@ def _determinant(transform: Diffeomorphism, J: Array, drawn_from: Array | None) 
 
 
 def _judged(health: Health, det: float, round_trip: float, falls: bool) -> Health:
-    """Health with certificates that may be worse than those it has, and a doubt for each new failure."""
+    """Health with certificates that may be worse than those it has, and a doubt for each new failure.
+
+    Where a step is known to fold space, that the Lyapunov value does not fall is none.
+    """
+    caused = health.says(FOLDS)
     if not det > 0 and not health.says(FOLDS):
         health = health.doubting(f"det J falls to {det:.2g}: the map {FOLDS}, the stack is no diffeomorphism there")
     if not round_trip <= MAX_ROUND_TRIP and not health.says(THERE_AND_BACK):
         health = health.doubting(f"{THERE_AND_BACK} again misses by {1e3 * round_trip:.3g} mm: steps too coarse")
-    if not falls:
+    if not (falls or caused):
         health = health.doubting("the Lyapunov value does not fall all the way")
     return replace(
         health,
