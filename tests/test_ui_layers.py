@@ -21,7 +21,7 @@ from dt_viz.ui import palette
 from dt_viz.ui.arm import PEDESTAL
 from dt_viz.ui.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.links import CELL, bodies, light_shells, simplified
-from dt_viz.ui.panel import VIEW_LABELS, status_html
+from dt_viz.ui.panel import PLOTS, VIEW_LABELS, Panel, status_html
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.scene import OF_A_MOTION, Rollouts, ScenePictures
@@ -278,6 +278,17 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 
 # --- Panel ---
+
+
+def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
+    panel = Panel(server.gui, {"draw_s": "Draw S"}, ROBOT, lambda *_: None)
+    handles = [control.handle for control in panel._controls]
+    box = {handle.label: handle for handle in handles if handle.label in VIEW_LABELS.values()}
+    of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._folder, box[VIEW_LABELS["health_plots"]]]
+    of_tab += [panel.health._folder, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
+    orders = [handle.order for handle in of_tab]
+    assert orders == sorted(orders)
+    assert len({handle._impl.parent_container_id for handle in of_tab}) == 1
 
 
 def test_every_layer_has_a_checkbox():

@@ -45,6 +45,8 @@ VIEW_LABELS: Mapping[str, str] = {
     "base": "Base attractor beside it",
     "generator": "Learned generator",
 }
+PLOTS = {"joint_plots", "health_plots"}
+"""Those of them that are in the panel, not in the scene."""
 VIEW_HINTS: Mapping[str, str] = {
     "field": "on the slice: longer and darker is faster",
     "streamlines": "motions from all over the slice: exact, as images of straight rays",
@@ -110,14 +112,13 @@ class Panel:
         with tabs.add_tab("Stack"):
             self._stack = StackPanel(gui, self._bind)
         with tabs.add_tab("Show"):
+            self._build_plots(robot)
             self._build_view()
             self._slice = SlicePanel(gui, self._bind)
         with tabs.add_tab("Arm"):
             self._build_arm()
         with tabs.add_tab("Picture"):
             self._build_export(save_png)
-        self.joints = JointPlots(gui, robot)
-        self.health = HealthPlots(gui)
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -282,13 +283,24 @@ class Panel:
             lambda _s, value: {"arm_rollout": int(value) - 1},
         )
 
+    def _build_plots(self, robot: Robot) -> None:
+        """Each right under its checkbox, at the top of the tab, to be seen when they open."""
+        self._build_checkbox("joint_plots")
+        self.joints = JointPlots(self._gui, robot)
+        self._build_checkbox("health_plots")
+        self.health = HealthPlots(self._gui)
+
+    def _build_checkbox(self, name: str) -> None:
+        self._bind(
+            self._gui.add_checkbox(VIEW_LABELS[name], getattr(View(), name), hint=VIEW_HINTS.get(name)),
+            lambda s: getattr(s.view, name),
+            lambda s, value: {"view": replace(s.view, **{name: value})},
+        )
+
     def _build_view(self) -> None:
-        for name, label in VIEW_LABELS.items():
-            self._bind(
-                self._gui.add_checkbox(label, getattr(View(), name), hint=VIEW_HINTS.get(name)),
-                lambda s, name=name: getattr(s.view, name),
-                lambda s, value, name=name: {"view": replace(s.view, **{name: value})},
-            )
+        for name in VIEW_LABELS:
+            if name not in PLOTS:
+                self._build_checkbox(name)
         self._flow = self._bind(
             self._gui.add_slider(
                 "Of flow",
