@@ -213,3 +213,15 @@ def test_letting_go_ends_what_is_held_and_no_detour_that_is_under_way(player):
     playback.take_detour(ramp(5.0, 6.0, 30.0), lambda: ended.append("detour"))
     playback.let_go()
     assert ended == ["held"]
+
+
+def test_the_time_at_the_goal_is_counted_from_arrival_to_the_next_round(player):
+    playback, recorder = player
+    rests = []
+    pose = recorder.__call__
+    playback._pose = lambda q, without: (rests.append((q[0], playback.resting)), pose(q, without))
+    playback.follow(ramp(0.0, 1.0, 0.2))
+    recorder.wait(lambda place: place == 1.0)
+    recorder.wait(lambda place: 0 < place < 0.5)
+    assert all((rest > 0) <= (place == 1.0) for place, rest in rests)
+    assert 0.1 < max(rest for _, rest in rests) <= 0.3

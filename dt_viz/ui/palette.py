@@ -46,6 +46,8 @@ GRID = (0, 114, 178)
 """Thinnest lines."""
 INSET = (120, 126, 136)
 POT = (176, 132, 98)
+CARRIED = (240, 228, 66)
+"""The ball that is dropped in a pot."""
 TABLE = (226, 217, 204)
 ARM = (206, 210, 216)
 ARM_RING = (62, 66, 74)

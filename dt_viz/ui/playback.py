@@ -66,6 +66,7 @@ class Playback:
         self._playing = True
         self._speed = 1.0
         self._clock = 0.0
+        self._resting = 0.0
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="playback", daemon=True)
         self._thread.start()
@@ -74,6 +75,11 @@ class Playback:
     def q(self) -> Array | None:
         """Joint angles (6,) of the arm now, rad; None before there is a motion."""
         return None if self._posed is None else self._posed[0]
+
+    @property
+    def resting(self) -> float:
+        """Seconds for which the arm has been at the goal; 0 on its way."""
+        return self._resting
 
     def follow(self, motion: ArmMotion | None) -> None:
         """Go on along this motion; None keeps the arm where it is."""
@@ -149,8 +155,11 @@ class Playback:
                 continue
             if detour is not None:
                 posed = detour.postures()
+                self._resting = max(0.0, detour.clock - detour.motion.times[-1])
             else:
-                posed = at_moment(motion, min(self._clock % (motion.times[-1] + REST), motion.times[-1]))
+                moment, end = self._clock % (motion.times[-1] + REST), motion.times[-1]
+                posed = at_moment(motion, min(moment, end))
+                self._resting = max(0.0, moment - end)
             self._posed = posed
             self._pose(*posed)
             shown = follows

@@ -20,6 +20,7 @@ from dt_viz.starts import followed, with_moved_start, with_start
 from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
 from dt_viz.ui.arm_layers import Arms
+from dt_viz.ui.carried import Carried
 from dt_viz.ui.export import RESOLUTIONS, render_png
 from dt_viz.ui.grip import Grip
 from dt_viz.ui.panel import Panel
@@ -70,6 +71,7 @@ class Visitor:
                 Starts(client.scene, self._start_moved, self._start_chosen, self._start_clicked),
             )
             self.arms = Arms(client.scene, robot)
+            self.carried = Carried(client.scene)
             self.pushed_path = PushedPath(client.scene)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
@@ -91,6 +93,7 @@ class Visitor:
             self.client.camera.fov = FIELD_OF_VIEW
         with self.client.atomic():
             self.pictures.draw(frame)
+            self.carried.stand(frame.task.pots)
             self.arm.stale = bool(frame.blocked)
         if frame.stage is not Stage.ROLLOUTS:
             if self.pushed_path.is_of_another(frame.scenario):
@@ -108,6 +111,7 @@ class Visitor:
         with self.client.atomic():
             self.pictures.adopt(scenario)
             self.arms.show(scenario.view)
+            self.carried.show(arm=scenario.view.arm)
         self._playback.set_pace(scenario.view.playing, scenario.view.speed)
         self._panel.adopt(scenario)
 
@@ -224,6 +228,7 @@ class Visitor:
     def _pose(self, q: Array, without: Array) -> None:
         with self.client.atomic():
             self.arms.pose(q, without)
+            self.carried.pose(self._robot.end_effector(q), self._playback.resting)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.without_handles(), self.grip.without_handles():
