@@ -17,7 +17,7 @@ SPACING, COARSE_SPACING = 0.004, 0.010
 """Metres between neighbouring samples."""
 NEAR = 0.006
 """Metres from the slice, within which labelled points are shown on it."""
-MAX_POINTS = 600
+MAX_POINTS = 300
 """That are shown."""
 
 

@@ -148,7 +148,7 @@ SCENES: Mapping[str, PaperScene] = {
             "All that is known of the clover: which points lie in it (dark). Strokes leave what is learned from them.",
             "draw_s",
             _cloud_in_the_letter,
-            view={"colour": "occupancy", "field": False},
+            view={"colour": "occupancy", "field": False, "demonstrations": False},
         ),
         PaperScene(
             "two_points",

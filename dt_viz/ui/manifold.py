@@ -10,6 +10,8 @@ from dt_viz.ui.picture import Arrows, Lines, Picture
 
 GENERATOR_LENGTH = 0.030
 """Of the largest arrow, metres."""
+THICK, THIN = 0.0011, 0.0007
+"""Of the warped grid, metres: by itself, and beside the rollouts of a level."""
 INSET_LENGTH = 0.026
 """Of the fastest arrow in the inset, metres."""
 
@@ -40,16 +42,20 @@ class Generator(Picture):
 
 
 class WarpedGrid(Picture):
-    """The grid of base space as ψ⁻¹ of the whole stack bends it."""
+    """The grid of base space as ψ⁻¹ of the stack bends it; thinner and paler beside the rollouts of a level."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self.lines = Lines(scene, "/grid", palette.GRID, 0.0011)
+        self.lines = Lines(scene, "/grid", palette.GRID, THICK)
         super().__init__(self.lines.node)
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
         if frame.pictures.grid is not None:
-            self.lines.show(frame.pictures.grid.lines)
+            beside = frame.level is not None
+            self.lines.show(frame.pictures.grid.lines, colour=palette.GRID_BESIDE if beside else palette.GRID)
+            thickness = THIN if beside else THICK
+            if self.lines.node.thickness != thickness:
+                self.lines.node.thickness = thickness
 
 
 class BaseInset(Picture):

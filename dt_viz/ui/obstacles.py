@@ -19,8 +19,8 @@ from dt_viz.ui.links import simplified
 
 HANDLE_SCALE = 0.2
 """Metres that the handles stick out, about."""
-OPACITY, OPACITY_FAINT = 0.8, 0.3
-"""The path that an obstacle blocks shines through; more so while it is not avoided, or its map is shown."""
+OPACITY, OPACITY_FAINT, OPACITY_OPENED = 0.8, 0.3, 0.12
+"""The path that an obstacle blocks shines through; more so while it is not avoided, and most while its map is shown."""
 CREASE = 0.6
 """Angle between neighbouring faces above which their edge is drawn sharp, rad."""
 MAX_FACES = 30_000
@@ -105,7 +105,7 @@ class ObstaclePicture:
         side = "back" if opened else "front"
         if self.mesh.side != side:
             self.mesh.side = side
-        opacity = OPACITY if avoided and not opened else OPACITY_FAINT
+        opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
         if self.mesh.opacity != opacity:
             self.mesh.opacity = opacity
 

@@ -35,6 +35,8 @@ LEVEL_LINE = (255, 255, 255)
 OCCUPANCY = (230, 159, 0)
 OCCUPANCY_LEVEL = (153, 88, 0)
 """Where the map finds occupied and free equally likely."""
+OUTLINE = (40, 44, 52)
+"""Of the obstacles themselves on the slice."""
 OCCUPIED, FREE = (92, 48, 0), (150, 158, 168)
 """Labelled points."""
 ARROW_SLOW = (198, 205, 216)
@@ -44,6 +46,8 @@ GENERATOR = (230, 159, 0)
 """Of the flows that ψ is made of."""
 GRID = (0, 114, 178)
 """Thinnest lines."""
+GRID_BESIDE = (158, 196, 222)
+"""Beside rollouts of the same colour."""
 INSET = (120, 126, 136)
 POT = (176, 132, 98)
 CARRIED = (240, 228, 66)

@@ -22,11 +22,11 @@ HEAD_LENGTH = 0.012
 """Of the arrow heads on streamlines, metres."""
 PIXEL = 0.004
 """Of the colours, metres."""
-OPACITY = 0.8
-"""Of the colours."""
+OPACITY = 0.5
+"""Of the colours: arm and rollouts behind them are seen through."""
 MOST_OPAQUE = 0.85
 """Opacity where the map is sure that something is there."""
-POINT_SIZE = 0.0025
+POINT_SIZE = 0.0016
 """Of a cloud's points, metres."""
 DET_DECADES = 2
 """Of det J to either side of 1; what is beyond has the last colour."""
@@ -164,8 +164,8 @@ class OccupancySlice(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/occupancy", show_axes=False))
         self.image = _Image(scene, "/occupancy/image")
-        self.level = Lines(scene, "/occupancy/level", palette.OCCUPANCY_LEVEL, 0.0035)
-        self.outline = Lines(scene, "/occupancy/outline", palette.GHOST, 0.0016)
+        self.level = Lines(scene, "/occupancy/level", palette.OCCUPANCY_LEVEL, 0.0025)
+        self.outline = Lines(scene, "/occupancy/outline", palette.OUTLINE, 0.0030)
         self.points = scene.add_point_cloud(
             "/occupancy/points", np.zeros((0, 3), np.float32), palette.FREE, point_size=POINT_SIZE, point_shape="circle"
         )
