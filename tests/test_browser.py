@@ -267,9 +267,10 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
 
     before, deadline = place(), time.monotonic() + PATIENCE
     x, y = project(visitor, before)
+    time.sleep(3.0)  # until the page has drawn the handles where they belong
     while not (np.linalg.norm(place() - before) > 0.03 and session.wait_idle(0.3)):
         assert time.monotonic() < deadline
-        drag(page, (x - 2, y + 2), (x + 30, y - 25), steps=4)  # again, if the page had not drawn the ball yet
+        drag(page, (x - 2, y + 2), (x + 13, y - 11), steps=4)  # again, if the page had not drawn the ball yet
     time.sleep(0.3)  # for the last event
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
     assert abs(place()[1] - before[1]) < 1e-6  # the drawing plane is y = const

@@ -14,6 +14,7 @@ from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Stage
 from dt_viz.imitation import ImitationError
 from dt_viz.obstacles import Box, Sphere
+from dt_viz.paper_scenes import SCENES
 from dt_viz.scenario import Layer, Scenario, View
 from dt_viz.stacking import AVOIDANCE, IMITATION, with_bias_point, without
 from dt_viz.tracking import UnreachableError
@@ -566,7 +567,7 @@ def test_what_a_scene_shows_goes_with_it_also_when_it_is_undone_or_done_again(op
     opened.engine.task = lambda name: name
     for leave in (session.undo, session.reset, lambda: session.choose_task("lift_box")):
         session.load("draw_s", lambda task: Scenario(task, (), scene="cloud"))
-        assert session.scenario.view == replace(mine, colour="occupancy", field=False)
+        assert session.scenario.view == replace(mine, **dict(SCENES["cloud"].view)) != mine
         leave()
         assert session.scenario.view == mine
     session.undo()
