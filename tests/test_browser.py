@@ -112,6 +112,21 @@ def drag(page, start, end, steps=12):
     page.mouse.up()
 
 
+def drag_until(page, done, reset, ends):
+    """Drag between the two pixels of `ends()` until `done()`; again after `reset()`, as a page drawn by software
+    may not show the handles in their place yet: then the drag has turned the camera instead."""
+    deadline = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < deadline
+        reset()
+        time.sleep(2.0)  # until the page has drawn it, and told its camera
+        start, end = ends()
+        page.mouse.move(*start)
+        time.sleep(1.0)
+        drag(page, start, end, steps=6)
+        time.sleep(0.5)  # for the last event
+
+
 def assert_shows_the_obstacle_where_it_is(visitor: Visitor) -> None:
     session, frame = visitor.session, visitor.shown
     assert frame is not None
@@ -192,16 +207,17 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     click_button(page, "Box")
     wait_until(lambda: [item.has_handles for item in pictures.items] == [False, True], "the box and its handles")
     before = np.array(session.scenario.obstacles[1].position)
+    boxed = session.scenario.obstacles
 
     def dragged():
         place = np.array(session.scenario.obstacles[1].position)
         return np.linalg.norm(place - before) > 0.03 and session.wait_idle(0.3)
 
-    x, y = project(visitor, before - (0.05, 0.05, 0.015))  # on its face, away from the handles
-    deadline = time.monotonic() + PATIENCE
-    while not dragged():
-        assert time.monotonic() < deadline
-        drag(page, (x, y), (x - 50, y + 30), steps=4)  # again, if the page had not drawn the box yet
+    def along_its_face():
+        x, y = project(visitor, before - (0.05, 0.05, 0.015))  # away from the handles
+        return (x, y), (x - 50, y + 30)
+
+    drag_until(page, dragged, lambda: session.edit("test", obstacles=boxed), along_its_face)
     assert session.scenario.obstacles[0] == sphere
     np.testing.assert_allclose(pictures.items[1].gizmo.position, session.scenario.obstacles[1].position, atol=1e-9)
 
@@ -235,20 +251,18 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
 
     picture = visitor.pictures.obstacles.items[0]
     arc = 0.65 * picture.gizmo.scale  # the handles that turn are quarters of circles between the arrows
-    start, end = (
-        project(visitor, mesh.position + arc * np.array([np.cos(turn), 0.0, np.sin(turn)])) for turn in (0.8, 0.1)
-    )
 
     def turned():
-        return abs(session.scenario.obstacles[0].wxyz[0]) < 0.9999 and session.wait_idle(0.3)
+        after = session.scenario.obstacles[0]
+        return abs(after.wxyz[0]) < 0.9999 and after == mesh.moved(mesh.position, after.wxyz)  # in place
 
+    def along_the_arc():
+        turns = [np.array([np.cos(angle), 0.0, np.sin(angle)]) for angle in (0.8, 0.1)]
+        return [project(visitor, mesh.position + arc * turn) for turn in turns]
+
+    drag_until(page, turned, lambda: session.edit("test", obstacles=(mesh,)), along_the_arc)
     assert session.wait_idle(PATIENCE)
-    page.mouse.move(*start)
-    time.sleep(3.0)  # until the page has drawn the handles where they belong
-    drag(page, start, end, steps=6)
-    wait_until(turned, "the mesh to be turned")
     (after,) = session.scenario.obstacles
-    assert after == mesh.moved(mesh.position, after.wxyz)  # in place
     axis = np.abs(after.wxyz[1:]) / np.linalg.norm(after.wxyz[1:])
     np.testing.assert_allclose(axis, [0, 1, 0], atol=1e-3)  # across the drawing plane
     np.testing.assert_allclose(picture.gizmo.wxyz, after.wxyz, atol=1e-9)
@@ -265,13 +279,16 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     def place():
         return np.array(bias_points(session.scenario.layers)["Bias 1"].position)
 
-    before, deadline = place(), time.monotonic() + PATIENCE
-    x, y = project(visitor, before)
-    time.sleep(3.0)  # until the page has drawn the handles where they belong
-    while not (np.linalg.norm(place() - before) > 0.03 and session.wait_idle(0.3)):
-        assert time.monotonic() < deadline
-        drag(page, (x - 2, y + 2), (x + 13, y - 11), steps=4)  # again, if the page had not drawn the ball yet
-    time.sleep(0.3)  # for the last event
+    before, layers = place(), session.scenario.layers
+
+    def beside_its_middle():
+        x, y = project(visitor, before)
+        return (x - 2, y + 2), (x + 13, y - 11)
+
+    def moved():
+        return 0.03 < np.linalg.norm(place() - before) < 0.15
+
+    drag_until(page, moved, lambda: session.edit("test", layers=layers), beside_its_middle)
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
     assert abs(place()[1] - before[1]) < 1e-6  # the drawing plane is y = const
     np.testing.assert_allclose(pictures.items[0].gizmo.position, place(), atol=1e-9)
