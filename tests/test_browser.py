@@ -20,6 +20,7 @@ from dt_viz.scenario import View
 from dt_viz.stacking import bias_points
 from dt_viz.tasks import TASKS
 from dt_viz.ui.server import Server
+from dt_viz.ui.slice_layers import VOLUME
 from dt_viz.ui.visitor import Visitor
 
 CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -302,7 +303,9 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
 
 
 def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
-    page, _ = visit
+    page, visitor = visit
+    visitor.session.edit("test", view=View(playing=False, colour="det"))
+    assert visitor.session.wait_idle(PATIENCE)
     open_tab(page, "Picture")
     with page.expect_download(timeout=1000 * PATIENCE) as download:
         page.get_by_text("Save PNG").click()
@@ -315,6 +318,9 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     # the rollouts are there, in their colour; the gizmo's blue and green arrows are not
     assert (np.abs(pixels.astype(int) - (213, 94, 0)).max(axis=1) < 40).sum() > 300
     assert (np.abs(pixels.astype(int) - (32, 128, 255)).max(axis=1) < 40).sum() == 0
+    corner = np.asarray(image)[-120:, :450].reshape(-1, 3).astype(int)
+    for shade in VOLUME[[0, -1]].astype(int):  # the legend's ends
+        assert (np.abs(corner - shade).max(axis=1) < 4).any()
 
 
 def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):

@@ -1,5 +1,6 @@
 """The slice in the page, without a browser: handles, colours and their legend, and what is shown beside a level."""
 
+import io
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -7,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from pages import frame_of
+from PIL import Image
 
 from dt_viz.engine import Stage
 from dt_viz.field_layers import ColourPicture, FieldPicture
@@ -18,11 +20,13 @@ from dt_viz.tasks import TASKS
 from dt_viz.ui import palette
 from dt_viz.ui.bias import Biases
 from dt_viz.ui.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
+from dt_viz.ui.export import as_png
+from dt_viz.ui.legend import OCCUPANCY, legend_of
 from dt_viz.ui.obstacles import Obstacles
 from dt_viz.ui.scene import Rollouts
 from dt_viz.ui.slice import MovableSlice
 from dt_viz.ui.slice_layers import VOLUME, ColourSlice, FieldArrows, Streamlines, painted, scale_of
-from dt_viz.ui.slice_panel import WHOLE_ARM_NOTE, SlicePanel, legend_html
+from dt_viz.ui.slice_panel import WHOLE_ARM_NOTE, SlicePanel
 
 SCENARIO = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
@@ -177,14 +181,47 @@ def test_the_lyapunov_value_grows_darker_and_one_has_no_colour():
 def test_the_legend_has_round_numbers_with_a_unit_that_reach_the_largest_value(largest, top):
     picture = picture_of(np.linspace(0, largest, 20).reshape(4, 5), "lyapunov")
     assert scale_of(picture).high == pytest.approx(top)
-    said = legend_html(picture)
-    assert "cm²/s" in said and f">{top:g}<" in said and ">0<" in said
+    said = legend_of(picture).html
+    assert "square cm per second" in said and f">{top:g}<" in said and ">0<" in said
 
 
 def test_the_legend_of_det_j_names_the_colour_of_folds():
-    said = legend_html(picture_of(np.ones((4, 5))))
+    said = legend_of(picture_of(np.ones((4, 5)))).html
     assert all(f">{number}<" in said for number in ("0.01", "0.1", "1", "10", "100"))
-    assert "≤ 0" in said and str(palette.FOLDED) in said
+    assert "0 or less" in said and str(palette.FOLDED) in said
+
+
+LEGENDS = {
+    "det": legend_of(picture_of(np.ones((4, 5)))),
+    "lyapunov": legend_of(picture_of(np.ones((4, 5)), "lyapunov")),
+    "occupancy": OCCUPANCY,
+}
+
+
+@pytest.mark.parametrize("height", [720, 2160])
+@pytest.mark.parametrize("what", LEGENDS)
+def test_a_saved_picture_has_the_legend_in_its_corner_and_nothing_else_is_changed(what, height):
+    legend, blank = LEGENDS[what], Image.new("RGBA", (height * 16 // 9, height))
+    pixels = np.asarray(legend.drawn_onto(blank))
+    rows, columns = np.nonzero(pixels[..., 3])
+    assert rows.min() > 0.8 * height and columns.max() < 0.65 * height
+    assert np.asarray(blank)[..., 3].max() == 0
+    # every shade is there in its order: the row of the plate that has most of them
+    ends = legend.scale.shades[[0, -1]].astype(int)
+    found = [np.nonzero((np.abs(pixels[..., :3] - end).max(axis=-1) <= 2) & (pixels[..., 3] == 255)) for end in ends]
+    assert found[0][1].min() < found[1][1].max()
+    for text in (legend.title, legend.note, *(text for _, text in legend.ticks)):
+        assert text.isascii()  # the font has no other letters
+
+
+def test_a_saved_picture_is_white_behind_or_transparent():
+    blank = Image.new("RGBA", (320, 180))
+    for legend in (None, OCCUPANCY):
+        white = Image.open(io.BytesIO(as_png(blank, legend, transparent=False)))
+        clear = Image.open(io.BytesIO(as_png(blank, legend, transparent=True)))
+        assert (white.mode, clear.mode) == ("RGB", "RGBA")
+        assert white.getpixel((300, 10)) == (255, 255, 255) and clear.getpixel((300, 10)) == (0, 0, 0, 0)
+        assert (np.asarray(white).min() < 255) == (legend is not None)
 
 
 # --- The panel ---
@@ -215,14 +252,15 @@ def test_the_colour_is_one_choice(opened):
 def test_the_panel_says_what_the_colours_mean_and_what_is_not_in_them(opened):
     panel, _, _ = opened
     panel.adopt(SCENARIO)
-    assert not (panel.legend.visible or panel.note.visible or panel.back.visible)
+    assert not (panel.key.visible or panel.note.visible or panel.back.visible)
     panel.adopt(seen(colour="det", slice=POSE))
     panel.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))
-    assert panel.legend.visible and "det J" in panel.legend.content and panel.back.visible
+    assert panel.key.visible and "det J" in panel.key.content and panel.back.visible
     panel.adopt(seen(colour="occupancy"))
-    assert "believes" in panel.legend.content
+    panel.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))  # on its way when another was chosen
+    assert panel.legend == OCCUPANCY and "Learned occupancy" in panel.key.content
     panel.adopt(replace(SCENARIO, space="cspace"))
     assert panel.note.visible and WHOLE_ARM_NOTE in panel.note.content
-    assert not panel.legend.visible
+    assert panel.legend is None and not panel.key.visible
     panel.adopt(replace(SCENARIO, space="cspace", avoidance=False))
     assert not panel.note.visible

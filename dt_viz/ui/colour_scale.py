@@ -1,10 +1,10 @@
-"""Scales of colours on which equal steps look equally large, and what is to be said of them."""
+"""Scales of colours on which equal steps look equally large."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from dt_viz.fields import Array
 from dt_viz.ui.picture import Colour
 
 NUM_SHADES = 256
+Number = TypeVar("Number", float, Array)
 
 # B. Ottosson, "A perceptual color space for image processing" (2020): linear sRGB → cone responses → OKLab
 _TO_CONES = np.array(
@@ -73,25 +74,8 @@ class Scale:
 
     def colours(self, values: Array) -> NDArray[np.uint8]:
         """(*B, 3) colours of values (*B,)."""
-        relative = (values - self.low) / (self.high - self.low)
-        return self.shades[np.round((NUM_SHADES - 1) * np.clip(relative, 0, 1)).astype(int)]
+        return self.shades[np.round((NUM_SHADES - 1) * np.clip(self.relative(values), 0, 1)).astype(int)]
 
-    def legend(self, title: str, ticks: Sequence[tuple[float, str]], note: str = "") -> str:
-        """HTML of the scale with numbers, from left to right.
-
-        Args:
-            title: what is shown, with its unit.
-            ticks: values and how they are written.
-            note: HTML below.
-        """
-        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in self.shades[:: NUM_SHADES // 16].tolist())
-        numbers = "".join(
-            f"<span style='position:absolute;left:{100 * (value - self.low) / (self.high - self.low):.1f}%;"
-            f"transform:translateX(-50%)'>{html.escape(text)}</span>"
-            for value, text in ticks
-        )
-        return (
-            f"<div style='font-size:0.8em;padding:0.2em 1.6em 0.5em;line-height:1.4'>{html.escape(title)}"
-            f"<div style='height:0.8em;border-radius:2px;background:linear-gradient(to right,{stops})'></div>"
-            f"<div style='position:relative;height:1.5em'>{numbers}</div>{note}</div>"
-        )
+    def relative(self, value: Number) -> Number:
+        """How far along the scale a value lies: 0 at `low`, 1 at `high`."""
+        return (value - self.low) / (self.high - self.low)

@@ -8,6 +8,8 @@ import numpy as np
 import viser
 from PIL import Image
 
+from dt_viz.ui.legend import Legend
+
 RESOLUTIONS = {
     "1280 × 720": (1280, 720),
     "1920 × 1080": (1920, 1080),
@@ -19,12 +21,13 @@ TIMEOUT = 60.0
 """Seconds to wait for the browser."""
 
 
-def render_png(client: viser.ClientHandle, size: tuple[int, int], *, transparent: bool) -> bytes:
+def render_png(client: viser.ClientHandle, size: tuple[int, int], legend: Legend | None, *, transparent: bool) -> bytes:
     """What the visitor sees, as a PNG file.
 
     Args:
         client: the visitor; must not be called on the server's event loop.
         size: width and height, pixels.
+        legend: of the colours in it, is drawn onto it.
         transparent: keep the background transparent, else make it white.
 
     Raises:
@@ -32,7 +35,13 @@ def render_png(client: viser.ClientHandle, size: tuple[int, int], *, transparent
     """
     width, height = size
     rgba = client.get_render(height, width, transport_format="png", timeout=TIMEOUT)
-    image = Image.fromarray(np.asarray(rgba), "RGBA")
+    return as_png(Image.fromarray(np.asarray(rgba), "RGBA"), legend, transparent=transparent)
+
+
+def as_png(image: Image.Image, legend: Legend | None, *, transparent: bool) -> bytes:
+    """A PNG file of the RGBA image with its legend; see `render_png`."""
+    if legend is not None:
+        image = legend.drawn_onto(image)
     if not transparent:
         white = Image.new("RGBA", image.size, "white")
         white.alpha_composite(image)

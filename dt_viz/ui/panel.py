@@ -20,6 +20,7 @@ from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.export import RESOLUTIONS
 from dt_viz.ui.health_plots import HealthPlots
+from dt_viz.ui.legend import Legend
 from dt_viz.ui.obstacle_panel import ObstaclePanel
 from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.push import PushButton
@@ -132,6 +133,11 @@ class Panel:
     def close(self) -> None:
         """The visitor has left: stop what plays."""
         self._stack.close()
+
+    @property
+    def legend(self) -> Legend | None:
+        """Of the colours on the slice."""
+        return self._slice.legend
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""

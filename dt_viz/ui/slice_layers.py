@@ -13,7 +13,7 @@ from dt_viz.field_layers import ColourPicture
 from dt_viz.fields import Array
 from dt_viz.slices import Slice
 from dt_viz.ui import palette
-from dt_viz.ui.colour_scale import Scale, diverging, ramp
+from dt_viz.ui.colour_scale import NUM_SHADES, Scale, diverging, ramp
 from dt_viz.ui.picture import Arrows, Lines, Picture
 
 ARROW_LENGTH = 0.024
@@ -34,6 +34,9 @@ CM2 = 1e4
 """Square centimetres in a square metre."""
 
 VOLUME, LYAPUNOV = diverging(palette.VOLUME), ramp(palette.LYAPUNOV)
+_LIKELY = np.linspace(0, MOST_OPAQUE, NUM_SHADES)[:, None]
+OCCUPANCY_SCALE = Scale(np.round(255 + _LIKELY * (np.array(palette.OCCUPANCY) - 255)).astype(np.uint8), 0.0, 1.0)
+"""As it looks on white."""
 
 
 class FieldArrows(Picture):

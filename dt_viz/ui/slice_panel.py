@@ -1,4 +1,4 @@
-"""Controls of the slice: where it lies, what its colour shows, and the legend."""
+"""Controls of the slice: where it lies and what its colour shows."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import Any
 import viser
 
 from dt_viz.engine import Frame
-from dt_viz.field_layers import ColourPicture
 from dt_viz.scenario import SLICE_COLOURS, Scenario
-from dt_viz.ui import palette
+from dt_viz.ui.legend import OCCUPANCY, Legend, legend_of
 from dt_viz.ui.session import Session
-from dt_viz.ui.slice_layers import DET_DECADES, scale_of
 
 COLOUR_LABELS: Mapping[str, str] = {
     "none": "None",
@@ -22,7 +20,6 @@ COLOUR_LABELS: Mapping[str, str] = {
     "occupancy": "Learned occupancy",
 }
 assert set(COLOUR_LABELS) == set(SLICE_COLOURS)
-OCCUPANCY_NOTE = "what the map believes, its level p = ½ (bold) and the true outline (thin)"
 WHOLE_ARM_NOTE = "The slice shows the stack of the hand's path; what the whole arm avoids with is not in it."
 _SMALL = "font-size:0.8em;line-height:1.4;padding:0.1em 0.9em 0.4em;opacity:0.85"
 
@@ -33,6 +30,7 @@ class SlicePanel:
     def __init__(self, gui: viser.GuiApi, bind: Callable[..., Any]) -> None:
         """Build the controls; `bind` ties one to the scenario, see `Panel`."""
         self._session: Session | None = None
+        self._colour = "none"
         bind(
             gui.add_checkbox(
                 "Move the slice", False, hint="handles that move and tilt the plane of arrows and colours"
@@ -54,7 +52,9 @@ class SlicePanel:
                 "view": replace(s.view, colour=next(name for name, label in COLOUR_LABELS.items() if label == value))
             },
         )
-        self.legend = gui.add_html("", visible=False)
+        self.legend: Legend | None = None
+        """Of the colours that are shown."""
+        self.key = gui.add_html("", visible=False)
         self.note = gui.add_html(f"<div style='{_SMALL}'>{WHOLE_ARM_NOTE}</div>", visible=False)
 
     def connect(self, session: Session) -> None:
@@ -64,34 +64,21 @@ class SlicePanel:
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
         view = scenario.view
+        self._colour = view.colour
         self.back.visible = view.slice is not None
         shown = view.colour != "none" or view.field or view.streamlines or view.grid
         self.note.visible = shown and scenario.avoidance and scenario.space != "task" and bool(scenario.obstacles)
         if view.colour in {"none", "occupancy"}:
-            self._say(f"<div style='{_SMALL}'>{OCCUPANCY_NOTE}</div>" if view.colour == "occupancy" else "")
+            self._explain(OCCUPANCY if view.colour == "occupancy" else None)
 
     def report(self, frame: Frame) -> None:
         """Show the legend of the colours that are shown."""
         picture = frame.pictures.colour
-        if picture is not None:
-            self._say(legend_html(picture))
+        if picture is not None and picture.what == self._colour:  # or another was chosen meanwhile
+            self._explain(legend_of(picture))
 
-    def _say(self, text: str) -> None:
-        if self.legend.content != text:
-            self.legend.content, self.legend.visible = text, bool(text)
-
-
-def legend_html(picture: ColourPicture) -> str:
-    """What the colours of a picture mean."""
-    scale = scale_of(picture)
-    if picture.what == "det":
-        decades = range(-DET_DECADES, DET_DECADES + 1)
-        swatch = f"display:inline-block;width:1.2em;height:0.7em;background:rgb{palette.FOLDED}"
-        note = f"<span style='{swatch}'></span> det J ≤ 0: folded, no diffeomorphism"
-        return scale.legend(
-            "det J: a small volume in base space, times that here", [(d, f"{10.0**d:g}") for d in decades], note
-        )
-    ticks = [k / 4 * scale.high for k in range(5)]
-    return scale.legend(
-        "Lyapunov value Φ(ψ(y)), cm²/s: every motion goes down", [(value, f"{value:g}") for value in ticks]
-    )
+    def _explain(self, legend: Legend | None) -> None:
+        self.legend = legend
+        text = legend.html if legend else ""
+        if self.key.content != text:
+            self.key.content, self.key.visible = text, bool(text)

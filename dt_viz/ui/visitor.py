@@ -232,6 +232,6 @@ class Visitor:
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.without_handles(), self.grip.without_handles():
-            content = render_png(self.client, RESOLUTIONS[resolution], transparent=transparent)
+            content = render_png(self.client, RESOLUTIONS[resolution], self._panel.legend, transparent=transparent)
         name = f"dt-viz-{self.session.scenario.task}.png"
         self.client.send_file_download(name, content, save_immediately=True)
