@@ -16,6 +16,7 @@ from dt_viz.imitation import ImitationError
 from dt_viz.obstacles import Box, Sphere
 from dt_viz.paper_scenes import SCENES
 from dt_viz.scenario import Layer, Scenario, View
+from dt_viz.slices import SlicePose
 from dt_viz.stacking import AVOIDANCE, IMITATION, with_bias_point, without
 from dt_viz.tracking import UnreachableError
 from dt_viz.ui import session as session_module
@@ -257,6 +258,18 @@ def test_another_task_brings_its_place_and_keeps_other_choices(opened):
     opened.session.undo()
     assert opened.session.scenario.task == "draw_s"
     assert opened.session.scenario.obstacles[0] == Sphere((0.0, 0.0, 0.0), 0.22)
+
+
+def test_another_task_has_its_own_slice_and_undo_brings_the_moved_one_back(opened):
+    session = opened.session
+    pose = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
+    session.edit("slice", view=replace(session.scenario.view, slice=pose))
+    session.choose_task("lift_box")
+    assert session.scenario.view.slice is None
+    session.undo()
+    assert session.scenario.view.slice == pose
+    session.redo()
+    assert session.scenario.view.slice is None
 
 
 def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first(opened):

@@ -71,14 +71,12 @@ def _end_if(superseded: Callable[[], bool]) -> None:
         raise _UnwantedError
 
 
-def _with_own_view(scenario: Scenario, before: Scenario) -> Scenario:
-    """The scenario, its view naming no level that is gone; of another task than before, with its slice."""
-    view = scenario.view
-    if scenario.task != before.task:
-        view = replace(view, slice=None)
-    if view.level and view.level not in (IMITATION, *names(scenario)):  # another layer may get its name
-        view = replace(view, level="")
-    return scenario if view is scenario.view else replace(scenario, view=view)
+def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
+    """The scenario, its view naming no level that is gone: another layer may get its name."""
+    level = scenario.view.level
+    if not level or level in (IMITATION, *names(scenario)):
+        return scenario
+    return replace(scenario, view=replace(scenario.view, level=""))
 
 
 class Display(Protocol):
@@ -153,7 +151,7 @@ class Session:
         """
         now = time.monotonic()
         with self._lock:
-            edited = _with_own_view(replace(self.scenario, **changes), self.scenario)
+            edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
             if edited == self.scenario:
                 return
             moves = not edited.moves_like(self.scenario)
@@ -203,6 +201,7 @@ class Session:
                 obstacles=tuple(had.moved(there.position, had.wxyz) for there, had in kept),
                 layers=fresh.layers,
                 avoidance_level=fresh.avoidance_level,
+                view=replace(self.scenario.view, slice=None),
             )
             self.end_gesture()
 
@@ -224,9 +223,11 @@ class Session:
         self.end_gesture()
 
     def _as_seen(self, other: Scenario) -> Scenario:
-        """Another scenario, looked at as this one."""
-        seen = replace(other, view=seen_in(self.scenario.view, other.scene, self.scenario.scene))
-        return _with_own_view(seen, self.scenario)
+        """Another scenario, looked at as this one; of another task, on the slice that it had."""
+        view = seen_in(self.scenario.view, other.scene, self.scenario.scene)
+        if other.task != self.scenario.task:
+            view = replace(view, slice=other.view.slice)
+        return _with_a_level_of_its_own(replace(other, view=view))
 
     def push(self, q: Array, show: Callable[[Pushed], None]) -> None:
         """Push the hand aside. Nothing is done while another motion than the scenario's is shown.
