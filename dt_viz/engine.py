@@ -7,24 +7,22 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 
 from dt_viz.avoidance import ObstacleAvoidance
-from dt_viz.behaviours import Behaviour, Motion
+from dt_viz.behaviours import Behaviour
 from dt_viz.belief import occupancy_picture
-from dt_viz.bias import Biasing
 from dt_viz.collision import load_collision_model
-from dt_viz.cspace import LEVERS
 from dt_viz.diffeo import Flow
+from dt_viz.doubts import motion_doubts, target_doubts
 from dt_viz.field_layers import Clearance, arrows_and_colour, streamlines
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
 from dt_viz.following import NUM_ARM_SAMPLES, OUT_OF_REACH, ArmMotion, Follower
 from dt_viz.ground import Ground, Learned, named_starts
-from dt_viz.health import Health, certified, certified_arm, fold_doubts, integration_doubts
+from dt_viz.health import Health, certified, certified_arm, fold_doubts
 from dt_viz.holding import held
 from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.metrics import maximum_collision_distance
@@ -42,12 +40,6 @@ from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
 from dt_viz.warping import warped
 from dt_viz.whole_arm import ArmSolution, Lift
-
-MAX_GOAL_MISS = 1e-3
-"""Metres by which motions may end beside the goal before it is said."""
-MAX_TARGET_MISS = 0.013
-"""Metres by which motions that avoid may miss a bias point before it is said: a centimetre, and what the arm's joints,
-interpolated between samples, are off by while a hand moves."""
 
 
 class Stage(IntEnum):
@@ -381,9 +373,9 @@ class Engine:
             clearance = arm.clearance
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
-        doubts = _doubts(ground, scenario, solved, clearance, float(np.linalg.norm(reached - ground.goal)))
+        doubts = motion_doubts(ground, scenario, stack, arm, clearance, float(np.linalg.norm(reached - ground.goal)))
         if scenario.avoidance and scenario.obstacles and scenario.warp == 1 and not stack.doubts:
-            doubts = (*doubts, *_missed_targets(ground, scenario, solved, self._robot))
+            doubts += target_doubts(ground, scenario, stack, arm, self._robot)
         return Frame(
             scenario=scenario,
             task=ground.task,
@@ -490,13 +482,6 @@ def _region_radius(stack: Solution, behaviour: Behaviour) -> float | None:
     return flow.field.scale if isinstance(flow, Flow) and isinstance(flow.field, PlacedField) else None
 
 
-def _moves_goal(ground: Ground, stack: Solution) -> bool:
-    """Whether some behaviour other than avoidance means to end elsewhere."""
-    goals = [ground.goal, *(made.goal for _, made in stack.built)]
-    moves = (bool(np.any(a != b)) for a, b in pairwise(goals))
-    return any(m and not isinstance(layer, ObstacleAvoidance) for m, (layer, _) in zip(moves, stack.built, strict=True))
-
-
 def _level(scenario: Scenario, stack: Solution) -> int | None:
     """Which level the view names, if it is in the stack."""
     names = levels(scenario)[: 1 + len(stack.built)]
@@ -525,75 +510,3 @@ def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse:
 def _clearance(scenario: Scenario, *, avoided: bool) -> Clearance:
     """Distance from where no motion comes: nowhere, or into the obstacle."""
     return scenario.obstacle.signed_distance if avoided else lambda points: np.full(len(points), np.inf)
-
-
-def _doubts(ground: Ground, scenario: Scenario, solved: _Solved, clearance: float, missed: float) -> tuple[str, ...]:
-    """Why the motion is not to be trusted, in words."""
-    doubts = [*ground.imitation.warnings, *solved.stack.doubts]
-    integration = _integration_doubts(scenario, solved)
-    if scenario.warp < 1:  # what does not do yet what it is made for has not failed
-        return (*doubts, *integration, *ground.doubts)
-    if solved.arm is not None:
-        if not solved.arm.cleared:
-            doubts.append(
-                "the arm finds no way around the obstacle: a motion comes too near to it"
-                if scenario.duration is None
-                else "a motion of the arm comes too near to the obstacle at this flow time"
-            )
-        numbers, num = np.array(ground.numbers), ground.num_demonstrated
-        doubts += named_starts(numbers[solved.arm.too_near], num, "without a way around the obstacle for the arm")
-        beside = np.setdiff1d(solved.arm.moved, solved.arm.too_near)
-        doubts += named_starts(numbers[beside], num, "so near to the obstacle that the arm begins elsewhere")
-    elif scenario.avoidance and clearance < 0 and not doubts:
-        doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
-    elif any(isinstance(layer, ObstacleAvoidance) for layer in solved.stack.unsatisfied) and not doubts:
-        doubts.append(f"a motion keeps only {1e3 * clearance:.1f} mm from the obstacle")
-    if not solved.stack.doubts:
-        missed_by = [layer.name for layer in scenario.layers if layer.behaviour in solved.stack.unsatisfied]
-        doubts += [f"{name or 'a layer'}: not every motion does what it asks for" for name in missed_by]
-    doubts += integration
-    if missed > MAX_GOAL_MISS and not doubts and not _moves_goal(ground, solved.stack):
-        doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
-    return (*doubts, *ground.doubts)
-
-
-def _missed_targets(ground: Ground, scenario: Scenario, solved: _Solved, robot: Robot) -> list[str]:
-    """Which bias points the stack leads the motion to, but giving way to the obstacle leads past, in words.
-
-    In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
-    """
-    stack, arm = solved.stack, solved.arm
-    bundle = stack.bundle if arm is None else arm
-    positions = stack.bundle.positions if arm is None else robot.end_effector(arm.p)
-    motion = Motion(
-        scenario, ground.starts, ground.goal, bundle.index, positions, num_demonstrated=ground.num_demonstrated
-    )
-    doubts = []
-    for layer in scenario.layers:
-        bias = layer.behaviour
-        if (
-            not layer.on
-            or not isinstance(bias, Biasing)
-            or bias in stack.unsatisfied
-            or bias.point.strength is not None
-        ):
-            continue
-        in_space = replace(bias, point=replace(bias.point, plane=None))
-        missed = float(in_space.distances(motion).max())
-        if missed > MAX_TARGET_MISS:
-            who = "a motion" if arm is None else "the arm"
-            doubts.append(f"{layer.name}: {who} gives way to the obstacle and passes {1e3 * missed:.0f} mm from it")
-    return doubts
-
-
-def _integration_doubts(scenario: Scenario, solved: _Solved) -> tuple[str, ...]:
-    """What the integrators cost that were chosen by hand, in words."""
-    doubts, bundle = [], solved.stack.bundle
-    for level, (name, (_, made)) in enumerate(zip(levels(scenario)[1:], solved.stack.built, strict=True), 1):
-        doubts += integration_doubts(
-            name, made.transform, made.integration, bundle.levels[:, level], bundle.levels[:, level - 1]
-        )
-    if solved.arm is not None:
-        arm = solved.arm
-        doubts += integration_doubts(WHOLE_ARM, arm.transform, scenario.integration, arm.p, arm.q, LEVERS)
-    return tuple(doubts)

@@ -4,6 +4,7 @@ import io
 import os
 import shutil
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -470,19 +471,19 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
         lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion without obstacle"
     )
     assert visitor.grip.ball.visible
-    robot, deadline = load_jaco(), time.monotonic() + PATIENCE
-    before = visitor._hand()
-    x, y = project(visitor, before)
-    while visitor.pushed_path.pushed is None:  # again, if the page had not drawn the ball yet
-        assert time.monotonic() < deadline
-        drag(page, (x, y), (x - 50, y - 40), steps=8)
-        time.sleep(0.5)
+    robot, before = load_jaco(), visitor._hand()
+
+    def from_the_ball():
+        x, y = project(visitor, before)
+        return (x, y), (x - 50, y - 40)
+
+    drag_until(page, lambda: visitor.pushed_path.pushed is not None, lambda: None, from_the_ball)
     wait_until(lambda: session.wait_idle(0.3), "the last event")
     pushed, hand = visitor.pushed_path.pushed, visitor._hand()
     np.testing.assert_allclose(pushed.path[0], hand, atol=1e-3)
     assert np.linalg.norm(hand - before) > 0.05
     assert abs(hand[1] - before[1]) < 5e-3  # parallel to the drawing plane, y = const
-    np.testing.assert_allclose(project(visitor, hand), (x - 50, y - 40), atol=12)
+    np.testing.assert_allclose(project(visitor, hand), from_the_ball()[1], atol=12)
     np.testing.assert_allclose(robot.end_effector(pushed.motion.q[-1]), visitor.shown.goal, atol=1e-3)
     session.edit("play", view=View(speed=3.0, field=False, table=False, demonstrations=False))
     wait_until(lambda: np.linalg.norm(visitor._hand() - visitor.shown.goal) < 5e-3, "the goal")
@@ -498,6 +499,31 @@ def test_the_warp_is_played_in_the_page(visit):
     page.get_by_text("0 → 1").wait_for(timeout=1000 * PATIENCE)
     visitor.session.undo()
     assert visitor.session.scenario.warp == 1  # it ended as it began
+
+
+def test_the_slice_is_moved_by_its_handles_and_the_field_with_it(visit):
+    page, visitor = visit
+    session, home = visitor.session, visitor.shown.slice
+    light = View(playing=False, streamlines=True, field=False, arm=False, table=False, demonstrations=False)
+    session.edit("test", obstacles=(), view=replace(light, move_slice=True))
+    wait_until(lambda: session.wait_idle(0.3), "the handles")
+    gizmo, right = visitor.pictures.slice.gizmo, home.axes[:, 0]
+
+    def along_its_first_arrow():
+        tip = home.centre + 0.8 * gizmo.scale * right
+        return project(visitor, tip), project(visitor, tip + 0.06 * right)
+
+    def moved():
+        return np.linalg.norm(visitor.shown.slice.centre - home.centre) > 0.03
+
+    drag_until(page, moved, lambda: session.edit("test", view=replace(light, move_slice=True)), along_its_first_arrow)
+    wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
+    area = visitor.shown.slice
+    np.testing.assert_allclose(np.cross(area.centre - home.centre, right), 0, atol=1e-6)  # along the arrow only
+    np.testing.assert_allclose(area.axes, home.axes, atol=1e-6)
+    (lines,) = [visitor.shown.pictures.streamlines]
+    points = np.concatenate(lines)
+    assert (np.abs((points - area.centre) @ area.axes) <= np.array(area.half_size) + 0.02).all()
 
 
 def test_a_click_on_the_slice_starts_a_rollout_and_a_drag_of_the_camera_does_not(visit):

@@ -7,7 +7,8 @@ import pytest
 
 from dt_viz.bias import BiasPoint, vector
 from dt_viz.demos import Demonstration
-from dt_viz.engine import MAX_TARGET_MISS, Stage
+from dt_viz.doubts import MAX_TARGET_MISS
+from dt_viz.engine import Stage
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles import Sphere
 from dt_viz.retiming import used_fraction

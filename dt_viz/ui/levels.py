@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import viser
 
-from dt_viz.engine import MAX_GOAL_MISS, Frame
+from dt_viz.doubts import MAX_GOAL_MISS
+from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.scenario import Scenario
 from dt_viz.stacking import IMITATION

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 import numpy as np
 import viser
 
-from dt_viz.engine import MAX_GOAL_MISS, Frame
+from dt_viz.doubts import MAX_GOAL_MISS
+from dt_viz.engine import Frame
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario, View
 from dt_viz.tasks import Task
