@@ -14,10 +14,9 @@ from dt_viz.cspace import LEVERS
 from dt_viz.ground import Ground, named_starts
 from dt_viz.health import integration_doubts
 from dt_viz.robot import Robot
-from dt_viz.scenario import Scenario
+from dt_viz.solved import Solved
 from dt_viz.solving import Solution
 from dt_viz.stacking import WHOLE_ARM, levels
-from dt_viz.whole_arm import ArmSolution
 
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
@@ -26,21 +25,17 @@ MAX_TARGET_MISS = 0.013
 interpolated between samples, are off by while a hand moves."""
 
 
-def motion_doubts(
-    ground: Ground, scenario: Scenario, stack: Solution, arm: ArmSolution | None, clearance: float, missed: float
-) -> tuple[str, ...]:
+def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str, ...]:
     """Why the motion is not to be trusted, in words.
 
     Args:
-        ground: what the stack is built on.
-        scenario: whose motion it is.
-        stack: of the end effector.
-        arm: how the whole arm avoids, if it does.
+        solved: the motion.
         clearance: of the motion, metres.
         missed: metres by which it ends beside the goal.
     """
+    ground, scenario, stack, arm = solved.ground, solved.scenario, solved.stack, solved.arm
     doubts = [*ground.imitation.warnings, *stack.doubts]
-    integration = _of_integration(scenario, stack, arm)
+    integration = _of_integration(solved)
     if scenario.warp < 1:  # what does not do yet what it is made for has not failed
         return (*doubts, *integration, *ground.doubts)
     if arm is not None:
@@ -67,13 +62,12 @@ def motion_doubts(
     return (*doubts, *ground.doubts)
 
 
-def target_doubts(
-    ground: Ground, scenario: Scenario, stack: Solution, arm: ArmSolution | None, robot: Robot
-) -> tuple[str, ...]:
+def target_doubts(solved: Solved, robot: Robot) -> tuple[str, ...]:
     """Which bias points the stack leads the motion to, but giving way to the obstacle leads past, in words.
 
     In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
     """
+    ground, scenario, stack, arm = solved.ground, solved.scenario, solved.stack, solved.arm
     bundle = stack.bundle if arm is None else arm
     positions = stack.bundle.positions if arm is None else robot.end_effector(arm.p)
     motion = Motion(
@@ -97,8 +91,9 @@ def target_doubts(
     return tuple(doubts)
 
 
-def _of_integration(scenario: Scenario, stack: Solution, arm: ArmSolution | None) -> tuple[str, ...]:
+def _of_integration(solved: Solved) -> tuple[str, ...]:
     """What the integrators cost that were chosen by hand, in words."""
+    scenario, stack, arm = solved.scenario, solved.stack, solved.arm
     doubts, bundle = [], stack.bundle
     for level, (name, (_, made)) in enumerate(zip(levels(scenario)[1:], stack.built, strict=True), 1):
         doubts += integration_doubts(

@@ -34,12 +34,12 @@ from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle
 from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
+from dt_viz.solved import Solved
 from dt_viz.solving import FINE, LIVE, Checkpoint, Precision, Solution, cut_off, solve
 from dt_viz.stacking import WHOLE_ARM, levels
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
 from dt_viz.warping import warped
-from dt_viz.whole_arm import ArmSolution, Lift
 
 
 class Stage(IntEnum):
@@ -101,27 +101,13 @@ class Frame:
         return self.task.slice.posed(self.scenario.view.slice)
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """What a scenario's motion is."""
-
-    stack: Solution
-    """Of the end effector, before the whole arm avoids anything."""
-    arm: ArmSolution | None
-    """None where only the end effector avoids."""
-    lifted: Lift | None
-    """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
-    ground: Ground
-    """What the stack is built on: the undisturbed motion, warped as far as the stack is."""
-
-
 @dataclass
 class _Kept:
     """What has been worked out of one motion, which is not again when only the view changes."""
 
     scenario: Scenario
     ground: Ground
-    solved: dict[Precision, _Solved] = field(default_factory=dict)
+    solved: dict[Precision, Solved] = field(default_factory=dict)
     rollouts: dict[Precision, Frame] = field(default_factory=dict)
     """Frames of stage ROLLOUTS."""
     arms: dict[Precision, Frame] = field(default_factory=dict)
@@ -150,15 +136,15 @@ class Engine:
         self._follower = Follower(robot)
         self._tasks: dict[str, Task] = {}
         self._learned: dict[tuple[str, bool, str], Learned] = {}
-        self._good: dict[str, tuple[Frame, Ground, Solution]] = {}
+        self._good: dict[str, tuple[Frame, Solved]] = {}
         """The last motion of each task."""
         self._kept: _Kept | None = None
         """Of the newest motion."""
-        self._full: dict[Precision, tuple[Scenario, Ground, _Solved]] = {}
+        self._full: dict[Precision, Solved] = {}
         """The last full stacks: while only the warp changes, nothing of them does."""
-        self._shown: tuple[Scenario, Ground, _Solved] | None = None
+        self._shown: Solved | None = None
         """The last motion that an arm was shown for."""
-        self._live: tuple[Scenario, Ground, _Solved] | None = None
+        self._live: Solved | None = None
         """The same as it was at stage LIVE: quicker, and exact enough for a hand that moves."""
 
     def task(self, name: str) -> Task:
@@ -201,10 +187,10 @@ class Engine:
                 return frame, ()
             ground = self._follower.admitted(ground, scenario.obstacle)
         fine = self._solved(ground, scenario, FINE)
-        frame = self._frame(ground, scenario, fine)
+        frame = self._frame(scenario, fine)
         arms, health = [], frame.health
         for rollout in range(len(frame.rollouts)):
-            arm, doubts = self._arm(frame, ground, fine, rollout, exact=True)
+            arm, doubts = self._arm(frame, fine, rollout, exact=True)
             arms.append(arm)
             health = health.doubting(*doubts)
         return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
@@ -220,11 +206,10 @@ class Engine:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        if self._shown is None or not self._shown[0].moves_like(scenario):
+        if self._shown is None or not self._shown.scenario.moves_like(scenario):
             return None
-        _, ground, solved = self._shown
         with _turn:
-            return pushed(self._follower, ground, scenario, solved.stack, solved.arm, q, rng)
+            return pushed(self._follower, self._shown, q, rng)
 
     def held(self, scenario: Scenario, q: Array, place: Array) -> Pushed | None:
         """The arm with its hand held at a place; None unless a motion of this scenario is shown.
@@ -237,11 +222,10 @@ class Engine:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        if self._live is None or not self._live[0].moves_like(scenario):
+        if self._live is None or not self._live.scenario.moves_like(scenario):
             return None
-        _, ground, solved = self._live
         with _turn:
-            return held(self._follower, ground, scenario, solved.stack, solved.arm, q, place)
+            return held(self._follower, self._live, q, place)
 
     def _stages(self, ground: Ground, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
         kept = self._kept
@@ -258,36 +242,35 @@ class Engine:
         ground = kept.ground
         with _turn:
             live = _once(kept.solved, LIVE, lambda: self._solved(ground, scenario, LIVE))
-            first = _once(kept.rollouts, LIVE, lambda: self._frame(ground, scenario, live))
+            first = _once(kept.rollouts, LIVE, lambda: self._frame(scenario, live))
             first = replace(first, scenario=scenario, level=_level(scenario, live.stack))
         yield first
         with _turn:
-            frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, ground, live, exact=False))
-            pictures = _pictures(live.ground, scenario, live.stack, coarse=True)
+            frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, live, exact=False))
+            pictures = _pictures(scenario, live, coarse=True)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.LIVE, pictures=pictures)
-            self._good[scenario.task] = frame, live.ground, live.stack
-            self._shown = scenario, ground, live
-            self._live = self._shown
+            self._good[scenario.task] = frame, live
+            self._shown = self._live = live
         yield frame
 
         with _turn:
             fine = _once(kept.solved, FINE, lambda: self._solved(ground, scenario, FINE, checkpoint))
         with _turn:
-            exact = _once(kept.rollouts, FINE, lambda: self._frame(ground, scenario, fine))
-            frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, ground, fine, exact=True))
+            exact = _once(kept.rollouts, FINE, lambda: self._frame(scenario, fine))
+            frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, fine, exact=True))
         with _turn:
-            pictures = _pictures(fine.ground, scenario, fine.stack, coarse=False)
+            pictures = _pictures(scenario, fine, coarse=False)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.FINE, pictures=pictures)
             if scenario.view.health_plots and frame.chosen is not None:
-                frame = replace(frame, profiles=self._profiles(frame, ground, fine, frame.chosen))
-            self._good[scenario.task] = frame, fine.ground, fine.stack
-            self._shown = scenario, ground, fine
+                frame = replace(frame, profiles=self._profiles(frame, fine, frame.chosen))
+            self._good[scenario.task] = frame, fine
+            self._shown = fine
         yield frame
         if kept.health is None:
             kept.health = self._certified(frame, fine)
         yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
 
-    def _certified(self, frame: Frame, fine: _Solved) -> Health:
+    def _certified(self, frame: Frame, fine: Solved) -> Health:
         obstacle, stack, arm = frame.scenario.obstacle, fine.stack, fine.arm
         by_hand = any(made.integration.by_hand for _, made in stack.built)
         with _turn:
@@ -310,15 +293,15 @@ class Engine:
         if scenario.task not in self._good:
             for _ in self._stages(ground, replace(scenario, avoidance=False)):
                 pass
-        good, ground, stack = self._good[scenario.task]
+        good, solved = self._good[scenario.task]
         seen = replace(good.scenario, view=scenario.view)
         changed = not seen.computes_like(good.scenario)
-        good = replace(good, level=_level(seen, stack))
+        good = replace(good, level=_level(seen, solved.stack))
         clearance = float(self._follower.whole_arm.clearance(self._any_arm(good), scenario.obstacle).min())
         health = Health(clearance=clearance)
         for stage in Stage:
             if changed and stage in (Stage.LIVE, Stage.FINE):
-                good = replace(good, pictures=_pictures(ground, seen, stack, coarse=stage is Stage.LIVE))
+                good = replace(good, pictures=_pictures(seen, solved, coarse=stage is Stage.LIVE))
             yield replace(good, scenario=scenario, stage=stage, blocked=blocked, health=health)
 
     def _ground(self, scenario: Scenario, progress: Progress | None) -> Ground:
@@ -331,7 +314,7 @@ class Engine:
 
     def _solved(
         self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint = lambda: None
-    ) -> _Solved:
+    ) -> Solved:
         full = self._fully_solved(ground, replace(scenario, warp=1.0), precision, checkpoint)
         if scenario.warp == 1:
             return full
@@ -339,32 +322,29 @@ class Engine:
         below = ground.warped(scenario.warp)
         stack = warped(below, full.stack, scenario.warp, precision)
         if full.arm is None:
-            return _Solved(stack, None, None, below)
+            return Solved(scenario, ground, below, stack, None, None)
         exact = precision is not LIVE
         lifted, whole_arm = self._follower.behaving(ground, stack, exact=exact), self._follower.whole_arm
         checkpoint()
         arm = whole_arm.warped(full.arm, lifted, scenario, scenario.warp, precision.spacing)
-        return _Solved(stack, arm, lifted, below)
+        return Solved(scenario, ground, below, stack, arm, lifted)
 
-    def _fully_solved(
-        self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint
-    ) -> _Solved:
+    def _fully_solved(self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint) -> Solved:
         known = self._full.get(precision)
-        if known is not None and ground.moves_like(known[1]) and scenario.moves_like(known[0]):
-            return known[2]
+        if known is not None and ground.moves_like(known.ground) and scenario.moves_like(known.scenario):
+            return known
         stack, arm, lifted, follower = solve(ground, scenario, precision, checkpoint), None, None, self._follower
         if _uses_whole_arm(scenario):
             exact = precision is not LIVE
             lifted = follower.behaving(ground, stack, exact=exact) if stack.built else follower.undisturbed(ground)
             checkpoint()
             arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, checkpoint, coarse=precision is LIVE)
-        solved = _Solved(stack, arm, lifted, ground)
-        self._full[precision] = scenario, ground, solved
+        solved = self._full[precision] = Solved(scenario, ground, ground, stack, arm, lifted)
         return solved
 
-    def _frame(self, ground: Ground, scenario: Scenario, solved: _Solved) -> Frame:
+    def _frame(self, scenario: Scenario, solved: Solved) -> Frame:
         """The frame of stage ROLLOUTS."""
-        stack, arm = solved.stack, solved.arm
+        ground, stack, arm = solved.ground, solved.stack, solved.arm
         if arm is None:
             index, fraction, positions = stack.bundle.index, stack.bundle.fraction, stack.bundle.positions
             clearance = float(scenario.obstacle.signed_distance(positions).min())
@@ -373,9 +353,9 @@ class Engine:
             clearance = arm.clearance
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
-        doubts = motion_doubts(ground, scenario, stack, arm, clearance, float(np.linalg.norm(reached - ground.goal)))
+        doubts = motion_doubts(solved, clearance, float(np.linalg.norm(reached - ground.goal)))
         if scenario.avoidance and scenario.obstacles and scenario.warp == 1 and not stack.doubts:
-            doubts += target_doubts(ground, scenario, stack, arm, self._robot)
+            doubts += target_doubts(solved, self._robot)
         return Frame(
             scenario=scenario,
             task=ground.task,
@@ -400,22 +380,21 @@ class Engine:
             layer_radii=tuple(_region_radius(stack, layer.behaviour) for layer in scenario.layers),
         )
 
-    def _with_arm(self, frame: Frame, ground: Ground, solved: _Solved, *, exact: bool) -> Frame:
+    def _with_arm(self, frame: Frame, solved: Solved, *, exact: bool) -> Frame:
+        ground = solved.ground
         arm, doubts = None, ()
         try:
             far = self._follower.out_of_reach(ground)
             if frame.chosen is not None and not far[frame.chosen]:
-                arm, doubts = self._arm(frame, ground, solved, frame.chosen, exact=exact)
+                arm, doubts = self._arm(frame, solved, frame.chosen, exact=exact)
             doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
         except UnreachableError as error:
             doubts = (f"the arm cannot reach the starts: {error}",)
         return replace(frame, arm=arm, health=frame.health.doubting(*doubts))
 
-    def _arm(
-        self, frame: Frame, ground: Ground, solved: _Solved, chosen: int, *, exact: bool
-    ) -> tuple[ArmMotion, tuple[str, ...]]:
+    def _arm(self, frame: Frame, solved: Solved, chosen: int, *, exact: bool) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
-        times = frame.times[chosen]
+        ground, times = solved.ground, frame.times[chosen]
         if solved.arm is not None and solved.lifted is not None:
             rows = solved.arm.index == chosen
             q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
@@ -430,8 +409,9 @@ class Engine:
         without = self._follower.undisturbed(ground.only([chosen])).at(np.zeros(len(fraction), int), fraction)
         return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), doubts
 
-    def _profiles(self, frame: Frame, ground: Ground, solved: _Solved, chosen: int) -> Profiles:
+    def _profiles(self, frame: Frame, solved: Solved, chosen: int) -> Profiles:
         """Of a rollout, with and without behaviours."""
+        ground = solved.ground
         obstacle, arm, task = frame.scenario.obstacle, solved.arm, ground.task
         path, undisturbed = frame.rollouts[chosen], ground.paths[chosen]
         of_mean, system = chosen >= ground.num_demonstrated, solved.stack.system
@@ -488,12 +468,13 @@ def _level(scenario: Scenario, stack: Solution) -> int | None:
     return names.index(scenario.view.level) if scenario.view.level in names else None
 
 
-def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse: bool) -> Pictures:
+def _pictures(scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
     """Those that the view shows, on its slice and of its level."""
+    ground, stack = solved.below, solved.stack
     view, book, area = scenario.view, ground.learned.sketchbook, ground.task.slice.posed(scenario.view.slice)
-    level = _level(scenario, solution)
-    built = solution.built[:level]
-    system = solution.system if level is None else cut_off(ground, solution, level)
+    level = _level(scenario, stack)
+    built = stack.built[:level]
+    system = stack.system if level is None else cut_off(ground, stack, level)
     clearance = _clearance(scenario, avoided=any(isinstance(behaviour, ObstacleAvoidance) for behaviour, _ in built))
     field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
     return Pictures(
@@ -502,7 +483,7 @@ def _pictures(ground: Ground, scenario: Scenario, solution: Solution, *, coarse:
         colour=colour,
         generator=book.generator(area, view.generator_layer) if view.generator else None,
         grid=book.grid(area, [made.transform for _, made in built], coarse=coarse) if view.grid else None,
-        base=book.base(solution.rays) if view.base else None,
+        base=book.base(stack.rays) if view.base else None,
         occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
     )
 

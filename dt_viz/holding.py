@@ -13,11 +13,9 @@ import numpy as np
 
 from dt_viz.fields import Array
 from dt_viz.following import MAX_TRACKING_ERROR, Follower
-from dt_viz.ground import Ground
 from dt_viz.pushing import Pushed, below, onwards
 from dt_viz.robot import NUM_JOINTS
-from dt_viz.scenario import Scenario
-from dt_viz.solving import Solution
+from dt_viz.solved import Solved
 from dt_viz.tracking import track
 from dt_viz.whole_arm import ArmSolution
 
@@ -40,10 +38,7 @@ Hands = Callable[[Array], Array]
 
 def held(
     follower: Follower,
-    ground: Ground,
-    scenario: Scenario,
-    stack: Solution,
-    arm: ArmSolution | None,
+    solved: Solved,
     q: Array,
     place: Array,
 ) -> Pushed:
@@ -51,24 +46,22 @@ def held(
 
     Args:
         follower: lifts paths to the joints.
-        ground: the undisturbed motion.
-        scenario: what is shown.
-        stack: its system of the end effector.
-        arm: its whole-arm avoidance, None where only the end effector avoids.
+        solved: the motion that is shown.
         q: (6,) joint angles now, rad.
         place: (3,) where the hand should be, metres.
 
     Raises:
         UnreachableError: the arm cannot get to where the motions start.
     """
-    robot, posture, reference = follower.robot, below(follower, arm, q), follower.reference(ground)
+    robot, scenario, arm = follower.robot, solved.scenario, solved.arm
+    posture, reference = below(follower, solved, q), follower.reference(solved.ground)
     target = place
     if arm is not None:
         target = _place_below(_hands(follower, arm, posture, reference), robot.end_effector(posture), place)
     tracked = track(robot, target[None], posture, reference=reference)
     posture = tracked.q[0]
     start = robot.end_effector(posture)
-    pushed, room = onwards(follower, ground, scenario, stack, arm, posture, start[None], np.zeros(1))
+    pushed, room = onwards(follower, solved, posture, start[None], np.zeros(1))
 
     missed, depth = float(np.linalg.norm(pushed.path[0] - place)), -float(scenario.obstacle.signed_distance(place))
     doubt = ""

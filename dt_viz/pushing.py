@@ -13,14 +13,12 @@ import numpy as np
 
 from dt_viz.fields import Array
 from dt_viz.following import MAX_TRACKING_ERROR, ArmMotion, Follower
-from dt_viz.ground import Ground
 from dt_viz.retiming import within_velocity_limits
 from dt_viz.rollouts import Rays, evenly_sampled
 from dt_viz.scenario import Scenario
-from dt_viz.solving import Solution
+from dt_viz.solved import Solved
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.tracking import track
-from dt_viz.whole_arm import ArmSolution
 
 DISTANCES = (0.06, 0.03, 0.015)
 """Metres by which the hand is pushed: less where there is no room for more."""
@@ -53,10 +51,7 @@ class Pushed:
 
 def pushed(
     follower: Follower,
-    ground: Ground,
-    scenario: Scenario,
-    stack: Solution,
-    arm: ArmSolution | None,
+    solved: Solved,
     q: Array,
     rng: np.random.Generator,
 ) -> Pushed:
@@ -67,10 +62,7 @@ def pushed(
 
     Args:
         follower: lifts paths to the joints.
-        ground: the undisturbed motion.
-        scenario: what is shown.
-        stack: its system of the end effector.
-        arm: its whole-arm avoidance, None where only the end effector avoids.
+        solved: the motion that is shown.
         q: (6,) joint angles when the push begins, rad.
         rng: for the directions.
 
@@ -78,8 +70,8 @@ def pushed(
         UnreachableError: the arm cannot get to where the motions start.
     """
     best, most = None, -np.inf
-    for place in _places(follower, scenario, stack, arm, q, rng):
-        found, room = _motion(follower, ground, scenario, stack, arm, q, place)
+    for place in _places(follower, solved, q, rng):
+        found, room = _motion(follower, solved, q, place)
         if best is None or room > most:
             best, most = found, room
         if most >= 0:
@@ -90,15 +82,13 @@ def pushed(
 
 def _places(
     follower: Follower,
-    scenario: Scenario,
-    stack: Solution,
-    arm: ArmSolution | None,
+    solved: Solved,
     q: Array,
     rng: np.random.Generator,
 ) -> Iterator[Array]:
     """Places (3,), metres, to push the end effector to, the farthest first."""
-    hand = follower.robot.end_effector(below(follower, arm, q))
-    directions = _across(stack.system, hand, rng)
+    hand = follower.robot.end_effector(below(follower, solved, q))
+    directions = _across(solved.stack.system, hand, rng)
     for distance in DISTANCES:
         yield from hand + distance * directions
 
@@ -112,26 +102,23 @@ def _across(system: DiffeomorphicSystem, hand: Array, rng: np.random.Generator) 
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def below(follower: Follower, arm: ArmSolution | None, q: Array) -> Array:
+def below(follower: Follower, solved: Solved, q: Array) -> Array:
     """The configuration (6,) of the motion that the whole arm's avoidance is made for, rad."""
-    return q if arm is None else arm.transform.forward(follower.whole_arm.limits.inside(q))
+    return q if solved.arm is None else solved.arm.transform.forward(follower.whole_arm.limits.inside(q))
 
 
 def _motion(
     follower: Follower,
-    ground: Ground,
-    scenario: Scenario,
-    stack: Solution,
-    arm: ArmSolution | None,
+    solved: Solved,
     q: Array,
     place: Array,
 ) -> tuple[Pushed, float]:
     """The motion by way of `place` (3,), and how much room it has, metres; below 0 there is too little."""
-    posture = below(follower, arm, q)
+    posture = below(follower, solved, q)
     u = np.linspace(0, 1, NUM_PUSH_SAMPLES)
     hand = follower.robot.end_effector(posture)
     aside = hand + (u * u * (3 - 2 * u))[:, None] * (place - hand)
-    found, room = onwards(follower, ground, scenario, stack, arm, posture, aside, PUSH_SECONDS * u)
+    found, room = onwards(follower, solved, posture, aside, PUSH_SECONDS * u)
     return found, min(room)
 
 
@@ -148,10 +135,7 @@ class Room(NamedTuple):
 
 def onwards(
     follower: Follower,
-    ground: Ground,
-    scenario: Scenario,
-    stack: Solution,
-    arm: ArmSolution | None,
+    solved: Solved,
     posture: Array,
     aside: Array,
     seconds: Array,
@@ -160,10 +144,7 @@ def onwards(
 
     Args:
         follower: lifts paths to the joints.
-        ground: the undisturbed motion.
-        scenario: what is shown.
-        stack: its system of the end effector.
-        arm: its whole-arm avoidance, None where only the end effector avoids.
+        solved: the motion that is shown.
         posture: (6,) joints near the beginning of the path, rad, as those of `below`.
         aside: (K, 3) the path, metres, of the end effector of the motion below the whole arm's avoidance.
         seconds: (K,) times on the path.
@@ -171,13 +152,13 @@ def onwards(
     Raises:
         UnreachableError: the arm cannot get to where the motions start.
     """
-    robot = follower.robot
+    robot, scenario, stack, arm = follower.robot, solved.scenario, solved.stack, solved.arm
     rays = Rays(stack.system.transform.forward(aside[-1:]), stack.rays.base)
     bundle = evenly_sampled(lambda i, u: stack.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
     path = np.concatenate([aside[:-1], bundle.positions])
     times = np.concatenate([seconds[:-1], seconds[-1] + rays.times(bundle.index, bundle.fraction)])
 
-    tracked = track(robot, path, posture, reference=follower.reference(ground))
+    tracked = track(robot, path, posture, reference=follower.reference(solved.ground))
     joints = tracked.q
     if arm is not None:
         joints = arm.transform.inverse(follower.whole_arm.limits.inside(joints))

@@ -74,8 +74,8 @@ def test_the_arm_gives_way_by_its_transform_while_it_is_held(engine, initial, ro
     """Its postures are those of eq. (4): ψ_q leads each to the section that the undisturbed motion is lifted by."""
     scenario = replace(initial("push_box"), space="cspace")
     for _, _, _, found in drags(engine, scenario, robot):
-        _, ground, solved = engine._live
-        section = Section(robot, engine._follower.reference(ground))
+        solved = engine._live
+        section = Section(robot, engine._follower.reference(solved.ground))
         q = solved.arm.transform.forward(found.motion.q[::30])
         np.testing.assert_allclose(section.postures(robot.end_effector(q)[:, None])[:, 0], q, atol=5e-3)
 
