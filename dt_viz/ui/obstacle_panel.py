@@ -102,9 +102,8 @@ class ObstaclePanel:
             )
             with gui.add_folder("From a file", expand_by_default=False):
                 self._unit = gui.add_dropdown("File is in", tuple(UNITS))
-                self._upload = gui.add_upload_button(
-                    "Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=f"{FORMATS}; a mesh must be closed"
-                )
+                hint = f"{FORMATS}; a mesh must be closed; a csv of points begins with x,y,z or x,y,z,occupied"
+                self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
                 self._again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
 
         @self._upload.on_upload
