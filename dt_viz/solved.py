@@ -1,0 +1,28 @@
+"""What a scenario's motion is, once it is worked out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dt_viz.ground import Ground
+from dt_viz.scenario import Scenario
+from dt_viz.solving import Solution
+from dt_viz.whole_arm import ArmSolution, Lift
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A scenario's motion: the end effector's stack, and how the whole arm avoids on top of it."""
+
+    scenario: Scenario
+    """It, or one that moves like it."""
+    ground: Ground
+    """The undisturbed motion."""
+    below: Ground
+    """The same, warped as far as the stack is that is built on it."""
+    stack: Solution
+    """Of the end effector, before the whole arm avoids anything."""
+    arm: ArmSolution | None
+    """None where only the end effector avoids."""
+    lifted: Lift | None
+    """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
