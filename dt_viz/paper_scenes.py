@@ -30,10 +30,17 @@ NUM_LABELS = 4000
 """Of the clover."""
 STROKE_SPHERE = 0.10
 """Diameter of the sphere in the strokes of fig. 5, metres."""
+STROKE_TEMPERATURE = 2.0
+"""There: its field ends soon, so that the rest of the letter stays."""
+STROKE_PLACES = {"draw_w": 0.20}
+"""Where it stands, as a fraction of the letter's length, if not where the task has its obstacle: in the middle of the W
+the arm would have to give way to it along the other strokes, too."""
 J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
 """Of the two points beside the J: fraction of its length, and metres to the right and up as seen from the front."""
 ARM_ONLY = {"field": False}
 """Where only the whole arm gives way: the vector field is the hand's, and goes through the obstacle."""
+HAND_ONLY = {"arm": False}
+"""Where only the path of the hand gives way: the fingers would be in the obstacle."""
 ABOVE = 0.16
 """Metres over a pot's opening where the object is let go, as the demonstrations do over the centre pot."""
 
@@ -49,12 +56,17 @@ class PaperScene:
     task: str
     """Name of its task."""
     make: Callable[[Task], Scenario]
-    view: Mapping[str, bool | str] = field(default_factory=dict)
+    view: Mapping[str, Any] = field(default_factory=dict)
     """What is to be seen of it: fields of `View`."""
 
     def scenario(self, task: Task) -> Scenario:
         """The scenario for its task."""
-        return replace(self.make(task), scene=self.name)
+        return replace(self.make(task), scene=self.name, view=replace(View(), **self.view))
+
+    def is_changed(self, scenario: Scenario, task: Task) -> bool:
+        """Whether obstacles, layers or how they act are not the scene's any more."""
+        own, followed = self.scenario(task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
+        return not scenario.moves_like(replace(own, warp=scenario.warp, **followed))
 
 
 def _bottle_in_the_way(task: Task) -> Scenario:
@@ -89,7 +101,9 @@ def _cloud_in_the_letter(task: Task) -> Scenario:
 
 def _sphere_in_the_stroke(task: Task) -> Scenario:
     """Fig. 5."""
-    return Scenario(task.name, (Sphere(task.obstacle_position, STROKE_SPHERE),), space="both")
+    u = STROKE_PLACES.get(task.name)
+    place = task.obstacle_position if u is None else vector(task.mean_path[round(100 * u)])
+    return Scenario(task.name, (Sphere(place, STROKE_SPHERE),), space="both", temperature=STROKE_TEMPERATURE)
 
 
 def _two_points(task: Task) -> Scenario:
@@ -141,6 +155,7 @@ SCENES: Mapping[str, PaperScene] = {
             "Every stroke leaves the cube, the rest stays. Only the path gives way: avoid with “Both” for the arm.",
             "draw_s",
             _cube_in_the_letter,
+            view=HAND_ONLY,
         ),
         PaperScene(
             "cloud",
@@ -148,7 +163,7 @@ SCENES: Mapping[str, PaperScene] = {
             "All that is known of the clover: which points lie in it (dark). Strokes leave what is learned from them.",
             "draw_s",
             _cloud_in_the_letter,
-            view={"colour": "occupancy", "field": False, "demonstrations": False},
+            view=HAND_ONLY | {"colour": "occupancy", "field": False, "demonstrations": False},
         ),
         PaperScene(
             "two_points",
@@ -184,21 +199,3 @@ SCENES: Mapping[str, PaperScene] = {
     )
 }
 """By name, in the order of the figures."""
-
-
-def seen_in(view: View, scene: str, before: str) -> View:
-    """How a scene that follows another is looked at: as before, but for what one of the two switches on or off.
-
-    Args:
-        view: as it was.
-        scene: name of the scene; one that is none switches nothing.
-        before: name of the scene that was shown before; what it switched is as it is for a start.
-    """
-    if scene == before:
-        return view
-    back = {name: getattr(View(), name) for name in _switched(before)}
-    return replace(view, **(back | _switched(scene)))
-
-
-def _switched(scene: str) -> dict[str, Any]:
-    return dict(SCENES[scene].view) if scene in SCENES else {}

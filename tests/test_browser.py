@@ -297,7 +297,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     assert all(np.linalg.norm(path - place(), axis=1).min() < 0.015 for path in visitor.shown.rollouts)
 
     open_tab(page, "Stack")
-    page.get_by_role("button", name="on", exact=True).first.evaluate("button => button.click()")  # of the outermost
+    page.get_by_role("button", name="● on", exact=True).first.evaluate("button => button.click()")  # of the outermost
     wait_until(lambda: not session.scenario.layers[0].on and session.wait_idle(0.3), "the switch")
     for path, undisturbed in zip(visitor.shown.rollouts, visitor.shown.ghost, strict=True):
         assert max(np.linalg.norm(undisturbed - point, axis=1).min() for point in path) < 0.02

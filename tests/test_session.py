@@ -18,6 +18,7 @@ from dt_viz.paper_scenes import SCENES
 from dt_viz.scenario import Layer, Scenario, View
 from dt_viz.slices import SlicePose
 from dt_viz.stacking import AVOIDANCE, IMITATION, with_bias_point, without
+from dt_viz.tasks import TASKS
 from dt_viz.tracking import UnreachableError
 from dt_viz.ui import session as session_module
 from dt_viz.ui.session import GESTURE_PAUSE, MAX_UNDO, Session
@@ -561,30 +562,70 @@ def test_who_avoids_can_be_undone(opened):
     assert opened.shown.space == "task"
 
 
-def test_a_scene_replaces_all_but_the_view_and_is_undone_at_once(opened):
-    session = opened.session
-    session.edit("view", view=View(grid=True))
-    before = session.scenario
-    scene = Scenario("draw_s", (), space="cspace", scene="somewhere")
-    opened.engine.task = lambda name: name
-    session.load("draw_s", lambda task: replace(scene, task=task))
+def test_a_scene_is_seen_as_it_wants_to_be_and_undo_brings_back_what_was_seen_before(opened):
+    session, task = opened.session, TASKS["draw_s"]()
+    opened.engine.task = lambda name: task
+    session.edit("view", view=View(grid=True, speed=2.0, colour="det"))
+    before, scene = session.scenario, SCENES["cloud"].scenario(task)
+    session.load("draw_s", SCENES["cloud"].scenario)
     opened.settle()
-    assert opened.shown == replace(scene, view=View(grid=True))
+    assert opened.shown == replace(scene, view=replace(scene.view, speed=2.0))
+    assert not scene.view.grid and scene.view.colour == "occupancy"
     session.undo()
     assert session.scenario == before
+    session.redo()
+    assert session.scenario.view == replace(scene.view, speed=2.0)
 
 
-def test_what_a_scene_shows_goes_with_it_also_when_it_is_undone_or_done_again(opened):
-    session, mine = opened.session, View(grid=True)
-    session.edit("view", view=mine)
-    opened.engine.task = lambda name: name
-    for leave in (session.undo, session.reset, lambda: session.choose_task("lift_box")):
-        session.load("draw_s", lambda task: Scenario(task, (), scene="cloud"))
-        assert session.scenario.view == replace(mine, **dict(SCENES["cloud"].view)) != mine
-        leave()
-        assert session.scenario.view == mine
+@pytest.mark.parametrize("leave", ["leave_scene", "choose_task"])
+def test_a_scene_that_is_left_leaves_nothing_of_what_it_shows(opened, leave):
+    session, task = opened.session, TASKS["draw_s"]()
+    opened.engine.task = lambda name: task
+    session.load("draw_s", SCENES["cloud"].scenario)
+    if leave == "leave_scene":
+        session.leave_scene()
+        assert session.scenario == fresh("draw_s")
+        session.leave_scene()
+        assert session.scenario == fresh("draw_s")
+    else:
+        session.choose_task("lift_box")
+        assert session.scenario == fresh("lift_box")
     session.undo()
     assert session.scenario.view.colour == "occupancy"
+
+
+def test_reset_in_a_scene_brings_the_scene_back_as_it_was(opened):
+    session, task = opened.session, TASKS["draw_s"]()
+    opened.engine.task = lambda name: task
+    session.load("draw_s", SCENES["cloud"].scenario)
+    loaded = session.scenario
+    session.edit("size", obstacles=(at(1.0),), temperature=2.0)
+    session.edit("view", view=View(grid=True))
+    changed = session.scenario
+    session.reset()
+    assert session.scenario == loaded
+    session.undo()
+    assert session.scenario.moves_like(changed)
+
+
+def test_moving_the_slice_is_a_step_for_undo(opened):
+    session, poses = opened.session, [SlicePose((0.1 * k, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0)) for k in range(3)]
+    session.edit("temperature", temperature=2.0)
+    for first, second in ((poses[0], poses[1]), (poses[1], poses[2])):
+        session.begin_gesture()
+        for pose in (first, second):
+            session.edit("slice", view=replace(session.scenario.view, slice=pose))
+        session.end_gesture()
+    session.edit("view", view=replace(session.scenario.view, grid=True))  # is none
+    for expected in (poses[1], None):
+        session.undo()
+        assert session.scenario.view.slice == expected and session.scenario.view.grid
+        assert session.scenario.temperature == 2.0
+    session.undo()
+    assert session.scenario.temperature != 2.0
+    for _ in range(3):
+        session.redo()
+    assert session.scenario.view.slice == poses[2]
 
 
 def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):

@@ -19,7 +19,7 @@ from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.pots import Pots, surface
 from dt_viz.ui.session import Session
-from dt_viz.ui.stack_panel import BASE, StackPanel, legend_html, rows
+from dt_viz.ui.stack_panel import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, legend_html, rows
 from dt_viz.ui.transform_settings import durations
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -58,13 +58,13 @@ def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
 def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done():
     by_name = listed(SCENARIO)
     assert [by_name[name].label for name in ("Bias 1", "Bias 2", AVOIDANCE)] == [
-        "Bias 1  0.80",
+        "Bias 1, t 0.80",
         "Bias 2",
-        "Avoidance  0.40",
+        "Avoidance, t 0.40",
     ]
-    assert by_name["Bias 1"].buttons == ("on", "↑", "see")
-    assert by_name["Bias 2"].buttons == ("on", "↑", "↓", "see")
-    assert by_name[AVOIDANCE].buttons == ("on", "↓", "see")
+    assert by_name["Bias 1"].buttons == (ON, UP, SEE)
+    assert by_name["Bias 2"].buttons == (ON, UP, DOWN, SEE)
+    assert by_name[AVOIDANCE].buttons == (ON, DOWN, SEE)
 
 
 @pytest.fixture
@@ -77,11 +77,11 @@ def panel(server):
 @pytest.mark.parametrize("name", ["Bias 1", "Bias 2", AVOIDANCE, IMITATION])
 def test_a_row_switches_its_transform_off_and_on_again(panel, name):
     panel, session = panel
-    panel.press(name, "on")
+    panel.press(name, ON)
     assert session.scenario != SCENARIO
     row = listed(session.scenario)[name]
-    assert row.buttons[0] == "off" and (name == IMITATION or "see" not in row.buttons)
-    panel.press(name, "off")
+    assert row.buttons[0] == OFF and (name == IMITATION or SEE not in row.buttons)
+    panel.press(name, OFF)
     assert session.scenario == SCENARIO
 
 
@@ -100,12 +100,12 @@ def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(panel):
     panel, session = panel
     assert legend_html(SCENARIO) == ""
     for name in (IMITATION, "Bias 1"):
-        panel.press(name, "see")
+        panel.press(name, SEE)
         assert session.scenario.view.level == name
-        assert [row.name for row in listed(session.scenario).values() if "seen" in row.buttons] == [name]
-    assert "Bias 1" in legend_html(session.scenario)
-    panel.press("Bias 1", "seen")
-    panel.press(BASE, "see")
+        assert [row.name for row in listed(session.scenario).values() if SEEN in row.buttons] == [name]
+    assert "bias 1" in legend_html(session.scenario)
+    panel.press("Bias 1", SEEN)
+    panel.press(BASE, SEE)
     assert session.scenario.view == View(base=True, tuned="Bias 1")  # and its settings stay in sight
 
 
@@ -114,7 +114,7 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
     panel.adopt(SCENARIO)
     panel.report(frame())
     shown = [handle.label for handle in panel._rows if handle.visible]
-    assert shown == ["Avoidance  0.40", "Bias 2", "Bias 1  0.80", IMITATION, BASE]
+    assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, t 0.80", IMITATION, BASE]
     panel.adopt(replace(SCENARIO, layers=(), obstacles=()))
     assert [handle.label for handle in panel._rows if handle.visible] == [IMITATION, BASE]
     panel.adopt(SCENARIO)
@@ -168,6 +168,7 @@ def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(
         assert first.gizmo.opacity == 0.0
     assert first.gizmo.opacity == 1.0
     assert first.region.visible and np.ravel(first.region.scale)[0] == 0.2
+    assert not np.any(first.region.points[..., 2]) and np.ptp(second.region.points, axis=(0, 1)).min() > 1.9
     assert not second.region.visible  # nobody knows how large
     picture.adopt(replace(SCENARIO, layers=()))
     assert not any(item.gizmo.visible for item in picture.items)

@@ -1,4 +1,4 @@
-"""Bias points in the scene: each is dragged itself, the selected one also by handles; its region is pale.
+"""Bias points in the scene: each is dragged itself, the selected one also by handles; a ring is around its region.
 
 In a drawing the handles move it in the drawing's plane.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
+import numpy as np
 import viser
 import viser.transforms
 
@@ -17,15 +18,16 @@ from dt_viz.scenario import Scenario
 from dt_viz.stacking import MAX_BIAS_POINTS, bias_points
 from dt_viz.ui import palette
 from dt_viz.ui.handles import Dragged, Handles
+from dt_viz.ui.picture import rgb
 
 BALL_RADIUS = 0.011
 """Of the marker, metres."""
 HANDLE_SCALE = 0.11
 """Metres that the handles stick out, about."""
-DISC_HEIGHT = 0.002
-"""Of the region in a drawing, metres."""
-OPACITY, OPACITY_OFF = 0.14, 0.05
-"""Of the region."""
+RING_WIDTH = 1.6
+"""Pixels."""
+NUM_SEGMENTS = 96
+"""Of a ring."""
 
 Moved = Callable[[str, Array, str], None]
 """Told which bias point was moved, by name, its position (3,), metres, and the phase of the drag."""
@@ -59,10 +61,16 @@ class BiasPicture:
         )
         self.handles = Handles(self.gizmo, HANDLE_SCALE)
         self.ball = scene.add_icosphere(f"{node}/ball", radius=BALL_RADIUS, color=palette.BIAS)
-        # a hidden node is not hit by the pointer, so the region never keeps it from what lies inside
-        self.region = scene.add_icosphere(
-            f"{node}/region", subdivisions=4, color=palette.BIAS, opacity=OPACITY, cast_shadow=False, visible=False
+        # lines, not a surface: what lies behind and inside, such as colours on the slice, stays as it is
+        self.region = scene.add_line_segments(
+            f"{node}/region",
+            _rings(flat=True),
+            palette.linear(palette.BIAS),
+            thickness=RING_WIDTH,
+            thickness_units="screen",
+            visible=False,
         )
+        self._flat = True
         self._label = scene.add_label(
             f"{node}/label",
             "",
@@ -92,13 +100,15 @@ class BiasPicture:
         flat = point.plane is not None
         if self.gizmo.active_axes[2] == flat:
             self.gizmo.active_axes = (True, True, not flat)
-        if self.name != name:
-            self.name = name
-            self._label.text = name.lower()
+        if self._flat != flat:
+            self._flat, self.region.points = flat, _rings(flat=flat)
+        self.name = name
+        label = f"{name.lower()}: goal" if point.moves_goal else name.lower()
+        if self._label.text != label:
+            self._label.text = label
         colour = palette.BIAS if on else palette.STALE
         if tuple(self.ball.color) != colour:
-            self.ball.color = self.region.color = colour
-            self.region.opacity = OPACITY if on else OPACITY_OFF
+            self.ball.color, self.region.colors = colour, rgb(colour, (3,))
         self.handles.show(selected)
         if not self.gizmo.visible:
             self.gizmo.visible = True
@@ -108,8 +118,7 @@ class BiasPicture:
         radius = used or point.radius
         shown = radius is not None
         if shown:
-            depth = radius if point.plane is None else DISC_HEIGHT
-            scale = (radius, radius, depth)
+            scale = (radius, radius, radius)
             if self.region.scale != scale:
                 self.region.scale = scale
         if self.region.visible != shown:
@@ -119,6 +128,14 @@ class BiasPicture:
         """There is no such bias point."""
         if self.gizmo.visible:
             self.gizmo.visible = False
+
+
+def _rings(*, flat: bool) -> Array:
+    """Segments (K, 2, 3) of a circle of radius 1 in the plane of the first two axes, or in those of any two."""
+    turn = np.linspace(0, 2 * np.pi, NUM_SEGMENTS + 1)
+    circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
+    circles = [circle] if flat else [np.roll(circle, shift, axis=1) for shift in range(3)]
+    return np.concatenate([np.stack([c[:-1], c[1:]], axis=1) for c in circles]).astype(np.float32)
 
 
 class Biases(Dragged):

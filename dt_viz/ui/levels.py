@@ -57,4 +57,4 @@ def manifold(scenario: Scenario) -> str:
     level = scenario.view.level
     if level == IMITATION:
         return "manifold of the imitation" if scenario.imitation else "base attractor: straight motions"
-    return f"manifold with {level}"
+    return f"manifold up to {level[:1].lower() + level[1:]}"

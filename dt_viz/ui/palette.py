@@ -32,12 +32,12 @@ LYAPUNOV = ((255, 250, 210), (160, 215, 185), (65, 160, 190), (45, 80, 160), (30
 """Lyapunov value from the goal up."""
 LEVEL_LINE = (255, 255, 255)
 """Of the Lyapunov value."""
-OCCUPANCY = (230, 159, 0)
-OCCUPANCY_LEVEL = (153, 88, 0)
+OCCUPANCY = (128, 100, 190)
+OCCUPANCY_LEVEL = (84, 48, 140)
 """Where the map finds occupied and free equally likely."""
 OUTLINE = (40, 44, 52)
 """Of the obstacles themselves on the slice."""
-OCCUPIED, FREE = (92, 48, 0), (150, 158, 168)
+OCCUPIED, FREE = (56, 24, 98), (178, 184, 192)
 """Labelled points."""
 ARROW_SLOW = (198, 205, 216)
 ARROW_FAST = (64, 84, 120)

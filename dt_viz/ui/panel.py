@@ -22,6 +22,7 @@ from dt_viz.ui.export import RESOLUTIONS
 from dt_viz.ui.health_plots import HealthPlots
 from dt_viz.ui.legend import Legend
 from dt_viz.ui.obstacle_panel import ObstaclePanel
+from dt_viz.ui.picture import Colour
 from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.push import PushButton
 from dt_viz.ui.session import Pace, Session
@@ -31,7 +32,7 @@ from dt_viz.ui.starts_panel import StartsPanel
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
-    "ghost": "Without the obstacle (dashed)",
+    "ghost": "Undisturbed (dashed)",
     "demonstrations": "Demonstrations",
     "field": "Vector field",
     "streamlines": "Streamlines",
@@ -51,6 +52,7 @@ PLOTS = {"joint_plots", "health_plots"}
 VIEW_HINTS: Mapping[str, str] = {
     "field": "on the slice: longer and darker is faster",
     "streamlines": "motions from all over the slice: exact, as images of straight rays",
+    "ghost": "what was learned, without obstacles and bias points",
     "ghost_arm": "where it would be at the same moment; left out where both are in one place",
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
@@ -75,7 +77,12 @@ class Panel:
     """The control panel of one visitor."""
 
     def __init__(
-        self, gui: viser.GuiApi, titles: Mapping[str, str], robot: Robot, save_png: Callable[[str, bool], None]
+        self,
+        gui: viser.GuiApi,
+        titles: Mapping[str, str],
+        robot: Robot,
+        save_png: Callable[[str, bool], None],
+        notify: Callable[[str, Colour], None],
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
@@ -84,7 +91,9 @@ class Panel:
             titles: of the tasks, by name.
             robot: whose joints are plotted.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
+            notify: says something in a colour where it is seen however far the panel is scrolled.
         """
+        self._notify = notify
         self._gui = gui
         self._session: Session | None = None
         self._titles = dict(titles)
@@ -113,9 +122,9 @@ class Panel:
         with tabs.add_tab("Stack"):
             self._stack = StackPanel(gui, self._bind)
         with tabs.add_tab("Show"):
+            self._slice = SlicePanel(gui, self._bind)
             self._build_plots(robot)
             self._build_view()
-            self._slice = SlicePanel(gui, self._bind)
         with tabs.add_tab("Arm"):
             self._build_arm()
         with tabs.add_tab("Picture"):
@@ -164,8 +173,7 @@ class Panel:
         self._learned()
         if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
             self._notice.visible, self._noticed = False, None
-        scene = SCENES.get(frame.scenario.scene)
-        self._hint.content = f"<div style='{_SMALL}'>{html.escape(scene.line if scene else frame.task.hint)}</div>"
+        self._hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(_hint(frame))}</div>"
         self._biases.report(frame)
         self._stack.report(frame)
         self._slice.report(frame)
@@ -196,9 +204,10 @@ class Panel:
             instead = "Choose another task, or move the obstacle to start again."
         self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
 
-    def _say(self, text: str, colour: str, background: str) -> None:
-        """Say something that stays until the next scenario is shown."""
+    def _say(self, text: str, colour: Colour, background: Colour) -> None:
+        """Say something that stays until the next scenario is shown, and for a while beside the panel."""
         self._learned()
+        self._notify(text[:1].upper() + text[1:], colour)
         self._notice.content, self._notice.visible = _alarm(text, colour, background), True
         self._noticed = self._adopted
 
@@ -251,7 +260,10 @@ class Panel:
         @scene.on_update
         async def _(event: viser.GuiEvent) -> None:
             session = self._session
-            if session is None or event.client is None or scene.value not in scenes:
+            if session is None or event.client is None:
+                return
+            if scene.value == _NO_SCENE:
+                session.leave_scene()
                 return
             try:
                 session.load(scenes[scene.value].task, scenes[scene.value].scenario)
@@ -290,7 +302,7 @@ class Panel:
         )
 
     def _build_plots(self, robot: Robot) -> None:
-        """Each right under its checkbox, at the top of the tab, to be seen when they open."""
+        """Each right under its checkbox, high up in the tab, to be seen when they open."""
         self._build_checkbox("joint_plots")
         self.joints = JointPlots(self._gui, robot)
         self._build_checkbox("health_plots")
@@ -340,12 +352,22 @@ def _set_max(slider: Any, value: int) -> None:
         slider.max = value
 
 
+CHANGED = "The scene is changed. “Reset” brings it back as it was."
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
 HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
-_BLUE = ("#1d4f7c", "#e8f1fa")
-_AMBER = ("#8a4b00", "#fff4e0")
-_RED = ("#b3261e", "#fdecea")
+_BLUE = ((29, 79, 124), (232, 241, 250))
+_AMBER = ((138, 75, 0), (255, 244, 224))
+_RED = ((179, 38, 30), (253, 236, 234))
+_TWO_LINES, _WARNING = "2.7em", "3.4em"
 _SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
+
+
+def _hint(frame: Frame) -> str:
+    """What to try in the task, or to see in the scene of the paper."""
+    scene = SCENES.get(frame.scenario.scene)
+    if scene is None:
+        return frame.task.hint
+    return CHANGED if scene.is_changed(frame.scenario, frame.task) else scene.line
 
 
 def status_html(frame: Frame, pace: Pace) -> str:
@@ -387,7 +409,9 @@ def status_html(frame: Frame, pace: Pace) -> str:
     if frame.blocked:
         blocked = _alarm(f"no motion: {'; '.join(frame.blocked)}. What is shown is the last good one.", *_RED)
     warp = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
-    return f"{blocked}<table style='{_SMALL}'>{cells}</table>{warp}{''.join(_alarm(w, *_AMBER) for w in warnings)}"
+    amber = "".join(_alarm(warning, *_AMBER) for warning in warnings)
+    # room for a line of warning, so that what is below does not jump under the pointer
+    return f"{blocked}<table style='{_SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{warp}{amber}</div>"
 
 
 def _rebuild(pace: Pace) -> str:
@@ -428,8 +452,8 @@ def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
     return f"{size}, {' – '.join(links)}"
 
 
-def _alarm(text: str, colour: str, background: str) -> str:
+def _alarm(text: str, colour: Colour, background: Colour) -> str:
     return (
-        f"<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;border-left:3px solid {colour};"
-        f"color:{colour};background:{background}'>{html.escape(text[:1].upper() + text[1:])}</div>"
+        f"<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;border-left:3px solid rgb{colour};"
+        f"color:rgb{colour};background:rgb{background}'>{html.escape(text[:1].upper() + text[1:])}</div>"
     )

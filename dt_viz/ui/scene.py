@@ -13,10 +13,11 @@ from dt_viz.doubts import MAX_GOAL_MISS
 from dt_viz.engine import Frame
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import bias_points
 from dt_viz.tasks import Task
 from dt_viz.ui import palette
 from dt_viz.ui.arm_layers import Onion
-from dt_viz.ui.bias import Biases
+from dt_viz.ui.bias import BALL_RADIUS, Biases
 from dt_viz.ui.bias import Moved as BiasMoved
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
@@ -30,6 +31,8 @@ from dt_viz.ui.starts import Starts
 
 BOLD, THIN = 0.0048, 0.0026
 """Of the rollouts of the whole stack, metres: by themselves, and beside those of a level."""
+GOAL, OLD_GOAL = "goal", "demonstrated goal"
+"""Labels of where the demonstrations end: if motions end there, and if they do not."""
 ADDED = 0.0022
 """Thickness of rollouts from added starts, metres."""
 OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
@@ -106,19 +109,24 @@ class Goal(Picture):
         super().__init__(self._goal)
         label = {"position": (0.0, 0.0, 0.02), "anchor": "bottom-center", "font_screen_scale": 0.8}
         scene.add_icosphere("/goal/ball", radius=0.012, color=palette.GOAL)
-        scene.add_label("/goal/label", "goal", **label)
+        self.label = scene.add_label("/goal/label", GOAL, **label)
         self._end = scene.add_frame("/end", show_axes=False, visible=False)
         scene.add_icosphere("/end/ball", radius=0.009, color=palette.ROLLOUT)
-        beside = {"position": (0.0, 0.0, 0.01), "anchor": "bottom-right", "font_screen_scale": 0.8}
-        scene.add_label("/end/label", "end", **beside)  # a bias point that moves the goal has its own below, right
+        scene.add_label("/end/label", "end", **label)
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
         self._goal.position = frame.goal
         self._end.position = frame.reached
         elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
-        if self._end.visible != elsewhere:
-            self._end.visible = elsewhere
+        text = OLD_GOAL if elsewhere else GOAL
+        if self.label.text != text:
+            self.label.text = text
+        # a bias point that moves the goal says so itself
+        biases = [point for point in bias_points(frame.scenario.layers).values() if point.moves_goal]
+        marked = any(np.linalg.norm(frame.reached - point.position) < BALL_RADIUS for point in biases)
+        if self._end.visible != (elsewhere and not marked):
+            self._end.visible = elsewhere and not marked
 
 
 class Table(Picture):

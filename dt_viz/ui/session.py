@@ -17,7 +17,7 @@ from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.errors import DataError
 from dt_viz.fields import Array
 from dt_viz.imitation import ImitationError
-from dt_viz.paper_scenes import seen_in
+from dt_viz.paper_scenes import SCENES
 from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
 from dt_viz.stacking import IMITATION, names
@@ -31,6 +31,8 @@ GESTURE_PAUSE = 1.0
 MAX_UNDO = 200
 LIVE_PAUSE = 0.05
 """Seconds between two drawings of field and arm while edits come faster: rollouts are drawn for each that can be."""
+HABITS = ("playing", "speed", "joint_plots", "health_plots")
+"""What of the view is how a visitor works, and stays when a scene of the paper comes or goes."""
 REST = 0.1
 """Seconds that a scenario must rest before it is refined: while a hand moves, edits come faster."""
 
@@ -77,6 +79,11 @@ def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
     if not level or level in (IMITATION, *names(scenario)):
         return scenario
     return replace(scenario, view=replace(scenario.view, level=""))
+
+
+def _is_step(after: Scenario, before: Scenario) -> bool:
+    """Whether the change from one to the other is a step for undo: what moves is, and where the slice lies."""
+    return not after.moves_like(before) or after.view.slice != before.view.slice
 
 
 class Display(Protocol):
@@ -154,8 +161,7 @@ class Session:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
             if edited == self.scenario:
                 return
-            moves = not edited.moves_like(self.scenario)
-            if moves:
+            if _is_step(edited, self.scenario):
                 name, when = self._gesture
                 # another control is moved, so whatever was held has been let go, even if nobody said so
                 self._held = self._held and name in {"", gesture}
@@ -177,7 +183,7 @@ class Session:
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
         with self._lock:
-            if self._held and self._gesture[0] and self._past and self.scenario.moves_like(self._past[-1]):
+            if self._held and self._gesture[0] and self._past and not _is_step(self.scenario, self._past[-1]):
                 self._past.pop()
             self._gesture, self._held = ("", 0.0), False
 
@@ -190,7 +196,7 @@ class Session:
         if name != self.scenario.task:
             fresh = self._initial(name)
             if self.scenario.scene:  # of the paper: leaves nothing behind
-                self._begin("task", fresh)
+                self._begin("task", self._as_seen(fresh))
                 return
             kept = zip(fresh.obstacles, self.scenario.obstacles, strict=False)
             self.edit(
@@ -206,28 +212,46 @@ class Session:
             self.end_gesture()
 
     def reset(self) -> None:
-        """Back to how the task began; can be undone."""
-        self._begin("reset", self._initial(self.scenario.task))
+        """Back to how the task or the scene began, a scene seen as it wants to be; can be undone."""
+        scene = SCENES.get(self.scenario.scene)
+        if scene is None:
+            self._begin("reset", self._as_seen(self._initial(self.scenario.task)))
+        else:
+            self._begin("reset", self._with_habits(scene.scenario(self.task)))
+
+    def leave_scene(self) -> None:
+        """Back to how the task of the scene begins; can be undone. Nothing is done while there is no scene."""
+        if self.scenario.scene:
+            self._begin("scene", self._as_seen(self._initial(self.scenario.task)))
 
     def load(self, task: str, scenario: Callable[[Task], Scenario]) -> None:
-        """Begin with a scenario for a task, seen as what is shown now or as its scene wants it; can be undone.
+        """Begin with a scenario for a task, seen as its scene wants it, or else as what is shown now; can be undone.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be used; the session stays with its own.
         """
-        self._begin("load", scenario(self._engine.task(task)))
+        self._begin("load", self._as_seen(scenario(self._engine.task(task))))
 
     def _begin(self, gesture: str, fresh: Scenario) -> None:
-        fresh = self._as_seen(fresh)
         self.edit(gesture, **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__})
         self.end_gesture()
 
     def _as_seen(self, other: Scenario) -> Scenario:
-        """Another scenario, looked at as this one; of another task, on the slice that it had."""
-        view = seen_in(self.scenario.view, other.scene, self.scenario.scene)
+        """Another scenario, looked at as this one, on the slice that it had if it is of another task.
+
+        If it is of a scene of the paper that this is not of, or the other way round, it is looked at as it was itself.
+        """
+        if other.scene != self.scenario.scene:
+            return self._with_habits(other)
+        view = self.scenario.view
         if other.task != self.scenario.task:
             view = replace(view, slice=other.view.slice)
         return _with_a_level_of_its_own(replace(other, view=view))
+
+    def _with_habits(self, other: Scenario) -> Scenario:
+        """Another scenario, looked at as it was itself, but for what stays whatever is shown."""
+        kept = {name: getattr(self.scenario.view, name) for name in HABITS}
+        return _with_a_level_of_its_own(replace(other, view=replace(other.view, **kept)))
 
     def push(self, q: Array, show: Callable[[Pushed], None]) -> None:
         """Push the hand aside. Nothing is done while another motion than the scenario's is shown.
@@ -298,7 +322,9 @@ class Session:
             if not source:
                 return
             target.append(self.scenario)
-            self.scenario = self._as_seen(source.pop())
+            other = source.pop()
+            seen = self._as_seen(other)
+            self.scenario = replace(seen, view=replace(seen.view, slice=other.view.slice))
             self._gesture = ("", 0.0)
             self._submit()
         self._adopt()

@@ -44,6 +44,7 @@ class SlicePanel:
         async def _(_event: viser.GuiEvent) -> None:
             if self._session is not None:
                 self._session.edit("slice", view=replace(self._session.scenario.view, slice=None))
+                self._session.end_gesture()
 
         bind(
             gui.add_dropdown("Colour", tuple(COLOUR_LABELS.values()), hint="of the slice"),

@@ -22,7 +22,7 @@ from dt_viz.ui.warp import WarpControls
 BASE = "Base attractor"
 BELOW = 1e9
 """Order of what stands below the rows in their folder."""
-ON, OFF, UP, DOWN, SEE, SEEN = "on", "off", "↑", "↓", "see", "seen"
+ON, OFF, UP, DOWN, SEE, SEEN = "● on", "○ off", "↑", "↓", "see", "● seen"
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class StackPanel:
         self._scenario: Scenario | None = None
         self._durations: dict[str, float | None] = {}
         with self._folder:
-            self._legend = gui.add_html("", order=BELOW, visible=False)
-            self._warp = WarpControls(gui, bind, BELOW + 1)
-            self._settings = TransformSettings(gui, bind, BELOW + 3)
+            self._warp = WarpControls(gui, bind, BELOW)
+            self._settings = TransformSettings(gui, bind, BELOW + 2)
+        self._legend = gui.add_html("", visible=False)  # at the end: it comes and goes, and would move what is below
 
     def connect(self, session: Session) -> None:
         """Let the rows edit this session."""
@@ -143,7 +143,7 @@ def legend_html(scenario: Scenario) -> str:
 
 
 def _label(name: str, duration: float | None) -> str:
-    return name if duration is None else f"{name}  {duration:.2f}"
+    return name if duration is None else f"{name}, t {duration:.2f}"
 
 
 def _look(scenario: Scenario, name: str) -> str:

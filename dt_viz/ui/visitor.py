@@ -24,6 +24,7 @@ from dt_viz.ui.carried import Carried
 from dt_viz.ui.export import RESOLUTIONS, render_png
 from dt_viz.ui.grip import Grip
 from dt_viz.ui.panel import Panel
+from dt_viz.ui.picture import Colour
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.push import PushedPath
 from dt_viz.ui.scene import ScenePictures
@@ -32,6 +33,8 @@ from dt_viz.ui.starts import Starts
 
 FIELD_OF_VIEW = 0.75
 """Vertical, rad."""
+NOTICE_SECONDS = 12.0
+"""That a notification stays, unless it is closed."""
 
 
 def initial_scenario(engine: Engine, task: str) -> Scenario:
@@ -76,7 +79,7 @@ class Visitor:
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
         self._playback = Playback(self._pose)
-        self._panel = Panel(client.gui, titles, robot, self._save_png)
+        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(self._push)
@@ -181,11 +184,15 @@ class Visitor:
     def _bias_selected(self, name: str) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
 
-    def _slice_moved(self, position: Array, wxyz: Array, _phase: str) -> None:
+    def _slice_moved(self, position: Array, wxyz: Array, phase: str) -> None:
+        if phase == "start":
+            self.session.begin_gesture()
         x, y, z = (float(c) for c in position)
         w, i, j, k = (float(c) for c in wxyz)
         pose = SlicePose((x, y, z), (w, i, j, k))
         self.session.edit("slice", view=replace(self.session.scenario.view, slice=pose))
+        if phase == "end":
+            self.session.end_gesture()
 
     def _push(self) -> None:
         if self._playback.q is not None:
@@ -229,6 +236,9 @@ class Visitor:
         with self.client.atomic():
             self.arms.pose(q, without)
             self.carried.pose(self._robot.end_effector(q), self._playback.resting)
+
+    def _notify(self, text: str, colour: Colour) -> None:
+        self.client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=NOTICE_SECONDS)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
         with self.pictures.without_handles(), self.grip.without_handles():
