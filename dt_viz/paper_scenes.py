@@ -136,7 +136,7 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "lift",
             "Fig. 1, 7: lift, a bottle in the way",
-            "The whole arm gives way to the bottle, and still dips to where the box is and lifts.",
+            "The whole arm gives way to the bottle, and still dips before it lifts.",
             "lift_box",
             _bottle_in_the_way,
             view=ARM_ONLY,

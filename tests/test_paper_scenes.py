@@ -99,7 +99,7 @@ def test_the_clover_is_known_by_labelled_points_only_and_every_stroke_leaves_it(
     undisturbed = max(maximum_collision_distance(path, cloud.signed_distance) for path in frame.ghost)
     assert undisturbed > 0.02
     assert max(maximum_collision_distance(path, cloud.signed_distance) for path in frame.rollouts) == 0
-    assert_only_the_stroke_gives_way(frame, cloud, 0.06)
+    assert_only_the_stroke_gives_way(frame, cloud, 0.08)
     assert SCENES["cloud"].view["colour"] == "occupancy"
 
 

@@ -1,5 +1,6 @@
 """What the page shows of the whole arm, without a browser: a scene takes handles also while nobody looks."""
 
+import html
 from dataclasses import fields, replace
 from typing import cast
 
@@ -11,9 +12,11 @@ from viser import transforms  # noqa: TID251
 
 from dt_viz.body import load_body_points
 from dt_viz.collision import CollisionReport, Nearest
+from dt_viz.demos import DemonstrationError
 from dt_viz.engine import ArmMotion, Stage
 from dt_viz.health import Health
 from dt_viz.obstacles import Sphere
+from dt_viz.paper_scenes import SCENES
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Scenario, View
 from dt_viz.tasks import TASKS
@@ -21,7 +24,7 @@ from dt_viz.ui import palette
 from dt_viz.ui.arm import PEDESTAL
 from dt_viz.ui.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.links import CELL, bodies, light_shells, simplified
-from dt_viz.ui.panel import PLOTS, VIEW_LABELS, Panel, status_html
+from dt_viz.ui.panel import CHANGED, PLOTS, VIEW_LABELS, Panel, hint, status_html
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.scene import OF_A_MOTION, Rollouts, ScenePictures
@@ -301,6 +304,37 @@ CLOSE = CollisionReport(
     Nearest(-0.008, ("link 5",), 2.5), Nearest(0.004, ("link 2", "hand"), 3.0), Nearest(-0.012, ("finger tip 1",), 4.0)
 )
 FAR = CollisionReport(Nearest(0.012, ("link 5",), 2.5), None, Nearest(0.034, ("hand",), 4.0))
+
+
+def test_the_line_of_a_scene_is_shown_only_while_it_is_as_it_was():
+    task = TASKS["draw_j"]()
+    scene, plain = SCENES["two_points"], Scenario("draw_j", ())
+    own = scene.scenario(task)
+    assert hint(frame(scenario=plain, task=task)) == task.hint
+    assert hint(frame(scenario=own, task=task)) == hint(frame(scenario=replace(own, warp=0.3), task=task)) == scene.line
+    assert hint(frame(scenario=replace(own, layers=own.layers[:1]), task=task)) == CHANGED
+
+
+def test_what_is_refused_is_said_beside_the_panel_too(server):
+    said = []
+    panel = Panel(server.gui, {"draw_s": "Draw S"}, ROBOT, lambda *_: None, lambda *told: said.append(told))
+    panel.fail(DemonstrationError("file.csv", "points", "3", "at least 20"))
+    ((text, colour),) = said
+    assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel._notice.content)
+    assert colour[0] > 2 * max(colour[1:])  # red
+
+
+def test_the_status_says_that_every_check_holds_only_when_all_are_made():
+    holds = Health(0.01, collision=FAR)
+    assert "Every check holds" in status_html(frame(health=holds), PACE)
+    for other in (
+        frame(health=holds, stage=Stage.FINE),
+        frame(health=holds, blocked=("it is in the way",)),
+        frame(health=holds.doubting("it is odd")),
+        frame(health=replace(holds, collision=CLOSE)),
+        frame(health=holds, scenario=Scenario("draw_s", (), warp=0.5)),
+    ):
+        assert "Every check holds" not in status_html(other, PACE)
 
 
 def test_the_status_says_what_the_arm_comes_near_to():

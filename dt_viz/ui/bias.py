@@ -18,7 +18,6 @@ from dt_viz.scenario import Scenario
 from dt_viz.stacking import MAX_BIAS_POINTS, bias_points
 from dt_viz.ui import palette
 from dt_viz.ui.handles import Dragged, Handles
-from dt_viz.ui.picture import rgb
 
 BALL_RADIUS = 0.011
 """Of the marker, metres."""
@@ -65,7 +64,7 @@ class BiasPicture:
         self.region = scene.add_line_segments(
             f"{node}/region",
             _rings(flat=True),
-            palette.linear(palette.BIAS),
+            palette.REGION,
             thickness=RING_WIDTH,
             thickness_units="screen",
             visible=False,
@@ -108,7 +107,8 @@ class BiasPicture:
             self._label.text = label
         colour = palette.BIAS if on else palette.STALE
         if tuple(self.ball.color) != colour:
-            self.ball.color, self.region.colors = colour, rgb(colour, (3,))
+            self.ball.color = colour
+            self.region.colors = np.array(palette.REGION if on else palette.STALE, dtype=np.uint8)
         self.handles.show(selected)
         if not self.gizmo.visible:
             self.gizmo.visible = True

@@ -17,6 +17,8 @@ START = (213, 94, 0)
 OBSTACLE = (204, 121, 167)
 BIAS = (230, 159, 0)
 """Bias points."""
+REGION = (240, 196, 108)
+"""That a bias point acts in."""
 LEVEL = (0, 114, 178)
 """Rollouts on the selected level of the stack."""
 ROLLOUT_BESIDE = (238, 178, 132)

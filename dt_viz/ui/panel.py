@@ -173,7 +173,7 @@ class Panel:
         self._learned()
         if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
             self._notice.visible, self._noticed = False, None
-        self._hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(_hint(frame))}</div>"
+        self._hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(hint(frame))}</div>"
         self._biases.report(frame)
         self._stack.report(frame)
         self._slice.report(frame)
@@ -207,7 +207,7 @@ class Panel:
     def _say(self, text: str, colour: Colour, background: Colour) -> None:
         """Say something that stays until the next scenario is shown, and for a while beside the panel."""
         self._learned()
-        self._notify(text[:1].upper() + text[1:], colour)
+        self._notify(_sentence(text), colour)
         self._notice.content, self._notice.visible = _alarm(text, colour, background), True
         self._noticed = self._adopted
 
@@ -356,13 +356,14 @@ CHANGED = "The scene is changed. “Reset” brings it back as it was."
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
 HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
 _BLUE = ((29, 79, 124), (232, 241, 250))
+_GREEN = ((0, 92, 66), (230, 245, 239))
 _AMBER = ((138, 75, 0), (255, 244, 224))
 _RED = ((179, 38, 30), (253, 236, 234))
-_TWO_LINES, _WARNING = "2.7em", "3.4em"
+_TWO_LINES, _WARNING = "2.7em", "2.6em"
 _SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
 
 
-def _hint(frame: Frame) -> str:
+def hint(frame: Frame) -> str:
     """What to try in the task, or to see in the scene of the paper."""
     scene = SCENES.get(frame.scenario.scene)
     if scene is None:
@@ -409,9 +410,11 @@ def status_html(frame: Frame, pace: Pace) -> str:
     if frame.blocked:
         blocked = _alarm(f"no motion: {'; '.join(frame.blocked)}. What is shown is the last good one.", *_RED)
     warp = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
-    amber = "".join(_alarm(warning, *_AMBER) for warning in warnings)
-    # room for a line of warning, so that what is below does not jump under the pointer
-    return f"{blocked}<table style='{_SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{warp}{amber}</div>"
+    said = warp + "".join(_alarm(warning, *_AMBER) for warning in warnings)
+    if not (said or blocked) and frame.stage is Stage.CERTIFIED:
+        said = _alarm("every check holds", *_GREEN)
+    # its room stays while checks are made, so that what is below does not jump under the pointer
+    return f"{blocked}<table style='{_SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{said}</div>"
 
 
 def _rebuild(pace: Pace) -> str:
@@ -452,8 +455,13 @@ def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
     return f"{size}, {' – '.join(links)}"
 
 
+def _sentence(text: str) -> str:
+    """The text with a capital letter, unless it begins with the name of a file."""
+    return text if "." in text.split(" ", 1)[0] else text[:1].upper() + text[1:]
+
+
 def _alarm(text: str, colour: Colour, background: Colour) -> str:
     return (
         f"<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;border-left:3px solid rgb{colour};"
-        f"color:rgb{colour};background:rgb{background}'>{html.escape(text[:1].upper() + text[1:])}</div>"
+        f"color:rgb{colour};background:rgb{background}'>{html.escape(_sentence(text))}</div>"
     )
