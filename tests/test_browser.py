@@ -244,7 +244,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     page.get_by_text("From a file", exact=True).click()
     upload = page.locator("input[type=file]").first
     upload.set_input_files({"name": "crate.stl", "mimeType": "model/stl", "buffer": crate})
-    page.get_by_text("is the file in millimetres").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("is the file in millimetres").first.wait_for(timeout=1000 * PATIENCE)
     assert session.scenario.obstacles == ()
     click_button(page, "Read it in millimetres")
     wait_until(lambda: session.scenario.obstacles, "the mesh")
@@ -456,7 +456,7 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     page.get_by_role("option", name="velocity").click()
     page.get_by_text("Learning the motion: without end").wait_for(timeout=1000 * PATIENCE)
     page.get_by_role("button", name="Cancel").click()
-    page.get_by_text("was cancelled. This is “Draw S” as before.").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for(timeout=1000 * PATIENCE)
     assert visitor.session.wait_idle(PATIENCE)
     assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
     page.get_by_text("Smallest det J").wait_for(timeout=1000 * PATIENCE)
