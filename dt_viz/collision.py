@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from dt_viz.interruption import checkpoint
 from dt_viz.link_distances import (
     SHAPE_TOLERANCE,
     Link,
@@ -199,6 +200,7 @@ class _Search:
         for k in np.argsort(values - slack):
             if values[k] >= self._best + slack[k]:
                 break
+            checkpoint()
             values[k] = self._measure.distance(poses, int(rows[k]), int(items[k]), float(self._best + slack[k]))
             if values[k] < self._best:
                 self._best, self._place, self._item = float(values[k]), float(places[k]), int(items[k])

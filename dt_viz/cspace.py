@@ -16,6 +16,7 @@ import numpy as np
 from dt_viz.body import BodyPoints
 from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array, Indices
+from dt_viz.interruption import checkpoint
 from dt_viz.obstacles import Obstacle
 from dt_viz.robot import NUM_JOINTS, KinematicChain, Robot, cross
 from dt_viz.tracking import DIRECTION_WEIGHT
@@ -104,6 +105,7 @@ class WholeArmField:
         """V_q at configurations `q` (N, 6), as (N, 6)."""
         if len(q) > BLOCK:
             return np.concatenate([self(q[i : i + BLOCK]) for i in range(0, len(q), BLOCK)])
+        checkpoint()
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
         distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]

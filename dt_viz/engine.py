@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TypeVar
@@ -25,6 +25,7 @@ from dt_viz.ground import Ground, Learned, named_starts
 from dt_viz.health import Health, certified, certified_arm, fold_doubts
 from dt_viz.holding import held
 from dt_viz.imitation import ImitationSettings, Progress
+from dt_viz.interruption import Checkpoint, interruptible
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.pictures import NO_PICTURES, Pictures, in_frame
 from dt_viz.profiles import Profiles, body_profile, hand_profile
@@ -35,10 +36,11 @@ from dt_viz.rollouts import Bundle
 from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
 from dt_viz.solved import Solved
-from dt_viz.solving import FINE, LIVE, Checkpoint, Precision, Solution, cut_off, solve
+from dt_viz.solving import FINE, LIVE, Precision, Solution, cut_off, solve
 from dt_viz.stacking import WHOLE_ARM, levels
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
+from dt_viz.turns import Turns
 from dt_viz.warping import warped
 
 
@@ -116,9 +118,26 @@ class _Kept:
     """Certified."""
 
 
-_turn = threading.Lock()
+_turns = Turns()
 """Engines take turns. Small array operations of several threads would fight for the interpreter, and all would lose:
 four sessions that drag at once get twice as many frames this way."""
+
+
+@contextmanager
+def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
+    """Within this block compute when it is this engine's turn, letting others go first when they are due.
+
+    Args:
+        checkpoint: of what refines: others that follow a hand are due before it, and what this raises ends it.
+    """
+
+    def pause() -> None:
+        if checkpoint is not None:
+            checkpoint()
+        _turns.give_way()
+
+    with _turns.taken(patient=checkpoint is not None), interruptible(pause):
+        yield
 
 
 class Engine:
@@ -161,7 +180,7 @@ class Engine:
         Args:
             scenario: what to show.
             progress: called while a task is fitted for the first time; see `dt_viz.imitation.fit`.
-            checkpoint: called now and then after stage LIVE; what it raises ends the computation.
+            checkpoint: called often after stage LIVE; what it raises ends the computation.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be read.
@@ -208,7 +227,7 @@ class Engine:
         """
         if self._shown is None or not self._shown.scenario.moves_like(scenario):
             return None
-        with _turn:
+        with _in_turn():
             return pushed(self._follower, self._shown, q, rng)
 
     def held(self, scenario: Scenario, q: Array, place: Array) -> Pushed | None:
@@ -224,28 +243,28 @@ class Engine:
         """
         if self._live is None or not self._live.scenario.moves_like(scenario):
             return None
-        with _turn:
+        with _in_turn():
             return held(self._follower, self._live, q, place)
 
     def _stages(self, ground: Ground, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
         kept = self._kept
         if kept is None or not kept.scenario.moves_like(scenario):
             if _uses_whole_arm(scenario):
-                with _turn:
+                with _in_turn():
                     blocked = self._follower.obstructions(ground, scenario.obstacle)
                     admitted = ground if blocked else self._follower.admitted(ground, scenario.obstacle)
                 if blocked:
-                    yield from self._stages_without_motion(ground, scenario, blocked)
+                    yield from self._stages_without_motion(ground, scenario, blocked, checkpoint)
                     return
                 ground = admitted
             kept = self._kept = _Kept(scenario, ground)
         ground = kept.ground
-        with _turn:
+        with _in_turn():
             live = _once(kept.solved, LIVE, lambda: self._solved(ground, scenario, LIVE))
             first = _once(kept.rollouts, LIVE, lambda: self._frame(scenario, live))
             first = replace(first, scenario=scenario, level=_level(scenario, live.stack))
         yield first
-        with _turn:
+        with _in_turn():
             frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, live, exact=False))
             pictures = _pictures(scenario, live, coarse=True)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.LIVE, pictures=pictures)
@@ -253,12 +272,10 @@ class Engine:
             self._shown = self._live = live
         yield frame
 
-        with _turn:
-            fine = _once(kept.solved, FINE, lambda: self._solved(ground, scenario, FINE, checkpoint))
-        with _turn:
+        with _in_turn(checkpoint):
+            fine = _once(kept.solved, FINE, lambda: self._solved(ground, scenario, FINE))
             exact = _once(kept.rollouts, FINE, lambda: self._frame(scenario, fine))
             frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, fine, exact=True))
-        with _turn:
             pictures = _pictures(scenario, fine, coarse=False)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.FINE, pictures=pictures)
             if scenario.view.health_plots and frame.chosen is not None:
@@ -267,32 +284,34 @@ class Engine:
             self._shown = fine
         yield frame
         if kept.health is None:
-            kept.health = self._certified(frame, fine)
+            with _in_turn(checkpoint):
+                kept.health = self._certified(frame, fine)
         yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
 
     def _certified(self, frame: Frame, fine: Solved) -> Health:
         obstacle, stack, arm = frame.scenario.obstacle, fine.stack, fine.arm
         by_hand = any(made.integration.by_hand for _, made in stack.built)
-        with _turn:
-            drawn_from = stack.rays.at(stack.bundle.index, stack.bundle.fraction) if by_hand else None
-            health = certified(frame.health, stack.system, stack.bundle, drawn_from)
-            if arm is not None:
-                integration = frame.scenario.integration
-                q = self._follower.whole_arm.limits.inside(arm.q)
-                health = health.doubting(*fold_doubts(WHOLE_ARM, arm.transform, integration, arm.p, q))
-                health = certified_arm(health, stack.system, arm, self._robot, q if integration.by_hand else None)
-        if fine.arm is None:
+        drawn_from = stack.rays.at(stack.bundle.index, stack.bundle.fraction) if by_hand else None
+        health = certified(frame.health, stack.system, stack.bundle, drawn_from)
+        if arm is None:
             depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
             health = replace(health, clearance=-depth if depth > 0 else health.clearance)
+        else:
+            integration = frame.scenario.integration
+            q = self._follower.whole_arm.limits.inside(arm.q)
+            health = health.doubting(*fold_doubts(WHOLE_ARM, arm.transform, integration, arm.p, q))
+            health = certified_arm(health, stack.system, arm, self._robot, q if integration.by_hand else None)
         if frame.arm is not None:
             health = replace(health, collision=load_collision_model().report(frame.arm.q, obstacle))
         return health
 
-    def _stages_without_motion(self, ground: Ground, scenario: Scenario, blocked: tuple[str, ...]) -> Iterator[Frame]:
-        """The last good motion at every stage, or the undisturbed one if there is none."""
+    def _stages_without_motion(
+        self, ground: Ground, scenario: Scenario, blocked: tuple[str, ...], checkpoint: Checkpoint = lambda: None
+    ) -> Iterator[Frame]:
+        """The last good motion at every stage, or the undisturbed one, refined, if there is none."""
         if scenario.task not in self._good:
-            for _ in self._stages(ground, replace(scenario, avoidance=False)):
-                pass
+            undisturbed = self._stages(ground, replace(scenario, avoidance=False), checkpoint)
+            next(frame for frame in undisturbed if frame.stage is Stage.FINE)
         good, solved = self._good[scenario.task]
         seen = replace(good.scenario, view=scenario.view)
         changed = not seen.computes_like(good.scenario)
@@ -312,33 +331,28 @@ class Engine:
             self._learned[key] = Learned.of(task, imitation, imitates=scenario.imitation)
         return self._learned[key].ground(scenario.starts)
 
-    def _solved(
-        self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint = lambda: None
-    ) -> Solved:
-        full = self._fully_solved(ground, replace(scenario, warp=1.0), precision, checkpoint)
+    def _solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> Solved:
+        full = self._fully_solved(ground, replace(scenario, warp=1.0), precision)
         if scenario.warp == 1:
             return full
-        checkpoint()
         below = ground.warped(scenario.warp)
         stack = warped(below, full.stack, scenario.warp, precision)
         if full.arm is None:
             return Solved(scenario, ground, below, stack, None, None)
         exact = precision is not LIVE
         lifted, whole_arm = self._follower.behaving(ground, stack, exact=exact), self._follower.whole_arm
-        checkpoint()
         arm = whole_arm.warped(full.arm, lifted, scenario, scenario.warp, precision.spacing)
         return Solved(scenario, ground, below, stack, arm, lifted)
 
-    def _fully_solved(self, ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint) -> Solved:
+    def _fully_solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> Solved:
         known = self._full.get(precision)
         if known is not None and ground.moves_like(known.ground) and scenario.moves_like(known.scenario):
             return known
-        stack, arm, lifted, follower = solve(ground, scenario, precision, checkpoint), None, None, self._follower
+        stack, arm, lifted, follower = solve(ground, scenario, precision), None, None, self._follower
         if _uses_whole_arm(scenario):
             exact = precision is not LIVE
             lifted = follower.behaving(ground, stack, exact=exact) if stack.built else follower.undisturbed(ground)
-            checkpoint()
-            arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, checkpoint, coarse=precision is LIVE)
+            arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, coarse=precision is LIVE)
         solved = self._full[precision] = Solved(scenario, ground, ground, stack, arm, lifted)
         return solved
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dt_viz.fields import Array, Mask, VectorField
+from dt_viz.interruption import checkpoint
 
 Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
 
@@ -72,6 +73,7 @@ def integrate(
     """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` for `duration` in equal `steps`."""
     h = duration / steps
     for _ in range(steps):
+        checkpoint()
         s, U = step(field, s, U, h)
     return s, U
 
@@ -106,6 +108,7 @@ def integrate_adaptive(
     for _ in range(max_rounds):
         if not len(active):
             return _split(state, s, U)
+        checkpoint()
         step = np.sign(duration) * h[:, None]
         stages = np.empty((len(_DP_STAGES), *start.shape))
         end, stages[0] = start, first

@@ -21,6 +21,7 @@ from dt_viz.diffeo import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identi
 from dt_viz.escape import escape_directions
 from dt_viz.fields import Array, Indices, Mask, Sum, VectorField
 from dt_viz.integrate import rk4
+from dt_viz.interruption import checkpoint
 from dt_viz.obstacles import Obstacle
 from dt_viz.robot import NUM_JOINTS, Robot
 from dt_viz.rollouts import Bundle, refined
@@ -170,7 +171,6 @@ class WholeArm:
         lifted: Lift,
         scenario: Scenario,
         spacing: float,
-        checkpoint: Callable[[], None] = lambda: None,
         *,
         coarse: bool,
     ) -> ArmSolution:
@@ -184,12 +184,10 @@ class WholeArm:
             lifted: the motions below.
             scenario: with obstacle, margin, temperature and duration.
             spacing: largest distance between neighbouring samples, metres at the hand, about.
-            checkpoint: called now and then; raises what is to end the computation.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
         """
         best = None
         for generator in self._generators(lifted, scenario):
-            checkpoint()
             solution = _Solver(self, lifted, scenario, generator, spacing, coarse=coarse).solution()
             if best is None or solution.cleared or solution.clearance > best.clearance:
                 best = solution
@@ -381,6 +379,7 @@ class _Solver:
         while len(state):
             if duration >= MAX_DURATION:
                 return MAX_DURATION
+            checkpoint()
             state, _ = rk4(self._generator, state, None, -SNAPSHOT)
             before, lack = lack, self._lack(limits.inverse(state))
             if (lack <= 0).all():

@@ -1,5 +1,6 @@
 """Scenario to frames, for the tasks that ship: what a picture promises, whatever the scenario."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -253,6 +254,47 @@ def test_refining_ends_where_a_checkpoint_says_so(engine, scenario):
     with pytest.raises(UnwantedError):
         next(frames)
     assert stage(engine, scenario, Stage.CERTIFIED).health.lyapunov_falls  # nothing is left locked
+
+
+@pytest.mark.parametrize("space", ["task", "cspace"])
+def test_wherever_refining_is_interrupted_it_leaves_nothing_half_done(new_engine, initial, space):
+    class UnwantedError(Exception):
+        pass
+
+    scenario, engine, passed = replace(initial("draw_s"), space=space), new_engine(), []
+    expected = [*new_engine().frames(scenario, checkpoint=lambda: passed.append(None))][-1]
+    assert len(passed) > 100  # all along, not between a few long parts
+    for moment in (0.05, 0.3, 0.7, 0.95):
+        left = iter(range(int(moment * len(passed))))
+
+        def refuse(left=left):
+            if next(left, None) is None:
+                raise UnwantedError
+
+        with pytest.raises(UnwantedError):
+            list(new_engine().frames(scenario, checkpoint=refuse))
+        with pytest.raises(UnwantedError):
+            list(engine.frames(replace(scenario, margin=0.01 * moment), checkpoint=refuse))
+    found = [*engine.frames(scenario)][-1]
+    for path, times, same, at in zip(found.rollouts, found.times, expected.rollouts, expected.times, strict=True):
+        np.testing.assert_allclose(path, same, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(times, at, rtol=0, atol=1e-9)
+    assert found.health == expected.health
+
+
+def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
+    followed = threading.Event()
+
+    def follow():
+        stage(new_engine(), initial("lift_box"), Stage.LIVE)
+        followed.set()
+
+    other = threading.Thread(target=follow, daemon=True)
+    frames = new_engine().frames(initial("draw_s"), checkpoint=lambda: followed.wait(0.05) and None)
+    assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
+    other.start()
+    assert next(frames).stage is Stage.FINE
+    assert followed.is_set()
 
 
 def random_edit(rng, scenario, initial):

@@ -1,0 +1,32 @@
+"""Long computations that can be interrupted, wherever they are in the middle of.
+
+Who wants to interrupt and what takes long are many calls apart, with values and pure functions in between: here a
+page's worker, there the steps of an integration. So what is called between those steps is a setting of the thread, as
+`numpy.errstate` is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+Checkpoint = Callable[[], None]
+"""Called often in long computations; raises what is to end them, and may take its time to let others go first."""
+
+_current: ContextVar[Checkpoint] = ContextVar("_current", default=lambda: None)
+
+
+@contextmanager
+def interruptible(checkpoint: Checkpoint) -> Iterator[None]:
+    """Within this block long computations of this thread call `checkpoint` between their steps."""
+    token = _current.set(checkpoint)
+    try:
+        yield
+    finally:
+        _current.reset(token)
+
+
+def checkpoint() -> None:
+    """To be called between steps that take milliseconds: does what `interruptible` was given, outside of it nothing."""
+    _current.get()()

@@ -1,0 +1,66 @@
+"""Long computations call the checkpoint of their own thread, and only within its block."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from dt_viz.diffeo import AdaptiveFlow, Flow
+from dt_viz.fields import GaussianGrid, GridRBF
+from dt_viz.interruption import checkpoint, interruptible
+
+GRID = GaussianGrid.covering(np.array([[-1.0, -1.0], [1.0, 1.0]]), 0.5)
+FIELD = GridRBF(GRID, np.random.default_rng(0).normal(size=(GRID.num_points, 2)))
+POINTS = np.random.default_rng(1).uniform(-1, 1, (20, 2))
+
+
+class StoppedError(Exception):
+    pass
+
+
+@pytest.fixture(params=[Flow(FIELD, steps=7), AdaptiveFlow(FIELD, 1.0)], ids=["equal steps", "adaptive"], name="flow")
+def _flow(request):
+    return request.param
+
+
+def counter():
+    calls = []
+    return calls, lambda: calls.append(threading.current_thread())
+
+
+def test_a_flow_passes_checkpoints_on_its_way_in_both_directions(flow):
+    for run in (flow.forward, flow.inverse, flow.jacobian):
+        calls, count = counter()
+        with interruptible(count):
+            run(POINTS)
+        assert len(calls) >= 7
+
+
+def test_what_a_checkpoint_raises_ends_the_flow(flow):
+    def stop():
+        raise StoppedError
+
+    expected = flow.forward(POINTS)
+    with pytest.raises(StoppedError), interruptible(stop):
+        flow.forward(POINTS)
+    np.testing.assert_array_equal(flow.forward(POINTS), expected)  # after the block nothing is called
+
+
+def test_of_nested_blocks_the_inner_counts_until_it_ends():
+    (outer, count_outer), (inner, count_inner) = counter(), counter()
+    with interruptible(count_outer):
+        with interruptible(count_inner):
+            checkpoint()
+        assert (len(outer), len(inner)) == (0, 1)
+        checkpoint()
+    checkpoint()
+    assert (len(outer), len(inner)) == (1, 1)
+
+
+def test_other_threads_are_not_concerned():
+    calls, count = counter()
+    with interruptible(count):
+        other = threading.Thread(target=checkpoint)
+        other.start()
+        other.join()
+    assert calls == []
