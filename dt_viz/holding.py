@@ -68,11 +68,11 @@ def held(
     if depth > 0:
         doubt = "inside the obstacle"
     elif missed > MAX_TRACKING_ERROR:
-        far = arm is None or tracked.error[0] > MAX_TRACKING_ERROR
+        far = arm is None or track(robot, place[None], posture, reference=reference).error[0] > MAX_TRACKING_ERROR
         doubt = "out of the arm's reach" if far else "the arm gives way to the obstacle here"
     elif place[2] < 0:
         doubt = "below the table"
-    elif scenario.avoidance and room.obstacle < 0:
+    elif scenario.avoidance and scenario.warp == 1 and room.obstacle < 0:
         doubt = "the motion from here touches the obstacle"
     elif room.tracking < 0:
         doubt = "the arm cannot follow the motion from here"

@@ -161,6 +161,18 @@ class TestBlocked:
         for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
             assert np.linalg.norm(path[:, None] - ghost, axis=-1).min(axis=0).max() < 1e-12
 
+    def test_refining_the_undisturbed_one_ends_where_a_checkpoint_says_so(self, new_engine, initial):
+        class UnwantedError(Exception):
+            pass
+
+        def refuse():
+            raise UnwantedError
+
+        engine, blocked = new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3))
+        with pytest.raises(UnwantedError):
+            next(engine.frames(blocked, checkpoint=refuse))
+        assert next(engine.frames(blocked, checkpoint=refuse)).blocked  # what there is so far is shown at the next edit
+
     def test_demonstrations_out_of_reach_are_shown_without_an_arm(self, too_far, initial):
         for frame in too_far.frames(placed(initial("push_box"), *initial("push_box").obstacles)):
             assert any("cannot reach the starts" in reason for reason in frame.blocked)

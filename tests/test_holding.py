@@ -109,6 +109,29 @@ def test_a_hand_that_is_held_in_the_obstacle_is_said_to_be(engine, initial, robo
     np.testing.assert_allclose(robot.end_effector(found.motion.q[-1]), frame.goal, atol=1e-3)
 
 
+@pytest.mark.parametrize("direction", [(0.5, -0.6, 0.6), (0.0, -1.0, 0.0), (-0.7, -0.1, 0.7)])
+def test_a_pointer_out_of_reach_is_said_to_be_and_no_other(engine, initial, robot, space, direction):
+    """Wherever the search for the place of the motion below gives up."""
+    scenario = replace(initial("draw_s"), space=space)
+    frame = shown(engine, scenario)
+    shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
+    q = frame.arm.q[len(frame.arm.q) // 2]
+    for distance in (4.0, 1.2 * robot.reach, 0.6 * robot.reach):
+        place = shoulder + distance * np.array(direction) / np.linalg.norm(direction)
+        doubt = engine.held(scenario, q, place).doubt
+        assert (doubt == "out of the arm's reach") == (distance > robot.reach)
+
+
+@pytest.mark.parametrize("warp", [0.0, 0.4])
+def test_under_a_warp_nothing_is_said_of_an_obstacle_that_is_not_avoided_yet(engine, initial, robot, space, warp):
+    """As of the motion itself."""
+    scenario = replace(initial("draw_s"), space=space, warp=warp)
+    for q in shown(engine, scenario).arm.q[::50]:
+        place = robot.end_effector(q)
+        if scenario.obstacle.signed_distance(place) > 0:
+            assert engine.held(scenario, q, place).doubt == ""
+
+
 def test_nothing_is_held_that_is_not_shown(new_engine, initial, robot):
     engine, scenario = new_engine(), initial("push_box")
     place = robot.end_effector(robot.home)

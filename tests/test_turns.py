@@ -56,7 +56,8 @@ def test_who_is_in_a_hurry_goes_first_and_else_who_came_first(crowd):
     assert crowd.order == ["b", "d", "a", "c"]
 
 
-def test_who_is_patient_gives_way_to_all_that_hurry_and_joins_the_end_of_the_queue(crowd):
+def test_who_is_patient_gives_way_to_all_that_hurry_and_joins_the_end_of_the_queue(crowd, monkeypatch):
+    monkeypatch.setattr(turns_module, "SLICE", float("inf"))
     with crowd.turns.taken(patient=True):
         crowd.turns.give_way()  # nobody is there
         crowd.join_queue("patient", patient=True)
