@@ -12,6 +12,8 @@ from dt_viz.systems import Attractor
 
 ARRIVED = 1e-4
 """Metres in base space from the goal at which a motion counts as arrived."""
+ARRIVING = 0.5
+"""The same, at most, as a part of what is left at the last sample before: a stack may stretch it to a visible way."""
 UNEVEN = 1.5
 """How much wider than one of its neighbours a gap is that is stretched unevenly itself."""
 OVERSAMPLING = 2
@@ -33,12 +35,18 @@ class Rays:
         return self.base.goal + (1 - fraction)[:, None] * (self.z0[index] - self.base.goal)
 
     def times(self, index: Indices, fraction: Array) -> Array:
-        """Seconds (N,) at which the motions are there, `index` not decreasing; the goal is reached within `ARRIVED`."""
+        """Seconds (N,) at which the motions are there, `index` not decreasing.
+
+        The goal counts as reached within `ARRIVED`, or nearer where other samples are nearer: no two share a time.
+        """
         radius = np.linalg.norm(self.z0 - self.base.goal, axis=1)
+        left = (1 - fraction) * radius[index]
+        least = np.full(len(radius), ARRIVED)
+        np.minimum.at(least, index[left > 0], ARRIVING * left[left > 0])
         # one row for each ray, filled up with starts: what holds for a whole ray is worked out once
         column = np.arange(len(index)) - np.searchsorted(index, index)
         remaining = np.repeat(radius[:, None], int(column.max()) + 1, axis=1)
-        remaining[index, column] = np.maximum((1 - fraction) * radius[index], ARRIVED)
+        remaining[index, column] = np.maximum(left, least[index])
         return self.base.times_at(self.z0, remaining)[index, column]
 
 

@@ -242,6 +242,19 @@ def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
         assert used_fraction(frame.arm.times, frame.arm.q, robot.velocity_limits) <= 1 + 1e-9
 
 
+@pytest.mark.parametrize(("beyond", "radius"), [((0.0, 0.2, 0.15), 0.4), ((0.0, 0.05, 0.05), 0.2)])
+def test_times_increase_where_a_strong_bias_stretches_space_at_the_goal(engine, initial, robot, beyond, radius):
+    scenario = replace(initial("drop_pots"), obstacles=())
+    target = mean_end(engine.task("drop_pots")) + np.array(beyond)
+    point = BiasPoint(vector(target), radius=radius, strength=4.0)
+    for frame in engine.frames(replace(scenario, layers=with_bias_point((), point))):
+        for times in frame.times:
+            assert (np.diff(times) > 0).all()
+        if frame.arm is not None:
+            assert (np.diff(frame.arm.times) > 0).all()
+            assert used_fraction(frame.arm.times, frame.arm.q, robot.velocity_limits) <= 1 + 1e-9
+
+
 def test_refining_ends_where_a_checkpoint_says_so(engine, scenario):
     class UnwantedError(Exception):
         pass

@@ -49,6 +49,24 @@ def test_times_start_at_zero_increase_and_end_on_arrival():
         assert np.linalg.norm(end - RAYS.base.goal) == pytest.approx(ARRIVED, rel=1e-6)
 
 
+@given(st.lists(st.floats(1e-4, 0.9), min_size=3, max_size=8), st.floats(1e-8, 1e-2))
+def test_samples_however_near_to_the_goal_have_times_of_their_own(left, nearest):
+    """A stack may stretch them to a visible way."""
+    per_ray = []
+    for scale in (1.0, nearest, 1e-3):  # each ray has its own nearest sample
+        remaining = scale * np.array(sorted(left, reverse=True))
+        distinct = np.r_[True, remaining[1:] < 0.99 * remaining[:-1]]
+        per_ray.append(np.r_[1.0, remaining[distinct], 0.0])
+    index = np.repeat(np.arange(3), [len(remaining) for remaining in per_ray])
+    fraction = 1 - np.concatenate(per_ray)
+    times = RAYS.times(index, fraction)
+    for which in range(3):
+        assert np.isfinite(times).all() and (np.diff(times[index == which]) > 0).all()
+    before = fraction < 1
+    flowed = RAYS.base.flow(RAYS.z0[index[before]], times[before, None])[:, 0]
+    np.testing.assert_allclose(flowed, RAYS.at(index[before], fraction[before]), rtol=0, atol=1e-9)
+
+
 def straight(index, fraction):
     return RAYS.at(index, fraction)[:, None]
 
