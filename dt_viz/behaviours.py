@@ -67,7 +67,7 @@ class Built:
 
 
 class Behaviour(Protocol):
-    """A kind of transform that the engine stacks. A new one is a file with such a class and a line in the engine."""
+    """A kind of transform that the engine stacks. A new one is a file with such a class, and a layer of a scenario."""
 
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
         """The transform for this motion; None where the scenario has it switched off.

@@ -38,6 +38,7 @@ from dt_viz.slices import Slice
 from dt_viz.solved import Solved
 from dt_viz.solving import FINE, LIVE, Precision, Solution, cut_off, solve
 from dt_viz.stacking import WHOLE_ARM, levels
+from dt_viz.starts import followed
 from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
 from dt_viz.turns import Turns
@@ -376,7 +377,7 @@ class Engine:
             stage=Stage.ROLLOUTS,
             ghost=ground.paths,
             rollouts=shown.paths,
-            chosen=ground.rollout(scenario.arm_rollout),
+            chosen=ground.rollout(followed(scenario, ground.num_demonstrated)),
             times=shown.split(stack.rays.times(index, fraction)),
             levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
             level=_level(scenario, stack),

@@ -160,8 +160,7 @@ class Ground:
         return tuple(number for number in range(total) if number not in self.left_out)
 
     def rollout(self, number: int) -> int | None:
-        """Which rollout begins at the start of this number, counted round; None if it has none."""
-        number %= len(self.strands) + len(self.left_out)
+        """Which rollout begins at the start of this number; None if it has none."""
         return self.numbers.index(number) if number in self.numbers else None
 
     def only(self, rollouts: Sequence[int] | Indices, doubts: Sequence[str] = ()) -> Ground:

@@ -90,7 +90,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
 
 
 def followed(scenario: Scenario, num_demonstrated: int) -> int:
-    """Which rollout the arm follows, less than there are: the same one when starts are added."""
+    """Number of the start whose rollout the arm follows, counted round: the same one when starts are added."""
     return scenario.arm_rollout % (num_demonstrated + len(scenario.starts))
 
 

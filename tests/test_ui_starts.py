@@ -79,10 +79,10 @@ def test_starts_are_added_up_to_a_limit_apart_from_each_other_and_moved(initial)
 def test_the_arm_follows_the_same_rollout_when_starts_are_added(engine, initial, arm_rollout):
     """Also where the scenario counts round, as after starts have gone."""
     scenario = replace(initial("draw_s"), arm_rollout=arm_rollout)
-    before = engine._ground(scenario, None).rollout(scenario.arm_rollout)
+    before = next(engine.frames(scenario)).chosen
     added = with_start(scenario, np.array([0.1, -0.5, 0.4]))
     after = replace(scenario, starts=added, arm_rollout=followed(scenario, 7))
-    assert engine._ground(after, None).rollout(after.arm_rollout) == before < 7
+    assert next(engine.frames(after)).chosen == before < 7
     assert followed(after, 7) == before
 
 
