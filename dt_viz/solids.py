@@ -35,6 +35,8 @@ WALK_CELLS = 1.0
 """Longest such step, in cells of the grid."""
 NUM_PROBES = 100_000
 """Points at which the slope is looked at."""
+BLOCK = 2048
+"""Points that a grid is evaluated at at once: of more, what is worked out on the way leaves the cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,31 +153,36 @@ class DistanceGrid:
 
     def _evaluate(self, s: Array, *, slopes: bool) -> tuple[Array, Array]:
         """Values (N,), and gradients (N, 3) where they are wanted."""
-        shape = np.array(self.values.shape)
-        t = (s - self.origin) / self.cell
+        if len(s) > BLOCK:
+            blocks = [self._evaluate(s[i : i + BLOCK], slopes=slopes) for i in range(0, len(s), BLOCK)]
+            values, gradients = zip(*blocks, strict=True)
+            return np.concatenate(values), np.concatenate(gradients)
+        shape = np.array(self.values.shape)[:, None]
+        t = (s.T - self.origin[:, None]) / self.cell  # the batch last, for long inner loops
         clipped = np.minimum(np.maximum(t, 0.5), shape - 1.5)
         node = np.minimum((clipped + 0.5).astype(np.intp), shape - 2)
         f = clipped - node  # from −1/2 to 1/2
         flat, around = self._coefficients
-        first = (node[:, 0] * shape[1] + node[:, 1]) * shape[2] + node[:, 2]
-        block = flat[first[:, None] + around].reshape(-1, 9, 3).astype(float)
-        weights = np.stack([0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2], axis=-1)  # (N, 3 axes, 3)
-        along_z = np.einsum("nab,nb->na", block, weights[:, 2]).reshape(-1, 3, 3)
-        along_yz = np.einsum("nab,nb->na", along_z, weights[:, 1])
-        value = np.einsum("na,na->n", along_yz, weights[:, 0])
+        first = (node[0] * shape[1] + node[1]) * shape[2] + node[2]
+        block = flat.take(first + around[:, None]).astype(float).reshape(3, 3, 3, -1)  # (x, y, z, N)
+        weights = np.stack([0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2])  # (3, 3 axes, N)
+        along_z = np.einsum("xyzn,zn->xyn", block, weights[:, 2])
+        along_yz = np.einsum("xyn,yn->xn", along_z, weights[:, 1])
+        value = np.einsum("xn,xn->n", along_yz, weights[:, 0])
         slope = np.empty((0, 3))
         if slopes:
-            rates = np.stack([f - 0.5, -2 * f, f + 0.5], axis=-1) / self.cell
-            rate_z = np.einsum("nab,nb->na", block, rates[:, 2]).reshape(-1, 3, 3)
+            rates = np.stack([f - 0.5, -2 * f, f + 0.5]) / self.cell
+            rate_y = np.einsum("xyn,yn->xn", along_z, rates[:, 1])
+            rate_z = np.einsum("xyn,yn->xn", np.einsum("xyzn,zn->xyn", block, rates[:, 2]), weights[:, 1])
             columns = [
-                np.einsum("na,na->n", along_yz, rates[:, 0]),
-                np.einsum("nab,nb,na->n", along_z, rates[:, 1], weights[:, 0]),
-                np.einsum("nab,nb,na->n", rate_z, weights[:, 1], weights[:, 0]),
+                np.einsum("xn,xn->n", along_yz, rates[:, 0]),
+                np.einsum("xn,xn->n", rate_y, weights[:, 0]),
+                np.einsum("xn,xn->n", rate_z, weights[:, 0]),
             ]
             slope = np.stack(columns, axis=-1)
-        outside = np.flatnonzero((t != clipped).any(axis=1))
+        outside = np.flatnonzero((t != clipped).any(axis=0))
         if len(outside):
-            self._extend((t - clipped) * self.cell, value, slope, outside)
+            self._extend((t - clipped).T * self.cell, value, slope, outside)
         self._raise_to_ball(s, value, slope)
         return value, slope
 
