@@ -286,7 +286,12 @@ class Engine:
         yield frame
         if kept.health is None:
             with _in_turn(checkpoint):
-                kept.health = self._certified(frame, fine)
+                health = self._certified(frame, fine)
+            if frame.arm is not None:
+                with interruptible(checkpoint):  # out of turn: the first time it prepares meshes for seconds
+                    report = load_collision_model().report(frame.arm.q, scenario.obstacle)
+                health = replace(health, collision=report)
+            kept.health = health
         yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
 
     def _certified(self, frame: Frame, fine: Solved) -> Health:
@@ -302,8 +307,6 @@ class Engine:
             q = self._follower.whole_arm.limits.inside(arm.q)
             health = health.doubting(*fold_doubts(WHOLE_ARM, arm.transform, integration, arm.p, q))
             health = certified_arm(health, stack.system, arm, self._robot, q if integration.by_hand else None)
-        if frame.arm is not None:
-            health = replace(health, collision=load_collision_model().report(frame.arm.q, obstacle))
         return health
 
     def _stages_without_motion(

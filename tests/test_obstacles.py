@@ -156,6 +156,14 @@ def test_the_distance_of_complex_points_is_that_of_their_real_part(obstacle):
 
 
 @obstacles
+def test_a_distance_does_not_depend_on_how_many_are_asked_for(obstacle):
+    """More than are worked out at once, or one."""
+    points = around(obstacle, 5000)
+    together = obstacle.signed_distance(points)
+    for k in (0, 1, 2047, 2048, 4999):
+        np.testing.assert_allclose(obstacle.signed_distance(points[k : k + 1]), together[k : k + 1], rtol=0, atol=1e-12)
+
+
 def test_the_nearest_free_place_is_free_and_near(obstacle):
     inside = within(obstacle, 200)
     moved = obstacle.nearest_free(inside)
