@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from dt_viz.bias import vector
 from dt_viz.obstacles import Box, Sphere
-from dt_viz.several import Several
+from dt_viz.several import ROUNDING, Several
 
 PARTS = (
     Sphere((0.0, 0.0, 0.0), 0.15),
@@ -26,9 +29,27 @@ def test_the_distance_is_that_of_the_nearest_part(points):
 
 def test_what_is_moved_out_is_outside_of_all(points):
     free = Several(PARTS).nearest_free(points)
-    assert Several(PARTS).signed_distance(free).min() > -1e-3
+    assert Several(PARTS).signed_distance(free).min() >= -ROUNDING
     outside = Several(PARTS).signed_distance(points) > 0
     np.testing.assert_array_equal(free[outside], points[outside])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 4))
+def test_it_is_moved_hardly_farther_than_to_the_nearest_place(seed, num):
+    """Also where two spheres hardly overlap, and where leaving one leads deeper into the next."""
+    rng = np.random.default_rng(seed)
+    spheres = [Sphere(vector(rng.normal(0, 0.05, 3)), float(rng.uniform(0.08, 0.2))) for _ in range(num)]
+    together, directions = Several(tuple(spheres)), rng.normal(size=(3000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    surfaces = np.concatenate([sphere.position + sphere.radius * directions for sphere in spheres])
+    surface = surfaces[together.signed_distance(surfaces) >= -ROUNDING]
+    points = rng.normal(0, 0.05, (50, 3))
+    points = points[together.signed_distance(points) < 0]
+    free = together.nearest_free(points)
+    assert (together.signed_distance(free) >= -ROUNDING).all()
+    moved = np.linalg.norm(free - points, axis=1)
+    nearest = np.linalg.norm(surface - points[:, None], axis=-1).min(axis=1)
+    assert (moved < 1.1 * nearest + 0.002).all()
 
 
 @pytest.mark.parametrize("parts", [PARTS, PARTS[:2], PARTS[2:], PARTS[:1]])
