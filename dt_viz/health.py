@@ -13,7 +13,7 @@ from dt_viz.fields import Array, Indices
 from dt_viz.integration import Integration
 from dt_viz.robot import Robot
 from dt_viz.rollouts import Bundle
-from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.systems import Attractor, DiffeomorphicSystem
 from dt_viz.whole_arm import ArmSolution
 
 MAX_ROUND_TRIP = 1e-6
@@ -24,7 +24,7 @@ NUM_CHECKED_POSTURES = 200
 """The same for the whole arm."""
 NUM_CHECKED_LIVE = 300
 """The same for what an integrator costs that was chosen by hand."""
-FOLDS, THERE_AND_BACK = "folds space", "there and back"
+FOLDS, THERE_AND_BACK, RISES = "folds space", "there and back", "the Lyapunov value does not fall all the way"
 """Words of the doubts that name a cause; certificates that fail for it do not repeat them."""
 
 
@@ -78,7 +78,7 @@ def certified(health: Health, system: DiffeomorphicSystem, bundle: Bundle, drawn
     y, (z, J) = bundle.positions[keep], system.transform.jacobian(bundle.positions[keep])
     det = _determinant(system.transform, J, None if drawn_from is None else drawn_from[keep])
     round_trip = float(np.linalg.norm(system.transform.inverse(z) - y, axis=1).max())
-    falls = _falls(system.base.potential(z), bundle.index[keep])
+    falls = _falls(system.base.potential(z), bundle.index[keep], system.base)
     return _judged(health, det, round_trip, falls)
 
 
@@ -98,7 +98,8 @@ def certified_arm(
     p, (q, J) = arm.p[keep], arm.transform.jacobian(arm.p[keep])
     det = _determinant(arm.transform, J, None if drawn_from is None else drawn_from[keep])
     round_trip = float(np.linalg.norm((arm.transform.inverse(q) - p) * LEVERS, axis=1).max())
-    falls = _falls(system.lyapunov(robot.end_effector(arm.q)), arm.index)  # of all: samples far apart hide a rise
+    potential = system.lyapunov(robot.end_effector(arm.q))  # of all samples: those far apart hide a rise
+    falls = _falls(potential, arm.index, system.base)
     return _judged(health, det, round_trip, falls)
 
 
@@ -125,7 +126,7 @@ def integration_doubts(
     doubts = fold_doubts(name, flow, integration, y[keep], x[keep]) if isinstance(flow, Flow) else ()
     if lost <= MAX_ROUND_TRIP:
         return doubts
-    loses = f"loses {_millimetres(lost)} {THERE_AND_BACK}"
+    loses = f"loses {in_millimetres(lost)} {THERE_AND_BACK}"
     return tuple(f"{doubt}. It {loses}" for doubt in doubts) or (f"{name}: {integration} {loses}",)
 
 
@@ -166,13 +167,13 @@ def _judged(health: Health, det: float, round_trip: float, falls: bool) -> Healt
 
     Where a step is known to fold space, that the Lyapunov value does not fall is none.
     """
-    caused = health.says(FOLDS)
-    if not det > 0 and not health.says(FOLDS):
+    folds = health.says(FOLDS)
+    if not (det > 0 or folds):
         health = health.doubting(f"det J falls to {det:.2g}: the map {FOLDS}, the stack is no diffeomorphism there")
     if not round_trip <= MAX_ROUND_TRIP and not health.says(THERE_AND_BACK):
         health = health.doubting(f"{THERE_AND_BACK} again misses by {1e3 * round_trip:.3g} mm: steps too coarse")
-    if not (falls or caused):
-        health = health.doubting("the Lyapunov value does not fall all the way")
+    if not (falls or folds or health.says(RISES)):
+        health = health.doubting(RISES)
     return replace(
         health,
         min_det_jacobian=min(det, np.inf if health.min_det_jacobian is None else health.min_det_jacobian),
@@ -181,12 +182,13 @@ def _judged(health: Health, det: float, round_trip: float, falls: bool) -> Healt
     )
 
 
-def _falls(potential: Array, index: Indices) -> bool:
-    """Whether the potential falls strictly between neighbouring samples of the same rollout."""
+def _falls(potential: Array, index: Indices, base: Attractor) -> bool:
+    """Whether the potential falls strictly between neighbouring samples of the same rollout, until that has arrived."""
     same = np.diff(index) == 0
-    return bool((np.diff(potential)[same] < 0).all())
+    arrived = potential[1:] <= base.potential(base.goal + MAX_ROUND_TRIP * np.eye(base.dim)[0])  # the rest is rounding
+    return bool((arrived | (np.diff(potential) < 0))[same].all())
 
 
-def _millimetres(length: float) -> str:
+def in_millimetres(length: float) -> str:
     """A length in metres, in words."""
     return f"{1e3 * length:.0f} mm" if length >= 0.01 else f"{1e3 * length:.2g} mm"

@@ -65,14 +65,22 @@ def test_a_bad_round_trip_is_recognised_and_measured():
     assert health.doubts[0] == "said before"
 
 
-def test_a_motion_that_turns_back_is_recognised():
+def test_a_motion_that_turns_back_is_recognised_and_said_once():
     there = np.linspace(0, 1, 100)
     fraction = np.concatenate([there[:60], there[40:]])
     index = np.zeros(len(fraction), dtype=int)
     bundle = Bundle(index, fraction, RAYS.at(index, fraction)[:, None])
     health = certify(Identity(3), bundle)
     assert health.lyapunov_falls is False
-    assert "the Lyapunov value does not fall all the way" in health.doubts
+    assert health.doubts == (*CLEAR.doubts, "the Lyapunov value does not fall all the way")
+    assert certified(health, DiffeomorphicSystem(Identity(3), BASE), bundle).doubts == health.doubts
+
+
+@pytest.mark.parametrize(("distance", "arrived"), [(1e-7, True), (1e-5, False)])
+def test_only_within_rounding_of_the_goal_a_motion_need_not_fall(distance, arrived):
+    away = distance * np.outer([0.9, 1.0], [1.0, 0.0, 0.0])
+    bundle = Bundle(np.zeros(2, dtype=int), np.array([0.0, 1.0]), (BASE.goal + away)[:, None])
+    assert certify(Identity(3), bundle).lyapunov_falls is arrived
 
 
 def test_a_motion_that_stands_still_does_not_fall_strictly():
