@@ -27,6 +27,14 @@ ROUNDING = 1e-6
 """Metres that do not count: a motion may end on the surface."""
 ACCEPTED_MARGIN = 0.9
 """Part of the margin that a sample between the checked ones may keep."""
+BESIDE = 1e-3
+"""Metres inside that still are beside the obstacle where its surface is only nearly known, and by which a motion may go
+deeper than its covered start before that counts."""
+TAIL = 2.0
+"""Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
+place: such a path arrives at up to 60° from the straight way out."""
+GOAL_INSIDE, STAYS_INSIDE = "the goal is inside the obstacle", "a motion does not leave the obstacle"
+"""Words of the doubts that name a cause; what follows from it is not said again."""
 
 
 class ObstacleAvoidance:
@@ -41,9 +49,7 @@ class ObstacleAvoidance:
         field = obstacle.field(scenario.generator, scenario.temperature)
         num_demonstrated = len(motion.demonstrated.starts)
         doubts = named_starts(np.flatnonzero(_blocked(motion)), num_demonstrated, "inside the obstacle")
-        if obstacle.signed_distance(motion.goal) < 0:
-            doubts.append("the goal is inside the obstacle: motions end beside it")
-        duration = scenario.duration
+        duration, hopeless = scenario.duration, False
         if duration is None:
             # the deepest samples leave last, or nearly so; where they did not tell the whole story, take all
             depth = np.where(_avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
@@ -52,16 +58,21 @@ class ObstacleAvoidance:
             else:
                 points = np.concatenate([_deepest(motion, depth), _crests(motion, depth, field)])
             duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
-        # where the exact flow is clear for longer already, more time is not what a coarse one lacks
-        hopeless = duration is None or (scenario.integration.by_hand and 0 < duration <= at_least)
-        if duration is None:
-            duration = MAX_DURATION
-            doubts.append(
-                "a motion does not leave the obstacle: "
-                + ("∇p is flat inside it" if scenario.generator == "probability" else "it runs through its dead centre")
-            )
+            # where the exact flow is clear for longer already, more time is not what a coarse one lacks
+            hopeless = duration is None or (scenario.integration.by_hand and 0 < duration <= at_least)
+            if duration is None:
+                duration = MAX_DURATION
+                carried, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
+                if obstacle.signed_distance(carried).min() < 0:
+                    flat = scenario.generator == "probability"
+                    why = "∇p is flat inside it" if flat else "it runs through its dead centre"
+                    doubts.append(f"{STAYS_INSIDE}: {why}")
         flow = scenario.integration.of(AdaptiveFlow(field, duration, tolerance))
         goal = _goal(motion) if motion.keeps_goal else flow.inverse(motion.goal)
+        if obstacle.signed_distance(motion.goal) < 0:
+            inside = -float(obstacle.signed_distance(goal))
+            end = "end beside it" if inside < BESIDE else f"end {1e3 * inside:.0f} mm deep in it"
+            doubts.append(f"{GOAL_INSIDE}: motions {end}")
         return Built(flow, duration, goal, hopeless, tuple(doubts), scenario.integration)
 
     def satisfied(self, motion: Motion) -> bool:
@@ -70,6 +81,17 @@ class ObstacleAvoidance:
             return True
         distance = motion.scenario.obstacle.signed_distance(motion.positions[_avoidable(motion)])
         return bool((distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING).all())
+
+
+def smallest_kept(motion: Motion) -> float:
+    """Smallest distance from the obstacle of what a transform can keep out of it, metres, negative inside.
+
+    Where a start is covered, what is deeper than it counts, too. Infinite if nothing counts.
+    """
+    obstacle = motion.scenario.obstacle
+    distance, at_start = obstacle.signed_distance(motion.positions), obstacle.signed_distance(motion.starts)
+    deeper = (at_start < 0)[motion.index] & (distance < at_start[motion.index] - BESIDE)
+    return float(distance[_avoidable(motion) | deeper].min(initial=np.inf))
 
 
 def _goal(motion: Motion) -> Array:
@@ -119,13 +141,14 @@ def _crests(motion: Motion, depth: Array, field: VectorField) -> Array:
 def _avoidable(motion: Motion) -> Mask:
     """(N,) bool: samples that a transform can keep out of the obstacle.
 
-    Not the first ones of a motion that starts inside it, until it keeps the margin, and not the last ones if it covers
-    the goal.
+    Not the first ones of a motion that starts inside it, until it keeps the margin. If it covers the goal, not the last
+    ones either, as near to the end as the way to where motions end instead is short.
     """
     obstacle = motion.scenario.obstacle
     distance = obstacle.signed_distance(motion.positions)
     free, clear = distance >= -ROUNDING, distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING
     goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
+    instead = _goal(motion) if goal_covered else motion.goal
     avoidable = np.ones(len(free), dtype=bool)
     for rollout, blocked in enumerate(_blocked(motion)):
         if not (blocked or goal_covered):
@@ -135,7 +158,11 @@ def _avoidable(motion: Motion) -> Mask:
         if blocked:
             avoidable[rows[: outside[0] if len(outside) else None]] = False
         if goal_covered:
-            avoidable[rows[outside[-1] + 1 if len(outside) else 0 :]] = False
+            path = motion.positions[rows]
+            to_end = np.append(np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)[::-1])[::-1], 0)
+            tail = to_end <= TAIL * np.linalg.norm(path[-1] - instead) + BESIDE
+            tail[: outside[-1] + 1 if len(outside) else 0] = False
+            avoidable[rows[tail]] = False
     return avoidable
 
 

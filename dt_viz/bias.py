@@ -49,6 +49,8 @@ OVERSHOOT = 2.0
 STEP = 2.2
 """Flow time of a step of the flow, for each fourth root of a metre of tolerance. The field is mild everywhere, so RK4
 with equal steps is quicker here than steps of each point's own length, and there and back it errs less."""
+OFF_PLANE = "before or behind the plane"
+"""Words of the doubt that a point of a drawing lies there; that motions miss it by so much is not said again."""
 SHOULDER = (0.0, 0.0, 0.28)
 """Of the arm, metres."""
 REACH = 0.95
@@ -199,7 +201,7 @@ class Biasing:
             doubts.append(_too_small(radius, distance))
         elif point.strength is None and at_least > LONG and at_end.any() and not point.moves_goal:
             hopeless = True  # its ends stay where they are, and no other place of it will be nearer
-            doubts.append("a motion has its start or goal nearer to the bias point than its way: it is not led there")
+            doubts.append("a motion has its start or goal nearer to the point than its way: it is not led there")
         flow = Flow(field, duration, max(1, math.ceil(duration / (STEP * tolerance**0.25))), sparse=True)
         flow = point.integration.of(flow)
         goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
@@ -234,29 +236,25 @@ class Biasing:
         point, doubts = self.point, []
         position = np.asarray(point.position)
         if np.linalg.norm(point.offsets(motion.goal)) < ACCEPTED:
-            doubts.append("the bias point is on the goal: the motions end there anyway")
+            doubts.append("the point is on the goal, where the motions end anyway")
         if (np.linalg.norm(point.offsets(motion.starts), axis=1) < ACCEPTED).any():
-            doubts.append("the bias point is on a start: the motion is there anyway")
+            doubts.append("the point is on a start, where the motion is anyway")
         if position[2] < 0:
-            doubts.append("the bias point is below the table")
+            doubts.append("the point is below the table")
         away = float(np.linalg.norm(position - SHOULDER))
         if away > REACH:
-            doubts.append(f"the bias point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m")
+            doubts.append(f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m")
         depth = float(np.abs((nearest - position) @ point.axes()[:, 2]).max()) if point.plane else 0.0
         if depth > ACCEPTED:
-            doubts.append(
-                f"the bias point lies {100 * depth:.0f} cm before or behind the plane: motions are not led to it"
-            )
+            doubts.append(f"the point lies {100 * depth:.0f} cm {OFF_PLANE}: motions are not led to it")
         if any(np.linalg.norm(point.offsets(np.asarray(other))) < 0.9 * radius for other in self.below):
-            doubts.append("a bias region covers the target of another one below: motions are pulled away from that")
+            doubts.append("the region covers a bias point below it in the stack: motions are pulled away from that")
         return doubts
 
 
 def _too_small(radius: float, distance: float) -> str:
     """What there is to say of a region from which not all motions arrive."""
-    sizes = (
-        f"the bias region of {100 * radius:.0f} cm is too small: a motion is {100 * distance:.0f} cm from the target"
-    )
+    sizes = f"the region of {100 * radius:.0f} cm is too small: a motion is {100 * distance:.0f} cm from the target"
     return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
 
 

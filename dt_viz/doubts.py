@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, takewhile
 
 import numpy as np
 
-from dt_viz.avoidance import ObstacleAvoidance
+from dt_viz.avoidance import GOAL_INSIDE, ROUNDING, STAYS_INSIDE, smallest_kept
 from dt_viz.behaviours import Motion
-from dt_viz.bias import Biasing
+from dt_viz.bias import OFF_PLANE, Biasing
 from dt_viz.cspace import LEVERS
 from dt_viz.ground import Ground, named_starts
-from dt_viz.health import integration_doubts
+from dt_viz.health import in_millimetres, integration_doubts
 from dt_viz.robot import Robot
 from dt_viz.solved import Solved
 from dt_viz.solving import Solution
-from dt_viz.stacking import WHOLE_ARM, levels
+from dt_viz.stacking import WHOLE_ARM
 
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
@@ -38,6 +38,7 @@ def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str,
     integration = _of_integration(solved)
     if scenario.warp < 1:  # what does not do yet what it is made for has not failed
         return (*doubts, *integration, *ground.doubts)
+    covered = any(GOAL_INSIDE in doubt for doubt in doubts)
     if arm is not None:
         if not arm.cleared:
             doubts.append(
@@ -49,17 +50,36 @@ def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str,
         doubts += named_starts(numbers[arm.too_near], num, "without a way around the obstacle for the arm")
         beside = np.setdiff1d(arm.moved, arm.too_near)
         doubts += named_starts(numbers[beside], num, "so near to the obstacle that the arm begins elsewhere")
-    elif scenario.avoidance and clearance < 0 and not doubts:
-        doubts.append(f"a motion enters the obstacle by {-1e3 * clearance:.0f} mm")
-    elif any(isinstance(layer, ObstacleAvoidance) for layer in stack.unsatisfied) and not doubts:
-        doubts.append(f"a motion keeps only {1e3 * clearance:.1f} mm from the obstacle")
-    if not stack.doubts:
-        missed_by = [layer.name for layer in scenario.layers if layer.behaviour in stack.unsatisfied]
-        doubts += [f"{name or 'a layer'}: not every motion does what it asks for" for name in missed_by]
+    else:
+        doubts += _of_clearance(solved, clearance)
+    for applied in stack.unsatisfied:
+        if applied.place is not None and not (applied.made.hopeless and applied.made.doubts):
+            doubts.append(f"{applied.name or 'a layer'}: not every motion does what it asks for")
     doubts += integration
-    if missed > MAX_GOAL_MISS and not doubts and not _moves_goal(ground, stack):
-        doubts.append(f"the obstacle leaves no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
+    if missed > MAX_GOAL_MISS and not covered and not _moves_goal(ground, stack):
+        # what an integrator loses there and back it loses at the goal, too
+        cause = "" if integration else "the obstacle leaves no way to the goal: "
+        doubts.append(f"{cause}motions end {1e3 * missed:.0f} mm beside {'it' if cause else 'the goal'}")
     return (*doubts, *ground.doubts)
+
+
+def _of_clearance(solved: Solved, clearance: float) -> tuple[str, ...]:
+    """What there is to say of how near the end effector comes to the obstacle that it avoids, in words."""
+    avoidance = solved.stack.at(None)
+    if avoidance is None or (clearance >= 0 and avoidance.satisfied):
+        return ()
+    ground, bundle = solved.ground, solved.stack.bundle
+    below = takewhile(lambda applied: applied is not avoidance, solved.stack.built)
+    *_, goal = ground.goal, *(applied.made.goal for applied in below)
+    kept = smallest_kept(Motion(solved.scenario, ground.starts, goal, bundle.index, bundle.positions))
+    if kept < -ROUNDING:
+        said = any(STAYS_INSIDE in doubt for doubt in avoidance.doubts)
+        return () if said else (f"a motion enters the obstacle by {in_millimetres(-kept)}",)
+    if avoidance.satisfied:
+        return ()
+    far = avoidance.made.hopeless and not avoidance.made.integration.by_hand
+    why = ": the field does not reach farther; a higher T or a smaller margin helps" if far else ""
+    return (f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle{why}",)
 
 
 def target_doubts(solved: Solved, robot: Robot) -> tuple[str, ...]:
@@ -74,20 +94,16 @@ def target_doubts(solved: Solved, robot: Robot) -> tuple[str, ...]:
         scenario, ground.starts, ground.goal, bundle.index, positions, num_demonstrated=ground.num_demonstrated
     )
     doubts = []
-    for layer in scenario.layers:
-        bias = layer.behaviour
-        if (
-            not layer.on
-            or not isinstance(bias, Biasing)
-            or bias in stack.unsatisfied
-            or bias.point.strength is not None
-        ):
+    for applied in stack.built:
+        bias = applied.behaviour
+        if not isinstance(bias, Biasing) or not applied.satisfied or bias.point.strength is not None:
             continue
-        in_space = replace(bias, point=replace(bias.point, plane=None))
-        missed = float(in_space.distances(motion).max())
+        if not any(OFF_PLANE in doubt for doubt in applied.doubts):
+            bias = replace(bias, point=replace(bias.point, plane=None))
+        missed = float(bias.distances(motion).max())
         if missed > MAX_TARGET_MISS:
-            who = "a motion" if arm is None else "the arm"
-            doubts.append(f"{layer.name}: {who} gives way to the obstacle and passes {1e3 * missed:.0f} mm from it")
+            who, does = "a motion" if arm is None else "the arm", "ends" if bias.point.moves_goal else "passes"
+            doubts.append(f"{applied.name}: {who} gives way to the obstacle and {does} {1e3 * missed:.0f} mm from it")
     return tuple(doubts)
 
 
@@ -95,10 +111,9 @@ def _of_integration(solved: Solved) -> tuple[str, ...]:
     """What the integrators cost that were chosen by hand, in words."""
     scenario, stack, arm = solved.scenario, solved.stack, solved.arm
     doubts, bundle = [], stack.bundle
-    for level, (name, (_, made)) in enumerate(zip(levels(scenario)[1:], stack.built, strict=True), 1):
-        doubts += integration_doubts(
-            name, made.transform, made.integration, bundle.levels[:, level], bundle.levels[:, level - 1]
-        )
+    for level, applied in enumerate(stack.built, 1):
+        y, x, made = bundle.levels[:, level], bundle.levels[:, level - 1], applied.made
+        doubts += integration_doubts(applied.name, made.transform, made.integration, y, x)
     if arm is not None:
         doubts += integration_doubts(WHOLE_ARM, arm.transform, scenario.integration, arm.p, arm.q, LEVERS)
     return tuple(doubts)
@@ -106,6 +121,6 @@ def _of_integration(solved: Solved) -> tuple[str, ...]:
 
 def _moves_goal(ground: Ground, stack: Solution) -> bool:
     """Whether some behaviour other than avoidance means to end elsewhere."""
-    goals = [ground.goal, *(made.goal for _, made in stack.built)]
+    goals = [ground.goal, *(applied.made.goal for applied in stack.built)]
     moves = (bool(np.any(a != b)) for a, b in pairwise(goals))
-    return any(m and not isinstance(layer, ObstacleAvoidance) for m, (layer, _) in zip(moves, stack.built, strict=True))
+    return any(m and applied.place is not None for m, applied in zip(moves, stack.built, strict=True))

@@ -11,8 +11,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from dt_viz.avoidance import ObstacleAvoidance
-from dt_viz.behaviours import Behaviour
 from dt_viz.belief import occupancy_picture
 from dt_viz.collision import load_collision_model
 from dt_viz.diffeo import Flow
@@ -296,7 +294,7 @@ class Engine:
 
     def _certified(self, frame: Frame, fine: Solved) -> Health:
         obstacle, stack, arm = frame.scenario.obstacle, fine.stack, fine.arm
-        by_hand = any(made.integration.by_hand for _, made in stack.built)
+        by_hand = any(applied.made.integration.by_hand for applied in stack.built)
         drawn_from = stack.rays.at(stack.bundle.index, stack.bundle.fraction) if by_hand else None
         health = certified(frame.health, stack.system, stack.bundle, drawn_from)
         if arm is None:
@@ -372,7 +370,7 @@ class Engine:
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
         doubts = motion_doubts(solved, clearance, float(np.linalg.norm(reached - ground.goal)))
-        if scenario.avoidance and scenario.obstacles and scenario.warp == 1 and not stack.doubts:
+        if scenario.avoidance and scenario.obstacles and scenario.warp == 1:
             doubts += target_doubts(solved, self._robot)
         return Frame(
             scenario=scenario,
@@ -389,13 +387,13 @@ class Engine:
             blocked=(),
             health=Health(
                 clearance=clearance,
-                duration=stack.avoidance_duration,
-                layer_durations=tuple(stack.duration_of(layer.behaviour) for layer in scenario.layers),
+                duration=stack.duration_at(None),
+                layer_durations=tuple(stack.duration_at(place) for place in range(len(scenario.layers))),
                 arm_duration=arm.duration if arm else None,
                 doubts=doubts,
             ),
             learned_steps=_learned_steps(ground),
-            layer_radii=tuple(_region_radius(stack, layer.behaviour) for layer in scenario.layers),
+            layer_radii=tuple(_region_radius(stack, place) for place in range(len(scenario.layers))),
         )
 
     def _with_arm(self, frame: Frame, solved: Solved, *, exact: bool) -> Frame:
@@ -474,9 +472,10 @@ def _learned_steps(ground: Ground) -> tuple[int, ...]:
     return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
 
 
-def _region_radius(stack: Solution, behaviour: Behaviour) -> float | None:
-    """Radius of the region that a behaviour acts in, if it is on and has one."""
-    flow = next((made.transform for layer, made in stack.built if layer == behaviour), None)
+def _region_radius(stack: Solution, place: int) -> float | None:
+    """Radius of the region that the layer at a place acts in, if it is on and has one."""
+    applied = stack.at(place)
+    flow = applied.made.transform if applied else None
     return flow.field.scale if isinstance(flow, Flow) and isinstance(flow.field, PlacedField) else None
 
 
@@ -493,14 +492,14 @@ def _pictures(scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
     level = _level(scenario, stack)
     built = stack.built[:level]
     system = stack.system if level is None else cut_off(ground, stack, level)
-    clearance = _clearance(scenario, avoided=any(isinstance(behaviour, ObstacleAvoidance) for behaviour, _ in built))
+    clearance = _clearance(scenario, avoided=any(applied.place is None for applied in built))
     field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
     return Pictures(
         field=field,
         streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
         colour=colour,
         generator=book.generator(area, view.generator_layer) if view.generator else None,
-        grid=book.grid(area, [made.transform for _, made in built], coarse=coarse) if view.grid else None,
+        grid=book.grid(area, [applied.made.transform for applied in built], coarse=coarse) if view.grid else None,
         base=book.base(stack.rays) if view.base else None,
         occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
     )

@@ -13,7 +13,8 @@ from dt_viz.diffeo import Chain, Diffeomorphism
 from dt_viz.fields import Array, Indices
 from dt_viz.ground import Ground
 from dt_viz.rollouts import Bundle, Rays, refined
-from dt_viz.scenario import Scenario
+from dt_viz.scenario import Layer, Scenario
+from dt_viz.stacking import AVOIDANCE
 from dt_viz.systems import DiffeomorphicSystem
 
 MAX_ATTEMPTS = 4
@@ -38,16 +39,40 @@ FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
 
 
 @dataclass(frozen=True)
+class Applied:
+    """A behaviour of a scenario that is on, as it was made."""
+
+    place: int | None
+    """Of its layer among the scenario's, which may be equal; None of the end effector's avoidance."""
+    name: str
+    """Of its layer."""
+    behaviour: Behaviour
+    made: Built
+    satisfied: bool
+    """Whether it finds in the motion what it was made for."""
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Of the behaviour, in words, that of a layer by its name."""
+        if self.place is None:
+            return self.made.doubts
+        return tuple(f"{self.name or 'a layer'}: {doubt}" for doubt in self.made.doubts)
+
+    @property
+    def may_improve(self) -> bool:
+        """Whether it is of use to try again."""
+        return not (self.satisfied or self.made.hopeless)
+
+
+@dataclass(frozen=True)
 class Solution:
     """The stack that a scenario asks for, and its rollouts."""
 
     transform: Diffeomorphism
     rays: Rays
     bundle: Bundle
-    built: tuple[tuple[Behaviour, Built], ...]
+    built: tuple[Applied, ...]
     """The behaviours that are on, from the inside out."""
-    unsatisfied: tuple[Behaviour, ...]
-    """Behaviours that do not find what they were made for."""
 
     @property
     def system(self) -> DiffeomorphicSystem:
@@ -55,18 +80,26 @@ class Solution:
         return DiffeomorphicSystem(self.transform, self.rays.base)
 
     @property
-    def doubts(self) -> tuple[str, ...]:
-        """Of the behaviours, in words."""
-        return tuple(doubt for _, made in self.built for doubt in made.doubts)
+    def unsatisfied(self) -> tuple[Applied, ...]:
+        """Those that do not find what they were made for."""
+        return tuple(applied for applied in self.built if not applied.satisfied)
 
     @property
-    def avoidance_duration(self) -> float | None:
-        """T of the end effector's avoidance, under a warp that of the full one; None where it is off."""
-        return next((made.duration for layer, made in self.built if isinstance(layer, ObstacleAvoidance)), None)
+    def doubts(self) -> tuple[str, ...]:
+        """Of the behaviours, in words."""
+        return tuple(doubt for applied in self.built for doubt in applied.doubts)
 
-    def duration_of(self, behaviour: Behaviour) -> float | None:
-        """T of the flow of a behaviour, under a warp that of the full one; None where it is off."""
-        return next((made.duration for layer, made in self.built if layer == behaviour), None)
+    def at(self, place: int | None) -> Applied | None:
+        """What was made of the layer at this place among the scenario's, None where that is off.
+
+        Place None is the end effector's avoidance.
+        """
+        return next((applied for applied in self.built if applied.place == place), None)
+
+    def duration_at(self, place: int | None) -> float | None:
+        """T of the flow of what is `at` this place, under a warp that of the full one; None where that is off."""
+        applied = self.at(place)
+        return applied.made.duration if applied else None
 
     def positions_at(self, index: Indices, fraction: Array) -> Array:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
@@ -75,7 +108,7 @@ class Solution:
 
 def cut_off(ground: Ground, solution: Solution, level: int) -> DiffeomorphicSystem:
     """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
-    stacked = [made.transform for _, made in solution.built[:level]]
+    stacked = [applied.made.transform for applied in solution.built[:level]]
     return DiffeomorphicSystem(Chain([ground.system.transform, *stacked]), solution.rays.base)
 
 
@@ -87,16 +120,15 @@ def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
     return np.stack(levels, axis=1)
 
 
-def behaviours(scenario: Scenario) -> tuple[Behaviour, ...]:
-    """What is stacked on the imitation, from the inside out, without the layers that are off."""
-    level = scenario.avoidance_level
-    below = scenario.layers if level is None else scenario.layers[:level]
-    above = scenario.layers[len(below) :]
-    return (
-        *(layer.behaviour for layer in below if layer.on),
-        ObstacleAvoidance(),
-        *(layer.behaviour for layer in above if layer.on),
-    )
+def stacked(scenario: Scenario) -> tuple[tuple[int | None, Layer], ...]:
+    """What is stacked on the imitation, from the inside out, without the layers that are off.
+
+    Each comes with its place among the scenario's layers; that of the end effector's avoidance is None.
+    """
+    order: list[tuple[int | None, Layer]] = [(place, layer) for place, layer in enumerate(scenario.layers)]
+    level = len(order) if scenario.avoidance_level is None else scenario.avoidance_level
+    order.insert(level, (None, Layer(ObstacleAvoidance(), name=AVOIDANCE)))
+    return tuple((place, layer) for place, layer in order if layer.on)
 
 
 Checkpoint = Callable[[], None]
@@ -110,7 +142,8 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
     behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not. Where
     there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
     """
-    solution, layers = None, behaviours(scenario)
+    solution, stack = None, stacked(scenario)
+    layers = [layer.behaviour for _, layer in stack]
     for keeps_goal in (True, False):
         rays, bundle = ground.rays, ground.bundle
         ends_below = ground.ends
@@ -141,15 +174,14 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
                 positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
                 bundle = replace(bundle, levels=positions[:, None])
             bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
-            stack = [ground.system.transform, *outer]
-            bundle = refined(bundle, lambda i, u, r=rays, s=stack: climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            unsatisfied = _unsatisfied(layers, built, above, bundle)
-            on = tuple((layer, made) for layer, (_, made) in zip(layers, built, strict=True) if made)
-            solution = Solution(Chain(stack), rays, bundle, on, unsatisfied)
-            if not unsatisfied or any(made.hopeless for _, made in on):
+            transforms = [ground.system.transform, *outer]
+            bundle = refined(bundle, lambda i, u, r=rays, s=transforms: climb(r.at(i, u), s)[:, 1:], precision.spacing)
+            solution = Solution(Chain(transforms), rays, bundle, _applied(stack, built, above, bundle))
+            if not any(applied.may_improve for applied in solution.built):
                 return solution
         assert solution is not None
-        if not any(isinstance(layer, ObstacleAvoidance) for layer in solution.unsatisfied):
+        avoidance = solution.at(None)
+        if avoidance is None or not avoidance.may_improve:
             break  # the goal has nothing to do with it
     assert solution is not None
     return solution
@@ -179,19 +211,17 @@ def _above(built: Sequence[Built | None]) -> tuple[Diffeomorphism | None, ...]:
     return tuple(Chain(stacked) if stacked else None for stacked in transforms)
 
 
-def _unsatisfied(
-    layers: Sequence[Behaviour],
+def _applied(
+    stack: Sequence[tuple[int | None, Layer]],
     built: Sequence[tuple[Motion, Built | None]],
     above: Sequence[Diffeomorphism | None],
     bundle: Bundle,
-) -> tuple[Behaviour, ...]:
-    """The behaviours that do not find in the bundle what they were made for."""
-    level, unsatisfied = 0, []
-    for behaviour, (motion, made), stacked in zip(layers, built, above, strict=True):
+) -> tuple[Applied, ...]:
+    """The behaviours that are on, and whether they find in the bundle what they were made for."""
+    found = []
+    for (place, layer), (motion, made), outer in zip(stack, built, above, strict=True):
         if made:
-            level += 1
-            at = {"positions": bundle.levels[:, level], "top": bundle.positions, "above": stacked}
-            after = replace(motion, index=bundle.index, **at)
-            if not behaviour.satisfied(after):
-                unsatisfied.append(behaviour)
-    return tuple(unsatisfied)
+            at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
+            satisfied = layer.behaviour.satisfied(replace(motion, index=bundle.index, **at))
+            found.append(Applied(place, layer.name, layer.behaviour, made, satisfied))
+    return tuple(found)

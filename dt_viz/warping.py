@@ -26,9 +26,12 @@ def warped(ground: Ground, full: Solution, fraction: float, precision: Precision
         fraction: s, from 0 to 1.
         precision: as it was solved with.
     """
-    built = tuple((layer, replace(made, transform=made.transform.scaled(fraction))) for layer, made in full.built)
-    outer = [made.transform for _, made in built]
-    moved = built[-1][1].goal - ground.goal if built else np.zeros_like(ground.goal)
+    outer = [applied.made.transform.scaled(fraction) for applied in full.built]
+    built = tuple(
+        replace(applied, made=replace(applied.made, transform=transform))
+        for applied, transform in zip(full.built, outer, strict=True)
+    )
+    moved = built[-1].made.goal - ground.goal if built else np.zeros_like(ground.goal)
     ends = np.concatenate([ground.starts, [ground.goal + fraction * moved]])
     below = Chain(outer).forward(ends) if outer else ends
     rays, bundle = ground.rays, ground.bundle
@@ -41,4 +44,4 @@ def warped(ground: Ground, full: Solution, fraction: float, precision: Precision
     bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
     stack = [ground.system.transform, *outer]
     bundle = refined(bundle, lambda i, u: climb(rays.at(i, u), stack)[:, 1:], precision.spacing)
-    return Solution(Chain(stack), rays, bundle, built, full.unsatisfied)
+    return Solution(Chain(stack), rays, bundle, built)

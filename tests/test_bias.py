@@ -279,10 +279,10 @@ def test_fig_8_the_object_falls_into_the_chosen_pot(ground, pot):
     assert POTS[1].catches(g.goal) and not pot.catches(g.goal)
     point = BiasPoint((pot.x, pot.y, float(g.goal[2])), moves_goal=True)
     solution = biased(g, Biasing(point))
-    (_, built), *_ = solution.built
-    assert not solution.unsatisfied and pot.catches(built.goal)
-    assert np.linalg.norm(built.goal - point.position) <= ACCEPTED
-    assert_sound(g, solution, goal=built.goal)
+    goal = solution.built[0].made.goal
+    assert not solution.unsatisfied and pot.catches(goal)
+    assert np.linalg.norm(goal - point.position) <= ACCEPTED
+    assert_sound(g, solution, goal=goal)
     assert (solution.bundle.positions[:, 2] > pot.height + 0.10).all()  # carried above the rims
 
 
@@ -304,7 +304,7 @@ def test_bias_and_avoidance_in_either_order(ground, level):
 def test_a_region_that_does_not_reach_the_motion_is_said_to_be_too_small():
     built = Biasing(BiasPoint((0.0, 0.0, 0.0), radius=0.08)).build(straight(0.12), 1e-8, 0.0)
     assert built.hopeless and built.duration == MAX_DURATION
-    assert built.doubts == ("the bias region of 8 cm is too small: a motion is 12 cm from the target",)
+    assert built.doubts == ("the region of 8 cm is too small: a motion is 12 cm from the target",)
 
 
 def test_a_region_that_hardly_reaches_the_motion_is_said_to_fade_out():
@@ -339,7 +339,7 @@ def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(ground):
     point = BiasPoint((0.0, -0.52, 0.14))
     solution = biased(g, Biasing(point), precision=LIVE)
     assert solution.unsatisfied
-    assert any("its start or goal nearer to the bias point" in doubt for doubt in solution.doubts)
+    assert any("its start or goal nearer to the point" in doubt for doubt in solution.doubts)
     for path in solution.bundle.paths:
         np.testing.assert_allclose(path[-1], g.goal, atol=1e-3)
 
@@ -347,7 +347,7 @@ def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(ground):
 def test_a_region_over_another_target_is_doubted():
     point = BiasPoint((0.0, 0.0, 0.0), radius=0.3)
     built = Biasing(point, below=((0.1, 0.1, 0.0),)).build(straight(0.1), 1e-6, 0.0)
-    assert any("covers the target of another" in doubt for doubt in built.doubts)
+    assert any("covers a bias point below it" in doubt for doubt in built.doubts)
 
 
 def test_equal_bias_points_are_equal_layers():
