@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
+from dt_viz.avoidance import GOAL_INSIDE, STAYS_INSIDE
 from dt_viz.bias import Biasing, BiasPoint
+from dt_viz.doubts import MAX_GOAL_MISS, MAX_TARGET_MISS
+from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles import Box, Cylinder, Sphere
 from dt_viz.scenario import Layer, Scenario
 
 TASK_NAMES = ("draw_s", "lift_box", "push_box")
+INSIDE = "inside the obstacle"
+BETWEEN_SAMPLES = 1e-4
+"""Metres by which a motion may be elsewhere between its samples."""
 
 
 def random_scenario(engine, seed):
@@ -57,6 +63,22 @@ def check(engine, seed):
     assert moved < 1e-3 or may_move
     assert health.min_det_jacobian > 0
     assert health.round_trip_error < 1e-6
+    assert_said(scenario, frame)
+
+
+def assert_said(scenario, frame):
+    """Whatever else is said: what goes through the obstacle, ends beside the goal or misses a bias point is."""
+    health, layers = frame.health, scenario.layers
+    if scenario.obstacles and health.clearance < -BETWEEN_SAMPLES:
+        assert any(health.says(words) for words in (INSIDE, STAYS_INSIDE, "a motion enters the obstacle"))
+    missed = np.linalg.norm(frame.reached - frame.goal)
+    if missed > MAX_GOAL_MISS and not any(layer.behaviour.point.moves_goal for layer in layers):
+        assert health.says(GOAL_INSIDE) or health.says(f"motions end {1e3 * missed:.0f} mm beside")
+    for layer in layers:
+        point = layer.behaviour.point
+        paths = [path[-1:] if point.moves_goal else resample_by_arc_length(path, 2000) for path in frame.rollouts]
+        passed = max(np.linalg.norm(path - point.position, axis=1).min() for path in paths)
+        assert passed < MAX_TARGET_MISS + BETWEEN_SAMPLES or health.says(f"{layer.name}: "), layer
 
 
 @pytest.mark.parametrize("seed", [*range(5), 1122])  # the last one is squeezed most
