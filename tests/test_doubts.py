@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dt_viz.avoidance import BESIDE
 from dt_viz.bias import Biasing, BiasPoint, vector
 from dt_viz.doubts import MAX_GOAL_MISS
 from dt_viz.engine import Stage
@@ -85,3 +86,45 @@ def test_a_hopeless_bias_point_leaves_the_obstacle_avoided(engine, seed):
     )
     assert with_it.says("Bias 1: the region of 5 cm is too small")
     assert with_it.clearance > 0.85 * min(without.clearance, 0.01)
+
+
+@pytest.mark.parametrize(("temperature", "diameter"), [(1.0, 0.04), (1.0, 0.10), (2.0, 0.06)])
+def test_a_margin_out_of_reach_is_said_with_what_is_kept_and_what_helps(engine, middle, temperature, diameter):
+    sphere = Sphere(vector(np.add(middle, (0.01, 0.005, 0.0))), diameter)
+    scenario = Scenario("draw_s", (sphere,), temperature=temperature, margin=0.05)
+    health = stage(engine, scenario).health
+    assert 0 < health.clearance < 0.05
+    (doubt,) = health.doubts
+    assert doubt.startswith(
+        f"a motion keeps only {1e3 * health.clearance:.1f} mm from the obstacle: the field does not"
+    )
+    assert stage(engine, replace(scenario, temperature=2 * temperature)).health.clearance > 1.2 * health.clearance
+    assert stage(engine, replace(scenario, margin=0.8 * health.clearance)).health.doubts == ()
+
+
+def test_a_motion_that_stays_inside_is_said_once(engine, middle):
+    health = stage(engine, Scenario("draw_s", (Sphere(middle, 0.15),), generator="probability")).health
+    assert health.clearance < 0
+    assert health.doubts == ("a motion does not leave the obstacle: ∇p is flat inside it",)
+
+
+@pytest.mark.parametrize("seed", [5, 25, 27])
+@pytest.mark.parametrize("wanted", [Stage.ROLLOUTS, Stage.FINE])
+def test_motions_to_a_goal_that_two_obstacles_cover_end_beside_both(engine, seed, wanted):
+    goal, rng = stage(engine, Scenario("draw_s", ())).goal, np.random.default_rng(seed)
+    scenario = Scenario("draw_s", tuple(Sphere(vector(goal + rng.normal(0, 0.04, 3)), 0.15) for _ in range(2)))
+    assert scenario.obstacle.signed_distance(goal) < 0
+    frame = stage(engine, scenario, wanted)
+    assert frame.health.clearance > -BESIDE
+    assert frame.health.doubts == ("the goal is inside the obstacle: motions end beside it",)
+
+
+def test_equal_layers_are_told_apart(engine, middle):
+    point = BiasPoint(vector(np.add(middle, (0.05, 0.0, 0.0))), plane=plane_of(engine.task("draw_s")))
+    layers = tuple(Layer(Biasing(point), on=on, name=name) for name, on in (("A", False), ("B", True), ("C", True)))
+    frame = stage(engine, Scenario("draw_s", (), layers=layers))
+    durations, radii = frame.health.layer_durations, frame.layer_radii
+    assert (durations[0], radii[0]) == (None, None)
+    assert durations[1] is not None and durations[1] > 0.1
+    assert durations[2] is not None and durations[2] < 0.01  # what is there already needs no flow
+    assert radii[1] is not None and radii[2] is not None
