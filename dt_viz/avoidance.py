@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dt_viz.behaviours import Built, Motion
@@ -41,7 +43,11 @@ class ObstacleAvoidance:
     """The end effector avoids the obstacle."""
 
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
-        """See `Behaviour`. With `auto` the duration is the shortest that clears all that can be cleared."""
+        """See `Behaviour`. With `auto` the duration is the shortest that clears all that can be cleared.
+
+        That is, of this motion. The ends of the next one are moved by this flow, and its duration only grows from one
+        attempt to the next: where a start or goal is close to the obstacle it may end up longer than needed.
+        """
         scenario = motion.scenario
         if not scenario.avoidance or scenario.space == "cspace" or not scenario.obstacle.parts:
             return None
@@ -84,11 +90,12 @@ class ObstacleAvoidance:
 
 
 def smallest_kept(motion: Motion) -> float:
-    """Smallest distance from the obstacle of what a transform can keep out of it, metres, negative inside.
+    """Smallest distance from the obstacle of what the stack could keep out of it, metres, negative inside.
 
-    Where a start is covered, what is deeper than it counts, too. Infinite if nothing counts.
+    Of a motion that starts inside, what is deeper than its start counts, too; of one that was to end beside a covered
+    goal, all up to its end. Infinite if nothing counts.
     """
-    obstacle = motion.scenario.obstacle
+    obstacle, motion = motion.scenario.obstacle, replace(motion, keeps_goal=False)
     distance, at_start = obstacle.signed_distance(motion.positions), obstacle.signed_distance(motion.starts)
     deeper = (at_start < 0)[motion.index] & (distance < at_start[motion.index] - BESIDE)
     return float(distance[_avoidable(motion) | deeper].min(initial=np.inf))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise, takewhile
+from itertools import pairwise
 
 import numpy as np
 
-from dt_viz.avoidance import GOAL_INSIDE, ROUNDING, STAYS_INSIDE, smallest_kept
+from dt_viz.avoidance import BESIDE, GOAL_INSIDE, ROUNDING, STAYS_INSIDE, smallest_kept
 from dt_viz.behaviours import Motion
 from dt_viz.bias import OFF_PLANE, Biasing
 from dt_viz.cspace import LEVERS
@@ -15,7 +15,7 @@ from dt_viz.ground import Ground, named_starts
 from dt_viz.health import in_millimetres, integration_doubts
 from dt_viz.robot import Robot
 from dt_viz.solved import Solved
-from dt_viz.solving import Solution
+from dt_viz.solving import Applied, Solution
 from dt_viz.stacking import WHOLE_ARM
 
 MAX_GOAL_MISS = 1e-3
@@ -69,13 +69,12 @@ def _of_clearance(solved: Solved, clearance: float) -> tuple[str, ...]:
     if avoidance is None or (clearance >= 0 and avoidance.satisfied):
         return ()
     ground, bundle = solved.ground, solved.stack.bundle
-    below = takewhile(lambda applied: applied is not avoidance, solved.stack.built)
-    *_, goal = ground.goal, *(applied.made.goal for applied in below)
-    kept = smallest_kept(Motion(solved.scenario, ground.starts, goal, bundle.index, bundle.positions))
-    if kept < -ROUNDING:
-        said = any(STAYS_INSIDE in doubt for doubt in avoidance.doubts)
+    kept = smallest_kept(Motion(solved.scenario, ground.starts, ground.goal, bundle.index, bundle.positions))
+    # where a goal is covered, what ends nearly on the surface is beside it
+    if kept < (-BESIDE if _says(avoidance, GOAL_INSIDE) else -ROUNDING):
+        said = _says(avoidance, STAYS_INSIDE)
         return () if said else (f"a motion enters the obstacle by {in_millimetres(-kept)}",)
-    if avoidance.satisfied:
+    if avoidance.satisfied or np.isinf(kept):
         return ()
     far = avoidance.made.hopeless and not avoidance.made.integration.by_hand
     why = ": the field does not reach farther; a higher T or a smaller margin helps" if far else ""
@@ -98,13 +97,18 @@ def target_doubts(solved: Solved, robot: Robot) -> tuple[str, ...]:
         bias = applied.behaviour
         if not isinstance(bias, Biasing) or not applied.satisfied or bias.point.strength is not None:
             continue
-        if not any(OFF_PLANE in doubt for doubt in applied.doubts):
+        if not _says(applied, OFF_PLANE):
             bias = replace(bias, point=replace(bias.point, plane=None))
         missed = float(bias.distances(motion).max())
         if missed > MAX_TARGET_MISS:
             who, does = "a motion" if arm is None else "the arm", "ends" if bias.point.moves_goal else "passes"
             doubts.append(f"{applied.name}: {who} gives way to the obstacle and {does} {1e3 * missed:.0f} mm from it")
     return tuple(doubts)
+
+
+def _says(applied: Applied, words: str) -> bool:
+    """Whether what there is to say of a behaviour has these words."""
+    return any(words in doubt for doubt in applied.doubts)
 
 
 def _of_integration(solved: Solved) -> tuple[str, ...]:
