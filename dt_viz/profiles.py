@@ -89,7 +89,7 @@ def _profile(path: Array, demonstration: Array, potential: Array, clearance: Arr
 
     a, b = (resample_by_arc_length(points, NUM_SAMPLES) for points in (path, demonstration))
     return Profile(
-        lyapunov=along(potential) / potential[0],
+        lyapunov=along(potential) / (potential[0] or 1.0),  # a motion from the goal has none to lose
         distance=distance_from_path(a, demonstration),
         clearance=along(clearance) if np.isfinite(clearance).all() else np.full(NUM_SAMPLES, np.inf),
         frechet=float(discrete_frechet(a, b)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,11 +131,7 @@ def stacked(scenario: Scenario) -> tuple[tuple[int | None, Layer], ...]:
     return tuple((place, layer) for place, layer in order if layer.on)
 
 
-Checkpoint = Callable[[], None]
-"""Called now and then in long computations; raises what is to end them."""
-
-
-def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: Checkpoint = lambda: None) -> Solution:
+def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
     """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
 
     A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
@@ -158,10 +154,8 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision, checkpoint: 
                 keeps_goal=keeps_goal,
                 num_demonstrated=ground.num_demonstrated,
             )
-            checkpoint()
             built = _build(layers, lowest, precision.tolerance, durations, above)
             above = _above([made for _, made in built])
-            checkpoint()
             durations = [made.duration if made else 0.0 for _, made in built]
             outer = [made.transform for _, made in built if made]
             goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
