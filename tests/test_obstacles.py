@@ -164,6 +164,7 @@ def test_a_distance_does_not_depend_on_how_many_are_asked_for(obstacle):
         np.testing.assert_allclose(obstacle.signed_distance(points[k : k + 1]), together[k : k + 1], rtol=0, atol=1e-12)
 
 
+@obstacles
 def test_the_nearest_free_place_is_free_and_near(obstacle):
     inside = within(obstacle, 200)
     moved = obstacle.nearest_free(inside)
