@@ -65,7 +65,7 @@ class PaperScene:
 
     def is_changed(self, scenario: Scenario, task: Task) -> bool:
         """Whether obstacles, layers or how they act are not the scene's any more."""
-        own, followed = self.scenario(task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
+        own, followed = _own(self.name, task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
         return not scenario.moves_like(replace(own, warp=scenario.warp, **followed))
 
 
@@ -199,3 +199,9 @@ SCENES: Mapping[str, PaperScene] = {
     )
 }
 """By name, in the order of the figures."""
+
+
+@lru_cache(maxsize=64)
+def _own(name: str, task: Task) -> Scenario:
+    """The scenario of a scene; a page asks for it with each frame."""
+    return SCENES[name].scenario(task)

@@ -626,6 +626,8 @@ def test_moving_the_slice_is_a_step_for_undo(opened):
     for _ in range(3):
         session.redo()
     assert session.scenario.view.slice == poses[2]
+    session.reset()
+    assert session.scenario.view.slice is None and session.scenario.view.grid
 
 
 def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):
@@ -687,10 +689,15 @@ def test_a_push_goes_through_the_worker_and_computes_no_frames(opened):
     assert opened.session.scenario == fresh("draw_s")  # and none is an edit
 
 
-def test_a_push_interrupts_frames_and_they_are_completed_after_it(opened):
+def busy_with(opened, gesture, **changes):
+    """Have the worker in the middle of an edit, until the gate is set."""
     opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.session.edit("grid", view=View(grid=True))  # the same motion: a push is possible
+    opened.session.edit(gesture, **changes)
     assert opened.engine.begun.wait(PATIENCE)
+
+
+def test_a_push_interrupts_frames_and_they_are_completed_after_it(opened):
+    busy_with(opened, "grid", view=View(grid=True))  # the same motion: a push is possible
     shown = push(opened)
     opened.engine.gate.set()
     opened.settle()
@@ -699,9 +706,7 @@ def test_a_push_interrupts_frames_and_they_are_completed_after_it(opened):
 
 
 def test_nothing_is_pushed_while_another_motion_is_computed_and_no_edit_is_lost(opened):
-    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
-    assert opened.engine.begun.wait(PATIENCE)
+    busy_with(opened, "obstacle", obstacles=(at(1.0),))
     opened.session.edit("obstacle", obstacles=(at(2.0),))
     shown = push(opened)
     opened.engine.gate.set()
@@ -758,9 +763,7 @@ def test_only_the_newest_place_of_several_threads_is_done_next_and_the_last_one_
 
 
 def test_frames_wait_while_the_hand_is_held_and_are_completed_when_it_is_let_go(opened):
-    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.session.edit("grid", view=View(grid=True))
-    assert opened.engine.begun.wait(PATIENCE)
+    busy_with(opened, "grid", view=View(grid=True))
     shown = []
     assert hold(opened, 1.0, shown)
     opened.engine.gate.set()
@@ -772,9 +775,7 @@ def test_frames_wait_while_the_hand_is_held_and_are_completed_when_it_is_let_go(
 
 
 def test_a_view_that_is_edited_while_the_hand_is_held_is_shown_and_loses_no_release(opened):
-    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.session.edit("grid", view=View(grid=True))
-    assert opened.engine.begun.wait(PATIENCE)
+    busy_with(opened, "grid", view=View(grid=True))
     shown = []
     hold(opened, 1.0, shown, last=True)
     opened.session.edit("grid", view=View(grid=True, base=True))  # overtakes it in the worker's slot
@@ -786,10 +787,8 @@ def test_a_view_that_is_edited_while_the_hand_is_held_is_shown_and_loses_no_rele
 
 @pytest.mark.parametrize("last", [False, True])
 def test_a_hold_that_fails_is_said_and_answered_and_the_frames_go_on(opened, last):
-    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
     opened.engine.beyond.add(9.0)
-    opened.session.edit("grid", view=View(grid=True))
-    assert opened.engine.begun.wait(PATIENCE)
+    busy_with(opened, "grid", view=View(grid=True))
     shown = []
     assert hold(opened, 9.0, shown, last=last)
     opened.engine.gate.set()
@@ -800,9 +799,7 @@ def test_a_hold_that_fails_is_said_and_answered_and_the_frames_go_on(opened, las
 
 
 def test_a_release_that_a_push_replaces_is_answered_before_the_push_is_shown(opened):
-    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.session.edit("grid", view=View(grid=True))
-    assert opened.engine.begun.wait(PATIENCE)
+    busy_with(opened, "grid", view=View(grid=True))
     shown = []
     assert hold(opened, 1.0, shown, last=True)
     opened.session.push(np.zeros(6), shown.append)
@@ -813,9 +810,7 @@ def test_a_release_that_a_push_replaces_is_answered_before_the_push_is_shown(ope
 
 
 def test_nothing_is_held_while_another_motion_is_computed(opened):
-    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
-    assert opened.engine.begun.wait(PATIENCE)
+    busy_with(opened, "obstacle", obstacles=(at(1.0),))
     shown = []
     assert not hold(opened, 1.0, shown)
     opened.engine.gate.set()

@@ -188,7 +188,7 @@ def test_the_legend_has_round_numbers_with_a_unit_that_reach_the_largest_value(l
 def test_the_legend_of_det_j_names_the_colour_of_folds():
     said = legend_of(picture_of(np.ones((4, 5)))).html
     assert all(f">{number}<" in said for number in ("0.01", "0.1", "1", "10", "100"))
-    assert "0 or less" in said and str(palette.FOLDED) in said
+    assert "0 or less" in said and palette.css(palette.FOLDED) in said
 
 
 LEGENDS = {
@@ -206,7 +206,7 @@ def test_a_saved_picture_has_the_legend_in_its_corner_and_nothing_else_is_change
     rows, columns = np.nonzero(pixels[..., 3])
     assert rows.min() > 0.8 * height and columns.max() < 0.65 * height
     assert np.asarray(blank)[..., 3].max() == 0
-    # every shade is there in its order: the row of the plate that has most of them
+    # both ends of the scale are there, the first to the left of the last
     ends = legend.scale.shades[[0, -1]].astype(int)
     found = [np.nonzero((np.abs(pixels[..., :3] - end).max(axis=-1) <= 2) & (pixels[..., 3] == 255)) for end in ends]
     assert found[0][1].min() < found[1][1].max()

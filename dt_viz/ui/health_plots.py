@@ -9,7 +9,8 @@ from viser import uplot
 from dt_viz.fields import Array
 from dt_viz.profiles import Profiles
 from dt_viz.ui import palette
-from dt_viz.ui.plots import LOOK, SMALL, columns, css
+from dt_viz.ui.palette import css
+from dt_viz.ui.plots import LOOK, SMALL, columns
 
 HEIGHT = 130
 """Of a plot, pixels."""

@@ -42,8 +42,10 @@ class Legend:
             f"transform:translateX(-50%)'>{html.escape(text)}</span>"
             for value, text in self.ticks
         )
-        swatch = f"display:inline-block;width:1.2em;height:0.7em;background:rgb{self.swatch}"
-        mark = f"<span style='{swatch}'></span> " if self.swatch else ""
+        mark = ""
+        if self.swatch:
+            look = f"display:inline-block;width:1.2em;height:0.7em;background:{palette.css(self.swatch)}"
+            mark = f"<span style='{look}'></span> "
         return (
             f"<div style='font-size:0.8em;padding:0.2em 1.6em 0.5em;line-height:1.4'>{html.escape(self.title)}"
             f"<div style='height:0.8em;border-radius:2px;background:linear-gradient(to right,{stops})'></div>"

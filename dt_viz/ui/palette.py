@@ -71,3 +71,8 @@ def linear(colour: tuple[int, int, int]) -> tuple[int, int, int]:
     """The value that shows as this colour where the browser takes colours as linear light: lines and arrows."""
     red, green, blue = (round(255 * (c / 255) ** 2.2) for c in colour)
     return red, green, blue
+
+
+def css(colour: tuple[int, int, int]) -> str:
+    """The colour as a browser reads it."""
+    return "rgb({}, {}, {})".format(*colour)

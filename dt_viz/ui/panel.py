@@ -22,6 +22,7 @@ from dt_viz.ui.export import RESOLUTIONS
 from dt_viz.ui.health_plots import HealthPlots
 from dt_viz.ui.legend import Legend
 from dt_viz.ui.obstacle_panel import ObstaclePanel
+from dt_viz.ui.palette import css
 from dt_viz.ui.picture import Colour
 from dt_viz.ui.plots import JointPlots
 from dt_viz.ui.push import PushButton
@@ -173,7 +174,9 @@ class Panel:
         self._learned()
         if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
             self._notice.visible, self._noticed = False, None
-        self._hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(hint(frame))}</div>"
+        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(hint(frame))}</div>"
+        if self._hint.content != said:
+            self._hint.content = said
         self._biases.report(frame)
         self._stack.report(frame)
         self._slice.report(frame)
@@ -403,8 +406,8 @@ def status_html(frame: Frame, pace: Pace) -> str:
         entered = [problem for problem in health.collision.problems if problem not in own]
         told = {problem: problem for problem in own}
         if scenario.warp == 1:
-            hint = HAND_ONLY if scenario.avoidance and scenario.space == "task" else ""
-            told = {**{problem: problem + hint for problem in entered}, **told}
+            advice = HAND_ONLY if scenario.avoidance and scenario.space == "task" else ""
+            told = {**{problem: problem + advice for problem in entered}, **told}
         warnings += [text for problem, text in told.items() if not any(problem in w for w in warnings)]
     blocked = ""
     if frame.blocked:
@@ -462,6 +465,7 @@ def _sentence(text: str) -> str:
 
 def _alarm(text: str, colour: Colour, background: Colour) -> str:
     return (
-        f"<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;border-left:3px solid rgb{colour};"
-        f"color:rgb{colour};background:rgb{background}'>{html.escape(_sentence(text))}</div>"
+        "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
+        f"border-left:3px solid {css(colour)};color:{css(colour)};background:{css(background)}'>"
+        f"{html.escape(_sentence(text))}</div>"
     )

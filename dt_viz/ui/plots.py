@@ -15,6 +15,7 @@ from dt_viz.engine import ArmMotion
 from dt_viz.fields import Array
 from dt_viz.robot import NUM_JOINTS, Robot
 from dt_viz.ui import palette
+from dt_viz.ui.palette import css
 
 NUM_SAMPLES = 80
 """Of each curve: what is sent in a drag stays small."""
@@ -113,11 +114,6 @@ class JointPlots:
 def columns(*arrays: Array) -> tuple[NDArray[np.float64], ...]:
     """What uPlot takes: all columns of arrays (N,) and (N, k), one after the other."""
     return tuple(np.column_stack(arrays).T.astype(np.float64))
-
-
-def css(colour: tuple[int, int, int]) -> str:
-    """The colour as a browser reads it."""
-    return "rgb({}, {}, {})".format(*colour)
 
 
 def _curves() -> list[uplot.Series]:

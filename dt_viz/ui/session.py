@@ -237,15 +237,13 @@ class Session:
         self.end_gesture()
 
     def _as_seen(self, other: Scenario) -> Scenario:
-        """Another scenario, looked at as this one, on the slice that it had if it is of another task.
+        """Another scenario, looked at as this one, on the slice that it had.
 
         If it is of a scene of the paper that this is not of, or the other way round, it is looked at as it was itself.
         """
         if other.scene != self.scenario.scene:
             return self._with_habits(other)
-        view = self.scenario.view
-        if other.task != self.scenario.task:
-            view = replace(view, slice=other.view.slice)
+        view = replace(self.scenario.view, slice=other.view.slice)
         return _with_a_level_of_its_own(replace(other, view=view))
 
     def _with_habits(self, other: Scenario) -> Scenario:
@@ -322,9 +320,7 @@ class Session:
             if not source:
                 return
             target.append(self.scenario)
-            other = source.pop()
-            seen = self._as_seen(other)
-            self.scenario = replace(seen, view=replace(seen.view, slice=other.view.slice))
+            self.scenario = self._as_seen(source.pop())
             self._gesture = ("", 0.0)
             self._submit()
         self._adopt()

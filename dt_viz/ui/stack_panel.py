@@ -133,7 +133,9 @@ def legend_html(scenario: Scenario) -> str:
     """Which lines are those of the selected level; nothing if none is shown."""
     if scenario.view.level not in levels(scenario):
         return ""
-    swatch = f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:rgb{palette.LEVEL}"
+    swatch = (
+        f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{palette.css(palette.LEVEL)}"
+    )
     what = manifold(scenario)
     return (
         "<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em;opacity:0.85'>"
