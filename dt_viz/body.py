@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.fields import Array
+from dt_viz.properties import cached_property
 from dt_viz.robot import NUM_JOINTS, KinematicChain, Robot
 
 FILE = Path(__file__).resolve().parent.parent / "assets" / "body_points.npz"

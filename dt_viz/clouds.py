@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from dt_viz.fields import Array, Indices
 from dt_viz.occupancy import fit_occupancy
+from dt_viz.properties import cached_property
 from dt_viz.solids import Solid
 from dt_viz.triangles import grid_nodes
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ from dt_viz.link_distances import (
     measure_from,
 )
 from dt_viz.obstacles import Obstacle, Sphere
+from dt_viz.properties import cached_property
 from dt_viz.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
 from dt_viz.several import Several
 

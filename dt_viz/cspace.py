@@ -8,7 +8,6 @@ complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array, Indices
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles import Obstacle
+from dt_viz.properties import cached_property
 from dt_viz.robot import NUM_JOINTS, KinematicChain, Robot, cross
 from dt_viz.tracking import DIRECTION_WEIGHT
 

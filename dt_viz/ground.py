@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from dt_viz.diffeo import Identity
 from dt_viz.fields import Array, Indices
 from dt_viz.imitation import Imitation
 from dt_viz.pictures import Sketchbook, in_frame
+from dt_viz.properties import cached_property
 from dt_viz.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.scenario import MAX_STARTS, Vector
 from dt_viz.systems import DiffeomorphicSystem

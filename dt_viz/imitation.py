@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +16,7 @@ from dt_viz.integrate import euler, implicit_euler
 from dt_viz.layers import Layer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.preparation import ImitationError, Motions, prepare
+from dt_viz.properties import cached_property
 from dt_viz.systems import DiffeomorphicSystem
 from dt_viz.timing import TimedAttractor, learn_timing
 from dt_viz.trajectory_fit import TrajectoryFit

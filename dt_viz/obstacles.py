@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from dt_viz.clouds import Cloud
 from dt_viz.fields import Array, Indices, Mask, PlacedField
 from dt_viz.occupancy import AvoidanceField, Generator, OccupancyMap, StretchedField, fit_occupancy, sample_labels
+from dt_viz.properties import cached_property
 from dt_viz.solids import Solid
 
 Point = tuple[float, float, float]

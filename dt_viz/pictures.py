@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -13,6 +12,7 @@ from dt_viz.belief import OccupancyPicture
 from dt_viz.diffeo import AdaptiveFlow, Chain, Diffeomorphism, Flow, Placed
 from dt_viz.field_layers import ColourPicture, FieldPicture
 from dt_viz.fields import Array, Indices, Mask
+from dt_viz.properties import cached_property
 from dt_viz.rollouts import Bundle, Rays, refined
 from dt_viz.slices import Slice
 from dt_viz.systems import DiffeomorphicSystem

@@ -10,13 +10,14 @@ from __future__ import annotations
 import hashlib
 import itertools
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
 from dt_viz.fields import Array, Indices
+from dt_viz.properties import cached_property
 from dt_viz.triangles import closest_on_triangles, grid_nodes, inside_of_grid, surface_samples
 
 NUM_NODES = 64**3

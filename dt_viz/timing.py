@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from scipy.optimize import lsq_linear
 
 from dt_viz.diffeo import Diffeomorphism
 from dt_viz.fields import Array
+from dt_viz.properties import cached_property
 from dt_viz.systems import Attractor, asinh_exp, log_sinh
 
 ARRIVED = 3e-4  # part of a ray's length: a demonstration's last point counts as this far from the goal

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -23,6 +22,7 @@ from dt_viz.fields import Array, Indices, Mask, Sum, VectorField
 from dt_viz.integrate import rk4
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles import Obstacle
+from dt_viz.properties import cached_property
 from dt_viz.robot import NUM_JOINTS, Robot
 from dt_viz.rollouts import Bundle, refined
 from dt_viz.scenario import Scenario

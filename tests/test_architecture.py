@@ -71,7 +71,7 @@ def test_computing_never_imports_the_ui():
     assert not [name for name in outside if not name.startswith(MAY_IMPORT_UI)]
 
 
-@pytest.mark.parametrize("module", ["matplotlib", "torch", "jax", "pickle"])
+@pytest.mark.parametrize("module", ["matplotlib", "torch", "jax", "pickle", "functools.cached_property"])
 def test_nothing_imports(module):
     assert importers(module) == set()
 

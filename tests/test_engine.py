@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import dt_viz.engine as engine_module
+import dt_viz.turns as turns_module
 from dt_viz.bias import BiasPoint, vector
 from dt_viz.demos import Demonstration
 from dt_viz.doubts import MAX_TARGET_MISS
@@ -15,7 +17,10 @@ from dt_viz.obstacles import Sphere
 from dt_viz.retiming import used_fraction
 from dt_viz.scenario import Scenario
 from dt_viz.stacking import plane_of, switched, with_bias_point
+from dt_viz.turns import Turns
 
+PATIENCE = 60
+"""Seconds after which threads that should have ended are given up; nothing takes that long."""
 TASK_NAMES = ["draw_s", "lift_box"]
 MARGIN_KEPT = 0.9
 
@@ -308,6 +313,28 @@ def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
     other.start()
     assert next(frames).stage is Stage.FINE
     assert followed.is_set()
+
+
+@pytest.mark.parametrize("space", ["task", "both"])
+def test_engines_that_take_turns_at_every_checkpoint_all_get_their_first_frames(
+    new_engine, initial, monkeypatch, space
+):
+    """Whatever one of them has half computed when it gives its turn away, the others can go on."""
+    monkeypatch.setattr(turns_module, "SLICE", -1.0)
+    monkeypatch.setattr(engine_module, "_turns", Turns())  # a deadlock is this test's own
+    scenario, barrier, done = replace(initial("draw_s"), space=space), threading.Barrier(4), []
+
+    def open_page():
+        engine = new_engine()
+        barrier.wait(PATIENCE)
+        done.append(next(frame for frame in engine.frames(scenario) if frame.stage is Stage.LIVE))
+
+    threads = [threading.Thread(target=open_page, daemon=True) for _ in range(barrier.parties)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert len(done) == len(threads)
 
 
 def random_edit(rng, scenario, initial):
