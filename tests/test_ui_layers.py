@@ -285,7 +285,7 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
     panel = Panel(server.gui, {"draw_s": "Draw S"}, ROBOT, lambda *_: None, lambda *_: None)
-    handles = [control.handle for control in panel._controls]
+    handles = [bound.control.handle for bound in panel._bound]
     box = {handle.label: handle for handle in handles if handle.label in VIEW_LABELS.values()}
     of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._folder, box[VIEW_LABELS["health_plots"]]]
     of_tab += [panel.health._folder, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]

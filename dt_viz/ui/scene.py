@@ -19,13 +19,13 @@ from dt_viz.ui import palette
 from dt_viz.ui.arm_layers import Onion
 from dt_viz.ui.bias import BALL_RADIUS, Biases
 from dt_viz.ui.bias import Moved as BiasMoved
+from dt_viz.ui.handles import Moved as SliceMoved
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
 from dt_viz.ui.obstacles import Moved, Obstacles
 from dt_viz.ui.picture import Lines, Picture
 from dt_viz.ui.pots import Pots
 from dt_viz.ui.slice import MovableSlice
-from dt_viz.ui.slice import Moved as SliceMoved
 from dt_viz.ui.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
 from dt_viz.ui.starts import Starts
 

@@ -14,6 +14,7 @@ from dt_viz.scenario import Scenario
 from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, levels, shifted, switched, visible_names
 from dt_viz.tuning import avoids, transforms
 from dt_viz.ui import palette
+from dt_viz.ui.controls import Control
 from dt_viz.ui.levels import manifold
 from dt_viz.ui.session import Session
 from dt_viz.ui.transform_settings import Bind, TransformSettings, durations
@@ -96,10 +97,11 @@ class StackPanel:
             handle = self._gui.add_button_group(row.label, row.buttons)
         self._rows.append(handle)
 
-        @handle.on_click
-        async def _(_event: viser.GuiEvent) -> None:
+        def pressed(button: str) -> None:
             if k < len(self._shown):
-                self.press(self._shown[k].name, handle.value)
+                self.press(self._shown[k].name, button)
+
+        Control(handle, pressed)
 
     def press(self, name: str, button: str) -> None:
         """Do what a button of the row of this name does."""
