@@ -13,10 +13,7 @@ from dt_viz.slices import SlicePose
 
 if TYPE_CHECKING:
     from dt_viz.behaviours import Behaviour
-
-Objective = Literal["trajectory", "velocity"]
-"""What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
-OBJECTIVES: tuple[Objective, ...] = ("trajectory", "velocity")
+    from dt_viz.imitation import Objective
 
 Space = Literal["task", "cspace", "both"]
 """What avoids the obstacle: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""

@@ -40,6 +40,7 @@ PLACES = [
 ]
 TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, "wxyz"]
 MIDDLE = (0.1, -0.5, 0.4)
+CLIENT = cast(Any, 0)
 
 
 class NoFrames:
@@ -103,26 +104,33 @@ class Page:
     def claim(self, handle: Any, value: Any) -> None:
         if isinstance(value, viser.UploadedFile):  # an upload can be sent to any input
             handle._impl.value = value
-            event = viser.GuiEvent(cast(Any, self.client), 0, handle)
+            event = viser.GuiEvent(cast(Any, self.client), CLIENT, handle)
             self.run(*(cb(event) for cb in handle._impl.update_cb))
         else:
-            self.run(self.gui._handle_gui_updates(0, messages.GuiUpdateMessage(handle._impl.uuid, {"value": value})))
+            self.run(
+                self.gui._handle_gui_updates(CLIENT, messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+            )
 
     def move(self, name: str, position: Any, wxyz: Any = (1.0, 0.0, 0.0, 0.0)) -> None:
         self.run(
-            self.scene._handle_transform_controls_drag_start(0, messages.TransformControlsDragStartMessage(name)),
+            self.scene._handle_transform_controls_drag_start(CLIENT, messages.TransformControlsDragStartMessage(name)),
             self.scene._handle_transform_controls_updates(
-                0, messages.TransformControlsUpdateMessage(name, wxyz, position)
+                CLIENT, messages.TransformControlsUpdateMessage(name, wxyz, position)
             ),
-            self.scene._handle_transform_controls_drag_end(0, messages.TransformControlsDragEndMessage(name)),
+            self.scene._handle_transform_controls_drag_end(CLIENT, messages.TransformControlsDragEndMessage(name)),
         )
 
     def drag(self, name: str, start: Any, end: Any, phase: Any = "update") -> None:
-        self.run(
-            self.scene._handle_node_drag(
-                0, messages.SceneNodeDragMessage(name, None, phase, start, (0.5, 0.5), end, (0.5, 0.5), "left", None)
-            )
+        at = {
+            "start_position": start,
+            "start_screen_pos": (0.5, 0.5),
+            "end_position": end,
+            "end_screen_pos": (0.5, 0.5),
+        }
+        message = messages.SceneNodeDragMessage(
+            phase=phase, name=name, instance_index=None, button="left", modifier=None, **at
         )
+        self.run(self.scene._handle_node_drag(CLIENT, message))
 
     def busy(self, **view: Any) -> Scenario:
         """A scenario in which most controls are shown, and most things stand in the scene."""
@@ -300,6 +308,19 @@ def test_only_gizmos_that_are_shown_can_be_moved_and_those_can(page):
     assert page.session.scenario != before
 
 
+def test_what_is_dragged_in_the_scene_moves_and_what_is_far_away_stays(page):
+    before = page.busy()
+    page.drag("/obstacles/0/surface", MIDDLE, (0.2, -0.4, 0.3))
+    page.drag("/bias/0/ball", MIDDLE, (0.2, -0.4, 0.3))
+    page.drag("/starts/1", MIDDLE, (0.2, -0.4, 0.3), "start")
+    after = page.session.scenario
+    assert after.obstacles[0] != before.obstacles[0] and after.obstacles[1:] == before.obstacles[1:]
+    assert after.layers != before.layers and after.starts != before.starts
+    for name in ("/obstacles/0/surface", "/bias/0/ball", "/starts/1"):
+        page.drag(name, MIDDLE, (900.0, -0.5, 0.4))
+    assert page.session.scenario == after
+
+
 @pytest.mark.parametrize("phase", ["start", "update", "end", "again", None])
 @pytest.mark.parametrize("place", PLACES, ids=repr)
 def test_what_is_dragged_in_the_scene_goes_nowhere_that_is_no_place(page, place, phase):
@@ -326,7 +347,7 @@ def test_a_ray_that_is_none_adds_no_start(page, ray):
     before = page.busy()
     for origin, direction in ((ray, (0.0, 1.0, 0.0)), ((0.8, -1.6, 0.8), ray)):
         message = messages.ScenePointerMessage("click", origin, direction, ((0.5, 0.5),), None)
-        page.run(page.scene._handle_scene_pointer_updates(0, message))
+        page.run(page.scene._handle_scene_pointer_updates(CLIENT, message))
         assert_sound(page)
     assert len(page.session.scenario.starts) <= len(before.starts) + 1
 

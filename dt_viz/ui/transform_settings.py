@@ -10,9 +10,10 @@ from typing import Any
 import viser
 
 from dt_viz.engine import Frame
+from dt_viz.imitation import OBJECTIVES
 from dt_viz.integration import MAX_STEPS, METHODS, Method
 from dt_viz.occupancy import GENERATORS
-from dt_viz.scenario import MAX_TEMPERATURE, MIN_TEMPERATURE, OBJECTIVES, SPACES, Scenario
+from dt_viz.scenario import MAX_TEMPERATURE, MIN_TEMPERATURE, SPACES, Scenario
 from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points
 from dt_viz.tuning import FlowSettings, avoids, flow_settings, transforms, tuned, with_flow
 from dt_viz.ui.controls import Control
