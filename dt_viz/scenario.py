@@ -161,6 +161,10 @@ class Scenario:
         """Whether both need the same fit."""
         return (self.task, self.objective) == (other.task, other.objective)
 
+    def begins_like(self, other: Scenario) -> bool:
+        """Whether both are of one task, learned likewise, and of one scene: the others are small steps away."""
+        return self.learns_like(other) and self.scene == other.scene
+
     def computes_like(self, other: Scenario) -> bool:
         """Whether a frame of `other` holds all that this needs."""
         before, after = other.view, self.view

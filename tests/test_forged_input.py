@@ -4,12 +4,14 @@ import asyncio
 import contextlib
 import dataclasses
 import math
+import threading
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
+from pages import frame_of
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
@@ -350,6 +352,38 @@ def test_a_ray_that_is_none_adds_no_start(page, ray):
         page.run(page.scene._handle_scene_pointer_updates(CLIENT, message))
         assert_sound(page)
     assert len(page.session.scenario.starts) <= len(before.starts) + 1
+
+
+def test_reset_brings_the_camera_back(page):
+    task = TASKS["draw_s"]()
+    page.visitor.shown = frame_of(page.busy(), task=task)
+    page.camera.position, page.camera.look_at = np.full(3, 9.0), np.ones(3)
+    (history,) = (handle for handle in page.inputs if handle.label == "History")
+    page.claim(history, "Undo")
+    np.testing.assert_array_equal(page.camera.position, np.full(3, 9.0))
+    page.claim(history, "Reset")
+    position, look_at = task.camera
+    np.testing.assert_array_equal(page.camera.position, position)
+    np.testing.assert_array_equal(page.camera.look_at, look_at)
+    page.visitor.shown = None
+
+
+def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(page, monkeypatch):
+    asked, answer = [], threading.Event()
+
+    def render(*_size, **_how):
+        asked.append(threading.current_thread())
+        assert answer.wait(30)
+        return np.zeros((2, 2, 4), np.uint8)
+
+    monkeypatch.setattr(page.client, "get_render", render)
+    (save,) = (handle for handle in page.inputs if handle.label == "Save PNG")
+    for _ in range(40):
+        page.claim(save, True)
+    assert page.gui._thread_executor.submit(lambda: True).result(timeout=20)
+    answer.set()
+    page.visitor._panel._saver._thread.join(30)
+    assert [thread.name for thread in asked] == ["picture"]
 
 
 def test_a_long_text_is_not_kept(page):

@@ -59,7 +59,7 @@ def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
 def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done():
     by_name = listed(SCENARIO)
     assert [by_name[name].label for name in ("Bias 1", "Bias 2", AVOIDANCE)] == [
-        "Bias 1, t 0.80",
+        "Bias 1, strength 0.80",
         "Bias 2",
         "Avoidance, t 0.40",
     ]
@@ -115,7 +115,7 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
     panel.adopt(SCENARIO)
     panel.report(frame())
     shown = [handle.label for handle in panel._rows if handle.visible]
-    assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, t 0.80", IMITATION, BASE]
+    assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, strength 0.80", IMITATION, BASE]
     panel.adopt(replace(SCENARIO, layers=(), obstacles=()))
     assert [handle.label for handle in panel._rows if handle.visible] == [IMITATION, BASE]
     panel.adopt(SCENARIO)

@@ -17,6 +17,7 @@ from dt_viz.imitation import ImitationError
 from dt_viz.paper_scenes import SCENES
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import bias_points
 from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.controls import Control, on_press
@@ -85,6 +86,7 @@ class Panel:
         robot: Robot,
         save_png: Callable[[str, bool], None],
         notify: Callable[[str, Colour], None],
+        look_home: Callable[[], None],
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
@@ -94,16 +96,19 @@ class Panel:
             robot: whose joints are plotted.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
             notify: says something in a colour where it is seen however far the panel is scrolled.
+            look_home: puts the camera back to where the task wants it.
         """
-        self._notify = notify
+        self._notify, self._look_home = notify, look_home
         self._gui = gui
         self._session: Session | None = None
         self._titles = dict(titles)
         self._bound: list[_Bound] = []
         self._notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
+        self._shows = self._waits = False
+        """Whether a frame was reported at all, and whether another task or scene is computed than that of the last."""
+        self._reported: Scenario | None = None
         self._adopted: Scenario | None = None
-        self._shows = False
         self._status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
@@ -161,18 +166,19 @@ class Panel:
         self.joints.visible = scenario.view.joint_plots
         self.health.visible = scenario.view.health_plots
         self._play.label = "Pause" if scenario.view.playing else "Play"
+        self._wait()
 
     def report(self, frame: Frame, pace: Pace) -> None:
         """Show how the rebuild went and how far its result is to be trusted."""
         if frame.stage is Stage.ROLLOUTS:
             return  # the next stage is a few milliseconds away
-        self._shows = True
+        if self._adopted is not None and not frame.scenario.begins_like(self._adopted):
+            return  # another task or scene was chosen meanwhile
+        self._reported, self._shows, self._waits = frame.scenario, True, False
         self._learned()
-        if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
+        if self._noticed is not None and frame.scenario != self._noticed:
             self._notice.visible, self._noticed = False, None
-        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(hint(frame))}</div>"
-        if self._hint.content != said:
-            self._hint.content = said
+        self._give_hint(hint(frame))
         self._biases.report(frame)
         self._stack.report(frame)
         self._slice.report(frame)
@@ -184,6 +190,20 @@ class Panel:
             _set_max(self._flow.handle, frame.pictures.generator.num_flows)
         self._status.content = status_html(frame, pace)
 
+    def _wait(self) -> None:
+        """Say that another task or scene is computed than the one reported last, whose status is pale."""
+        last = self._reported
+        if not (self._waits or last is None or self._adopted is None or last.begins_like(self._adopted)):
+            self._waits = True
+            self._give_hint("")
+            said = f"<div style='{_SMALL}'>{COMPUTING}</div>"
+            self._status.content = f"{said}<div style='{_PALE}'>{self._status.content}</div>"
+
+    def _give_hint(self, text: str) -> None:
+        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
+        if self._hint.content != said:
+            self._hint.content = said
+
     def learning(self, fraction: float, message: str) -> None:
         """Show how far learning a task is."""
         self._bar.visible = self._cancel.visible = True
@@ -192,6 +212,8 @@ class Panel:
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
+        if self._waits:
+            self._status.content = ""
         expected = isinstance(error, DataError | ImitationError)
         self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
 
@@ -280,6 +302,8 @@ class Panel:
         session = self._session
         if session is not None:
             {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
+            if button == "Reset":
+                self._look_home()
 
     def _build_arm(self) -> None:
         gui = self._gui
@@ -352,6 +376,7 @@ def _set_max(slider: Any, value: int) -> None:
         slider.max = value
 
 
+COMPUTING = "Computing the motion…"
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
 HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
@@ -359,6 +384,7 @@ _BLUE = ((29, 79, 124), (232, 241, 250))
 _GREEN = ((0, 92, 66), (230, 245, 239))
 _AMBER = ((138, 75, 0), (255, 244, 224))
 _RED = ((179, 38, 30), (253, 236, 234))
+_PALE = "opacity:0.3;filter:grayscale(1)"
 _TWO_LINES, _WARNING = "2.7em", "2.6em"
 _SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
 
@@ -381,18 +407,22 @@ def status_html(frame: Frame, pace: Pace) -> str:
     durations = {"": health.duration, " arm": health.arm_duration}
     if None not in durations.values():
         durations = {" hand": health.duration, " arm": health.arm_duration}
+    flow_time = " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None)
+    biases, layer_times = bias_points(scenario.layers), zip(scenario.layers, health.layer_durations, strict=False)
+    strength = " · ".join(f"{t:.2f} {layer.name}" for layer, t in layer_times if layer.name in biases and t is not None)
     rows = (
         ("Rebuild", _rebuild(pace)),
         ("Clearance", off if frame.blocked else _clearance(health.clearance, of)),
         *_collision_rows(health.collision, unknown),
-        ("Flow time t", " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None) or off),
+        *((("Flow time t", flow_time or off),) if flow_time or not strength else ()),
+        *((("Strength", strength),) if strength else ()),
         ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.2g}"),
         ("There and back", unknown if health.round_trip_error is None else _tiny(health.round_trip_error)),
         ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[health.lyapunov_falls]),
     )
     cells = "".join(
-        f"<tr><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
-        f"<td style='font-weight:600;white-space:nowrap'>{html.escape(value)}</td></tr>"
+        f"<tr style='vertical-align:top'><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
+        f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
         for name, value in rows
     )
     warnings = list(health.doubts)

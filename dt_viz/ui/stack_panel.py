@@ -11,7 +11,7 @@ import viser
 
 from dt_viz.engine import Frame
 from dt_viz.scenario import Scenario
-from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, levels, shifted, switched, visible_names
+from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, levels, shifted, switched, visible_names
 from dt_viz.tuning import avoids, transforms
 from dt_viz.ui import palette
 from dt_viz.ui.controls import Control
@@ -118,11 +118,12 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row
     on = {layer.name for layer in scenario.layers if layer.on} | ({AVOIDANCE} if scenario.avoidance else set())
     seen = levels(scenario)
     listed = []
-    order = visible_names(scenario)
+    order, biases = visible_names(scenario), bias_points(scenario.layers)
     for k, name in enumerate(order):
         moves = (UP,) * (k < len(order) - 1) + (DOWN,) * (k > 0)
         look = (_look(scenario, name),) * (name in seen)
-        listed.append(Row(name, _label(name, durations.get(name)), (ON if name in on else OFF, *moves, *look)))
+        label = _label(name, durations.get(name), "strength" if name in biases else "t")
+        listed.append(Row(name, label, (ON if name in on else OFF, *moves, *look)))
     if WHOLE_ARM in transforms(scenario):
         label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
         listed.append(Row(WHOLE_ARM, label, (ON if scenario.avoidance else OFF,)))
@@ -146,8 +147,8 @@ def legend_html(scenario: Scenario) -> str:
     )
 
 
-def _label(name: str, duration: float | None) -> str:
-    return name if duration is None else f"{name}, t {duration:.2f}"
+def _label(name: str, duration: float | None, what: str = "t") -> str:
+    return name if duration is None else f"{name}, {what} {duration:.2f}"
 
 
 def _look(scenario: Scenario, name: str) -> str:
