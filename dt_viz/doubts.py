@@ -14,12 +14,14 @@ from dt_viz.cspace import LEVERS
 from dt_viz.ground import Ground, named_starts
 from dt_viz.health import in_millimetres, integration_doubts
 from dt_viz.robot import Robot
+from dt_viz.rollouts import MAX_SAMPLES
 from dt_viz.solved import Solved
 from dt_viz.solving import Applied, Solution
 from dt_viz.stacking import WHOLE_ARM
 
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
+UNSAMPLED = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"
 MAX_TARGET_MISS = 0.013
 """Metres by which motions that avoid may miss a bias point before it is said: a centimetre, and what the arm's joints,
 interpolated between samples, are off by while a hand moves."""
@@ -35,6 +37,8 @@ def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str,
     """
     ground, scenario, stack, arm = solved.ground, solved.scenario, solved.stack, solved.arm
     doubts = [*ground.imitation.warnings, *stack.doubts]
+    if max(len(stack.bundle.index), len(arm.index) if arm else 0) >= MAX_SAMPLES:
+        doubts.append(UNSAMPLED)
     integration = _of_integration(solved)
     if scenario.warp < 1:  # what does not do yet what it is made for has not failed
         return (*doubts, *integration, *ground.doubts)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -25,6 +25,10 @@ from dt_viz.velocity_fit import VelocityFit
 
 Progress = Callable[[float, str], None]
 
+Objective = Literal["trajectory", "velocity"]
+"""What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
+OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
+
 MIN_STEP_DETERMINANT = 0.05  # of an Euler step's derivative; at 0 it would fold
 STEP_LENGTH = 0.8  # how far an Euler step of the start may move a point, in σ
 MAX_LAYERS = 10
@@ -36,9 +40,13 @@ NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contra
 
 @dataclass(frozen=True)
 class ImitationSettings:
-    """How to fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean)."""
+    """How to fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean).
 
-    objective: Literal["trajectory", "velocity"] = "trajectory"
+    Raises:
+        ImitationError: there is no such objective.
+    """
+
+    objective: Objective = "trajectory"
     """What is fitted: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
     num_layers: int = 3
     """Stationary flows that ψ is composed of, at least; motions that turn far get more. The velocity objective
@@ -63,8 +71,12 @@ class ImitationSettings:
     max_iterations: int = 20
     """Of Gauss–Newton; L-BFGS, whose iterations are cheaper, may take ten times as many."""
 
+    def __post_init__(self) -> None:
+        if self.objective not in OBJECTIVES:
+            raise ImitationError(f"objective: found {self.objective!r}; accepted: {' or '.join(OBJECTIVES)}")
 
-def paper_preset(objective: Literal["trajectory", "velocity"] = "velocity") -> ImitationSettings:
+
+def paper_preset(objective: Objective = "velocity") -> ImitationSettings:
     """The paper's choices (sec. 5): m = 720 equally spaced states, ℓ = 0.005 with LASA in millimetres, Euler steps."""
     return ImitationSettings(objective, ell=0.005e6, num_inducing=720)
 

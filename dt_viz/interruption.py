@@ -19,8 +19,17 @@ _current: ContextVar[Checkpoint] = ContextVar("_current", default=lambda: None)
 
 @contextmanager
 def interruptible(checkpoint: Checkpoint) -> Iterator[None]:
-    """Within this block long computations of this thread call `checkpoint` between their steps."""
-    token = _current.set(checkpoint)
+    """Within this block long computations of this thread call `checkpoint` between their steps.
+
+    Blocks nest: the checkpoints of those around it are called, too, the outermost first.
+    """
+    outer = _current.get()
+
+    def both() -> None:
+        outer()
+        checkpoint()
+
+    token = _current.set(both)
     try:
         yield
     finally:

@@ -20,6 +20,8 @@ OVERSAMPLING = 2
 """Times as many samples are put into such a gap as it lacks: another round costs more."""
 MAX_INSERTED = 40
 """Samples put between two neighbours in one round of refinement."""
+MAX_SAMPLES = 60_000
+"""Samples of a bundle at which refinement ends: a stack may stretch a motion without limit."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: i
         max_rounds: of insertion.
 
     Returns:
-        The refined bundle.
+        The refined bundle. One of `MAX_SAMPLES` samples has gaps left that are wider.
     """
     for round_ in range(max_rounds + 1):
         same = np.diff(bundle.index) == 0
@@ -119,12 +121,16 @@ def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: i
         # a gap that rounding cannot divide any more stays: two neighbouring floats on either side of the centre
         divisible = np.diff(bundle.fraction) > 1e-13
         wide = np.flatnonzero((gap > spacing) & divisible)
-        if not len(wide) or round_ == max_rounds:
+        room = MAX_SAMPLES - len(bundle.index)
+        if not len(wide) or round_ == max_rounds or room <= 0:
             break
         inside = np.r_[np.inf, np.where(same, gap, np.inf), np.inf]
         uneven = gap[wide] > UNEVEN * np.minimum(inside[:-2], inside[2:])[wide]
         lacking = (gap[wide] / spacing - 1) * np.where(uneven, OVERSAMPLING, 1)
         counts = np.minimum(np.ceil(lacking).astype(int), MAX_INSERTED)
+        if counts.sum() > room:
+            widest = np.argsort(-gap[wide], kind="stable")
+            counts[widest] = np.diff(np.minimum(np.cumsum(counts[widest]), room), prepend=0)
         within = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in counts])
         before = np.repeat(wide, counts)
         fraction = bundle.fraction[before] + within * (bundle.fraction[before + 1] - bundle.fraction[before])

@@ -13,10 +13,7 @@ from dt_viz.slices import SlicePose
 
 if TYPE_CHECKING:
     from dt_viz.behaviours import Behaviour
-
-Objective = Literal["trajectory", "velocity"]
-"""What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
-OBJECTIVES: tuple[Objective, ...] = ("trajectory", "velocity")
+    from dt_viz.imitation import Objective
 
 Space = Literal["task", "cspace", "both"]
 """What avoids the obstacle: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""
@@ -163,6 +160,10 @@ class Scenario:
     def learns_like(self, other: Scenario) -> bool:
         """Whether both need the same fit."""
         return (self.task, self.objective) == (other.task, other.objective)
+
+    def begins_like(self, other: Scenario) -> bool:
+        """Whether both are of one task, learned likewise, and of one scene: the others are small steps away."""
+        return self.learns_like(other) and self.scene == other.scene
 
     def computes_like(self, other: Scenario) -> bool:
         """Whether a frame of `other` holds all that this needs."""

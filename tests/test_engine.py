@@ -8,10 +8,12 @@ import pytest
 
 import dt_viz.engine as engine_module
 import dt_viz.turns as turns_module
+from dt_viz import doubts, rollouts
 from dt_viz.bias import BiasPoint, vector
 from dt_viz.demos import Demonstration
-from dt_viz.doubts import MAX_TARGET_MISS
+from dt_viz.doubts import MAX_TARGET_MISS, UNSAMPLED
 from dt_viz.engine import Stage
+from dt_viz.interruption import interruptible
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles import Sphere
 from dt_viz.retiming import used_fraction
@@ -272,6 +274,36 @@ def test_refining_ends_where_a_checkpoint_says_so(engine, scenario):
     with pytest.raises(UnwantedError):
         next(frames)
     assert stage(engine, scenario, Stage.CERTIFIED).health.lyapunov_falls  # nothing is left locked
+
+
+@pytest.mark.parametrize("space", ["task", "both"])
+def test_what_follows_a_hand_ends_where_the_thread_is_interrupted(new_engine, initial, space):
+    class ClosedError(Exception):
+        pass
+
+    def refuse():
+        raise ClosedError
+
+    engine, scenario, passed = new_engine(), replace(initial("draw_s"), space=space), []
+    with interruptible(lambda: passed.append(None)):
+        frames = engine.frames(replace(scenario, margin=0.012))
+        assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
+    assert len(passed) > 20
+    with pytest.raises(ClosedError), interruptible(refuse):
+        next(engine.frames(scenario))
+    assert stage(engine, scenario, Stage.LIVE).rollouts  # nothing is left locked
+
+
+def test_a_motion_that_would_take_too_many_samples_says_so(new_engine, initial, monkeypatch):
+    scenario = initial("draw_s")
+    frame = stage(new_engine(), scenario, Stage.FINE)
+    assert not frame.health.says(UNSAMPLED)
+    most = sum(len(path) for path in frame.rollouts) - 5
+    for module in (rollouts, doubts):
+        monkeypatch.setattr(module, "MAX_SAMPLES", most)
+    frame = stage(new_engine(), scenario, Stage.FINE)
+    assert sum(len(path) for path in frame.rollouts) == most
+    assert frame.health.says(UNSAMPLED)
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])

@@ -1,6 +1,7 @@
 """What a fit must give, whatever the demonstrations: a stable, invertible system that ends at the goal."""
 
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -344,6 +345,11 @@ def test_a_demonstration_that_starts_at_the_goal_loses_its_beginning():
     imitation = fit([Demonstration(3 * s, loop, "loop")])
     assert any("'loop' starts at the goal" in warning for warning in imitation.warnings)
     assert imitation.min_det_jacobian > 0
+
+
+def test_an_objective_that_there_is_not_is_refused_before_anything_is_fitted():
+    with pytest.raises(ImitationError, match=r"objective: found 'nonsense'; accepted: trajectory or velocity"):
+        ImitationSettings(cast(Any, "nonsense"))
 
 
 @pytest.mark.parametrize("path", [np.zeros((50, 2)), np.full((50, 2), 0.3)])

@@ -46,15 +46,15 @@ def test_what_a_checkpoint_raises_ends_the_flow(flow):
     np.testing.assert_array_equal(flow.forward(POINTS), expected)  # after the block nothing is called
 
 
-def test_of_nested_blocks_the_inner_counts_until_it_ends():
+def test_of_nested_blocks_both_count_until_they_end():
     (outer, count_outer), (inner, count_inner) = counter(), counter()
     with interruptible(count_outer):
         with interruptible(count_inner):
             checkpoint()
-        assert (len(outer), len(inner)) == (0, 1)
+        assert (len(outer), len(inner)) == (1, 1)
         checkpoint()
     checkpoint()
-    assert (len(outer), len(inner)) == (1, 1)
+    assert (len(outer), len(inner)) == (2, 1)
 
 
 def test_other_threads_are_not_concerned():

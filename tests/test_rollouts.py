@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dt_viz import rollouts
 from dt_viz.rollouts import ARRIVED, Bundle, Rays, evenly_sampled, refined
 from dt_viz.systems import Attractor
 
@@ -155,3 +156,20 @@ def test_neighbouring_rollouts_are_not_joined():
     fine = refined(rough, straight, 0.1)
     assert np.linalg.norm(fine.paths[1][0] - fine.paths[0][-1]) > 0.5
     assert len(fine.paths) == 2
+
+
+def test_a_path_that_is_stretched_without_limit_gets_no_more_samples_than_there_may_be(monkeypatch):
+    monkeypatch.setattr(rollouts, "MAX_SAMPLES", 500)
+
+    def evaluate(index, fraction):
+        far = 1e6 * np.tanh((fraction - 0.5) * 1e3) * (index == 1) + fraction
+        return np.stack([far, fraction, fraction], axis=1)[:, None]
+
+    index, fraction = np.repeat([0, 1], 11), np.tile(np.linspace(0, 1, 11), 2)
+    bundle = refined(Bundle(index, fraction, evaluate(index, fraction)), evaluate, 0.01)
+    assert len(bundle.index) == 500
+    assert (np.diff(bundle.index) >= 0).all()
+    for own in bundle.split(bundle.fraction):
+        assert (np.diff(own) > 0).all()
+    again = refined(bundle, evaluate, 0.01)
+    np.testing.assert_array_equal(again.fraction, bundle.fraction)

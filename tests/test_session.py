@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from dt_viz import interruption
 from dt_viz.bias import BiasPoint
 from dt_viz.demos import DemonstrationError
 from dt_viz.engine import Engine, Stage
@@ -43,6 +44,7 @@ class FakeEngine:
         self.unlearned, self.learning = set(), threading.Event()
         self.pushes, self.pushable = [], True
         self.holds, self.beyond = [], set()
+        self.endless, self.busy = None, threading.Event()
 
     def frames(self, scenario, progress=None, checkpoint=None):
         self.asked.append(scenario)
@@ -59,6 +61,12 @@ class FakeEngine:
         if scenario.temperature == 13.0:
             raise DemonstrationError("unlucky.csv", "file", "13", "another")
         for stage in Stage:
+            while stage is self.endless:
+                self.busy.set()
+                interruption.checkpoint()
+                time.sleep(0.001)
+            if stage is Stage.LIVE and scenario.view.generator_layer == -9:
+                raise IndexError("no such flow")
             yield Sketch(scenario, stage)
 
     def pushed(self, scenario, q, rng):
@@ -237,15 +245,15 @@ def test_history_does_not_grow_without_end(opened):
     assert opened.session.scenario.temperature == 20.0 + 49
 
 
-def test_reset_goes_back_to_the_beginning_keeps_the_view_and_can_be_undone(opened):
-    opened.session.edit("ghost", view=View(ghost=False))
+def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_the_motion_can_be_undone(opened):
+    opened.session.edit("ghost", view=View(ghost=False, playing=False, health_plots=True))
     opened.session.edit("a", temperature=2.0, obstacles=(at(1.0),), generator="probability")
     changed = opened.session.scenario
     opened.session.reset()
     opened.settle()
-    assert opened.session.scenario == opened.shown == replace(fresh("draw_s"), view=View(ghost=False))
+    assert opened.session.scenario == opened.shown == fresh("draw_s")
     opened.session.undo()
-    assert opened.session.scenario == changed
+    assert opened.session.scenario == replace(changed, view=View())
 
 
 def test_another_task_brings_its_place_and_keeps_other_choices(opened):
@@ -335,6 +343,72 @@ def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
     opened.settle()
     assert opened.shown.temperature == 5.0
     assert len(opened.page.errors) == 1
+
+
+def test_a_view_that_cannot_be_drawn_is_left_by_reset(opened, caplog):
+    bad = View(generator=True, generator_layer=-9, health_plots=True)
+    with caplog.at_level(logging.CRITICAL):
+        opened.session.edit("view", view=bad)
+        opened.settle()
+    assert [str(error) for error in opened.page.errors] == ["no such flow"]
+    opened.session.reset()
+    opened.settle()
+    assert opened.session.scenario == fresh("draw_s")
+    assert opened.page.frames[-1] == Sketch(fresh("draw_s"), Stage.CERTIFIED)
+    assert len(opened.page.errors) == 1
+
+
+def test_after_a_picture_that_failed_any_choice_that_can_be_drawn_is(opened, caplog):
+    """Also one that needs nothing but what was asked for before, and did not come."""
+    with caplog.at_level(logging.CRITICAL):
+        opened.session.edit("view", view=View(generator=True, generator_layer=-9))
+        opened.settle()
+    opened.page.frames.clear()
+    opened.session.edit("view", view=View())
+    opened.settle()
+    assert opened.page.frames[-1] == Sketch(opened.session.scenario, Stage.CERTIFIED)
+
+
+def test_a_view_that_is_left_while_it_fails_is_drawn_without_another_edit(opened, caplog):
+    gate = opened.engine.gate = threading.Event()
+    opened.engine.begun.clear()
+    with caplog.at_level(logging.CRITICAL):
+        opened.session.edit("view", view=View(generator=True, generator_layer=-9))
+        assert opened.engine.begun.wait(PATIENCE)
+        opened.page.frames.clear()
+        opened.session.edit("view", view=View())
+        gate.set()
+        opened.settle()
+    assert opened.page.frames[-1] == Sketch(opened.session.scenario, Stage.CERTIFIED)
+
+
+@pytest.mark.parametrize("stage", [Stage.ROLLOUTS, Stage.LIVE])
+def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
+    opened.engine.endless = stage
+    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    assert opened.engine.busy.wait(PATIENCE)
+    opened.session.edit("obstacle", obstacles=(at(2.0),))
+    assert not opened.session.wait_idle(0.2)  # a newer edit ends nothing that follows a hand
+    opened.session.close()
+    opened.session._worker._thread.join(5.0)
+    assert not opened.session._worker._thread.is_alive()
+    assert opened.page.errors == []
+
+
+def test_a_session_that_closes_ends_what_its_arm_is_asked_for(opened):
+    def endless(scenario, q, rng):
+        opened.engine.busy.set()
+        while True:
+            interruption.checkpoint()
+            time.sleep(0.001)
+
+    opened.engine.pushed = endless
+    opened.session.push(np.zeros(6), lambda _pushed: None)
+    assert opened.engine.busy.wait(PATIENCE)
+    opened.session.close()
+    opened.session._worker._thread.join(5.0)
+    assert not opened.session._worker._thread.is_alive()
+    assert opened.page.errors == []
 
 
 def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
@@ -627,7 +701,7 @@ def test_moving_the_slice_is_a_step_for_undo(opened):
         session.redo()
     assert session.scenario.view.slice == poses[2]
     session.reset()
-    assert session.scenario.view.slice is None and session.scenario.view.grid
+    assert session.scenario.view.slice is None and not session.scenario.view.grid
 
 
 def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):

@@ -1,6 +1,7 @@
 """What the page shows of the whole arm, without a browser: a scene takes handles also while nobody looks."""
 
 import html
+import re
 from dataclasses import fields, replace
 from typing import cast
 
@@ -10,6 +11,7 @@ import trimesh
 from pages import frame_of
 from viser import transforms  # noqa: TID251
 
+from dt_viz.bias import BiasPoint
 from dt_viz.body import load_body_points
 from dt_viz.collision import CollisionReport, Nearest
 from dt_viz.demos import DemonstrationError
@@ -19,15 +21,18 @@ from dt_viz.obstacles import Sphere
 from dt_viz.paper_scenes import SCENES
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import with_bias_point
 from dt_viz.tasks import TASKS
 from dt_viz.ui import palette
 from dt_viz.ui.arm import PEDESTAL
 from dt_viz.ui.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
+from dt_viz.ui.legend import OCCUPANCY
 from dt_viz.ui.links import CELL, bodies, light_shells, simplified
-from dt_viz.ui.panel import CHANGED, PLOTS, VIEW_LABELS, Panel, hint, status_html
+from dt_viz.ui.panel import CHANGED, COMPUTING, PLOTS, VIEW_LABELS, Panel, hint, status_html
+from dt_viz.ui.picture import Arrows, Lines
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
-from dt_viz.ui.scene import OF_A_MOTION, Rollouts, ScenePictures
+from dt_viz.ui.scene import OF_A_MOTION, OF_A_TASK, Rollouts, ScenePictures
 from dt_viz.ui.session import Pace
 from dt_viz.ui.starts import Starts
 
@@ -45,6 +50,11 @@ def motion(num=60, seconds=4.0, *, sway=0.0):
 
 def frame(arm=None, *, scenario=None, **changes):
     return frame_of(scenario or Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),)), arm=arm, **changes)
+
+
+def panel_of(server, notify=lambda *_: None):
+    titles = {name: entry.title for name, entry in TASKS.items()}
+    return Panel(server.gui, titles, ROBOT, lambda *_: None, notify, lambda: None)
 
 
 # --- Along the motion ---
@@ -232,6 +242,87 @@ def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(eng
     assert shown() == {*OF_A_MOTION, "colour"}
 
 
+@pytest.fixture
+def drawn(engine, initial, scene):
+    """The pictures of a scenario that was adopted and drawn."""
+
+    def ignored(*_what):
+        pass
+
+    starts = Starts(scene, ignored, ignored, ignored)
+    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, starts)
+    scenario = replace(initial("draw_s"), view=View(field=True, streamlines=True, grid=True, onion=True))
+    pictures.adopt(scenario)
+    pictures.draw(next(engine.frames(scenario)))
+    return pictures, scenario
+
+
+def is_grey(pictures):
+    lines = cast(Rollouts, pictures.layer("rollouts")).lines.node
+    shown = {pictures.layer(name).visible for name in (*OF_A_MOTION, *OF_A_TASK)}
+    grey = bool(np.ptp(lines.colors.reshape(-1, 3).astype(int), axis=1).max() < 20)
+    assert shown == {not grey}
+    return grey
+
+
+@pytest.mark.parametrize("changes", [{"task": "lift_box"}, {"scene": "cloud"}, {"objective": "velocity"}], ids=str)
+def test_what_is_drawn_of_another_task_or_scene_is_grey_until_its_own_frame_comes(drawn, engine, changes):
+    pictures, scenario = drawn
+    assert not is_grey(pictures)
+    chosen = replace(scenario, **changes)
+    pictures.adopt(chosen)
+    assert is_grey(pictures) and pictures.stale
+    pictures.draw(next(engine.frames(scenario)))  # what was under way when it was chosen
+    assert is_grey(pictures)
+    pictures.adopt(scenario)
+    assert not is_grey(pictures)
+    pictures.adopt(chosen)
+    pictures.draw(replace(next(engine.frames(scenario)), scenario=chosen))
+    assert not is_grey(pictures) and not pictures.stale
+
+
+def test_nothing_is_grey_while_something_is_dragged(drawn):
+    pictures, scenario = drawn
+    pictures.adopt(replace(scenario, obstacles=(Sphere((0.1, -0.4, 0.3)),), temperature=3.0))
+    assert not is_grey(pictures)
+
+
+def test_the_status_of_another_task_is_pale_and_says_what_is_done(server):
+    panel = panel_of(server)
+    scenario, other = Scenario("draw_s", ()), Scenario("lift_box", ())
+    said = {s.task: replace(frame(scenario=s), task=TASKS[s.task]()) for s in (scenario, other)}
+    panel.adopt(scenario)
+    panel.report(said["draw_s"], PACE)
+    settled = panel._status.content
+    assert COMPUTING not in settled and said["draw_s"].task.hint in html.unescape(panel._hint.content)
+    panel.adopt(other)
+    for _ in range(2):
+        waiting = panel._status.content
+        assert COMPUTING in waiting and f"opacity:0.3;filter:grayscale(1)'>{settled}" in waiting
+        assert said["draw_s"].task.hint not in html.unescape(panel._hint.content)
+        panel.report(said["draw_s"], PACE)  # what was under way when it was chosen
+    panel.report(said["lift_box"], PACE)
+    assert COMPUTING not in panel._status.content
+    assert said["lift_box"].task.hint in html.unescape(panel._hint.content)
+    panel.adopt(scenario)
+    assert COMPUTING in panel._status.content
+    panel.fail(ValueError("nothing comes"))
+    assert COMPUTING not in panel._status.content
+    server.gui.reset()
+
+
+@pytest.mark.parametrize("num", [0, 1, 5])
+def test_the_browser_gets_a_colour_for_each_point_and_of_none_a_single_one(scene, num):
+    lines = Lines(scene, "/lines", (10, 20, 30), 0.001)
+    arrows = Arrows(scene, "/arrows", (10, 20, 30), (40, 50, 60), 0.01)
+    for _ in range(2):
+        lines.show_segments(np.ones((num, 2, 3)))
+        arrows.show(np.ones((num, 3)), np.ones((num, 3)))
+        for node in (lines.node, arrows.node):
+            assert len(node.points) == num
+            assert node.colors.shape[0] == (num or 3)
+
+
 # --- Joint plots ---
 
 
@@ -284,8 +375,8 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 
 def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
-    panel = Panel(server.gui, {"draw_s": "Draw S"}, ROBOT, lambda *_: None, lambda *_: None)
-    handles = [control.handle for control in panel._controls]
+    panel = panel_of(server)
+    handles = [bound.control.handle for bound in panel._bound]
     box = {handle.label: handle for handle in handles if handle.label in VIEW_LABELS.values()}
     of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._folder, box[VIEW_LABELS["health_plots"]]]
     of_tab += [panel.health._folder, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
@@ -317,7 +408,7 @@ def test_the_line_of_a_scene_is_shown_only_while_it_is_as_it_was():
 
 def test_what_is_refused_is_said_beside_the_panel_too(server):
     said = []
-    panel = Panel(server.gui, {"draw_s": "Draw S"}, ROBOT, lambda *_: None, lambda *told: said.append(told))
+    panel = panel_of(server, notify=lambda *told: said.append(told))
     panel.fail(DemonstrationError("file.csv", "points", "3", "at least 20"))
     ((text, colour),) = said
     assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel._notice.content)
@@ -361,6 +452,24 @@ def test_an_arm_in_the_obstacle_is_told_how_to_give_way(space, hinted):
 )
 def test_the_status_says_which_flow_runs_how_long(hand, arm, said):
     assert said in status_html(frame(health=Health(0.01, duration=hand, arm_duration=arm)), PACE)
+
+
+@pytest.mark.parametrize(("hand", "flow_time"), [(None, False), (0.4, True)])
+def test_the_status_calls_what_a_bias_point_has_its_strength(hand, flow_time):
+    layers = with_bias_point(with_bias_point((), BiasPoint((0.0, -0.5, 0.4))), BiasPoint((0.1, -0.5, 0.4)))
+    health = Health(0.01, duration=hand, layer_durations=(0.8, None))
+    said = status_html(frame(scenario=Scenario("draw_s", (), layers=layers), health=health), PACE)
+    assert ">0.80 Bias 1<" in said and ">Strength<" in said
+    assert ("Flow time t" in said) == flow_time and ">off<" not in said
+
+
+def test_no_value_of_the_status_runs_out_of_the_panel_and_no_number_of_a_legend():
+    """What is too long for its column is broken; numbers at the ends of a scale end with it."""
+    said = status_html(frame(), PACE)
+    names, values = re.findall(r"<td style='([^']*)'>", said)[::2], re.findall(r"<td style='([^']*)'>", said)[1::2]
+    assert all("nowrap" in style for style in names) and not any("nowrap" in style for style in values)
+    ends = re.findall(r"left:([\d.]+)%;transform:translateX\(-([\d.]+)%\)", OCCUPANCY.html)
+    assert [float(left) for left, _ in ends] == [float(shift) for _, shift in ends] == [0, 25, 50, 75, 100]
 
 
 @pytest.mark.parametrize(

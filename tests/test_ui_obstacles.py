@@ -19,6 +19,7 @@ from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
 from dt_viz.several import Several
 from dt_viz.solids import Solid
 from dt_viz.tasks import TASKS
+from dt_viz.ui.controls import Control
 from dt_viz.ui.handles import in_slice
 from dt_viz.ui.obstacle_panel import SHAPES, ObstaclePanel, name_of, with_room
 from dt_viz.ui.obstacles import Obstacles, shaded
@@ -108,7 +109,7 @@ def test_surfaces_are_drawn_outward_with_sharp_edges(obstacle):
 def test_what_is_dragged_stays_in_the_slice_and_under_the_pointer():
     area = TASKS["draw_s"]().slice
     camera, grabbed, pointer = np.array([0.8, -1.6, 0.7]), np.array([0.02, -0.53, 0.44]), np.array([0.1, -0.6, 0.5])
-    shift = in_slice(area, camera, grabbed.tolist(), pointer.tolist())
+    shift = in_slice(area, camera, grabbed, pointer)
     assert shift @ np.cross(*area.axes.T) == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(np.cross(grabbed + shift - camera, pointer - camera), 0, atol=1e-12)
 
@@ -122,6 +123,7 @@ def opened(server):
 
     def bind(handle, read, change):
         controls.setdefault(handle.label, []).append(SimpleNamespace(handle=handle, read=read, change=change))
+        return Control(handle)
 
     said = []
     panel = ObstaclePanel(server.gui, bind, lambda text, wrong: said.append((text, wrong)))

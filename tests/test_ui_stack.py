@@ -16,6 +16,7 @@ from dt_viz.stacking import AVOIDANCE, IMITATION, MAX_BIAS_POINTS, WHOLE_ARM, bi
 from dt_viz.tasks import POTS, TASKS
 from dt_viz.ui.bias import Biases, selected_point
 from dt_viz.ui.bias_panel import BiasPanel
+from dt_viz.ui.controls import Control
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.pots import Pots, surface
 from dt_viz.ui.session import Session
@@ -58,7 +59,7 @@ def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
 def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done():
     by_name = listed(SCENARIO)
     assert [by_name[name].label for name in ("Bias 1", "Bias 2", AVOIDANCE)] == [
-        "Bias 1, t 0.80",
+        "Bias 1, strength 0.80",
         "Bias 2",
         "Avoidance, t 0.40",
     ]
@@ -69,7 +70,7 @@ def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done
 
 @pytest.fixture
 def panel(server):
-    panel, session = StackPanel(server.gui, lambda handle, *_: handle), Edited(SCENARIO)
+    panel, session = StackPanel(server.gui, lambda handle, *_: Control(handle)), Edited(SCENARIO)
     panel.connect(cast(Session, session))
     return panel, session
 
@@ -114,7 +115,7 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
     panel.adopt(SCENARIO)
     panel.report(frame())
     shown = [handle.label for handle in panel._rows if handle.visible]
-    assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, t 0.80", IMITATION, BASE]
+    assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, strength 0.80", IMITATION, BASE]
     panel.adopt(replace(SCENARIO, layers=(), obstacles=()))
     assert [handle.label for handle in panel._rows if handle.visible] == [IMITATION, BASE]
     panel.adopt(SCENARIO)
@@ -175,7 +176,7 @@ def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(
 
 
 def test_bias_points_are_added_changed_and_deleted(server):
-    panel, session = BiasPanel(server.gui, lambda handle, *_: handle), Edited(replace(SCENARIO, layers=()))
+    panel, session = BiasPanel(server.gui, lambda handle, *_: Control(handle)), Edited(replace(SCENARIO, layers=()))
     panel.connect(cast(Session, session))
     for _ in range(MAX_BIAS_POINTS + 1):
         panel.adopt(session.scenario)
@@ -194,11 +195,11 @@ def test_bias_points_are_added_changed_and_deleted(server):
 
 
 def test_the_panel_shows_what_auto_chose(server):
-    panel = BiasPanel(server.gui, lambda handle, *_: handle)
+    panel = BiasPanel(server.gui, lambda handle, *_: Control(handle))
     panel.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
     panel.report(frame())
     assert panel._radius.value == 20.0
-    assert panel._radius.disabled
+    assert panel._radius.handle.disabled
 
 
 # --- Pots ---

@@ -99,7 +99,7 @@ class Scene:
         self.labels[name] = text
 
     def add_icosphere(self, name, **_look):
-        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False, color=palette.START)
+        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False, color=palette.START, visible=True)
 
         def keep(callback, what):
             setattr(node, what, callback)

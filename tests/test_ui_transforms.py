@@ -15,6 +15,7 @@ from dt_viz.integration import Integration
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Scenario, View
 from dt_viz.stacking import AVOIDANCE, IMITATION, bias_points, with_bias_point
+from dt_viz.ui.controls import Control
 from dt_viz.ui.panel import status_html
 from dt_viz.ui.session import Pace, Session
 from dt_viz.ui.transform_settings import TransformSettings, learned_html
@@ -43,21 +44,22 @@ class Controls:
         self.adopt(SCENARIO)
 
     def bind(self, handle, read, change):
-        self.bound[handle.label] = handle, read, change
-        return handle
+        control = Control(handle)
+        self.bound[handle.label] = control, read, change
+        return control
 
     def adopt(self, scenario):
         self.scenario = scenario
         self.settings.adopt(scenario)
-        for handle, read, _ in self.bound.values():
-            handle.value = read(scenario)
+        for control, read, _ in self.bound.values():
+            control.value = read(scenario)
 
     def set(self, label, value):
         self.adopt(replace(self.scenario, **self.bound[label][2](self.scenario, value)))
 
     @property
     def visible(self):
-        return {handle.label for handle, *_ in self.bound.values() if handle.visible}
+        return {control.handle.label for control, *_ in self.bound.values() if control.handle.visible}
 
     def value(self, label):
         return self.bound[label][0].value
@@ -103,10 +105,10 @@ def test_a_duration_by_hand_goes_on_from_what_auto_chose(controls):
         controls.set("Settings of", name)
         controls.settings.report(frame(controls.scenario))
         slider = controls.bound["Flow time t"][0]
-        assert slider.disabled and slider.value == chosen
+        assert slider.handle.disabled and slider.value == chosen
         assert controls.bound["Flow time t"][2](controls.scenario, 1.5) == {}  # it is `auto` that chooses
         controls.set("Flow time: auto", False)
-        assert not slider.disabled and slider.value == chosen
+        assert not slider.handle.disabled and slider.value == chosen
         controls.set("Flow time t", 1.5)
     assert controls.scenario.duration == 1.5
     assert bias_points(controls.scenario.layers)["Bias 1"].strength == 1.5

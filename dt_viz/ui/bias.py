@@ -16,7 +16,8 @@ from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.scenario import Scenario
 from dt_viz.stacking import MAX_BIAS_POINTS, bias_points
-from dt_viz.ui import palette
+from dt_viz.ui import gestures, palette
+from dt_viz.ui.gestures import Drag
 from dt_viz.ui.handles import Dragged, Handles
 
 BALL_RADIUS = 0.011
@@ -41,7 +42,7 @@ class BiasPicture:
         number: int,
         moved: Moved,
         selected: Callable[[str], None],
-        along: Callable[[viser.SceneNodeDragEvent], Array],
+        along: Callable[[Drag], Array],
     ) -> None:
         """Hidden until `adopt` gives it a bias point.
 
@@ -78,20 +79,17 @@ class BiasPicture:
             font_screen_scale=0.8,
         )
 
-        @self.gizmo.on_update
-        async def _(event: viser.TransformControlsEvent) -> None:
-            moved(self.name, event.target.position.copy(), event.phase)
+        def put(position: Array, _wxyz: Array, phase: str) -> None:
+            moved(self.name, position, phase)
 
-        @self.ball.on_drag
-        async def _(event: viser.SceneNodeDragEvent) -> None:
-            if event.phase == "start":
+        def dragged(drag: Drag) -> None:
+            if drag.phase == "start":
                 selected(self.name)
-            self.gizmo.position = self.gizmo.position + along(event)
-            moved(self.name, self.gizmo.position.copy(), event.phase)
+            self.handles.drag(drag, along(drag), put)
 
-        @self.ball.on_click
-        async def _(_event: viser.SceneNodePointerEvent) -> None:
-            selected(self.name)
+        self.handles.on_move(put)
+        gestures.on_drag(self.ball, dragged)
+        gestures.on_click(self.ball, lambda: selected(self.name))
 
     def adopt(self, name: str, point: BiasPoint, *, on: bool, selected: bool) -> None:
         """Stand where the bias point does, unless that is where the browser has put it already."""
@@ -126,6 +124,7 @@ class BiasPicture:
 
     def hide(self) -> None:
         """There is no such bias point."""
+        self.name = ""
         if self.gizmo.visible:
             self.gizmo.visible = False
 

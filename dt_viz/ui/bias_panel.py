@@ -12,6 +12,7 @@ from dt_viz.engine import Frame
 from dt_viz.scenario import Scenario
 from dt_viz.stacking import MAX_BIAS_POINTS, bias_points, place_beside, with_bias_point, with_changed_point, without
 from dt_viz.ui.bias import selected_point
+from dt_viz.ui.controls import Control
 from dt_viz.ui.session import Session
 from dt_viz.ui.transform_settings import Bind
 
@@ -61,10 +62,7 @@ class BiasPanel:
             )
         self._settings = (self._which, radius_is_auto, self._radius, moves_goal)
 
-        @self._buttons.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            if self._session is not None:
-                {"Add": self.add, "Delete": self.delete}[self._buttons.value]()
+        Control(self._buttons, lambda name: {"Add": self.add, "Delete": self.delete}[name]())
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -97,14 +95,14 @@ class BiasPanel:
         buttons = ("Add",) * (len(names) < MAX_BIAS_POINTS) + ("Delete",) * bool(names)
         if self._buttons.options != buttons:
             self._buttons.options = buttons
-        if self._which.options != (names or (NONE,)):
-            self._which.options = names or (NONE,)
+        if self._which.handle.options != (names or (NONE,)):
+            self._which.handle.options = names or (NONE,)
         point = _selected(scenario)
-        for handle in self._settings:
-            shown = bool(names) and (handle is not self._which or len(names) > 1)
-            if handle.visible != shown:
-                handle.visible = shown
-        self._radius.disabled = point.radius is None
+        for control in self._settings:
+            shown = bool(names) and (control is not self._which or len(names) > 1)
+            if control.handle.visible != shown:
+                control.handle.visible = shown
+        self._radius.handle.disabled = point.radius is None
 
     def report(self, frame: Frame) -> None:
         """Show what `auto` chose for the selected one, to go on from by hand."""

@@ -12,7 +12,8 @@ from dt_viz.engine import Frame
 from dt_viz.fields import Array
 from dt_viz.robot import Robot
 from dt_viz.slices import Slice
-from dt_viz.ui import palette
+from dt_viz.ui import gestures, palette
+from dt_viz.ui.gestures import Drag
 from dt_viz.ui.handles import in_slice
 
 RADIUS = 0.016
@@ -55,16 +56,20 @@ class Grip:
         )
         self.ball.visible = False
         self._slice: Slice | None = None
-        self._grabbed, self._offset = np.zeros(3), np.zeros(3)
+        self._grabbed, self._offset, self._place = np.zeros(3), np.zeros(3), np.zeros(3)
 
-        @self.ball.on_drag
-        async def _(event: viser.SceneNodeDragEvent) -> None:
-            if event.phase == "start":
-                self._grabbed, hand = np.asarray(event.start_position), where()
+        def dragged(drag: Drag) -> None:
+            if drag.phase == "start":
+                self._grabbed, hand = drag.grabbed, where()
                 self._offset = np.zeros(3) if hand is None else hand - self._grabbed
-            camera = np.asarray(event.client.camera.position)
-            shift = in_slice(self._slice, camera, tuple(self._grabbed), event.end_position)
-            held(self._grabbed + self._offset + shift, event.phase)
+                self._place = self._grabbed + self._offset
+            shift = in_slice(self._slice, drag.camera, self._grabbed, drag.pointer)
+            place = gestures.place(self._grabbed + self._offset + shift)
+            if place is not None:
+                self._place = place
+            held(self._place, drag.phase)
+
+        gestures.on_drag(self.ball, dragged)
 
     def draw(self, frame: Frame) -> None:
         """Show the ball where there is a motion to go on with, and remember the slice to be dragged in."""

@@ -38,9 +38,9 @@ class Legend:
         """For the panel."""
         stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in self.scale.shades[:: NUM_SHADES // 16].tolist())
         numbers = "".join(
-            f"<span style='position:absolute;left:{100 * self.scale.relative(value):.1f}%;"
-            f"transform:translateX(-50%)'>{html.escape(text)}</span>"
-            for value, text in self.ticks
+            f"<span style='position:absolute;left:{at:.1f}%;transform:translateX(-{at:.1f}%)'>"
+            f"{html.escape(text)}</span>"
+            for at, text in ((100 * self.scale.relative(value), text) for value, text in self.ticks)
         )
         mark = ""
         if self.swatch:

@@ -18,6 +18,7 @@ from dt_viz.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETE
 from dt_viz.several import Several
 from dt_viz.shapes import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
 from dt_viz.tasks import Task
+from dt_viz.ui.controls import Control
 from dt_viz.ui.session import Session
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
@@ -35,7 +36,7 @@ MIN_SIZE, MAX_SIZE = 0.03, 0.40
 FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
 NONE: str = "none"
 
-Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Any]
+Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Control]
 """Ties a control to the scenario; see `Panel`."""
 Shape = type[Obstacle] | UnionType
 """What an obstacle may be."""
@@ -54,10 +55,11 @@ class ObstaclePanel:
         """
         self._bind, self._say = bind, say
         self._session: Session | None = None
-        self._sizes: list[tuple[Any, Shape]] = []
+        self._sizes: list[tuple[Control, Shape]] = []
         self._refused: tuple[bytes, str, str] | None = None  # content and name of a file, and the unit it may be in
         with gui.add_folder("Obstacles"):
-            self._choice = gui.add_dropdown("Selected", (NONE,), hint="the one with handles; or click it in the scene")
+            hint = "the one with handles; or click it in the scene"
+            self._choice = Control(gui.add_dropdown("Selected", (NONE,), hint=hint), self._select)
             self._add = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
             self._change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected one")
             diameters = 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0
@@ -101,7 +103,7 @@ class ObstaclePanel:
                 lambda _s, value: {"margin": value / 100},
             )
             with gui.add_folder("From a file", expand_by_default=False):
-                self._unit = gui.add_dropdown("File is in", tuple(UNITS))
+                self._unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
                 hint = f"{FORMATS}; a mesh must be closed; a csv of points begins with x,y,z or x,y,z,occupied"
                 self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
                 self._again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
@@ -115,19 +117,8 @@ class ObstaclePanel:
         def _(_event: viser.GuiEvent) -> None:  # in a thread, too
             self.load_again()
 
-        @self._choice.on_update
-        async def _(event: viser.GuiEvent) -> None:
-            if self._session is not None and event.client is not None and self._choice.value != NONE:
-                index = self._choice.options.index(self._choice.value)
-                self._session.edit("select", view=replace(self._session.scenario.view, selected=index))
-
-        @self._add.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            self.add(SHAPES[self._add.value])
-
-        @self._change.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            {"Duplicate": self.duplicate, "Delete": self.delete}[self._change.value]()
+        Control(self._add, lambda name: self.add(SHAPES[name]))
+        Control(self._change, lambda name: {"Duplicate": self.duplicate, "Delete": self.delete}[name]())
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -136,15 +127,13 @@ class ObstaclePanel:
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's obstacles; what is tied by `bind` shows itself."""
         options = tuple(f"{k}: {name_of(obstacle)}" for k, obstacle in enumerate(scenario.obstacles, 1)) or (NONE,)
-        if self._choice.options != options:
-            self._choice.options = options
-        value = options[scenario.selected or 0]
-        if self._choice.value != value:
-            self._choice.value = value
+        if self._choice.handle.options != options:
+            self._choice.handle.options = options
+        self._choice.value = options[scenario.selected or 0]
         chosen = _selected(scenario)
-        for handle, shape in self._sizes:
-            if handle.visible != isinstance(chosen, shape):
-                handle.visible = isinstance(chosen, shape)
+        for control, shape in self._sizes:
+            if control.handle.visible != isinstance(chosen, shape):
+                control.handle.visible = isinstance(chosen, shape)
         for group, useful in (
             (self._add, len(scenario.obstacles) < MAX_OBSTACLES),
             (self._upload, len(scenario.obstacles) < MAX_OBSTACLES),
@@ -152,6 +141,11 @@ class ObstaclePanel:
         ):
             if group.visible != useful:  # groups of buttons cannot be disabled
                 group.visible = useful
+
+    def _select(self, name: str) -> None:
+        if self._session is not None and name != NONE:
+            index = self._choice.handle.options.index(name)
+            self._session.edit("select", view=replace(self._session.scenario.view, selected=index))
 
     def add(self, obstacle: Obstacle) -> None:
         """Put another obstacle, turned as it is, where there is room on the motion, and select it."""
@@ -228,7 +222,7 @@ class ObstaclePanel:
 
         def shown(scenario: Scenario) -> float:
             chosen = _selected(scenario)
-            return round(100 * read(chosen), 3) if isinstance(chosen, shape) else handle.value
+            return round(100 * read(chosen), 3) if isinstance(chosen, shape) else control.value
 
         def changed(scenario: Scenario, value: float) -> dict[str, Any]:
             chosen = _selected(scenario)
@@ -238,8 +232,8 @@ class ObstaclePanel:
             return {"obstacles": (*before[:index], change(chosen, value / 100), *before[index + 1 :])}
 
         handle.visible = False
-        self._bind(handle, shown, changed)
-        self._sizes.append((handle, shape))
+        control = self._bind(handle, shown, changed)
+        self._sizes.append((control, shape))
 
 
 def _selected(scenario: Scenario) -> Obstacle | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import trimesh
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from dt_viz.fields import Array
 from dt_viz.obstacles import CloudObstacle, MeshObstacle, Obstacle, Sphere
 from dt_viz.scenario import MAX_DIAMETER, Scenario
-from dt_viz.ui import palette
+from dt_viz.ui import gestures, palette
+from dt_viz.ui.gestures import Drag
 from dt_viz.ui.handles import Dragged, Handles
 from dt_viz.ui.links import simplified
 
@@ -41,7 +43,7 @@ class ObstaclePicture:
         index: int,
         moved: Moved,
         selected: Callable[[int], None],
-        along: Callable[[viser.SceneNodeDragEvent], Array],
+        along: Callable[[Drag], Array],
     ) -> None:
         """Draw nothing yet.
 
@@ -63,20 +65,14 @@ class ObstaclePicture:
         )
         self._look: Obstacle | None = None
 
-        @self.gizmo.on_update
-        async def _(event: viser.TransformControlsEvent) -> None:
-            moved(index, event.target.position.copy(), event.target.wxyz.copy(), event.phase)
-
-        @self.mesh.on_drag
-        async def _(event: viser.SceneNodeDragEvent) -> None:
-            if event.phase == "start":
+        def dragged(drag: Drag) -> None:
+            if drag.phase == "start":
                 selected(index)
-            self.gizmo.position = self.gizmo.position + along(event)
-            moved(index, self.gizmo.position.copy(), self.gizmo.wxyz.copy(), event.phase)
+            self.handles.drag(drag, along(drag), partial(moved, index))
 
-        @self.mesh.on_click
-        async def _(_event: viser.SceneNodePointerEvent) -> None:
-            selected(index)
+        self.handles.on_move(partial(moved, index))
+        gestures.on_drag(self.mesh, dragged)
+        gestures.on_click(self.mesh, partial(selected, index))
 
     @property
     def has_handles(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import viser
@@ -16,9 +17,11 @@ from dt_viz.imitation import ImitationError
 from dt_viz.paper_scenes import SCENES
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import bias_points
 from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.bias_panel import BiasPanel
-from dt_viz.ui.export import RESOLUTIONS
+from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.health_plots import HealthPlots
 from dt_viz.ui.legend import Legend
 from dt_viz.ui.obstacle_panel import ObstaclePanel
@@ -66,11 +69,10 @@ MAX_FLOWS = 3
 
 
 @dataclass(frozen=True)
-class _Control:
+class _Bound:
     """A control and how it reads the scenario."""
 
-    handle: Any
-    """A GUI input handle of viser."""
+    control: Control
     read: Callable[[Scenario], Any]
 
 
@@ -84,6 +86,7 @@ class Panel:
         robot: Robot,
         save_png: Callable[[str, bool], None],
         notify: Callable[[str, Colour], None],
+        look_home: Callable[[], None],
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
@@ -93,25 +96,24 @@ class Panel:
             robot: whose joints are plotted.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
             notify: says something in a colour where it is seen however far the panel is scrolled.
+            look_home: puts the camera back to where the task wants it.
         """
-        self._notify = notify
+        self._notify, self._look_home = notify, look_home
         self._gui = gui
         self._session: Session | None = None
         self._titles = dict(titles)
-        self._controls: list[_Control] = []
+        self._bound: list[_Bound] = []
         self._notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
+        self._shows = self._waits = False
+        """Whether a frame was reported at all, and whether another task or scene is computed than that of the last."""
+        self._reported: Scenario | None = None
         self._adopted: Scenario | None = None
-        self._shows = False
         self._status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
 
-        @self._cancel.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            if self._session is not None:
-                self._session.cancel()
-
+        on_press(self._cancel, self._cancel_learning)
         self._build_task()
         tabs = gui.add_tab_group()
         with tabs.add_tab("World"):
@@ -143,6 +145,7 @@ class Panel:
     def close(self) -> None:
         """The visitor has left: stop what plays."""
         self._stack.close()
+        self._saver.close()
 
     @property
     def legend(self) -> Legend | None:
@@ -157,36 +160,49 @@ class Panel:
         self._stack.adopt(scenario)
         self._slice.adopt(scenario)
         self.push.adopt(scenario)
-        for control in self._controls:
-            value = control.read(scenario)
-            if control.handle.value != value:
-                control.handle.value = value
-        self._flow.visible = scenario.view.generator
+        for bound in self._bound:
+            bound.control.value = bound.read(scenario)
+        self._flow.handle.visible = scenario.view.generator
         self.joints.visible = scenario.view.joint_plots
         self.health.visible = scenario.view.health_plots
         self._play.label = "Pause" if scenario.view.playing else "Play"
+        self._wait()
 
     def report(self, frame: Frame, pace: Pace) -> None:
         """Show how the rebuild went and how far its result is to be trusted."""
         if frame.stage is Stage.ROLLOUTS:
             return  # the next stage is a few milliseconds away
-        self._shows = True
+        if self._adopted is not None and not frame.scenario.begins_like(self._adopted):
+            return  # another task or scene was chosen meanwhile
+        self._reported, self._shows, self._waits = frame.scenario, True, False
         self._learned()
-        if self._noticed is not None and not frame.scenario.moves_like(self._noticed):
+        if self._noticed is not None and frame.scenario != self._noticed:
             self._notice.visible, self._noticed = False, None
-        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(hint(frame))}</div>"
-        if self._hint.content != said:
-            self._hint.content = said
+        self._give_hint(hint(frame))
         self._biases.report(frame)
         self._stack.report(frame)
         self._slice.report(frame)
         self.joints.draw(frame.arm)
         self.health.draw(frame.profiles)
         self.push.report(frame)
-        _set_max(self._rollout, len(frame.task.demonstrations) + len(frame.scenario.starts))
+        _set_max(self._rollout.handle, len(frame.task.demonstrations) + len(frame.scenario.starts))
         if frame.pictures.generator is not None:
-            _set_max(self._flow, frame.pictures.generator.num_flows)
+            _set_max(self._flow.handle, frame.pictures.generator.num_flows)
         self._status.content = status_html(frame, pace)
+
+    def _wait(self) -> None:
+        """Say that another task or scene is computed than the one reported last, whose status is pale."""
+        last = self._reported
+        if not (self._waits or last is None or self._adopted is None or last.begins_like(self._adopted)):
+            self._waits = True
+            self._give_hint("")
+            said = f"<div style='{_SMALL}'>{COMPUTING}</div>"
+            self._status.content = f"{said}<div style='{_PALE}'>{self._status.content}</div>"
+
+    def _give_hint(self, text: str) -> None:
+        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
+        if self._hint.content != said:
+            self._hint.content = said
 
     def learning(self, fraction: float, message: str) -> None:
         """Show how far learning a task is."""
@@ -196,6 +212,8 @@ class Panel:
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
+        if self._waits:
+            self._status.content = ""
         expected = isinstance(error, DataError | ImitationError)
         self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
 
@@ -226,72 +244,72 @@ class Panel:
 
     def _bind(
         self, handle: Any, read: Callable[[Scenario], Any], change: Callable[[Scenario, Any], Mapping[str, Any]]
-    ) -> Any:
+    ) -> Control:
         """Tie a control to the scenario: `read` gives its value, `change` the fields that a new value replaces."""
-        self._controls.append(_Control(handle, read))
 
-        @handle.on_update
-        async def _(event: viser.GuiEvent) -> None:
-            session = self._session
-            # setting a value from Python calls back too, without a client
-            if session is not None and event.client is not None:
-                self._edit(handle.label, **change(session.scenario, handle.value))
+        def act(value: Any) -> None:
+            if self._session is not None:
+                self._edit(handle.label, **change(self._session.scenario, value))
 
-        return handle
+        return self._tie(handle, read, act)
+
+    def _tie(self, handle: Any, read: Callable[[Scenario], Any], act: Callable[[Any], None]) -> Control:
+        """Have a control show what `read` gives, and `act` on new values."""
+        control = Control(handle, act)
+        self._bound.append(_Bound(control, read))
+        return control
+
+    def _cancel_learning(self) -> None:
+        if self._session is not None:
+            self._session.cancel()
 
     def _build_task(self) -> None:
         names = {title: name for name, title in self._titles.items()}
-        task = self._gui.add_dropdown("Task", tuple(names))
-        self._controls.append(_Control(task, lambda s: self._titles[s.task]))
+
+        def choose(session: Session, title: str) -> None:
+            session.choose_task(names[title])
+
+        self._tie(
+            self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
+        )
         self._hint = self._gui.add_html("")
-
-        @task.on_update
-        async def _(event: viser.GuiEvent) -> None:
-            session = self._session
-            if session is None or event.client is None:
-                return
-            try:
-                session.choose_task(names[task.value])
-            except DataError as error:
-                self.fail(error)
-                self.adopt(session.scenario)
-
         scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
-        scene = self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each")
-        self._controls.append(_Control(scene, lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE))
 
-        @scene.on_update
-        async def _(event: viser.GuiEvent) -> None:
-            session = self._session
-            if session is None or event.client is None:
-                return
-            if scene.value == _NO_SCENE:
+        def load(session: Session, title: str) -> None:
+            if title == _NO_SCENE:
                 session.leave_scene()
-                return
+            else:
+                session.load(scenes[title].task, scenes[title].scenario)
+
+        self._tie(
+            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each"),
+            lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
+            partial(self._begin, load),
+        )
+        Control(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+
+    def _begin(self, begin: Callable[[Session, str], None], title: str) -> None:
+        """Begin a task or a scene; where that cannot be, say why and stay."""
+        session = self._session
+        if session is not None:
             try:
-                session.load(scenes[scene.value].task, scenes[scene.value].scenario)
+                begin(session, title)
             except DataError as error:
                 self.fail(error)
                 self.adopt(session.scenario)
 
-        history = self._gui.add_button_group("History", ("Undo", "Redo", "Reset"))
-
-        @history.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            if self._session is not None:
-                {"Undo": self._session.undo, "Redo": self._session.redo, "Reset": self._session.reset}[history.value]()
+    def _travel(self, button: str) -> None:
+        session = self._session
+        if session is not None:
+            {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
+            if button == "Reset":
+                self._look_home()
 
     def _build_arm(self) -> None:
         gui = self._gui
         self._play = gui.add_button("Pause")
 
-        @self._play.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            session = self._session
-            if session is not None:
-                view = session.scenario.view
-                session.edit("play", view=replace(view, playing=not view.playing))
-
+        on_press(self._play, self._play_or_pause)
         self._bind(
             gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
             lambda s: s.view.speed,
@@ -303,6 +321,11 @@ class Panel:
             lambda s: s.arm_rollout + 1,
             lambda _s, value: {"arm_rollout": int(value) - 1},
         )
+
+    def _play_or_pause(self) -> None:
+        if self._session is not None:
+            view = self._session.scenario.view
+            self._edit("play", view=replace(view, playing=not view.playing))
 
     def _build_plots(self, robot: Robot) -> None:
         """Each right under its checkbox, high up in the tab, to be seen when they open."""
@@ -337,17 +360,15 @@ class Panel:
         )
 
     def _build_export(self, save_png: Callable[[str, bool], None]) -> None:
-        resolution = self._gui.add_dropdown("Resolution", tuple(RESOLUTIONS))
-        transparent = self._gui.add_checkbox("Transparent", False)
+        resolution = Control(self._gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
+        transparent = Control(self._gui.add_checkbox("Transparent", False))
         save = self._gui.add_button("Save PNG", icon=viser.Icon.CAMERA)
 
-        @save.on_click
-        def _(_event: viser.GuiEvent) -> None:  # in a thread: waiting for a render would block the event loop
-            save.disabled = True
-            try:
-                save_png(resolution.value, transparent.value)
-            finally:
-                save.disabled = False
+        def show(saving: bool) -> None:
+            save.disabled = saving
+
+        self._saver = PictureSaver(save_png, show, self.fail)
+        on_press(save, lambda: self._saver.request(resolution.value, transparent.value))
 
 
 def _set_max(slider: Any, value: int) -> None:
@@ -355,6 +376,7 @@ def _set_max(slider: Any, value: int) -> None:
         slider.max = value
 
 
+COMPUTING = "Computing the motion…"
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
 HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
@@ -362,6 +384,7 @@ _BLUE = ((29, 79, 124), (232, 241, 250))
 _GREEN = ((0, 92, 66), (230, 245, 239))
 _AMBER = ((138, 75, 0), (255, 244, 224))
 _RED = ((179, 38, 30), (253, 236, 234))
+_PALE = "opacity:0.3;filter:grayscale(1)"
 _TWO_LINES, _WARNING = "2.7em", "2.6em"
 _SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
 
@@ -384,18 +407,22 @@ def status_html(frame: Frame, pace: Pace) -> str:
     durations = {"": health.duration, " arm": health.arm_duration}
     if None not in durations.values():
         durations = {" hand": health.duration, " arm": health.arm_duration}
+    flow_time = " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None)
+    biases, layer_times = bias_points(scenario.layers), zip(scenario.layers, health.layer_durations, strict=False)
+    strength = " · ".join(f"{t:.2f} {layer.name}" for layer, t in layer_times if layer.name in biases and t is not None)
     rows = (
         ("Rebuild", _rebuild(pace)),
         ("Clearance", off if frame.blocked else _clearance(health.clearance, of)),
         *_collision_rows(health.collision, unknown),
-        ("Flow time t", " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None) or off),
+        *((("Flow time t", flow_time or off),) if flow_time or not strength else ()),
+        *((("Strength", strength),) if strength else ()),
         ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.2g}"),
         ("There and back", unknown if health.round_trip_error is None else _tiny(health.round_trip_error)),
         ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[health.lyapunov_falls]),
     )
     cells = "".join(
-        f"<tr><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
-        f"<td style='font-weight:600;white-space:nowrap'>{html.escape(value)}</td></tr>"
+        f"<tr style='vertical-align:top'><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
+        f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
         for name, value in rows
     )
     warnings = list(health.doubts)

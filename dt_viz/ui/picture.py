@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import viser
@@ -78,13 +79,20 @@ class Lines:
                 pieces = pieces[(middle / self._dash).astype(int) % 2 == 0]
             segments.append(pieces)
             colours.append(rgb(mark if index == marked else colour or self._colour, pieces.shape))
-        self.node.points = np.concatenate(segments).astype(np.float32)
-        self.node.colors = np.concatenate(colours)
+        assign(self.node, np.concatenate(segments), np.concatenate(colours))
 
     def show_segments(self, segments: Array) -> None:
         """Show these segments (K, 2, 3), metres."""
-        self.node.points = segments.astype(np.float32)
-        self.node.colors = rgb(self._colour, segments.shape)
+        assign(self.node, segments, rgb(self._colour, segments.shape))
+
+
+def assign(node: Any, points: Array, colours: NDArray[np.uint8]) -> None:  # noqa: ANN401 - lines, arrows and clouds
+    """Give a node points (N, …), metres, and as many colours: two messages, for the browser to apply as one.
+
+    So it must be done in an atomic block. Of no points there are no colours; the one that is sent instead means all.
+    """
+    node.points = points.astype(np.float32)
+    node.colors = colours if len(colours) else np.zeros(3, np.uint8)
 
 
 def rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -124,5 +132,5 @@ class Arrows:
         # the largest lie where ψ⁻¹ stretches most; a high quantile keeps the others readable
         relative = np.minimum(size / np.quantile(size, 0.9), 1) if len(size) else size
         arrows = vectors / np.maximum(size, 1e-12) * self._length * (0.45 + 0.55 * relative)
-        self.node.points = np.stack([points - arrows / 2, points + arrows / 2], axis=1).astype(np.float32)
-        self.node.colors = (self._little + relative * (self._much - self._little)).astype(np.uint8)
+        ends = np.stack([points - arrows / 2, points + arrows / 2], axis=1)
+        assign(self.node, ends, (self._little + relative * (self._much - self._little)).astype(np.uint8))

@@ -10,6 +10,7 @@ from dt_viz.engine import Frame
 from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
 from dt_viz.ui import palette
+from dt_viz.ui.controls import on_press
 from dt_viz.ui.picture import Lines
 
 
@@ -29,10 +30,7 @@ class PushButton:
 
     def connect(self, push: Callable[[], None]) -> None:
         """Call `push`, which must only submit, when the button is pressed."""
-
-        @self.handle.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            push()
+        on_press(self.handle, push)
 
     def adopt(self, scenario: Scenario) -> None:
         """Nothing is pushed that stands still."""

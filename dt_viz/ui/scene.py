@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import viser
@@ -19,13 +20,13 @@ from dt_viz.ui import palette
 from dt_viz.ui.arm_layers import Onion
 from dt_viz.ui.bias import BALL_RADIUS, Biases
 from dt_viz.ui.bias import Moved as BiasMoved
+from dt_viz.ui.handles import Moved as SliceMoved
 from dt_viz.ui.levels import LevelRollouts
 from dt_viz.ui.manifold import BaseInset, Generator, WarpedGrid
 from dt_viz.ui.obstacles import Moved, Obstacles
 from dt_viz.ui.picture import Lines, Picture
 from dt_viz.ui.pots import Pots
 from dt_viz.ui.slice import MovableSlice
-from dt_viz.ui.slice import Moved as SliceMoved
 from dt_viz.ui.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
 from dt_viz.ui.starts import Starts
 
@@ -37,6 +38,9 @@ ADDED = 0.0022
 """Thickness of rollouts from added starts, metres."""
 OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
 """What the view shows of a motion, and nothing says that it may be of another one: rollouts are grey then."""
+OF_A_TASK = {"demonstrations", "ghost"}
+"""The same of what belongs to a task or a scene."""
+COMPUTING = "computing"
 
 
 class Demonstrations(Picture):
@@ -199,6 +203,11 @@ class ScenePictures:
         }
         self._view, self._blocked = View(), False
         self._showing = threading.Lock()  # whoever changes the view is not who draws
+        self._drawing = threading.Lock()
+        self._frame: Frame | None = None
+        self._adopted: Scenario | None = None
+        self._grey = False
+        """Whether it was drawn as `stale`."""
         function = ColourSlice(scene)
         self._by_colour: dict[str, Picture] = {
             "det": function,
@@ -210,17 +219,32 @@ class ScenePictures:
         """The picture that this field of `View` shows or hides."""
         return self._by_view[view]
 
+    @property
+    def stale(self) -> bool:
+        """Whether the last frame belongs to another task or scene than the scenario adopted since."""
+        return not (self._frame is None or self._adopted is None or self._frame.scenario.begins_like(self._adopted))
+
     def draw(self, frame: Frame) -> None:
         """Assign fresh arrays to the handles."""
+        with self._drawing:
+            self._frame = frame
+            self._draw(frame)
+
+    def _draw(self, frame: Frame) -> None:
+        """Draw a frame, a stale one grey: as one that there is no motion for."""
+        before, self._grey = (self._blocked, self._grey), self.stale
+        if self._grey:
+            frame = replace(frame, blocked=(*frame.blocked, COMPUTING))
         for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
             picture.draw(frame)
-        if bool(frame.blocked) != self._blocked:
+        if (bool(frame.blocked), self._grey) != before:
             with self._showing:
                 self._blocked = bool(frame.blocked)
                 self._show()
 
     def adopt(self, scenario: Scenario) -> None:
         """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
+        self._adopted = scenario
         self.obstacles.adopt(scenario)
         self.biases.adopt(scenario)
         self.slice.adopt(scenario)
@@ -228,11 +252,16 @@ class ScenePictures:
         with self._showing:
             self._view = scenario.view
             self._show()
+        if self.stale != self._grey:  # who draws at this moment has seen one of both, or is waited for
+            with self._drawing:
+                if self._frame is not None:
+                    self._draw(self._frame)
 
     def _show(self) -> None:
         """Show what the view says; nothing that belongs to another motion while the scenario has none."""
         for name, picture in self._by_view.items():
-            picture.visible = getattr(self._view, name) and not (self._blocked and name in OF_A_MOTION)
+            hidden = (self._blocked and name in OF_A_MOTION) or (self._grey and name in OF_A_TASK)
+            picture.visible = getattr(self._view, name) and not hidden
         shown = None if self._blocked else self._by_colour.get(self._view.colour)
         for picture in self._by_colour.values():
             picture.visible = picture is shown

@@ -17,6 +17,7 @@ from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.errors import DataError
 from dt_viz.fields import Array
 from dt_viz.imitation import ImitationError
+from dt_viz.interruption import interruptible
 from dt_viz.paper_scenes import SCENES
 from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
@@ -65,7 +66,7 @@ _Job = tuple[Scenario, float]
 
 
 class _UnwantedError(Exception):
-    """Nobody wants any more what is being learned, or refined."""
+    """Nobody wants any more what is being computed."""
 
 
 def _end_if(superseded: Callable[[], bool]) -> None:
@@ -133,6 +134,9 @@ class Session:
         self._gesture: tuple[str, float] = ("", 0.0)
         self._held = False
         self._learning = self._stopped = self._closed = False
+        self._failed = False
+        """Whether the last computation ended by an error, so that what is shown is not all that the scenario asks for.
+        """
         self._shown: Scenario | None = None
         self._complete = False
         self._requests: list[_Request] = []
@@ -159,7 +163,7 @@ class Session:
         now = time.monotonic()
         with self._lock:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
-            if edited == self.scenario:
+            if edited == self.scenario and not self._failed:
                 return
             if _is_step(edited, self.scenario):
                 name, when = self._gesture
@@ -169,7 +173,7 @@ class Session:
                     self._past.append(self.scenario)
                 self._gesture = (gesture, now)
                 self._future.clear()
-            needs_frames = not edited.computes_like(self.scenario)
+            needs_frames = self._failed or not edited.computes_like(self.scenario)
             self.scenario = edited
             if needs_frames:
                 self._submit()
@@ -212,12 +216,9 @@ class Session:
             self.end_gesture()
 
     def reset(self) -> None:
-        """Back to how the task or the scene began, a scene seen as it wants to be; can be undone."""
+        """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
         scene = SCENES.get(self.scenario.scene)
-        if scene is None:
-            self._begin("reset", self._as_seen(self._initial(self.scenario.task)))
-        else:
-            self._begin("reset", self._with_habits(scene.scenario(self.task)))
+        self._begin("reset", self._initial(self.scenario.task) if scene is None else scene.scenario(self.task))
 
     def leave_scene(self) -> None:
         """Back to how the task of the scene begins; can be undone. Nothing is done while there is no scene."""
@@ -355,18 +356,27 @@ class Session:
         self._worker.submit((self.scenario, time.perf_counter()))
 
     def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:
+        self._failed = False
         try:
-            self._show_frames(job, superseded)
+            with interruptible(self._end_if_closed):
+                self._show_frames(job, superseded)
         except _UnwantedError:
             pass
-        except (DataError, ImitationError):
+        except Exception as error:
             with self._lock:
-                returned = self._retreat(job[0])
+                self._failed = True
+                returned = isinstance(error, DataError | ImitationError) and self._retreat(job[0])
+                if not returned and self.scenario != job[0] and not superseded():
+                    self._submit()  # it was edited meanwhile, and seemed to need no frames of its own
             if returned:
                 self._adopt()
             raise
         finally:
             self._learning = False
+
+    def _end_if_closed(self) -> None:
+        if self._closed:
+            raise _UnwantedError
 
     def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
@@ -380,6 +390,8 @@ class Session:
         """Do what is asked for; whether the frames of the scenario, which it may have interrupted, can wait."""
         try:
             pushed, failed = request.compute(scenario), False
+        except _UnwantedError:
+            raise
         except Exception as error:  # as in `LatestWorker`, but the frames go on
             logger.exception("the arm could not do what it was asked for")
             pushed, failed = None, True

@@ -2,42 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 import numpy as np
 import viser
 
 from dt_viz.engine import Frame
-from dt_viz.fields import Array
 from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
 from dt_viz.ui import palette
-from dt_viz.ui.handles import Handles
+from dt_viz.ui.handles import Handles, Moved
 from dt_viz.ui.picture import Lines, Picture
 
 HANDLE_SCALE = 0.24
 """Metres that the handles stick out, about."""
-
-Moved = Callable[[Array, Array, str], None]
-"""Told the centre (3,) of the slice, metres, its quaternion (4,), and the phase of the drag."""
 
 
 class MovableSlice(Picture):
     """The frame of the slice, hung on a gizmo: the browser moves both together, without asking the server."""
 
     def __init__(self, scene: viser.SceneApi, moved: Moved) -> None:
-        """Hidden until `adopt` shows it; `moved` is told of each new pose."""
+        """Hidden until `adopt` shows it; `moved` is told of each new pose, the position being the slice's centre."""
         self.gizmo = scene.add_transform_controls("/slice", line_width=3.0, depth_test=False, visible=False)
         super().__init__(self.gizmo)
         self.border = Lines(scene, "/slice/border", palette.SLICE, 0.0022)
         self._home: Slice | None = None
         self._handles = Handles(self.gizmo, HANDLE_SCALE)
+        self._handles.on_move(moved)
         self._scenario: Scenario | None = None
-
-        @self.gizmo.on_update
-        async def _(event: viser.TransformControlsEvent) -> None:
-            moved(event.target.position.copy(), event.target.wxyz.copy(), event.phase)
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`: remembers where the task has it."""

@@ -14,7 +14,7 @@ from dt_viz.fields import Array
 from dt_viz.slices import Slice
 from dt_viz.ui import palette
 from dt_viz.ui.colour_scale import NUM_SHADES, Scale, diverging, ramp
-from dt_viz.ui.picture import Arrows, Lines, Picture
+from dt_viz.ui.picture import Arrows, Lines, Picture, assign
 
 ARROW_LENGTH = 0.024
 """Of the fastest arrow, metres."""
@@ -183,8 +183,8 @@ class OccupancySlice(Picture):
         self.image.show(picture.area, _of_probability(picture.probability))
         self.level.show_segments(picture.level)
         self.outline.show_segments(picture.outline)
-        self.points.points = picture.points.astype(np.float32)
-        self.points.colors = np.where(picture.occupied[:, None], palette.OCCUPIED, palette.FREE).astype(np.uint8)
+        colours = np.where(picture.occupied[:, None], palette.OCCUPIED, palette.FREE).astype(np.uint8)
+        assign(self.points, picture.points, colours)
 
 
 def _of_probability(probability: Array) -> NDArray[np.uint8]:

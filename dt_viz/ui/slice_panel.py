@@ -10,6 +10,7 @@ import viser
 
 from dt_viz.engine import Frame
 from dt_viz.scenario import SLICE_COLOURS, Scenario
+from dt_viz.ui.controls import on_press
 from dt_viz.ui.legend import OCCUPANCY, Legend, legend_of
 from dt_viz.ui.session import Session
 
@@ -40,11 +41,7 @@ class SlicePanel:
         )
         self.back = gui.add_button("Back to the task's slice", visible=False)
 
-        @self.back.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            if self._session is not None:
-                self._session.edit("slice", view=replace(self._session.scenario.view, slice=None))
-                self._session.end_gesture()
+        on_press(self.back, self._put_back)
 
         bind(
             gui.add_dropdown("Colour", tuple(COLOUR_LABELS.values()), hint="of the slice"),
@@ -61,6 +58,11 @@ class SlicePanel:
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
         self._session = session
+
+    def _put_back(self) -> None:
+        if self._session is not None:
+            self._session.edit("slice", view=replace(self._session.scenario.view, slice=None))
+            self._session.end_gesture()
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""

@@ -11,9 +11,10 @@ import viser
 
 from dt_viz.engine import Frame
 from dt_viz.scenario import Scenario
-from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, levels, shifted, switched, visible_names
+from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, levels, shifted, switched, visible_names
 from dt_viz.tuning import avoids, transforms
 from dt_viz.ui import palette
+from dt_viz.ui.controls import Control
 from dt_viz.ui.levels import manifold
 from dt_viz.ui.session import Session
 from dt_viz.ui.transform_settings import Bind, TransformSettings, durations
@@ -96,10 +97,11 @@ class StackPanel:
             handle = self._gui.add_button_group(row.label, row.buttons)
         self._rows.append(handle)
 
-        @handle.on_click
-        async def _(_event: viser.GuiEvent) -> None:
+        def pressed(button: str) -> None:
             if k < len(self._shown):
-                self.press(self._shown[k].name, handle.value)
+                self.press(self._shown[k].name, button)
+
+        Control(handle, pressed)
 
     def press(self, name: str, button: str) -> None:
         """Do what a button of the row of this name does."""
@@ -116,11 +118,12 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row
     on = {layer.name for layer in scenario.layers if layer.on} | ({AVOIDANCE} if scenario.avoidance else set())
     seen = levels(scenario)
     listed = []
-    order = visible_names(scenario)
+    order, biases = visible_names(scenario), bias_points(scenario.layers)
     for k, name in enumerate(order):
         moves = (UP,) * (k < len(order) - 1) + (DOWN,) * (k > 0)
         look = (_look(scenario, name),) * (name in seen)
-        listed.append(Row(name, _label(name, durations.get(name)), (ON if name in on else OFF, *moves, *look)))
+        label = _label(name, durations.get(name), "strength" if name in biases else "t")
+        listed.append(Row(name, label, (ON if name in on else OFF, *moves, *look)))
     if WHOLE_ARM in transforms(scenario):
         label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
         listed.append(Row(WHOLE_ARM, label, (ON if scenario.avoidance else OFF,)))
@@ -144,8 +147,8 @@ def legend_html(scenario: Scenario) -> str:
     )
 
 
-def _label(name: str, duration: float | None) -> str:
-    return name if duration is None else f"{name}, t {duration:.2f}"
+def _label(name: str, duration: float | None, what: str = "t") -> str:
+    return name if duration is None else f"{name}, {what} {duration:.2f}"
 
 
 def _look(scenario: Scenario, name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 import numpy as np
 import viser
@@ -13,7 +13,8 @@ from dt_viz.fields import Array
 from dt_viz.scenario import Scenario
 from dt_viz.slices import Slice
 from dt_viz.starts import struck
-from dt_viz.ui import palette
+from dt_viz.ui import gestures, palette
+from dt_viz.ui.gestures import Clicks, Drag
 from dt_viz.ui.handles import in_slice
 from dt_viz.ui.picture import Picture
 
@@ -56,17 +57,14 @@ class StartBall:
         )
         self._grabbed, self._from = np.zeros(3), np.zeros(3)
 
-        @self.ball.on_drag
-        async def _(event: viser.SceneNodeDragEvent) -> None:
-            if event.phase == "start":
-                self._grabbed, self._from = np.asarray(event.start_position), np.array(self.ball.position)
-            camera = np.asarray(event.client.camera.position)
-            shift = in_slice(area(), camera, tuple(self._grabbed), event.end_position)
-            moved(index, self._from + shift, event.phase)
+        def dragged(drag: Drag) -> None:
+            if drag.phase == "start":
+                self._grabbed, self._from = drag.grabbed, np.array(self.ball.position)
+            place = gestures.place(self._from + in_slice(area(), drag.camera, self._grabbed, drag.pointer))
+            moved(index, np.array(self.ball.position) if place is None else place, drag.phase)
 
-        @self.ball.on_click
-        async def _(_event: viser.SceneNodePointerEvent) -> None:
-            chosen(index)
+        gestures.on_drag(self.ball, dragged)
+        gestures.on_click(self.ball, partial(chosen, index))
 
 
 class Starts(Picture):
@@ -86,7 +84,7 @@ class Starts(Picture):
         super().__init__(scene.add_frame("/starts", show_axes=False))
         self._scene, self._moved, self._chosen, self._clicked = scene, moved, chosen, clicked
         self._slice: Slice | None = None
-        self._listens = False
+        self._clicks = Clicks(scene, self.click)
         self.items: list[StartBall] = []
         """In the order of the scenario."""
 
@@ -108,17 +106,10 @@ class Starts(Picture):
         for item, start in zip(self.items, scenario.starts, strict=True):
             if np.abs(np.asarray(item.ball.position) - start).max() > 1e-9:
                 item.ball.position = start
-        if scenario.view.click_to_start != self._listens:
-            self._listens = scenario.view.click_to_start
-            listener: Any = self.click  # viser takes coroutines, too, and does not say so
-            if self._listens:
-                self._scene.on_click()(listener)
-            else:
-                self._scene.remove_click_callback(listener)
+        self._clicks.listen(scenario.view.click_to_start)
 
-    async def click(self, event: viser.SceneClickEvent) -> None:
-        """Add a start where the slice was clicked, unless one that is there already was."""
-        origin, direction = np.asarray(event.ray_origin), np.asarray(event.ray_direction)
+    def click(self, origin: Array, direction: Array) -> None:
+        """Add a start where this ray, both (3,), metres, meets the slice, unless one that is there was clicked."""
         place = None if self._slice is None else struck(self._slice, origin, direction)
         if place is not None and not any(self._hits(item, origin, direction) for item in self.items):
             self._clicked(place)

@@ -13,8 +13,9 @@ from dt_viz.robot import load_jaco
 from dt_viz.scenario import MAX_STARTS, Scenario
 from dt_viz.starts import followed, with_grid
 from dt_viz.tracking import UnreachableError
-from dt_viz.ui.bias_panel import Bind
+from dt_viz.ui.controls import Control
 from dt_viz.ui.session import Session
+from dt_viz.ui.transform_settings import Bind
 
 
 class StartsPanel:
@@ -36,10 +37,8 @@ class StartsPanel:
                 "Starts", ("Grid", "Remove", "Clear"), hint="Remove: the one that the arm follows, or else the newest"
             )
 
-        @self._buttons.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            if self._session is not None:
-                {"Grid": self.add_grid, "Remove": self.remove, "Clear": self.clear}[self._buttons.value]()
+        acts = {"Grid": self.add_grid, "Remove": self.remove, "Clear": self.clear}
+        Control(self._buttons, lambda name: acts[name]())
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -80,7 +79,7 @@ class StartsPanel:
             self._session.end_gesture()
 
     def clear(self) -> None:
-        """All."""
+        """Remove all added starts."""
         if self._session is not None:
             number = followed(self._session.scenario, len(self._session.task.demonstrations))
             arm_rollout = number if number < len(self._session.task.demonstrations) else 0

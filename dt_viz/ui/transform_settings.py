@@ -10,13 +10,15 @@ from typing import Any
 import viser
 
 from dt_viz.engine import Frame
+from dt_viz.imitation import OBJECTIVES
 from dt_viz.integration import MAX_STEPS, METHODS, Method
 from dt_viz.occupancy import GENERATORS
-from dt_viz.scenario import MAX_TEMPERATURE, MIN_TEMPERATURE, OBJECTIVES, SPACES, Scenario
+from dt_viz.scenario import MAX_TEMPERATURE, MIN_TEMPERATURE, SPACES, Scenario
 from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points
 from dt_viz.tuning import FlowSettings, avoids, flow_settings, transforms, tuned, with_flow
+from dt_viz.ui.controls import Control
 
-Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], Mapping[str, Any]]], Any]
+Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], Mapping[str, Any]]], Control]
 """Ties a control to the scenario: how its value is read, and which fields a new value replaces."""
 
 SPACE_LABELS: Mapping[str, str] = {"task": "End effector", "cspace": "Whole arm", "both": "Both"}
@@ -114,35 +116,35 @@ class TransformSettings:
             lambda s: _flow(s, lambda flow: flow.integration.steps, 8),
             lambda s, value: _integrated(s, steps=int(value)),
         )
-        self._of_imitation = (learn, self._note)
-        self._of_avoidance = (space, generator, reach)
-        self._auto = auto
-        self._of_flow = (auto, self._duration, method)
+        self._of_imitation = (learn.handle, self._note)
+        self._of_avoidance = (space.handle, generator.handle, reach.handle)
+        self._auto = auto.handle
+        self._of_flow = (auto.handle, self._duration.handle, method.handle)
 
     def adopt(self, scenario: Scenario) -> None:
         """Offer what the chosen transform has; the values themselves are those of bound controls."""
         self._adopted = scenario
         name = tuned(scenario)
         flow = flow_settings(scenario, name)
-        if self._which.options != transforms(scenario):
-            self._which.options = transforms(scenario)
+        if self._which.handle.options != transforms(scenario):
+            self._which.handle.options = transforms(scenario)
         shown = (
             (self._of_imitation, name == IMITATION),
             (self._of_avoidance, avoids(name)),
             (self._of_flow, flow is not None),
-            ((self._steps,), flow is not None and flow.integration.by_hand),
+            ((self._steps.handle,), flow is not None and flow.integration.by_hand),
         )
         for handles, visible in shown:
             for handle in handles:
                 if handle.visible != visible:
                     handle.visible = visible
-        for handle, label in zip((self._auto, self._duration), flow_labels(scenario, name), strict=True):
+        for handle, label in zip((self._auto, self._duration.handle), flow_labels(scenario, name), strict=True):
             if handle.label != label:
                 handle.label = label
         if flow is not None:
-            if self._duration.max != flow.max_duration:
-                self._duration.max = flow.max_duration
-            self._duration.disabled = flow.duration is None
+            if self._duration.handle.max != flow.max_duration:
+                self._duration.handle.max = flow.max_duration
+            self._duration.handle.disabled = flow.duration is None
         self._write_note()
 
     def report(self, frame: Frame) -> None:

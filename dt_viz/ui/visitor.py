@@ -17,6 +17,7 @@ from dt_viz.scenario import Scenario
 from dt_viz.slices import SlicePose
 from dt_viz.stacking import bias_points, with_changed_point
 from dt_viz.starts import followed, with_moved_start, with_start
+from dt_viz.tasks import Task
 from dt_viz.ui import palette
 from dt_viz.ui.arm import ArmPicture
 from dt_viz.ui.arm_layers import Arms
@@ -79,7 +80,7 @@ class Visitor:
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
         self._playback = Playback(self._pose)
-        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify)
+        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._look_home)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(self._push)
@@ -92,12 +93,12 @@ class Visitor:
     def draw(self, frame: Frame, pace: Pace) -> None:
         """See `Display`."""
         if self.shown is None or frame.task is not self.shown.task:
-            self.client.camera.position, self.client.camera.look_at = frame.task.camera
-            self.client.camera.fov = FIELD_OF_VIEW
+            self._look_at(frame.task)
         with self.client.atomic():
             self.pictures.draw(frame)
             self.carried.stand(frame.task.pots)
-            self.arm.stale = bool(frame.blocked)
+            if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then it is where it was
+                self.arm.stale = bool(frame.blocked) or self.pictures.stale
         if frame.stage is not Stage.ROLLOUTS:
             if self.pushed_path.is_of_another(frame.scenario):
                 self._playback.end_detour()
@@ -113,6 +114,8 @@ class Visitor:
         """See `Display`."""
         with self.client.atomic():
             self.pictures.adopt(scenario)
+            if self.pictures.stale:
+                self.arm.stale = True
             self.arms.show(scenario.view)
             self.carried.show(arm=scenario.view.arm)
         self._playback.set_pace(scenario.view.playing, scenario.view.speed)
@@ -130,6 +133,15 @@ class Visitor:
     def cancelled(self, task: str) -> None:
         """See `Display`."""
         self._panel.cancelled(task)
+
+    def _look_at(self, task: Task) -> None:
+        """Put the camera where the task wants it."""
+        self.client.camera.position, self.client.camera.look_at = task.camera
+        self.client.camera.fov = FIELD_OF_VIEW
+
+    def _look_home(self) -> None:
+        if self.shown is not None:
+            self._look_at(self.shown.task)
 
     def close(self) -> None:
         """The visitor has left: stop all threads."""
@@ -199,7 +211,8 @@ class Visitor:
             self.session.push(self._playback.q, self._show_pushed)
 
     def _show_pushed(self, pushed: Pushed) -> None:
-        self.pushed_path.show(pushed)
+        with self.client.atomic():
+            self.pushed_path.show(pushed)
         self._playback.take_detour(pushed.motion, self._detour_ended)
 
     def _detour_ended(self) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import viser
 
+from dt_viz.ui.controls import Control
 from dt_viz.ui.session import Session
 
 SECONDS = 5.0
@@ -90,10 +91,11 @@ class WarpControls:
         )
         self._play = gui.add_button_group("Play warp", (PLAY,), order=order + 1)
 
-        @self._play.on_click
-        async def _(_event: viser.GuiEvent) -> None:
-            if self._session is not None:
-                self._player.toggle(self._session)
+        Control(self._play, lambda _button: self._toggle())
+
+    def _toggle(self) -> None:
+        if self._session is not None:
+            self._player.toggle(self._session)
 
     def connect(self, session: Session) -> None:
         """Let them edit this session."""

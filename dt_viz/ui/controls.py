@@ -1,0 +1,87 @@
+"""The only way from a control of the page to the session: what a browser sends is checked here before anything acts.
+
+viser takes over whatever arrives, without a look at limits, choices or types, also for controls that are disabled or
+hidden, and calls back afterwards. So `handle.value` is what a browser claims; `Control.value` is what was shown to it,
+or accepted from it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+
+class Control:
+    """An input of the panel.
+
+    A number beyond the control's limits is moved to them. Anything else that the control cannot have sent is refused,
+    and the browser is shown the value from before.
+    """
+
+    def __init__(self, handle: Any, act: Callable[[Any], None] | None = None) -> None:  # noqa: ANN401
+        """Take over an input of viser.
+
+        Args:
+            handle: a slider, a dropdown, a checkbox, a button or a group of buttons.
+            act: given each value that the browser sends and the control allows. It must only submit.
+        """
+        self.handle = handle
+        self._value, self._act = handle.value, act
+        listen = handle.on_click if _is_button(handle) else handle.on_update
+        listen(self._changed)
+
+    @property
+    def value(self) -> Any:  # noqa: ANN401 - as the kind of control
+        """The value shown last, or accepted from the browser since. Assigning shows another one."""
+        return self._value
+
+    @value.setter
+    def value(self, value: Any) -> None:  # noqa: ANN401
+        self._value = value
+        if self.handle.value != value:
+            self.handle.value = value
+
+    async def _changed(self, event: viser.GuiEvent) -> None:
+        if event.client is None:  # assigned here, not in a browser
+            return
+        claimed = self.handle.value
+        value = allowed(self.handle, claimed)
+        self._value = self._value if value is None else value
+        if claimed != self._value:
+            self._put_back()
+        if value is not None and self._act is not None:
+            self._act(value)
+
+    def _put_back(self) -> None:
+        # not by viser's setter, which casts to the type of what it has: that is the claim's
+        self.handle._impl.value = self._value
+        if not _is_button(self.handle):
+            self.handle._queue_update("value", self._value)
+
+
+def on_press(button: viser.GuiButtonHandle, act: Callable[[], None]) -> None:
+    """Call `act`, which must only submit, when the button is pressed while that is possible."""
+    Control(button, lambda _pressed: act())
+
+
+def allowed(handle: Any, claimed: Any) -> Any | None:  # noqa: ANN401 - handles and values of all kinds
+    """The value that a control takes for what a browser claims; None if the control cannot have sent it."""
+    if handle.disabled or not handle.visible:
+        return None
+    match handle:
+        case viser.GuiSliderHandle():
+            if isinstance(claimed, bool) or not isinstance(claimed, int | float) or not math.isfinite(claimed):
+                return None
+            return type(claimed)(min(max(claimed, handle.min), handle.max))
+        case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
+            return claimed if claimed in handle.options else None
+        case viser.GuiCheckboxHandle() | viser.GuiButtonHandle():
+            return claimed if isinstance(claimed, bool) else None
+    raise TypeError(f"nobody has said what a {type(handle).__name__} may send")
+
+
+def _is_button(handle: Any) -> bool:  # noqa: ANN401
+    return isinstance(handle, viser.GuiButtonHandle | viser.GuiButtonGroupHandle)

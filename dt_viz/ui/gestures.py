@@ -1,0 +1,100 @@
+"""The only way from the scene of the page to the session: what a browser says of places is checked before it is used.
+
+viser passes on whatever numbers arrive; a node that is hidden can be clicked and dragged by a forged message, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+
+from dt_viz.fields import Array
+
+MAX_DISTANCE = 5.0
+"""Distance from the robot's base, along each axis, beyond which nothing can be put, metres."""
+MAX_SIGHT = 1e4
+"""Largest coordinate of a camera and of what it points at, metres."""
+MIN_TURN, MAX_TURN = 0.5, 2.0
+"""Lengths of a quaternion that is taken for a rotation: browsers send unit ones, with rounding."""
+PHASES = ("start", "update", "end")
+
+
+def vector(values: Any, size: int, limit: float) -> Array | None:  # noqa: ANN401 - whatever a browser sends
+    """The numbers (size,) that were sent; None if they are none, not finite, or beyond ±limit."""
+    try:
+        numbers = np.array(values, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return numbers if numbers.shape == (size,) and (np.abs(numbers) <= limit).all() else None
+
+
+def place(values: Any) -> Array | None:  # noqa: ANN401
+    """The place (3,), metres, that was sent; None if nothing can be put there."""
+    return vector(values, 3, MAX_DISTANCE)
+
+
+def turn(values: Any) -> Array | None:  # noqa: ANN401
+    """The quaternion (4,) w, x, y, z that was sent; None if it is no rotation."""
+    wxyz = vector(values, 4, MAX_TURN)
+    return wxyz if wxyz is not None and MIN_TURN <= np.linalg.norm(wxyz) <= MAX_TURN else None
+
+
+@dataclass(frozen=True)
+class Drag:
+    """An event of a drag at something in the scene; places (3,) in metres."""
+
+    phase: str
+    """One of `PHASES`."""
+    camera: Array
+    grabbed: Array
+    """Where the thing was grabbed, moved with it."""
+    pointer: Array
+    """The pointer, on a plane through the grabbed point that faces the camera."""
+
+
+def on_drag(node: Any, act: Callable[[Drag], None]) -> None:  # noqa: ANN401 - viser's nodes of all kinds
+    """Call `act`, which must only submit, with each event of a drag at a node that is shown."""
+
+    @node.on_drag
+    async def _(event: viser.SceneNodeDragEvent) -> None:
+        camera = vector(event.client.camera.position, 3, MAX_SIGHT)
+        grabbed, pointer = (vector(at, 3, MAX_SIGHT) for at in (event.start_position, event.end_position))
+        if node.visible and event.phase in PHASES and not (camera is None or grabbed is None or pointer is None):
+            act(Drag(event.phase, camera, grabbed, pointer))
+
+
+def on_click(node: Any, act: Callable[[], None]) -> None:  # noqa: ANN401
+    """Call `act`, which must only submit, when a node that is shown is clicked."""
+
+    @node.on_click
+    async def _(_event: viser.SceneNodePointerEvent) -> None:
+        if node.visible:
+            act()
+
+
+class Clicks:
+    """Clicks anywhere in the scene, while they are listened to."""
+
+    def __init__(self, scene: viser.SceneApi, act: Callable[[Array, Array], None]) -> None:
+        """Wait for `listen`; `act`, which must only submit, is given origin and direction (3,) of the ray, metres."""
+        self._scene, self._act = scene, act
+        self._listens = False
+
+    def listen(self, wanted: bool) -> None:
+        """Listen from now on, or no more."""
+        if wanted != self._listens:
+            self._listens = wanted
+            listener: Any = self._clicked  # viser takes coroutines, too, and does not say so
+            if wanted:
+                self._scene.on_click()(listener)
+            else:
+                self._scene.remove_click_callback(listener)
+
+    async def _clicked(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = vector(event.ray_origin, 3, MAX_SIGHT), vector(event.ray_direction, 3, MAX_TURN)
+        if origin is not None and direction is not None and np.linalg.norm(direction) >= MIN_TURN:
+            self._act(origin, direction)

@@ -1,0 +1,394 @@
+"""What a page sends, forged: each control, gizmo and node of a visitor's page, through viser's own handlers."""
+
+import asyncio
+import contextlib
+import dataclasses
+import math
+import threading
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import viser  # noqa: TID251 - forges what a browser sends
+from pages import frame_of
+from viser import _messages as messages  # noqa: TID251
+from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
+
+from dt_viz.bias import BiasPoint
+from dt_viz.engine import Engine
+from dt_viz.integration import Integration
+from dt_viz.obstacles import Box, Cylinder, Sphere
+from dt_viz.scenario import Scenario, View
+from dt_viz.stacking import with_bias_point
+from dt_viz.tasks import TASKS
+from dt_viz.ui import controls, gestures, handles
+from dt_viz.ui.visitor import Visitor
+
+BORDERS = {controls.__name__, gestures.__name__, handles.__name__}
+UPLOAD = viser.GuiUploadButtonHandle
+FILE = viser.UploadedFile(name="x", content=b"\0" * 100)
+CLAIMS = [math.nan, math.inf, -math.inf, 1e300, -1e300, 1e6, -9, 0, 2**70, True, None, "", "x" * 100_000, [], {}, FILE]
+NUMBERS = (math.nan, math.inf, -math.inf, 1e300, -1e300, 6.0)
+PLACES = [
+    *((number, 0.1, 0.2) for number in NUMBERS),
+    *((0.1, 0.2, number) for number in NUMBERS),
+    (0.1, 0.2),
+    (),
+    None,
+    "abc",
+    ((1.0, 2.0, 3.0),),
+    ("a", "b", "c"),
+]
+TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, "wxyz"]
+MIDDLE = (0.1, -0.5, 0.4)
+CLIENT = cast(Any, 0)
+
+
+class NoFrames:
+    """An engine that has no frames: nothing here is about motions."""
+
+    def task(self, name):
+        return TASKS[name]()
+
+    def frames(self, *_what):
+        return iter(())
+
+
+class Page:
+    """A visitor's page on a server that nobody looks at, and what a browser may send to it."""
+
+    def __init__(self, server: viser.ViserServer, robot: Any) -> None:
+        self.gui, self.scene = server.gui, server.scene
+        self.camera = SimpleNamespace(position=np.array([0.8, -1.6, 0.8]), look_at=np.zeros(3), fov=0.75)
+        self.client = SimpleNamespace(
+            client_id=0,
+            gui=server.gui,
+            scene=server.scene,
+            camera=self.camera,
+            atomic=contextlib.nullcontext,
+            flush=lambda: None,
+            add_notification=lambda *_what, **_how: None,
+            get_render=lambda *_size, **_how: np.zeros((2, 2, 4), np.uint8),
+            send_file_download=lambda *_what, **_how: None,
+        )
+        self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
+        self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
+        titles = {name: entry.title for name, entry in TASKS.items()}
+        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, titles, "draw_s")
+        self.session = self.visitor.session
+
+    @property
+    def inputs(self) -> list[Any]:
+        """All but those whose value nobody reads."""
+        inputs = self.gui._gui_input_handle_from_uuid.values()
+        return [handle for handle in inputs if not isinstance(handle, GuiProgressBarHandle)]
+
+    @property
+    def gizmos(self) -> dict[str, Any]:
+        return self.scene._handle_from_transform_controls_name
+
+    @property
+    def nodes(self) -> dict[str, Any]:
+        return self.scene._handle_from_node_name
+
+    def run(self, *handling) -> None:
+        """Handle messages as viser does: what raises ends the handling of that message only."""
+
+        async def one_after_the_other():
+            for coroutine in handling:
+                with contextlib.suppress(Exception):
+                    await coroutine
+
+        asyncio.run(one_after_the_other())
+        self.session.wait_idle(10)
+
+    def claim(self, handle: Any, value: Any) -> None:
+        if isinstance(value, viser.UploadedFile):  # an upload can be sent to any input
+            handle._impl.value = value
+            event = viser.GuiEvent(cast(Any, self.client), CLIENT, handle)
+            self.run(*(cb(event) for cb in handle._impl.update_cb))
+        else:
+            self.run(
+                self.gui._handle_gui_updates(CLIENT, messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+            )
+
+    def move(self, name: str, position: Any, wxyz: Any = (1.0, 0.0, 0.0, 0.0)) -> None:
+        self.run(
+            self.scene._handle_transform_controls_drag_start(CLIENT, messages.TransformControlsDragStartMessage(name)),
+            self.scene._handle_transform_controls_updates(
+                CLIENT, messages.TransformControlsUpdateMessage(name, wxyz, position)
+            ),
+            self.scene._handle_transform_controls_drag_end(CLIENT, messages.TransformControlsDragEndMessage(name)),
+        )
+
+    def drag(self, name: str, start: Any, end: Any, phase: Any = "update") -> None:
+        at = {
+            "start_position": start,
+            "start_screen_pos": (0.5, 0.5),
+            "end_position": end,
+            "end_screen_pos": (0.5, 0.5),
+        }
+        message = messages.SceneNodeDragMessage(
+            phase=phase, name=name, instance_index=None, button="left", modifier=None, **at
+        )
+        self.run(self.scene._handle_node_drag(CLIENT, message))
+
+    def busy(self, **view: Any) -> Scenario:
+        """A scenario in which most controls are shown, and most things stand in the scene."""
+        task = TASKS["draw_s"]()
+        obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
+        self.session.edit(
+            "test",
+            obstacles=obstacles,
+            space="both",
+            duration=0.5,
+            integration=Integration("rk4", 8),
+            layers=with_bias_point((), BiasPoint(MIDDLE, radius=0.1, strength=0.5)),
+            starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
+            view=View(generator=True, click_to_start=True, **view),
+        )
+        assert task.name == "draw_s"
+        return self.session.scenario
+
+
+@pytest.fixture(scope="module")
+def page(server, robot):
+    page = Page(server, robot)
+    yield page
+    page.visitor.close()
+
+
+def values_of(value: Any):
+    """All plain values in a scenario, but for what obstacles keep of files."""
+    if dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from values_of(getattr(value, field.name))
+    elif isinstance(value, tuple | list):
+        for one in value:
+            yield from values_of(one)
+    else:
+        yield value
+
+
+def assert_sound(page: Page) -> None:
+    """The scenario holds nothing that the page could not have asked for, and each control shows what it allows."""
+    scenario = page.session.scenario
+    for value in values_of(scenario):
+        if isinstance(value, float | int):
+            assert math.isfinite(value) and abs(value) <= 50
+        elif isinstance(value, str):
+            assert len(value) < 40
+    assert scenario.task in TASKS and 0 <= scenario.view.generator_layer <= 20 and scenario.arm_rollout >= 0
+    for obstacle in scenario.obstacles:
+        assert 0.01 < obstacle.radius < 1 and 0.9 < np.linalg.norm(obstacle.wxyz) < 1.1
+    for handle in page.inputs:
+        value = handle.value
+        if isinstance(handle, viser.GuiSliderHandle):
+            assert handle.min <= value <= max(handle.max, 20) and type(value) in (int, float)
+        elif isinstance(handle, viser.GuiDropdownHandle):
+            assert value in handle.options
+        elif isinstance(handle, viser.GuiCheckboxHandle):
+            assert isinstance(value, bool)
+    for gizmo in page.gizmos.values():
+        assert gizmo.position.shape == (3,) and np.isfinite(gizmo.position.astype(float)).all()
+        assert gizmo.wxyz.shape == (4,) and np.isfinite(gizmo.wxyz.astype(float)).all()
+
+
+def test_nothing_that_a_page_sends_passes_by_the_border(page):
+    """Whoever adds a control cannot forget to have it checked. Uploads are bytes, and checked by what reads them."""
+    page.busy()
+    inputs = [handle for handle in page.inputs if handle.label not in {"", "Mesh or point cloud"}]
+    assert len(inputs) > 50 and page.gizmos and page.nodes
+    callbacks = [(handle.label, callback) for handle in inputs for callback in handle._impl.update_cb]
+    assert {label for label, _ in callbacks} == {handle.label for handle in inputs}
+    callbacks += [(name, cb) for name, gizmo in page.gizmos.items() for cb in gizmo._impl_aux.update_cb]
+    for name, node in page.nodes.items():
+        callbacks += [(name, entry.callback) for entry in (*(node._impl.click_cb or ()), *(node._impl.drag_cb or ()))]
+    callbacks += [("scene", entry.callback) for entry in page.scene._scene_pointer_cb]
+    assert {name for name, _ in callbacks} > {"scene", "/obstacles/0/surface", "/bias/0/ball", "/starts/1", "/slice"}
+    for name, callback in callbacks:
+        assert callback.__module__ in BORDERS, name
+        assert asyncio.iscoroutinefunction(callback), f"{name} would wait in the pool that all visitors share"
+
+
+@pytest.mark.parametrize("selected", range(3))
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: repr(claim)[:20])
+def test_a_forged_value_is_refused_or_moved_to_the_limits(page, claim, selected):
+    page.busy(selected=selected)
+    for handle in page.inputs:
+        if not isinstance(handle, UPLOAD):
+            page.claim(handle, claim)
+            assert_sound(page)
+
+
+@pytest.mark.parametrize(
+    ("label", "claim", "read", "expected"),
+    [
+        ("Diameter [cm]", 1e6, lambda s: s.obstacles[0].diameter, 0.30),
+        ("Height [cm]", -1.0, lambda s: s.obstacles[0].height, 0.03),
+        ("Steps", 10**6, lambda s: s.integration.steps, 50),
+        ("Warp", 50.0, lambda s: s.warp, 1.0),
+        ("Of flow", -9, lambda s: s.view.generator_layer, 0),
+        ("Reach T", 1e9, lambda s: s.temperature, 20.0),
+        ("Warp", math.nan, lambda s: s.warp, 1.0),
+        ("Learn", "nonsense", lambda s: s.objective, "trajectory"),
+        ("Task", "nonsense", lambda s: s.task, "draw_s"),
+        ("Speed", math.inf, lambda s: s.view.speed, 1.0),
+    ],
+)
+def test_what_is_forged_is_shown_as_what_it_has_become(page, label, claim, read, expected):
+    page.busy(selected=0, tuned="Imitation" if label == "Learn" else "Avoidance")
+    (handle,) = (handle for handle in page.inputs if handle.label == label and handle.visible)
+    told = []
+    handle._queue_update = lambda name, value: told.append((name, value))
+    page.claim(handle, claim)
+    assert read(page.session.scenario) == expected
+    assert told == [("value", handle.value)] and handle.value != claim
+
+
+def test_controls_that_are_hidden_or_disabled_do_nothing(page):
+    page.busy()
+    hidden = [handle for handle in page.inputs if handle.disabled or not handle.visible]
+    assert {"Radius: auto", "Learn", "Back to the task's slice"} & {handle.label for handle in hidden}
+    for handle in hidden:
+        before, shown = page.session.scenario, handle.value
+        for claim in (True, False, 1, 7, *getattr(handle, "options", ())):
+            if not isinstance(handle, UPLOAD):
+                page.claim(handle, claim)
+        assert page.session.scenario == before, handle.label
+        assert handle.value == shown, handle.label
+
+
+def test_every_value_that_a_control_offers_is_taken(page):
+    """Or the border would be too narrow."""
+    page.busy()
+    for handle in page.inputs:
+        offered = {
+            viser.GuiSliderHandle: lambda h: (h.min, h.max),
+            viser.GuiDropdownHandle: lambda h: h.options,
+            viser.GuiCheckboxHandle: lambda h: (True, False),
+        }.get(type(handle), lambda h: ())(handle)
+        for value in offered:
+            if handle.visible and not handle.disabled:
+                assert controls.allowed(handle, value) == value, (handle.label, value)
+
+
+@pytest.mark.parametrize("position", PLACES, ids=repr)
+def test_a_gizmo_goes_nowhere_that_is_no_place(page, position):
+    before = page.busy(move_slice=True)
+    for name in page.gizmos:
+        page.move(name, position)
+        assert_sound(page)
+    assert page.session.scenario == before
+    page.busy()
+    for name in page.gizmos:
+        page.move(name, position)
+        assert_sound(page)
+
+
+@pytest.mark.parametrize("wxyz", TURNS, ids=repr)
+def test_a_gizmo_takes_no_turn_that_is_none(page, wxyz):
+    before = page.busy()
+    for name in page.gizmos:
+        page.move(name, MIDDLE, wxyz)
+        assert_sound(page)
+    assert page.session.scenario == before
+    page.session.edit("test", view=View(move_slice=True))
+    page.move("/slice", MIDDLE, wxyz)
+    assert page.session.scenario.view.slice is None
+
+
+def test_only_gizmos_that_are_shown_can_be_moved_and_those_can(page):
+    before = page.busy(selected=1)
+    for name in ("/obstacles/0", "/obstacles/2", "/slice", "/bias/3"):
+        page.move(name, (0.2, -0.4, 0.3))
+    assert page.session.scenario == before
+    page.move("/obstacles/1", (0.2, -0.4, 0.3))
+    assert page.session.scenario.obstacles[1].position == (0.2, -0.4, 0.3)
+    page.move("/bias/0", (0.2, -0.4, 0.3))
+    assert page.session.scenario != before
+
+
+def test_what_is_dragged_in_the_scene_moves_and_what_is_far_away_stays(page):
+    before = page.busy()
+    page.drag("/obstacles/0/surface", MIDDLE, (0.2, -0.4, 0.3))
+    page.drag("/bias/0/ball", MIDDLE, (0.2, -0.4, 0.3))
+    page.drag("/starts/1", MIDDLE, (0.2, -0.4, 0.3), "start")
+    after = page.session.scenario
+    assert after.obstacles[0] != before.obstacles[0] and after.obstacles[1:] == before.obstacles[1:]
+    assert after.layers != before.layers and after.starts != before.starts
+    for name in ("/obstacles/0/surface", "/bias/0/ball", "/starts/1"):
+        page.drag(name, MIDDLE, (900.0, -0.5, 0.4))
+    assert page.session.scenario == after
+
+
+@pytest.mark.parametrize("phase", ["start", "update", "end", "again", None])
+@pytest.mark.parametrize("place", PLACES, ids=repr)
+def test_what_is_dragged_in_the_scene_goes_nowhere_that_is_no_place(page, place, phase):
+    page.busy()
+    dragged = [name for name, node in page.nodes.items() if node._impl.drag_cb]
+    assert len(dragged) >= 7
+    for name in dragged:
+        page.drag(name, place, MIDDLE, phase)
+        page.drag(name, MIDDLE, place, phase)
+        assert_sound(page)
+
+
+@pytest.mark.parametrize("place", PLACES, ids=repr)
+def test_a_camera_that_is_nowhere_drags_nothing_anywhere(page, place, monkeypatch):
+    page.busy()
+    monkeypatch.setattr(page.camera, "position", place)
+    for name in [name for name, node in page.nodes.items() if node._impl.drag_cb]:
+        page.drag(name, MIDDLE, (0.2, -0.4, 0.3))
+        assert_sound(page)
+
+
+@pytest.mark.parametrize("ray", [*PLACES, (0.0, 0.0, 0.0)], ids=repr)
+def test_a_ray_that_is_none_adds_no_start(page, ray):
+    before = page.busy()
+    for origin, direction in ((ray, (0.0, 1.0, 0.0)), ((0.8, -1.6, 0.8), ray)):
+        message = messages.ScenePointerMessage("click", origin, direction, ((0.5, 0.5),), None)
+        page.run(page.scene._handle_scene_pointer_updates(CLIENT, message))
+        assert_sound(page)
+    assert len(page.session.scenario.starts) <= len(before.starts) + 1
+
+
+def test_reset_brings_the_camera_back(page):
+    task = TASKS["draw_s"]()
+    page.visitor.shown = frame_of(page.busy(), task=task)
+    page.camera.position, page.camera.look_at = np.full(3, 9.0), np.ones(3)
+    (history,) = (handle for handle in page.inputs if handle.label == "History")
+    page.claim(history, "Undo")
+    np.testing.assert_array_equal(page.camera.position, np.full(3, 9.0))
+    page.claim(history, "Reset")
+    position, look_at = task.camera
+    np.testing.assert_array_equal(page.camera.position, position)
+    np.testing.assert_array_equal(page.camera.look_at, look_at)
+    page.visitor.shown = None
+
+
+def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(page, monkeypatch):
+    asked, answer = [], threading.Event()
+
+    def render(*_size, **_how):
+        asked.append(threading.current_thread())
+        assert answer.wait(30)
+        return np.zeros((2, 2, 4), np.uint8)
+
+    monkeypatch.setattr(page.client, "get_render", render)
+    (save,) = (handle for handle in page.inputs if handle.label == "Save PNG")
+    for _ in range(40):
+        page.claim(save, True)
+    assert page.gui._thread_executor.submit(lambda: True).result(timeout=20)
+    answer.set()
+    page.visitor._panel._saver._thread.join(30)
+    assert [thread.name for thread in asked] == ["picture"]
+
+
+def test_a_long_text_is_not_kept(page):
+    page.busy()
+    for handle in page.inputs:
+        if not isinstance(handle, UPLOAD):
+            page.claim(handle, "x" * 1_000_000)
+            assert not isinstance(handle.value, str) or len(handle.value) < 100
