@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import dt_viz.engine as engine_module
 from dt_viz.bias import BiasPoint, vector
 from dt_viz.demos import Demonstration
 from dt_viz.doubts import MAX_TARGET_MISS
@@ -302,8 +303,13 @@ def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
         stage(new_engine(), initial("lift_box"), Stage.LIVE)
         followed.set()
 
+    def until_it_is_due():
+        while not followed.is_set() and not engine_module._turns._queue:
+            assert other.is_alive()
+            followed.wait(0.001)
+
     other = threading.Thread(target=follow, daemon=True)
-    frames = new_engine().frames(initial("draw_s"), checkpoint=lambda: followed.wait(0.05) and None)
+    frames = new_engine().frames(initial("draw_s"), checkpoint=until_it_is_due)
     assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     other.start()
     assert next(frames).stage is Stage.FINE
