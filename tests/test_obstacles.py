@@ -152,7 +152,7 @@ def test_the_distance_of_complex_points_is_that_of_their_real_part(obstacle):
     points = around(obstacle, 300).reshape(3, 100, 3)
     shifted = obstacle.signed_distance(points + 1e-30j)
     assert shifted.shape == (3, 100)
-    np.testing.assert_allclose(shifted.real, obstacle.signed_distance(points), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(shifted.real, obstacle.signed_distance(points), rtol=0, atol=1e-14)
 
 
 @obstacles
