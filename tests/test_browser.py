@@ -14,7 +14,6 @@ from playwright.sync_api import sync_playwright
 
 import dt_viz.fits
 from dt_viz.engine import ArmMotion
-from dt_viz.fits import FitStore
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles import MeshObstacle
 from dt_viz.robot import load_jaco
@@ -51,8 +50,8 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    server = Server(TASKS, FitStore(tmp_path_factory.mktemp("fits")), task="draw_s", port=0, max_sessions=2)
+def server(fits):
+    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=2)
     yield server
     server.close()
 
