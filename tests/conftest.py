@@ -1,5 +1,10 @@
 """What several test modules share: a robot, learned tasks in a temporary cache, scenarios."""
 
+import os
+
+# Tests run beside each other, each on one core: read when numpy is imported, by its BLAS.
+os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"} | os.environ)
+
 import pytest
 import viser  # noqa: TID251 - a page for tests of pictures and controls
 from hypothesis import settings
@@ -17,7 +22,8 @@ settings.load_profile("dt-viz")
 
 
 def pytest_collection_modifyitems(config, items):
-    """What is marked slow runs when it is asked for by its marker."""
+    """What is marked slow runs when it is asked for by its marker; the browser begins, as it waits longest."""
+    items.sort(key=lambda item: item.get_closest_marker("browser") is None)
     if "slow" not in config.getoption("-m"):
         for item in items:
             if item.get_closest_marker("slow"):
@@ -30,9 +36,11 @@ def robot() -> Robot:
 
 
 @pytest.fixture(scope="session")
-def fits(tmp_path_factory) -> FitStore:
-    """Learns each task once for the whole test run."""
-    return FitStore(tmp_path_factory.mktemp("fits"))
+def fits(tmp_path_factory, request) -> FitStore:
+    """Learns each task once for the whole test run: workers beside each other share a folder."""
+    is_worker = hasattr(request.config, "workerinput")
+    folder = tmp_path_factory.getbasetemp()
+    return FitStore((folder.parent if is_worker else folder) / "fits")
 
 
 @pytest.fixture(scope="session")

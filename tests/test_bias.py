@@ -137,7 +137,7 @@ def test_the_derivative_of_a_placed_field_is_that_of_its_values(seed, plane):
     field = BiasPoint((0.1, -0.4, 0.3), plane=plane).field(0.25)
     s = np.array([0.1, -0.4, 0.3]) + rng.uniform(-0.2, 0.2, (40, 3))
     V, DV = field.with_jacobian(s)
-    np.testing.assert_allclose(V, field(s), atol=1e-15)
+    np.testing.assert_allclose(V, field(s), rtol=1e-12, atol=1e-12)
     h = 1e-5
     for j, step in enumerate(h * np.eye(3)):
         np.testing.assert_allclose(DV[:, :, j], (field(s + step) - field(s - step)) / (2 * h), atol=1e-6)
@@ -153,16 +153,17 @@ def test_in_a_plane_nothing_moves_out_of_it(seed):
     rng = np.random.default_rng(seed)
     s = np.array([0.0, -0.5, 0.4]) + rng.uniform(-0.3, 0.3, (50, 3))
     V = BiasPoint((0.0, -0.5, 0.4), plane=PLANE).field(0.3)(s)
-    assert V.any() and np.abs(V @ DRAWING_AXES[:, 2]).max() < 1e-15
+    assert V.any() and np.abs(V @ DRAWING_AXES[:, 2]).max() < 1e-13
 
 
 # motions
 
 
 @pytest.mark.parametrize("task", ["draw_s", "lift_box", "push_box"])
-def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(ground, task):
+@pytest.mark.parametrize("num", [9, pytest.param(30, marks=pytest.mark.slow)])
+def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(ground, task, num):
     g, rng, off, turns = ground(task), np.random.default_rng(7), [], []
-    for number in range(30):
+    for number in range(num):
         point = BiasPoint(beside(g, rng, plane_of(task)), plane=plane_of(task))
         solution = biased(g, Biasing(point), precision=FINE if number % 3 == 0 else LIVE)
         assert not solution.unsatisfied and solution.doubts == ()

@@ -13,7 +13,7 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 import dt_viz.fits
-from dt_viz.fits import FitStore
+from dt_viz.engine import ArmMotion
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles import MeshObstacle
 from dt_viz.robot import load_jaco
@@ -26,7 +26,10 @@ from dt_viz.ui.visitor import Visitor
 
 CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 WIDTH, HEIGHT = 900, 560
-PATIENCE = 90.0  # seconds: software rendering is slow
+PATIENCE = 240.0
+"""Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
+LIGHT = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
+"""What is drawn by software thirty times a second; with the arm it takes most of a second."""
 
 pytestmark = [
     pytest.mark.browser,
@@ -47,8 +50,8 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    server = Server(TASKS, FitStore(tmp_path_factory.mktemp("fits")), task="draw_s", port=0, max_sessions=2)
+def server(fits):
+    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=2)
     yield server
     server.close()
 
@@ -60,17 +63,26 @@ def wait_until(condition, what):
         time.sleep(0.05)
 
 
+def until_drawn(visitor):
+    """Until the page has drawn what it was sent, and what it has sent itself has arrived: messages keep their order."""
+    visitor.client.flush()
+    visitor.client.get_render(height=16, width=16, timeout=PATIENCE)
+
+
 def open_page(browser, server):
-    """A new tab and the visitor that the server made for it, once its first scenario is drawn."""
+    """A new tab and the visitor that the server made for it, once its first scenario is drawn, without the arm."""
     known = set(server.visitors)
     page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    page.set_default_timeout(1000 * PATIENCE)
     page.goto(f"http://127.0.0.1:{server.port}")
     wait_until(lambda: set(server.visitors) - known, "the page of a visitor")
     (visitor,) = set(server.visitors) - known
+    visitor.session.edit("test", view=LIGHT)
     assert visitor.session.wait_idle(PATIENCE)
-    page.get_by_text("Smallest det J").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("Smallest det J").wait_for()
     # the notice about software rendering may go by itself at any moment
     page.locator("button.mantine-Notification-closeButton").evaluate_all("all => all.forEach(button => button.click())")
+    until_drawn(visitor)
     return page, visitor
 
 
@@ -78,6 +90,7 @@ def open_page(browser, server):
 def visit(browser, server):
     page, visitor = open_page(browser, server)
     wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
+    until_drawn(visitor)
     yield page, visitor
     page.close()
     wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
@@ -105,7 +118,12 @@ def project(visitor: Visitor, point) -> tuple[float, float]:
     return WIDTH / 2 + focal * seen[0] / seen[2], HEIGHT / 2 + focal * seen[1] / seen[2]
 
 
-def drag(page, start, end, steps=12):
+def seen_at(visitor: Visitor) -> tuple[float, float]:
+    """CSS pixels of the obstacle."""
+    return project(visitor, visitor.session.scenario.obstacles[0].position)
+
+
+def drag(page, start, end, steps=6):
     page.mouse.move(*start)
     page.mouse.down()
     for k in range(1, steps + 1):
@@ -114,19 +132,20 @@ def drag(page, start, end, steps=12):
     page.mouse.up()
 
 
-def drag_until(page, done, reset, ends):
+def drag_until(page, visitor, done, reset, ends):
     """Drag between the two pixels of `ends()` until `done()`; again after `reset()`, as a page drawn by software
     may not show the handles in their place yet: then the drag has turned the camera instead."""
     deadline = time.monotonic() + PATIENCE
     while not done():
         assert time.monotonic() < deadline
         reset()
-        time.sleep(2.0)  # until the page has drawn it, and told its camera
+        until_drawn(visitor)
         start, end = ends()
         page.mouse.move(*start)
-        time.sleep(1.0)
-        drag(page, start, end, steps=6)
-        time.sleep(0.5)  # for the last event
+        until_drawn(visitor)
+        drag(page, start, end)
+        time.sleep(0.2)  # viser holds the last event back for a moment
+        until_drawn(visitor)
 
 
 def assert_shows_the_obstacle_where_it_is(visitor: Visitor) -> None:
@@ -163,13 +182,12 @@ def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_p
     page, visitor = visit
     centre = np.array(visitor.session.scenario.obstacles[0].position)
     x, y = project(visitor, centre)
-    grabbed = (x - 18, y + 14)  # off the handles
     for target in ((x + 40, y - 30), (x - 60, y + 20), (x + 25, y + 35)):
-        drag(page, grabbed, target, steps=6)
-        time.sleep(0.2)
-        grabbed = target
+        before = np.array(seen_at(visitor))
+        drag(page, np.add(before, (-18, 14)), target)  # off the handles
+        wait_until(lambda before=before: np.linalg.norm(seen_at(visitor) - before) > 20, "the sphere to follow")
+        until_drawn(visitor)
     assert visitor.session.wait_idle(PATIENCE)
-    wait_until(lambda: visitor.session.wait_idle(0.3), "the last event")
     shift = np.array(visitor.session.scenario.obstacles[0].position) - centre
     assert np.linalg.norm(shift) > 0.02
     assert abs(shift[1]) < 1e-6  # the drawing plane is y = const
@@ -203,8 +221,7 @@ def click_button(page, name):
 def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit):
     page, visitor = visit
     session, pictures = visitor.session, visitor.pictures.obstacles
-    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
-    session.edit("test", view=light, avoidance=False)  # software rendering is slow
+    session.edit("test", avoidance=False)
     (sphere,) = session.scenario.obstacles
     click_button(page, "Box")
     wait_until(lambda: [item.has_handles for item in pictures.items] == [False, True], "the box and its handles")
@@ -219,7 +236,7 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
         x, y = project(visitor, before - (0.05, 0.05, 0.015))  # away from the handles
         return (x, y), (x - 50, y + 30)
 
-    drag_until(page, dragged, lambda: session.edit("test", obstacles=boxed), along_its_face)
+    drag_until(page, visitor, dragged, lambda: session.edit("test", obstacles=boxed), along_its_face)
     assert session.scenario.obstacles[0] == sphere
     np.testing.assert_allclose(pictures.items[1].gizmo.position, session.scenario.obstacles[1].position, atol=1e-9)
 
@@ -232,19 +249,18 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     click_button(page, "Delete")
     wait_until(lambda: session.scenario.obstacles == (sphere,) and len(pictures.items) == 1, "the box to go")
     click_button(page, "Delete")
-    page.get_by_text("no obstacle").first.wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("no obstacle").first.wait_for()
 
 
 def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     page, visitor = visit
     session = visitor.session
-    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
-    session.edit("test", obstacles=(), view=light, avoidance=False)  # software rendering is slow
+    session.edit("test", obstacles=(), avoidance=False)
     crate = trimesh.creation.box((150, 100, 50)).export(file_type="stl")
     page.get_by_text("From a file", exact=True).click()
     upload = page.locator("input[type=file]").first
     upload.set_input_files({"name": "crate.stl", "mimeType": "model/stl", "buffer": crate})
-    page.get_by_text("is the file in millimetres").first.wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("is the file in millimetres").first.wait_for()
     assert session.scenario.obstacles == ()
     click_button(page, "Read it in millimetres")
     wait_until(lambda: session.scenario.obstacles, "the mesh")
@@ -262,7 +278,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
         turns = [np.array([np.cos(angle), 0.0, np.sin(angle)]) for angle in (0.8, 0.1)]
         return [project(visitor, mesh.position + arc * turn) for turn in turns]
 
-    drag_until(page, turned, lambda: session.edit("test", obstacles=(mesh,)), along_the_arc)
+    drag_until(page, visitor, turned, lambda: session.edit("test", obstacles=(mesh,)), along_the_arc)
     assert session.wait_idle(PATIENCE)
     (after,) = session.scenario.obstacles
     axis = np.abs(after.wxyz[1:]) / np.linalg.norm(after.wxyz[1:])
@@ -273,8 +289,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
 def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_the_stack(visit):
     page, visitor = visit
     session, pictures = visitor.session, visitor.pictures.biases
-    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
-    session.edit("test", obstacles=(), view=light)  # software rendering is slow
+    session.edit("test", obstacles=())
     click_button(page, "Add")
     wait_until(lambda: session.scenario.layers and session.wait_idle(0.3), "the bias point")
 
@@ -290,7 +305,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     def moved():
         return 0.03 < np.linalg.norm(place() - before) < 0.15
 
-    drag_until(page, moved, lambda: session.edit("test", layers=layers), beside_its_middle)
+    drag_until(page, visitor, moved, lambda: session.edit("test", layers=layers), beside_its_middle)
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
     assert abs(place()[1] - before[1]) < 1e-6  # the drawing plane is y = const
     np.testing.assert_allclose(pictures.items[0].gizmo.position, place(), atol=1e-9)
@@ -308,7 +323,7 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     visitor.session.edit("test", view=View(playing=False, colour="det"))
     assert visitor.session.wait_idle(PATIENCE)
     open_tab(page, "Picture")
-    with page.expect_download(timeout=1000 * PATIENCE) as download:
+    with page.expect_download() as download:
         page.get_by_text("Save PNG").click()
     image = Image.open(io.BytesIO(download.value.path().read_bytes()))
     assert image.size == (1280, 720)
@@ -326,15 +341,15 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
 
 def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):
     _, first = visit
-    first.session.edit("test", view=View(playing=False))  # pages share one software renderer
     page, second = open_page(browser, server)
     third = browser.new_page()
+    third.set_default_timeout(1000 * PATIENCE)
     try:
-        second.session.edit("test", avoidance=False, view=View(playing=False))
+        second.session.edit("test", avoidance=False)
         assert second.session.wait_idle(PATIENCE)
         assert first.session.scenario.avoidance
         third.goto(f"http://127.0.0.1:{server.port}")
-        third.get_by_text("All 2 places are taken").wait_for(timeout=1000 * PATIENCE)
+        third.get_by_text("All 2 places are taken").wait_for()
     finally:
         third.close()
         page.close()
@@ -405,11 +420,12 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
     session, plain = visitor.session, View(playing=False, field=False, ghost=False)
     session.edit("test", view=plain)
     wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
-    time.sleep(0.2)  # for the playback to rest
     q = visitor.shown.arm.q[50]
-    visitor.arms.pose(q, q + 0.6 * np.eye(6)[0])
+    apart = ArmMotion(np.array([0.0, 1.0]), np.stack([q, q]), np.stack([q, q]) + 0.6 * np.eye(6)[0])
+    visitor._playback.hold(apart, lambda: None)
+    wait_until(lambda: np.array_equal(visitor._playback.q, q), "the arm to be posed")
     open_tab(page, "Show")
-    time.sleep(1.0)
+    until_drawn(visitor)
     before = pixels(page)
     for label, (name, coloured) in ARM_LAYERS.items():
         box = page.get_by_label(label, exact=True).first
@@ -454,12 +470,12 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     page.get_by_role("option", name="Imitation").click()
     page.get_by_role("textbox", name="Learn").or_(page.locator("input[value='trajectory']")).first.click()
     page.get_by_role("option", name="velocity").click()
-    page.get_by_text("Learning the motion: without end").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("Learning the motion: without end").wait_for()
     page.get_by_role("button", name="Cancel").click()
-    page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for()
     assert visitor.session.wait_idle(PATIENCE)
     assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
-    page.get_by_text("Smallest det J").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("Smallest det J").wait_for()
     assert page.get_by_role("button", name="Cancel").count() == 0
 
 
@@ -477,7 +493,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
         x, y = project(visitor, before)
         return (x, y), (x - 50, y - 40)
 
-    drag_until(page, lambda: visitor.pushed_path.pushed is not None, lambda: None, from_the_ball)
+    drag_until(page, visitor, lambda: visitor.pushed_path.pushed is not None, lambda: None, from_the_ball)
     wait_until(lambda: session.wait_idle(0.3), "the last event")
     pushed, hand = visitor.pushed_path.pushed, visitor._hand()
     np.testing.assert_allclose(pushed.path[0], hand, atol=1e-3)
@@ -496,7 +512,7 @@ def test_the_warp_is_played_in_the_page(visit):
     page.get_by_text("0 → 1").click()
     wait_until(lambda: visitor.shown.scenario.warp < 1, "a picture on its way")
     wait_until(lambda: visitor.session.scenario.warp == visitor.shown.scenario.warp == 1, "the full stack")
-    page.get_by_text("0 → 1").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("0 → 1").wait_for()
     visitor.session.undo()
     assert visitor.session.scenario.warp == 1  # it ended as it began
 
@@ -504,9 +520,6 @@ def test_the_warp_is_played_in_the_page(visit):
 def test_the_slice_is_moved_by_its_handles_and_the_field_with_it(visit):
     page, visitor = visit
     session, home = visitor.session, visitor.shown.slice
-    light = View(playing=False, streamlines=True, field=False, arm=False, table=False, demonstrations=False)
-    session.edit("test", obstacles=(), view=replace(light, move_slice=True))
-    wait_until(lambda: session.wait_idle(0.3), "the handles")
     gizmo, right = visitor.pictures.slice.gizmo, home.axes[:, 0]
 
     def along_its_first_arrow():
@@ -516,7 +529,10 @@ def test_the_slice_is_moved_by_its_handles_and_the_field_with_it(visit):
     def moved():
         return np.linalg.norm(visitor.shown.slice.centre - home.centre) > 0.03
 
-    drag_until(page, moved, lambda: session.edit("test", view=replace(light, move_slice=True)), along_its_first_arrow)
+    moving = replace(LIGHT, streamlines=True, move_slice=True)
+    session.edit("test", obstacles=(), view=moving)
+    wait_until(lambda: session.wait_idle(0.3), "the handles")
+    drag_until(page, visitor, moved, lambda: session.edit("test", view=moving), along_its_first_arrow)
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
     area = visitor.shown.slice
     np.testing.assert_allclose(np.cross(area.centre - home.centre, right), 0, atol=1e-6)  # along the arrow only
@@ -529,19 +545,19 @@ def test_the_slice_is_moved_by_its_handles_and_the_field_with_it(visit):
 def test_a_click_on_the_slice_starts_a_rollout_and_a_drag_of_the_camera_does_not(visit):
     page, visitor = visit
     session, area = visitor.session, visitor.shown.slice
-    light = View(playing=False, field=False, arm=False, table=False, demonstrations=False, click_to_start=True)
-    session.edit("test", obstacles=(), view=light)
+    session.edit("test", obstacles=(), view=replace(LIGHT, click_to_start=True))
     wait_until(lambda: session.wait_idle(0.3), "the mode")
     place = area.at(np.array([-0.6, 0.6]) * area.half_size)
     deadline = time.monotonic() + PATIENCE
     while not session.scenario.starts:  # again, if the page was not listening yet
         assert time.monotonic() < deadline
         page.mouse.click(*project(visitor, place))
-        time.sleep(0.5)
+        time.sleep(0.2)
+        until_drawn(visitor)
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its rollout")
     np.testing.assert_allclose(session.scenario.starts[0], place, atol=0.01)
     np.testing.assert_allclose(visitor.shown.rollouts[-1][0], session.scenario.starts[0], atol=1e-6)
     np.testing.assert_allclose(visitor.shown.rollouts[-1][-1], visitor.shown.goal, atol=1e-4)
     drag(page, (60, 60), (90, 80), steps=4)
-    time.sleep(0.5)
+    until_drawn(visitor)
     assert len(session.scenario.starts) == 1

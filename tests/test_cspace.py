@@ -76,11 +76,17 @@ def clearance(field, q):
     return (field.obstacle.signed_distance(points) - field.body.radius).min(axis=-1)
 
 
+def rounding(field, q):
+    """What rounding may leave of a field's values: some tens of operations on the places of body points, a metre or so
+    away, by the steepest slope of the field; ten times that."""
+    return 1e3 * np.finfo(float).eps * np.abs(field.with_jacobian(q)[1]).max()
+
+
 class TestFields:
     def test_the_derivative_is_that_of_central_differences(self, field):
         q = near(60)
         value, DV = field.with_jacobian(q)
-        np.testing.assert_allclose(value, field(q), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(value, field(q), rtol=0, atol=rounding(field, q))
         scale = np.abs(DV).max()
         assert scale > 0.1
         np.testing.assert_allclose(DV, central_differences(field, q, 1e-5), rtol=0, atol=1e-5 * scale)
@@ -89,11 +95,11 @@ class TestFields:
         q, u = near(20), np.random.default_rng(1).normal(size=NUM_JOINTS)
         DV = by_complex_steps(field, q)[1]
         for h in (1e3 * COMPLEX_STEP, 1e-20):
-            np.testing.assert_allclose(field(q + 1j * h * u).imag / h, DV @ u, rtol=0, atol=1e-12 * np.abs(DV).max())
+            np.testing.assert_allclose(field(q + 1j * h * u).imag / h, DV @ u, rtol=0, atol=1e-11 * np.abs(DV).max())
 
     def test_each_posture_is_on_its_own(self, field):
         q = near(30)
-        np.testing.assert_allclose(field(q)[7:9], field(q[7:9]), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(field(q)[7:9], field(q[7:9]), rtol=0, atol=rounding(field, q))
         assert field(q[:0]).shape == (0, NUM_JOINTS)
         assert field.dim == NUM_JOINTS
 
@@ -101,7 +107,7 @@ class TestFields:
         """In blocks, and with those parts of the arm left out that are far from the obstacle in all of a block."""
         q = near(2 * BLOCK + 5, spread=0.4)
         few = np.concatenate([field(posture[None]) for posture in q])
-        np.testing.assert_allclose(field(q), few, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(field(q), few, rtol=0, atol=rounding(field, q))
 
     def test_beyond_its_reach_nothing_moves(self, field):
         q = near(3000, spread=0.6)
@@ -190,7 +196,7 @@ class TestGradientField:
 
     def test_its_jacobian_is_symmetric(self, gradient):
         DV = gradient.with_jacobian(near(60))[1]
-        np.testing.assert_allclose(DV, DV.transpose(0, 2, 1), rtol=0, atol=1e-12 * np.abs(DV).max())
+        np.testing.assert_allclose(DV, DV.transpose(0, 2, 1), rtol=0, atol=1e-10 * np.abs(DV).max())
 
 
 LIMITS = JointLimits(ROBOT.lower, ROBOT.upper)
@@ -227,10 +233,13 @@ class TestJointLimits:
     def test_away_from_limits_and_on_continuous_joints_nothing_changes(self, seed):
         q = inside(50, seed)
         away = ~LIMITED | ((q > ROBOT.lower + LIMITS.zone) & (q < ROBOT.upper - LIMITS.zone))
+        near = (q < ROBOT.lower + LIMITS.zone / 2) | (
+            q > ROBOT.upper - LIMITS.zone / 2
+        )  # farther it may be lost in rounding
         for image, J in (LIMITS.jacobian(q), LIMITS.inverse_jacobian(q)):
             np.testing.assert_array_equal(image[away], q[away])
             np.testing.assert_array_equal(J[away], np.broadcast_to(np.eye(NUM_JOINTS), J.shape)[away])
-            assert (image[~away] != q[~away]).all()
+            assert (image[near] != q[near]).all()
 
     @given(seeds, st.floats(0, 1))
     def test_scaled_it_is_the_same_flow_for_a_part_of_its_time(self, seed, part):

@@ -1,5 +1,6 @@
 """Scenario to frames, for the tasks that ship: what a picture promises, whatever the scenario."""
 
+import itertools
 import threading
 from dataclasses import replace
 
@@ -254,7 +255,8 @@ def test_times_increase_where_a_strong_bias_stretches_space_at_the_goal(engine, 
     scenario = replace(initial("drop_pots"), obstacles=())
     target = mean_end(engine.task("drop_pots")) + np.array(beyond)
     point = BiasPoint(vector(target), radius=radius, strength=4.0)
-    for frame in engine.frames(replace(scenario, layers=with_bias_point((), point))):
+    frames = engine.frames(replace(scenario, layers=with_bias_point((), point)))
+    for frame in itertools.islice(frames, Stage.CERTIFIED):  # certificates change no times
         for times in frame.times:
             assert (np.diff(times) > 0).all()
         if frame.arm is not None:
@@ -314,7 +316,7 @@ def test_wherever_refining_is_interrupted_it_leaves_nothing_half_done(new_engine
     scenario, engine, passed = replace(initial("draw_s"), space=space), new_engine(), []
     expected = [*new_engine().frames(scenario, checkpoint=lambda: passed.append(None))][-1]
     assert len(passed) > 100  # all along, not between a few long parts
-    for moment in (0.05, 0.3, 0.7, 0.95):
+    for moment in (0.05, 0.5, 0.95):
         left = iter(range(int(moment * len(passed))))
 
         def refuse(left=left):
@@ -339,8 +341,13 @@ def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
         stage(new_engine(), initial("lift_box"), Stage.LIVE)
         followed.set()
 
+    def until_it_is_due():
+        while not followed.is_set() and not engine_module._turns._queue:
+            assert other.is_alive()
+            followed.wait(0.001)
+
     other = threading.Thread(target=follow, daemon=True)
-    frames = new_engine().frames(initial("draw_s"), checkpoint=lambda: followed.wait(0.05) and None)
+    frames = new_engine().frames(initial("draw_s"), checkpoint=until_it_is_due)
     assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     other.start()
     assert next(frames).stage is Stage.FINE

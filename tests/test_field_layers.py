@@ -103,8 +103,7 @@ def test_what_is_not_shown_is_not_computed(engine, scenario):
 # --- Streamlines ---
 
 
-@pytest.mark.parametrize("moved", [False, True])
-@pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
+@pytest.mark.parametrize(("wanted", "moved"), [(Stage.LIVE, True), (Stage.FINE, False)])
 def test_streamlines_follow_the_velocity_and_the_lyapunov_value_falls_along_them(engine, scenario, wanted, moved):
     view = {"slice": tilted(engine.task(scenario.task))} if moved else {}
     frame = shown(engine, scenario, wanted, streamlines=True, **view)

@@ -122,7 +122,7 @@ def test_lyapunov_value_falls_along_motions_from_anywhere(learned):
 def test_a_motion_from_the_goal_stays_there(learned):
     _, imitation = learned
     assert np.allclose(imitation.system.rollout(imitation.goal, np.array([0.0, 1.0])), imitation.goal, atol=1e-12)
-    assert np.allclose(imitation.system.velocity(imitation.goal), 0, atol=1e-12)
+    assert np.allclose(imitation.system.velocity(imitation.goal), 0, atol=1e-11)
 
 
 def mean_error(demonstrations, imitation):

@@ -67,9 +67,9 @@ def test_implicit_euler_inverts_euler_to_rounding(seed, dim, h):
     rng = np.random.default_rng(seed)
     field, s = smooth_field(rng, dim, 0.4), rng.uniform(-1.5, 1.5, (12, dim))
     back, _ = implicit_euler(field, euler(field, s, None, -h)[0], None, h)
-    np.testing.assert_allclose(back, s, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(back, s, rtol=0, atol=1e-13)
     there, _ = euler(field, implicit_euler(field, s, None, h)[0], None, -h)
-    np.testing.assert_allclose(there, s, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(there, s, rtol=0, atol=1e-13)
 
 
 @given(seeds, st.sampled_from(STEPS), st.floats(-0.15, 0.15))
@@ -111,17 +111,17 @@ def test_adaptive_error_falls_with_its_tolerance(duration):
     assert errors[3] < errors[2] < errors[1] < errors[0]
 
 
-@pytest.mark.parametrize(("tolerance", "largest"), [(2e-5, 1e-3), (2e-9, 1e-7)])
 @pytest.mark.parametrize("duration", [-0.9, -0.6, -0.3, 0.3, 0.9])
-def test_adaptive_is_not_deceived_by_a_first_step_that_is_far_too_long(tolerance, largest, duration):
+def test_adaptive_is_not_deceived_by_a_first_step_that_is_far_too_long(duration):
     """In several times the time in which a field turns motions around, some error estimate is small by chance."""
-    s = np.random.default_rng(0).normal(size=(3000, 3))
-    s *= np.linspace(0.001, 0.08, 3000)[:, None] / np.linalg.norm(s, axis=1, keepdims=True)
+    s = np.random.default_rng(0).normal(size=(1500, 3))
+    s *= np.linspace(0.001, 0.08, 1500)[:, None] / np.linalg.norm(s, axis=1, keepdims=True)
     for temperature in (3.0, 6.0, 9.0):
         field = Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", temperature)
         reference, _ = integrate(rk4, field, s, None, duration, 300)
-        end, _ = integrate_adaptive(field, s, None, duration, tolerance)
-        assert np.abs(end - reference).max() < largest
+        for tolerance, largest in ((2e-5, 1e-3), (2e-9, 1e-7)):
+            end, _ = integrate_adaptive(field, s, None, duration, tolerance)
+            assert np.abs(end - reference).max() < largest
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-6, 1e-3, 1e-2])

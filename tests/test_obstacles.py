@@ -96,7 +96,7 @@ def solid(obstacle: Obstacle) -> trimesh.Trimesh:
 @obstacles
 def test_the_distance_changes_no_faster_than_the_point_moves(obstacle):
     rng = np.random.default_rng(1)
-    points = around(obstacle, 20_000)
+    points = around(obstacle, 5000)
     for step in (1e-4, 1e-3, 1e-2, 0.1):
         moved = points + step * rng.normal(size=points.shape)
         change = np.abs(obstacle.signed_distance(moved) - obstacle.signed_distance(points))
@@ -152,7 +152,7 @@ def test_the_distance_of_complex_points_is_that_of_their_real_part(obstacle):
     points = around(obstacle, 300).reshape(3, 100, 3)
     shifted = obstacle.signed_distance(points + 1e-30j)
     assert shifted.shape == (3, 100)
-    np.testing.assert_allclose(shifted.real, obstacle.signed_distance(points), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(shifted.real, obstacle.signed_distance(points), rtol=0, atol=1e-14)
 
 
 @obstacles

@@ -1,7 +1,6 @@
 """The hand is pushed aside in the middle of its motion: what the arm does then."""
 
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +15,10 @@ from dt_viz.ui.playback import Playback
 
 MOMENTS = (0.1, 0.5, 0.9)
 """Of the motion, between 0 and 1."""
+PICTURE = 0.005
+"""Seconds from one picture of the playback to the next."""
+PATIENCE = 30.0
+"""Seconds after which a test gives up; nothing takes that long."""
 
 
 @pytest.fixture(params=["draw_s", "push_box"], name="task")
@@ -95,21 +98,19 @@ def test_nothing_is_pushed_that_is_not_shown(new_engine, initial, robot):
 # --- Playback ---
 
 
-class Recorder:
-    """Poses with the moments at which they were taken, and a way to wait for one."""
+class Player:
+    """A playback whose clock only moves when it is told to, and the places where the arm was posed."""
 
     def __init__(self):
-        self.poses = []
-        self.posed = threading.Condition()
+        self.places = []
+        self.playback = Playback(lambda q, _without: self.places.append(q[0]))
 
-    def __call__(self, q, _without):
-        with self.posed:
-            self.poses.append(q[0])
-            self.posed.notify_all()
-
-    def wait(self, wanted):
-        with self.posed:
-            assert self.posed.wait_for(lambda: bool(self.poses) and wanted(self.poses[-1]), 20.0)
+    def play(self, seconds):
+        """The places where the arm is meanwhile."""
+        before = len(self.places)
+        for _ in range(round(seconds / PICTURE)):
+            self.playback.advance(PICTURE)
+        return self.places[before:]
 
 
 def ramp(begin, end, seconds):
@@ -119,93 +120,92 @@ def ramp(begin, end, seconds):
 
 @pytest.fixture
 def player(monkeypatch):
-    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
+    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 1e-4)  # its thread sleeps until it is closed
     monkeypatch.setattr(playback_module, "REST", 0.3)
     monkeypatch.setattr(playback_module, "CATCH_UP", 0.1)
-    recorder = Recorder()
-    player = Playback(recorder)
-    yield player, recorder
-    player.close()
+    player = Player()
+    yield player
+    player.playback.close()
+
+
+def test_a_motion_is_played_without_being_asked_for(monkeypatch):
+    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
+    arrived = threading.Event()
+    playback = Playback(lambda q, _without: arrived.set() if q[0] == 1.0 else None)
+    playback.follow(ramp(0.0, 1.0, 0.1))
+    assert arrived.wait(PATIENCE)
+    playback.close()
 
 
 def test_a_detour_is_followed_once_from_where_the_arm_is_and_then_the_loop_goes_on(player):
-    playback, recorder = player
-    ended = threading.Event()
+    playback, ended = player.playback, []
     assert playback.q is None
     playback.follow(ramp(0.0, 1.0, 0.5))
-    recorder.wait(lambda place: place > 0.3)
-    before = len(recorder.poses)
-    playback.take_detour(ramp(3.0, 4.0, 0.5), ended.set)
-    recorder.wait(lambda place: place == 4.0)
-    first = next(place for place in recorder.poses[before:] if place > 1.0 or place < 0.3)
-    assert first < 3.0  # it does not jump there
-    assert ended.wait(20.0)
-    recorder.wait(lambda place: 0.5 < place < 1.0)
-    back = recorder.poses[max(k for k, place in enumerate(recorder.poses) if place == 4.0) + 1 :]
-    assert max(back) <= 1.0 and back[0] < 0.5  # the loop from its start
+    assert player.play(0.2)[-1] == pytest.approx(0.4)
+    playback.take_detour(ramp(3.0, 4.0, 0.5), lambda: ended.append("detour"))
+    detour = player.play(0.5 + 0.2)
+    assert 0.4 < detour[0] < 0.6  # it does not jump there
+    assert detour[-1] == 4.0 and ended == []
+    back = player.play(0.3)
+    back = back[back.index(next(place for place in back if place < 4.0)) :]
+    assert ended == ["detour"]
+    assert back[0] < 0.05 and 0.1 < back[-1] < 1.0  # the loop from its start
     assert playback.q is not None
 
 
 def test_a_detour_ends_at_once_when_told_to_and_only_the_newest_one_says_so(player):
-    playback, recorder = player
-    ended = []
+    playback, ended = player.playback, []
     playback.follow(ramp(0.0, 1.0, 0.5))
-    recorder.wait(lambda place: place > 0)
+    player.play(0.1)
     playback.take_detour(ramp(3.0, 4.0, 30.0), lambda: ended.append("first"))
     playback.take_detour(ramp(5.0, 6.0, 30.0), lambda: ended.append("second"))
-    recorder.wait(lambda place: place > 5.0)
+    assert player.play(1.0)[-1] > 5.0
     playback.end_detour()
     assert ended == ["second"]
-    recorder.wait(lambda place: place <= 1.0)
+    assert player.play(PICTURE)[-1] <= 1.0
     playback.end_detour()
     assert ended == ["second"]
 
 
 def test_a_pause_holds_a_detour(player):
-    playback, recorder = player
+    playback = player.playback
     playback.follow(ramp(0.0, 1.0, 0.5))
     playback.take_detour(ramp(3.0, 4.0, 0.5), lambda: None)
-    recorder.wait(lambda place: place > 3.2)
+    held = player.play(0.2)[-1]
+    assert 3.0 < held < 4.0
     playback.set_pace(False, 1.0)
-    time.sleep(0.1)
-    held = recorder.poses[-1]
-    time.sleep(0.2)
-    assert recorder.poses[-1] == held
+    assert set(player.play(1.0)) <= {held}
     playback.set_pace(True, 1.0)
-    recorder.wait(lambda place: place == 4.0)
+    after = player.play(0.4)
+    assert held < after[0] < 4.0 and after[-1] == 4.0
 
 
 def test_a_held_arm_stays_where_it_is_held_also_while_it_is_played_and_goes_on_when_it_is_let_go(player):
-    playback, recorder = player
-    ended = []
+    playback, ended = player.playback, []
     playback.hold(None, lambda: ended.append("before there is a motion"))
     playback.follow(ramp(0.0, 1.0, 0.5))
-    recorder.wait(lambda place: place > 0.3)
+    held = player.play(0.2)[-1]
     playback.hold(None, lambda: ended.append("stopped"))
-    time.sleep(0.1)
-    held = recorder.poses[-1]
-    time.sleep(0.2)
-    assert recorder.poses[-1] == held
+    assert set(player.play(1.0)) == {held}
     for place in (5.0, 6.0, 7.0):
         playback.hold(ramp(place, 8.0, 0.5), lambda: ended.append("held"))
-        recorder.wait(lambda posed, place=place: posed == place)
-    time.sleep(0.1)
-    assert recorder.poses[-1] == 7.0 and ended == []
+        assert set(player.play(1.0)) == {place}
+    assert ended == []
     playback.take_detour(ramp(7.0, 8.0, 0.3), lambda: ended.append("over"))
-    recorder.wait(lambda place: place == 8.0)
-    recorder.wait(lambda place: place <= 1.0)
+    assert player.play(0.4)[-1] == 8.0
+    assert player.play(0.4)[-1] <= 1.0
     assert ended == ["over"]
     playback.hold(ramp(5.0, 8.0, 0.5), lambda: ended.append("held"))
+    assert player.play(PICTURE) == [5.0]
     playback.end_detour()
-    recorder.wait(lambda place: place <= 1.0)
+    assert player.play(PICTURE)[-1] <= 1.0
     assert ended == ["over", "held"]
 
 
 def test_letting_go_ends_what_is_held_and_no_detour_that_is_under_way(player):
-    playback, recorder = player
-    ended = []
+    playback, ended = player.playback, []
     playback.follow(ramp(0.0, 1.0, 0.5))
-    recorder.wait(lambda place: place > 0)
+    player.play(0.1)
     playback.hold(ramp(3.0, 4.0, 30.0), lambda: ended.append("held"))
     playback.let_go()
     playback.let_go()
@@ -216,12 +216,10 @@ def test_letting_go_ends_what_is_held_and_no_detour_that_is_under_way(player):
 
 
 def test_the_time_at_the_goal_is_counted_from_arrival_to_the_next_round(player):
-    playback, recorder = player
-    rests = []
-    pose = recorder.__call__
-    playback._pose = lambda q, without: (rests.append((q[0], playback.resting)), pose(q, without))
+    playback, rests = player.playback, []
     playback.follow(ramp(0.0, 1.0, 0.2))
-    recorder.wait(lambda place: place == 1.0)
-    recorder.wait(lambda place: 0 < place < 0.5)
+    for _ in range(200):
+        player.play(PICTURE)
+        rests.append((player.places[-1], playback.resting))
     assert all((rest > 0) <= (place == 1.0) for place, rest in rests)
-    assert 0.1 < max(rest for _, rest in rests) <= 0.3
+    assert 0.3 - 2 * PICTURE < max(rest for _, rest in rests) <= 0.3

@@ -121,12 +121,12 @@ class TestKinematics:
         rotations, origins = robot.forward_kinematics(q)
         assert rotations.shape == (2, 3, 6, 3, 3)
         for index in np.ndindex(2, 3):
-            np.testing.assert_allclose(rotations[index], robot.forward_kinematics(q[index])[0], atol=1e-15)
-            np.testing.assert_allclose(origins[index], robot.forward_kinematics(q[index])[1], atol=1e-15)
-            np.testing.assert_allclose(robot.end_effector(q)[index], robot.end_effector(q[index]), atol=1e-15)
-            np.testing.assert_allclose(robot.hand_direction(q)[index], robot.hand_direction(q[index]), atol=1e-15)
-            np.testing.assert_allclose(robot.jacobian(q)[index], robot.jacobian(q[index]), atol=1e-15)
-            np.testing.assert_allclose(robot.joint_frames(q)[index], robot.joint_frames(q[index]), atol=1e-15)
+            np.testing.assert_allclose(rotations[index], robot.forward_kinematics(q[index])[0], atol=1e-13)
+            np.testing.assert_allclose(origins[index], robot.forward_kinematics(q[index])[1], atol=1e-13)
+            np.testing.assert_allclose(robot.end_effector(q)[index], robot.end_effector(q[index]), atol=1e-13)
+            np.testing.assert_allclose(robot.hand_direction(q)[index], robot.hand_direction(q[index]), atol=1e-13)
+            np.testing.assert_allclose(robot.jacobian(q)[index], robot.jacobian(q[index]), atol=1e-13)
+            np.testing.assert_allclose(robot.joint_frames(q)[index], robot.joint_frames(q[index]), atol=1e-13)
 
     def test_joint_frames_equal_the_viewers_scene_tree(self, robot):
         urdf = yourdfpy.URDF.load(str(urdf_path()), load_meshes=False, build_scene_graph=True)

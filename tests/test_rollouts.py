@@ -27,9 +27,9 @@ def gaps(bundle):
 
 def test_rays_run_straight_from_their_start_to_the_goal():
     index = np.arange(3)
-    np.testing.assert_allclose(RAYS.at(index, np.zeros(3)), RAYS.z0, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(RAYS.at(index, np.zeros(3)), RAYS.z0, rtol=0, atol=1e-14)
     np.testing.assert_array_equal(RAYS.at(index, np.ones(3)), np.tile(RAYS.base.goal, (3, 1)))
-    np.testing.assert_allclose(RAYS.at(index, np.full(3, 0.5)), (RAYS.z0 + RAYS.base.goal) / 2, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(RAYS.at(index, np.full(3, 0.5)), (RAYS.z0 + RAYS.base.goal) / 2, rtol=0, atol=1e-14)
 
 
 @given(st.integers(0, 2), st.floats(0, 0.999))

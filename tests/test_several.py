@@ -56,8 +56,8 @@ def test_it_is_moved_hardly_farther_than_to_the_nearest_place(seed, num):
 def test_the_fields_add_up(points, parts):
     together = Several(parts).field("free-space", 6.0)
     apart = [part.field("free-space", 6.0) for part in parts]
-    np.testing.assert_allclose(together(points), sum(field(points) for field in apart), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(together(points), sum(field(points) for field in apart), rtol=0, atol=1e-12)
     value, derivative = together.with_jacobian(points)
-    np.testing.assert_allclose(value, together(points), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(value, together(points), rtol=0, atol=1e-12)
     expected = sum(field.with_jacobian(points)[1] for field in apart)
     np.testing.assert_allclose(derivative, expected, rtol=0, atol=1e-12)

@@ -192,11 +192,11 @@ class TestMeshes:
 
     def test_many_faces_are_ready_soon(self):
         content = exported(trimesh.creation.icosphere(6, 0.07), "stl")
-        start = time.perf_counter()
+        start = time.thread_time()  # of the processor: what else it has to do counts not
         loaded = read_mesh(content, "fine.stl")
         MeshObstacle((0.0, 0.0, 0.0), loaded.solid).field("free-space", 3.0)
         assert len(loaded.solid.faces) == 81_920
-        assert time.perf_counter() - start < 20  # a tenth of it on a machine at rest
+        assert time.thread_time() - start < 20  # a tenth of it on a machine at rest
 
 
 class TestClouds:

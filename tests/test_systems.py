@@ -19,6 +19,8 @@ def field(dim, seed=0, strength=0.25):
 
 
 ATTRACTOR = Attractor(np.array([0.2, -0.1]), speed=0.3, smoothing=0.2)
+ROUNDING = 10 * np.finfo(float).eps * ATTRACTOR.speed * ATTRACTOR.smoothing
+"""Ten times what is lost of the potential near the goal, where logarithms of about 1 cancel."""
 TRANSFORMS = {
     "identity": Identity(2),
     "flow": Flow(field(2), 1.0, 20),
@@ -84,16 +86,15 @@ def test_the_potential_falls_strictly_along_the_motion(seed):
 
 
 def test_the_potential_is_zero_at_the_goal_only():
-    assert ATTRACTOR.potential(ATTRACTOR.goal) == pytest.approx(0, abs=1e-17)
+    assert ATTRACTOR.potential(ATTRACTOR.goal) == pytest.approx(0, abs=ROUNDING)
     assert (ATTRACTOR.potential(ATTRACTOR.goal + 1e-3 * np.eye(2)) > 0).all()
 
 
 def test_close_to_the_goal_the_potential_is_its_parabola():
     r = np.array([1e-3, 1e-5, 1e-7])
     z = ATTRACTOR.goal + r[:, None] * np.array([1.0, 0.0])
-    np.testing.assert_allclose(
-        ATTRACTOR.potential(z), ATTRACTOR.speed * r**2 / (2 * ATTRACTOR.smoothing), rtol=1e-4, atol=2e-17
-    )
+    parabola = ATTRACTOR.speed * r**2 / (2 * ATTRACTOR.smoothing)
+    np.testing.assert_allclose(ATTRACTOR.potential(z), parabola, rtol=1e-4, atol=ROUNDING)
 
 
 def test_the_goal_stays_where_it_is():
@@ -141,14 +142,14 @@ def test_the_transform_is_a_conjugacy(system):
     y0 = np.random.default_rng(3).uniform(-0.7, 0.7, (5, 2))
     times = np.linspace(0, 5, 11)
     images = system.transform.forward(system.rollout(y0, times))
-    np.testing.assert_allclose(images, system.base.flow(system.transform.forward(y0), times), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(images, system.base.flow(system.transform.forward(y0), times), rtol=0, atol=1e-7)
 
 
 def test_the_velocity_solves_with_the_jacobian(system):
     y = np.random.default_rng(4).uniform(-0.7, 0.7, (3, 5, 2))
     z, J = system.transform.jacobian(y)
     solved = np.linalg.solve(J, system.base.velocity(z)[..., None])[..., 0]
-    np.testing.assert_allclose(system.velocity(y), solved, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(system.velocity(y), solved, rtol=0, atol=1e-7)
 
 
 def test_the_velocity_is_the_derivative_of_the_rollout(system):

@@ -47,8 +47,18 @@ def test_the_obstacle_first_stands_in_the_way_of_the_motion(name, initial):
     assert clearance < scenario.margin
 
 
-@pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("name", TASKS)
+OTHER_LETTERS = [name for name in TASKS if name.startswith("draw_") and name != "draw_s"]
+"""What both do at once for these is much the same as for S, and takes longest."""
+
+
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [
+        pytest.param(name, space, marks=[pytest.mark.slow] * (space == "both" and name in OTHER_LETTERS))
+        for name in TASKS
+        for space in SPACES
+    ],
+)
 def test_the_obstacle_first_stands_where_hand_and_arm_find_a_way_to_the_goal(name, space, engine, initial):
     *_, frame = engine.frames(replace(initial(name), space=space))
     assert frame.blocked == () and frame.health.doubts == ()

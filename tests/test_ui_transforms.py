@@ -1,7 +1,9 @@
 """The warp and the settings of the transforms in the page, without a browser."""
 
+import itertools
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -15,6 +17,7 @@ from dt_viz.integration import Integration
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Scenario, View
 from dt_viz.stacking import AVOIDANCE, IMITATION, bias_points, with_bias_point
+from dt_viz.ui import warp as warp_module
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel import status_html
 from dt_viz.ui.session import Pace, Session
@@ -181,7 +184,8 @@ def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(
     edit = session.edit
     session.edit("Warp", warp=0.7)
     session.end_gesture()
-    told = []
+    told, clock = [], itertools.count()
+    monkeypatch.setattr(warp_module, "time", SimpleNamespace(monotonic=lambda: 0.03 * next(clock)))
     player = WarpPlayer(told.append, seconds=0.3)
     warps = []
     monkeypatch.setattr(session, "edit", lambda name, warp: warps.append(warp) or edit(name, warp=warp))

@@ -63,6 +63,8 @@ class Playback:
         self._detour: _Detour | None = None
         self._changing = threading.Lock()
         self._posed: tuple[Array, Array] | None = None
+        self._shown: ArmMotion | _Detour | None = None
+        """What the arms were posed along last."""
         self._playing = True
         self._speed = 1.0
         self._clock = 0.0
@@ -137,29 +139,34 @@ class Playback:
         detour.ended()
 
     def _loop(self) -> None:
-        before, shown = time.monotonic(), None
+        before = time.monotonic()
         while not self._closed.wait(1 / PICTURES_PER_SECOND):
             now = time.monotonic()
-            step = self._speed * (now - before) if self._playing else 0.0
-            before, motion, detour = now, self._motion, self._detour
-            if detour is not None:
-                detour.clock += 0.0 if detour.held else step
-                if detour.over:
-                    self._clock = 0.0
-                    self._leave(detour)
-                    continue
-            else:
-                self._clock += step
-            follows = motion if detour is None else detour
-            if motion is None or follows is None or (shown is follows and not self._playing):
-                continue
-            if detour is not None:
-                posed = detour.postures()
-                self._resting = max(0.0, detour.clock - detour.motion.times[-1])
-            else:
-                moment, end = self._clock % (motion.times[-1] + REST), motion.times[-1]
-                posed = at_moment(motion, min(moment, end))
-                self._resting = max(0.0, moment - end)
-            self._posed = posed
-            self._pose(*posed)
-            shown = follows
+            self.advance(now - before)
+            before = now
+
+    def advance(self, seconds: float) -> None:
+        """Move the clock on by so much real time and pose the arms; called by the thread of the playback only."""
+        step = self._speed * seconds if self._playing else 0.0
+        motion, detour = self._motion, self._detour
+        if detour is not None:
+            detour.clock += 0.0 if detour.held else step
+            if detour.over:
+                self._clock = 0.0
+                self._leave(detour)
+                return
+        else:
+            self._clock += step
+        follows = motion if detour is None else detour
+        if motion is None or follows is None or (self._shown is follows and not self._playing):
+            return
+        if detour is not None:
+            posed = detour.postures()
+            self._resting = max(0.0, detour.clock - detour.motion.times[-1])
+        else:
+            moment, end = self._clock % (motion.times[-1] + REST), motion.times[-1]
+            posed = at_moment(motion, min(moment, end))
+            self._resting = max(0.0, moment - end)
+        self._posed = posed
+        self._pose(*posed)
+        self._shown = follows
