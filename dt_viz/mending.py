@@ -64,7 +64,8 @@ def closed(vertices: Array, faces: Indices) -> ClosedMesh:
     if not len(faces):
         raise FormatError("faces", "only triangles without area", "a closed mesh of triangles")
     notes, once = [], np.empty((0, 2), dtype=np.intp)
-    if not _joins_pairs(faces, len(vertices)):
+    sides = np.sort(_sides(faces, len(vertices)))
+    if not _joins_pairs(sides):
         vertices, faces = _merged(vertices, faces, NEAR * size)
         faces = _different(faces, len(vertices))
         once = _edges_of_one(faces, len(vertices))
@@ -73,8 +74,10 @@ def closed(vertices: Array, faces: Indices) -> ClosedMesh:
         vertices, faces, note = _filled(vertices, faces, once)
         notes = [note]
     checkpoint()
-    turned = _turned(faces, len(vertices))
-    if turned.any():
+    if notes:
+        sides = np.sort(_sides(faces, len(vertices)))
+    if (sides[::2] == sides[1::2]).any():  # neighbours that run along their edge in the same direction
+        turned = _turned(faces, len(vertices))
         faces = np.where(turned[:, None], faces[:, ::-1], faces)
         notes.append("triangles that faced inwards were turned")
     a, b, c = (vertices[column] for column in faces.T)
@@ -100,20 +103,16 @@ def _merged(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indice
     return vertices[kept[order[new]]], faces[(a != b) & (b != c) & (c != a)]
 
 
-def _edges(faces: Indices) -> Indices:
-    """(3F, 2) edges along the triangles."""
-    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+def _sides(faces: Indices, num_vertices: int) -> Indices:
+    """(3F,) a number for each side of each triangle: twice that of its edge, one more in the other direction."""
+    a, b = np.concatenate(faces.T), np.concatenate(np.roll(faces, -1, axis=1).T)
+    return 2 * (np.minimum(a, b) * num_vertices + np.maximum(a, b)) + (a > b)
 
 
-def _keys(edges: Indices, num_vertices: int) -> Indices:
-    """(E,) a number for each edge, the same for both directions."""
-    return edges.min(axis=1) * num_vertices + edges.max(axis=1)
-
-
-def _joins_pairs(faces: Indices, num_vertices: int) -> bool:
-    """Whether each edge is one of exactly two triangles."""
-    keys = np.sort(_keys(_edges(faces), num_vertices))
-    return bool(len(keys) % 2 == 0 and (keys[::2] == keys[1::2]).all() and (keys[1:-1:2] != keys[2::2]).all())
+def _joins_pairs(sides: Indices) -> bool:
+    """Whether each edge is one of exactly two triangles, given their sides in order."""
+    edges = sides // 2
+    return bool(len(edges) % 2 == 0 and (edges[::2] == edges[1::2]).all() and (edges[1:-1:2] != edges[2::2]).all())
 
 
 def _different(faces: Indices, num_vertices: int) -> Indices:
@@ -127,12 +126,12 @@ def _different(faces: Indices, num_vertices: int) -> Indices:
 
 def _edges_of_one(faces: Indices, num_vertices: int) -> Indices:
     """(E, 2) the edges of one triangle only, along it. Raises FormatError if some are of more than two."""
-    edges = _edges(faces)
-    _, first, count = np.unique(_keys(edges, num_vertices), return_index=True, return_counts=True)
+    _, first, count = np.unique(_sides(faces, num_vertices) // 2, return_index=True, return_counts=True)
     if (count > 2).any():
         found = f"{(count != 2).sum()} edges that do not join two triangles, {(count > 2).sum()} of them more than two"
         raise FormatError("mesh", found, f"a closed (watertight) mesh: {REMEDY}")
-    return edges[first[count == 1]]
+    side, triangle = np.divmod(first[count == 1], len(faces))
+    return np.stack([faces[triangle, side], faces[triangle, (side + 1) % 3]], axis=1)
 
 
 def _filled(vertices: Array, faces: Indices, once: Indices) -> tuple[Array, Indices, str]:
@@ -210,12 +209,10 @@ def _turned(faces: Indices, num_vertices: int) -> Mask:
     Raises:
         FormatError: there is no such way, as for a Klein bottle.
     """
-    edges = _edges(faces)
-    order = np.argsort(_keys(edges, num_vertices), kind="stable").reshape(-1, 2)  # the two triangles of each edge
-    agree = (edges[order[:, 0]] != edges[order[:, 1]]).all(axis=1)
-    if agree.all():
-        return np.zeros(len(faces), dtype=bool)
-    (one, other), num = (order // 3).T, len(faces)
+    sides, num = _sides(faces, num_vertices), len(faces)
+    order = np.argsort(sides, kind="stable").reshape(-1, 2)  # the two triangles of each edge
+    agree = sides[order[:, 0]] != sides[order[:, 1]]
+    one, other = (order % num).T
     rows = np.concatenate([one, one + num])
     columns = np.concatenate([np.where(agree, other, other + num), np.where(agree, other + num, other)])
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * num, 2 * num))
