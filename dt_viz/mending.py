@@ -157,7 +157,7 @@ def _filled(vertices: Array, faces: Indices, once: Indices) -> tuple[Array, Indi
     holes = _counted(len(loops), "hole")
     if share > MAX_FILLED:
         widest = max(float(np.linalg.norm(np.ptp(vertices[loop], axis=0))) for loop in loops)
-        found = f"{holes}, {share:.0%} of its closed surface, the largest {100 * widest:.3g} cm across"
+        found = f"{holes}, {share:.1%} of its closed surface, the largest {100 * widest:.3g} cm across"
         accepted = f"a closed (watertight) mesh, of which holes of up to {MAX_FILLED:.0%} are filled: {REMEDY}"
         raise FormatError("mesh", found, accepted)
     note = f"{holes} ({max(share, 1e-4):.2%} of its surface) filled with {_counted(len(added), 'triangle')}"

@@ -194,7 +194,12 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
         some = np.sort(np.random.default_rng(0).permutation(len(points))[:ENOUGH_POINTS])
         notes.append(f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random")
         points, labels = points[some], None if labels is None else labels[some]
+    if labels is None:  # a search among very many points in one place takes the square of their number
+        points = np.unique(points, axis=0)
+        if len(points) < MIN_POINTS:
+            raise ShapeError(source, "points", f"{len(points)} different ones", f"at least {MIN_POINTS}")
     cloud = Cloud(points, labels)
+    checkpoint()
     with parsing(ShapeError, source, "points", "points that something occupies"):
         depth = cloud.solid.distances.depth
     if not depth > 0:

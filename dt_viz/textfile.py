@@ -82,7 +82,8 @@ def read_table(
 def _rows(lines: Iterator[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
     for number, line in lines:
         try:
-            row = next(csv.reader((line,), strict=True), [])  # one line each: no quoted cell goes on in the next
+            # one line each: no quoted cell goes on in the next
+            row = next(csv.reader((line,), strict=True), []) if '"' in line else line.split(",")
         except csv.Error as error:
             raise FormatError(f"line {number}", repr(line[:60]), "comma-separated cells") from error
         cells = [cell.strip() for cell in row]

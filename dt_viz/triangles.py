@@ -9,8 +9,8 @@ from dt_viz.fields import Array, Indices, Mask
 
 CHUNK = 1_000_000
 """Triangles times lines that are looked at at once."""
-MAX_CROSSINGS = 5_000_000
-"""Largest number of lines in one direction times triangles near them: 500,000 even triangles have less than 1,000,000."""
+MAX_CROSSINGS = 3_000_000
+"""Largest number of lines in one direction times triangles near them; 500,000 even triangles have some 10,000."""
 
 
 def closest_on_triangles(s: Array, triangles: Array) -> Array:

@@ -17,6 +17,7 @@ from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.errors import DataError
 from dt_viz.fields import Array
 from dt_viz.imitation import ImitationError
+from dt_viz.interruption import UnwantedError
 from dt_viz.paper_scenes import SCENES
 from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
@@ -64,13 +65,9 @@ _Job = tuple[Scenario, float]
 """What to compute, and when it was asked for."""
 
 
-class _UnwantedError(Exception):
-    """Nobody wants any more what is being learned, or refined."""
-
-
 def _end_if(superseded: Callable[[], bool]) -> None:
     if superseded():
-        raise _UnwantedError
+        raise UnwantedError
 
 
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
@@ -357,7 +354,7 @@ class Session:
     def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:
         try:
             self._show_frames(job, superseded)
-        except _UnwantedError:
+        except UnwantedError:
             pass
         except (DataError, ImitationError):
             with self._lock:
@@ -372,7 +369,7 @@ class Session:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
         with self._lock:
             if self._stopped or self._closed or not self.scenario.learns_like(scenario):
-                raise _UnwantedError
+                raise UnwantedError
             self._learning = True
         self._display.learning(fraction, message)
 
