@@ -20,23 +20,26 @@ LASA handwriting (``.mat``, MATLAB v5 to v7), seconds and millimetres:
     ``demos``, a cell array (or array) of structures with ``t`` 1×T and ``pos`` d×T; nothing else in it is used.
 """
 
-import csv
-import io
 import re
-import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from array import array
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dt_viz.errors import DataError
+from dt_viz.errors import DataError, parsing
 from dt_viz.matfile import Value, read_variable
+from dt_viz.npzfile import NpzFile
+from dt_viz.textfile import read_table
 
 DIMENSIONS = (2, 3)
 MAX_BYTES = 16 * 2**20  # of a file, and of what an npz unpacks to; some 300,000 samples
+MAX_CSV_ROWS = 600_000
+MAX_DEMONSTRATIONS = 1000
+MAX_NAME = 1000  # characters
+CSV_HEADERS = (("demo", "t", "x", "y"), ("demo", "t", "x", "y", "z"), ("t", "x", "y"), ("t", "x", "y", "z"))
 MAX_COORDINATE = 100.0  # metres; beyond it the numbers are in another unit
 MAX_DURATION = 3600.0  # seconds; beyond it the numbers are in another unit
 MIN_EXTENT = 1e-6  # metres; a motion that stays within it is a point
@@ -89,12 +92,14 @@ def check_demonstrations(
         The same motions with times from 0, as read-only float64 arrays.
 
     Raises:
-        DemonstrationError: there are none; they differ in dimension; or one of them has not the shapes, the number
-            of samples, the finite values or the increasing times that :class:`Demonstration` promises, does not
-            move, or has values so large that its unit must be another one.
+        DemonstrationError: there are none, or too many; they differ in dimension; or one of them has not the shapes,
+            the number of samples, the finite values or the increasing times that :class:`Demonstration` promises, does
+            not move, has values so large that its unit must be another one, or a name that cannot be shown.
     """
     if not demonstrations:
         raise DemonstrationError(source, "demonstrations", "none", "at least one")
+    if len(demonstrations) > MAX_DEMONSTRATIONS:
+        raise DemonstrationError(source, "demonstrations", f"{len(demonstrations)}", f"at most {MAX_DEMONSTRATIONS}")
     checked = []
     for i, demonstration in enumerate(demonstrations):
         where = (lambda row: f"sample {row + 1}") if lines is None else (lambda row, n=lines[i]: f"line {n[row]}")
@@ -112,6 +117,8 @@ def check_demonstrations(
 
 def _check_one(demonstration: Demonstration, source: str | Path, where: Callable[[int], str]) -> Demonstration:
     name = demonstration.name
+    if len(name) > MAX_NAME or re.search("[\ud800-\udfff]", name):  # halves of characters cannot be sent to a page
+        raise DemonstrationError(source, "name", repr(name[:40]), f"text of at most {MAX_NAME} characters")
     times_field, positions_field = f"times of {name!r}", f"positions of {name!r}"
     times = _real_numbers(demonstration.times, source, times_field)
     positions = _real_numbers(demonstration.positions, source, positions_field)
@@ -277,37 +284,22 @@ def _load_csv_folder(folder: Path) -> tuple[Demonstration, ...]:
     return check_demonstrations([demo for path in tables for demo in load_demonstrations(path)], folder)
 
 
-@contextmanager
-def _parsing(source: Path, field: str, accepted: str) -> Iterator[None]:
-    """Turn whatever a parser raises on hostile bytes into one DemonstrationError."""
-    try:
-        yield
-    except DemonstrationError:
-        raise
-    except Exception as error:  # no parser lists what corrupt bytes make it raise
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DemonstrationError(source, field, f"something that cannot be read ({reason})", accepted) from error
-
-
 def _read_csv(content: bytes, source: Path) -> tuple[Demonstration, ...]:
-    with _parsing(source, "file", "comma-separated text in UTF-8"):
-        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(row)]
-    header = tuple(cell.lower() for cell in rows[0][1]) if rows else ()
-    labelled = header[:1] == ("demo",)
-    columns = header[1:] if labelled else header
-    if columns not in {("t", "x", "y"), ("t", "x", "y", "z")}:
-        found = repr(",".join(header)[:80])
-        raise DemonstrationError(source, "header line", found, "'demo,t,x,y', 'demo,t,x,y,z', 't,x,y' or 't,x,y,z'")
-    samples: dict[str, list[list[float]]] = {}
-    lines: dict[str, list[int]] = {}
-    for line, row in rows[1:]:
-        if len(row) != len(header):
-            raise DemonstrationError(source, f"line {line}", f"{len(row)} columns", f"{len(header)}, as in the header")
-        label = row[0] if labelled else source.stem
-        samples.setdefault(label, []).append(_csv_numbers(row[-len(columns) :], columns, line, source))
-        lines.setdefault(label, []).append(line)
-    tables = {label: np.array(table) for label, table in samples.items()}
+    samples: dict[str, array[float]] = {}
+    lines: dict[str, array[int]] = {}
+    with parsing(DemonstrationError, source, "file", "comma-separated text in UTF-8"):
+        header, rows = read_table(content, CSV_HEADERS, max_rows=MAX_CSV_ROWS)
+        columns = [name for name in header if name != "demo"]
+        for line, row in rows:
+            label = source.stem if len(row) == len(columns) else row[0]
+            if label not in samples:
+                if len(samples) == MAX_DEMONSTRATIONS:
+                    found = f"more than {MAX_DEMONSTRATIONS}"
+                    raise DemonstrationError(source, "demonstrations", found, f"at most {MAX_DEMONSTRATIONS}")
+                samples[label], lines[label] = array("d"), array("q")
+            samples[label].extend(_csv_numbers(row[-len(columns) :], columns, line, source))
+            lines[label].append(line)
+    tables = {label: np.asarray(numbers).reshape(-1, len(columns)) for label, numbers in samples.items()}
     demonstrations = [Demonstration(table[:, 0], table[:, 1:], label) for label, table in tables.items()]
     return check_demonstrations(demonstrations, source, list(lines.values()))
 
@@ -324,43 +316,38 @@ def _csv_numbers(cells: Sequence[str], columns: Sequence[str], line: int, source
 
 
 def _read_npz(content: bytes, source: Path) -> tuple[Demonstration, ...]:
-    arrays = _npz_arrays(content, source)
+    with parsing(DemonstrationError, source, "file", "an npz archive"):
+        archive = NpzFile(content, max_bytes=MAX_BYTES)
     accepted = "times_0, positions_0, times_1, positions_1, … and optionally name_0, name_1, …"
     numbers = set()
-    for key in arrays:
+    for key in archive.names:
         match = re.fullmatch(r"(?:times|positions|name)_(0|[1-9][0-9]{0,8})", key)
         if match is None:
             raise DemonstrationError(source, "arrays", repr(key[:40]), accepted)
         numbers.add(int(match[1]))
-    for key in (f"{kind}_{i}" for i in sorted(numbers) for kind in ("times", "positions")):
-        if key not in arrays:
+
+    def read(key: str) -> np.ndarray:
+        if key not in archive.names:
             raise DemonstrationError(source, "arrays", f"no {key!r}", accepted)
+        with parsing(DemonstrationError, source, f"array {key!r}", "plain numbers; pickled objects are never opened"):
+            return archive.read(key)
+
     demonstrations = []
     for i in sorted(numbers):
-        name = arrays.get(f"name_{i}", np.array(f"{source.stem} {i}"))
-        if name.dtype.kind != "U" or name.ndim:
-            raise DemonstrationError(source, f"name_{i}", f"{name.dtype} of shape {name.shape}", "one string")
-        demonstrations.append(Demonstration(arrays[f"times_{i}"], arrays[f"positions_{i}"], str(name)))
+        name = f"{source.stem} {i}"
+        if f"name_{i}" in archive.names:
+            text = read(f"name_{i}")
+            if text.dtype.kind != "U" or text.ndim:
+                raise DemonstrationError(source, f"name_{i}", f"{text.dtype} of shape {text.shape}", "one string")
+            with parsing(DemonstrationError, source, f"name_{i}", "one string"):
+                name = str(text)
+        demonstrations.append(Demonstration(read(f"times_{i}"), read(f"positions_{i}"), name))
     return check_demonstrations(demonstrations, source)
-
-
-def _npz_arrays(content: bytes, source: Path) -> Mapping[str, np.ndarray]:
-    with _parsing(source, "file", "an npz archive"):
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > MAX_BYTES:  # a small archive may unpack to more than the memory holds
-            raise DemonstrationError(source, "file", f"{size} bytes when unpacked", f"at most {MAX_BYTES} bytes")
-        arrays: dict[str, np.ndarray] = {}
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            for key in archive.files:
-                with _parsing(source, f"array {key[:40]!r}", "plain numbers; pickled objects are never opened"):
-                    arrays[key] = np.asarray(archive[key])
-        return arrays
 
 
 def _read_lasa(content: bytes, source: Path) -> tuple[Demonstration, ...]:
     accepted = "a cell array of structures with t and pos"
-    with _parsing(source, "file", "a MATLAB file of version 5 to 7"):
+    with parsing(DemonstrationError, source, "file", "a MATLAB file of version 5 to 7"):
         try:
             recordings = read_variable(content, "demos")
         except KeyError as error:

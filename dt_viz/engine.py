@@ -122,6 +122,11 @@ _turns = Turns()
 four sessions that drag at once get twice as many frames this way."""
 
 
+def let_drags_pass(longest: float) -> None:
+    """Wait while an engine follows a hand, at most so many seconds; called often by what takes long beside engines."""
+    _turns.let_pass(longest)
+
+
 @contextmanager
 def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
     """Within this block compute when it is this engine's turn, letting others go first when they are due.

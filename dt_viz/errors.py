@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
+
+from dt_viz.interruption import UnwantedError
 
 
 class DataError(ValueError):
@@ -21,3 +27,45 @@ class DataError(ValueError):
 
     def __str__(self) -> str:
         return f"{self.source}: {self.field}: found {self.found}; accepted: {self.accepted}"
+
+
+class FormatError(ValueError):
+    """Bytes that are not what a reader of a format expects; `parsing` adds whose bytes they are.
+
+    Attributes:
+        field: the part of them that is wrong.
+        found: what is there.
+        accepted: what would be right.
+    """
+
+    def __init__(self, field: str, found: str, accepted: str) -> None:
+        super().__init__(field, found, accepted)
+        self.field, self.found, self.accepted = field, found, accepted
+
+    def __str__(self) -> str:
+        return f"{self.field}: found {self.found}; accepted: {self.accepted}"
+
+
+@contextmanager
+def parsing(kind: type[DataError], source: str | Path, field: str, accepted: str) -> Iterator[None]:
+    """Turn whatever a reader raises on hostile bytes into one kind of error.
+
+    Args:
+        kind: of the error.
+        source: the file.
+        field: the part of it that is read, unless a FormatError says better.
+        accepted: what it should be, unless a FormatError says better.
+
+    Raises:
+        DataError: of that kind. UnwantedError is let through: nothing is wrong with the data then.
+    """
+    try:
+        with np.errstate(all="ignore"):  # what overflows is refused as not finite, or as too large
+            yield
+    except (DataError, UnwantedError):
+        raise
+    except FormatError as error:
+        raise kind(source, error.field, error.found, error.accepted) from error
+    except Exception as error:  # no reader lists what corrupt bytes make it raise
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise kind(source, field, f"something that cannot be read ({reason})", accepted) from error

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +20,9 @@ logger = logging.getLogger(__name__)
 
 FORMAT = 1
 """Raised whenever the fit or its file changes, so that older files are not taken for newer ones."""
+
+LONGEST_WRITE = 3600.0
+"""Age after which a file that is still being written was left behind by a server that ended meanwhile, seconds."""
 
 LONGEST_WITHOUT_REPORT = 0.2
 """Seconds after which those who wait for a fit are told again how far it is."""
@@ -107,6 +111,8 @@ class FitStore:
         self._memory: dict[str, Imitation] = {}
         self._running: dict[str, _RunningFit] = {}
         self._lock = threading.Lock()
+        if folder is not None:
+            _remove_leftovers(folder)
 
     def get(
         self,
@@ -186,6 +192,14 @@ class FitStore:
         except Exception as error:  # damaged bytes make zipfile, zlib and numpy raise almost anything
             logger.warning("%s is damaged and will be fitted anew: %s", path, error)
             return None
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove files that nobody goes on writing; those of another running server are younger."""
+    for path in folder.glob("*.partial"):
+        with suppress(OSError):  # another server may be faster
+            if time.time() - path.stat().st_mtime > LONGEST_WRITE:
+                path.unlink()
 
 
 def _content_key(demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> str:

@@ -14,6 +14,11 @@ from contextvars import ContextVar
 Checkpoint = Callable[[], None]
 """Called often in long computations; raises what is to end them, and may take its time to let others go first."""
 
+
+class UnwantedError(Exception):
+    """Nobody wants any more what is being computed; raised by a checkpoint."""
+
+
 _current: ContextVar[Checkpoint] = ContextVar("_current", default=lambda: None)
 
 

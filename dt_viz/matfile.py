@@ -5,6 +5,7 @@ This reader is plain Python: whatever the bytes, it ends, in bounded memory, wit
 The layout is that of the "MAT-File Level 5 File Format" (The MathWorks).
 """
 
+import itertools
 import math
 import struct
 import zlib
@@ -13,11 +14,15 @@ from typing import TypeAlias, Union
 
 import numpy as np
 
+from dt_viz.interruption import checkpoint
+
 # Numbers are an array. A cell array is the list of its values, a structure array the list of its structures, both in
 # column-major order. What a demonstration does not need (text, sparse or complex numbers, objects) is None.
 Value: TypeAlias = Union[np.ndarray, "list[Value]", "dict[str, Value]", None]
 
 MAX_UNPACKED_BYTES = 16 * 2**20
+MAX_VARIABLES = 1000  # looked at
+MAX_VALUES = 100_000  # matrices, cells and structures of the variable, inside each other
 MAX_DEPTH = 8  # of cells and structures inside each other
 MAX_AXES = 32
 MAX_FIELDS = 1000  # of a structure
@@ -58,7 +63,12 @@ def _variables(content: bytes, order: str) -> Iterator["_Elements"]:
     """Yield the inside of each variable, unpacked."""
     left = MAX_UNPACKED_BYTES
     elements = _Elements(memoryview(content)[HEADER_BYTES:], order)
-    while elements.data:
+    for num in itertools.count(1):
+        if not elements.data:
+            return
+        if num > MAX_VARIABLES:
+            raise MatFileError(f"more than {MAX_VARIABLES} variables")
+        checkpoint()
         kind, data = elements.take()
         if kind == COMPRESSED:
             try:
@@ -71,7 +81,7 @@ def _variables(content: bytes, order: str) -> Iterator["_Elements"]:
             kind, data = _Elements(memoryview(plain), order).take()
         if kind != MATRIX:
             raise MatFileError(f"an element of type {kind} where a variable should be")
-        yield _Elements(data, order)
+        yield _Elements(data, order, iter(range(MAX_VALUES)))
 
 
 class _Elements:
@@ -81,9 +91,10 @@ class _Elements:
         data: what has not been taken yet.
     """
 
-    def __init__(self, data: memoryview, order: str) -> None:
+    def __init__(self, data: memoryview, order: str, tickets: Iterator[int] | None = None) -> None:
         self.data = data
         self._order = order  # of the bytes in a number, as struct and numpy write it
+        self._tickets = tickets or iter(())  # one for each value that may still be made
 
     def take(self) -> tuple[int, memoryview]:
         """Take the next element's type and bytes."""
@@ -150,10 +161,12 @@ class _Elements:
         return [{name: self._matrix(depth - 1) for name in names} for _ in range(count if names else 0)]
 
     def _matrix(self, depth: int) -> Value:
+        if next(self._tickets, None) is None:
+            raise MatFileError(f"more than {MAX_VALUES} values")
         kind, data = self.take()
         if kind != MATRIX:
             raise MatFileError(f"an element of type {kind} where a matrix should be")
-        inside = _Elements(data, self._order)
+        inside = _Elements(data, self._order, self._tickets)
         kind, shape, _ = inside.header()
         return inside.value(kind, shape, depth)
 

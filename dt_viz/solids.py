@@ -26,6 +26,8 @@ MARGIN = 0.2
 """Of the grid around the shape, relative to the largest side of its bounding box."""
 NUM_SAMPLES = 60_000
 """Of the surface, about, and one at least on each triangle."""
+LONGEST_ROWS = 8
+"""Bound of the number of samples in a row along all triangles, in `NUM_SAMPLES`."""
 NUM_NEAREST = 6
 """Samples whose triangles are measured exactly for each point."""
 NUM_ROUNDS, NUM_SWEEPS = 2, 3
@@ -79,8 +81,14 @@ class Solid:
     @cached_property
     def bounds(self) -> Array:
         """(2, 3) lower and upper corner of its bounding box, metres."""
-        used = self.vertices[np.unique(self.faces)]
-        return np.stack([used.min(axis=0), used.max(axis=0)])
+        return np.stack([self.used.min(axis=0), self.used.max(axis=0)])
+
+    @property
+    def used(self) -> Array:
+        """The vertices of its faces, metres."""
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.faces] = True
+        return self.vertices[used]
 
     def nearest(self, s: Array) -> Array:
         """The points of the surface nearest to the points `s` (N, 3), (N, 3), metres."""
@@ -214,7 +222,10 @@ class _Surface:
         self._triangles = triangles
         a, b, c = triangles.swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-        self.samples, self._owner = surface_samples(triangles, np.sqrt(area / NUM_SAMPLES))
+        # triangles that are long and thin would have one sample after the other along them
+        length = sum(np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)).sum() / 2
+        spacing = max(np.sqrt(area / NUM_SAMPLES), length / (LONGEST_ROWS * NUM_SAMPLES))
+        self.samples, self._owner = surface_samples(triangles, spacing)
         self._tree = KDTree(self.samples)
 
     def nearest(self, s: Array) -> Array:
@@ -311,9 +322,9 @@ def _distances(solid: Solid) -> DistanceGrid:
     origin = centre - cell * (counts - 1) / 2
     shape = (int(counts[0]), int(counts[1]), int(counts[2]))
     nodes = grid_nodes(origin, cell, shape)
+    inside = inside_of_grid(solid.vertices[solid.faces], origin, cell, shape)  # first: it refuses what takes too long
     distance = _surface(solid).distances(nodes, origin, cell, shape)
-    inside = inside_of_grid(solid.vertices[solid.faces], origin, cell, shape)
-    radius = float(np.linalg.norm(solid.vertices[np.unique(solid.faces)] - centre, axis=1).max())
+    radius = float(np.linalg.norm(solid.used - centre, axis=1).max())
     signed = np.where(inside, -distance, distance)
     _flatten(signed, cell)
     grid = DistanceGrid(origin, cell, signed, margin, centre, radius)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.fields import Array, Indices, Mask
 
 CHUNK = 1_000_000
 """Triangles times lines that are looked at at once."""
+MAX_CROSSINGS = 3_000_000
+"""Largest number of lines in one direction times triangles near them; 500,000 even triangles have some 10,000."""
 
 
 def closest_on_triangles(s: Array, triangles: Array) -> Array:
@@ -66,6 +69,9 @@ def inside_of_grid(triangles: Array, origin: Array, cell: float, shape: tuple[in
     """Which nodes of a grid closed triangles (F, 3, 3) enclose: the winding number along lines in all three directions.
 
     Two of the three must say so, for a line that leaves through a small hole counts wrongly.
+
+    Raises:
+        FormatError: there are very many triangles that are long, or one over the other.
     """
     votes = np.zeros(shape, dtype=np.int8)
     for axis in range(3):
@@ -89,6 +95,9 @@ def _winding(triangles: Array, origin: Array, cell: float, shape: tuple[int, ...
     crossings = np.zeros((nx, ny, nz + 1), dtype=np.int32)
     hit = np.flatnonzero(count)
     ends = np.cumsum(count[hit])
+    if len(hit) and ends[-1] > MAX_CROSSINGS:
+        found = f"{len(hit)} triangles, most of them long or one over the other"
+        raise FormatError("faces", found, "a mesh of even triangles; remesh it more coarsely or more evenly")
     start = 0
     while start < len(hit):
         done = ends[start - 1] if start else 0

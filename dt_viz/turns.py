@@ -50,6 +50,18 @@ class Turns:
             self._end()
             self._take(patient=patient)
 
+    def let_pass(self, longest: float) -> None:
+        """Called by who needs no turn, but takes the processor as well: wait while somebody in a hurry has or wants it.
+
+        Args:
+            longest: seconds after which not to wait any more.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: not self._is_hurried(), longest)
+
+    def _is_hurried(self) -> bool:
+        return (self._taken and not self._patient) or any(not patient for patient, _ in self._queue)
+
     def _is_due(self) -> bool:
         with self._changed:
             if not self._queue:

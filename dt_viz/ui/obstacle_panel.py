@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import UnionType
 from typing import Any
@@ -12,13 +13,14 @@ from typing import Any
 import numpy as np
 import viser
 
-from dt_viz import shapes
+from dt_viz import plyfile, shapes
 from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
 from dt_viz.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.several import Several
 from dt_viz.shapes import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
 from dt_viz.tasks import Task
 from dt_viz.ui.controls import Control
+from dt_viz.ui.reading import Reader
 from dt_viz.ui.session import Session
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
@@ -57,6 +59,7 @@ class ObstaclePanel:
         self._session: Session | None = None
         self._sizes: list[tuple[Control, Shape]] = []
         self._refused: tuple[bytes, str, str] | None = None  # content and name of a file, and the unit it may be in
+        self._reader = Reader(lambda: say("Another visitor's file is being read; yours is read after it.", False))
         with gui.add_folder("Obstacles"):
             hint = "the one with handles; or click it in the scene"
             self._choice = Control(gui.add_dropdown("Selected", (NONE,), hint=hint), self._select)
@@ -109,14 +112,11 @@ class ObstaclePanel:
                 self._again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
 
         @self._upload.on_upload
-        def _(_event: viser.GuiEvent) -> None:  # in a thread: reading takes a while
+        async def _(_event: viser.GuiEvent) -> None:
             file = self._upload.value
-            self.load(file.content, file.name, UNITS[self._unit.value])
+            self._begin(partial(self.load, file.content, file.name, UNITS[self._unit.value]))
 
-        @self._again.on_click
-        def _(_event: viser.GuiEvent) -> None:  # in a thread, too
-            self.load_again()
-
+        Control(self._again, lambda _clicked: self._begin(self.load_again))
         Control(self._add, lambda name: self.add(SHAPES[name]))
         Control(self._change, lambda name: {"Duplicate": self.duplicate, "Delete": self.delete}[name]())
 
@@ -156,8 +156,20 @@ class ObstaclePanel:
         added = with_room(obstacle, before, session.task)
         self._replace((*before, added), selected=len(before))
 
+    def close(self) -> None:
+        """The visitor has left: stop reading."""
+        self._reader.close()
+
+    def _begin(self, load: Callable[[], None]) -> None:
+        if not self._reader.begin(load):
+            self._say("A file of yours is being read; load the next one after it.", False)
+
     def load(self, content: bytes, name: str, scale: float) -> None:
-        """Add what a file holds, or say why that cannot be; see `from_file`."""
+        """Add what a file holds, or ask or say why that cannot be; see `from_file`.
+
+        Raises:
+            UnwantedError: the visitor has left.
+        """
         self._upload.disabled = True
         try:
             self._load(content, name, scale)
@@ -178,11 +190,14 @@ class ObstaclePanel:
                 raise ShapeError(
                     name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
                 )
-            obstacle, notes = from_file(content, name, scale)
-        except ShapeError as error:
-            if isinstance(error, SizeError) and error.unit is not None:
+            with self._reader.turn():
+                obstacle, notes = from_file(content, name, scale)
+        except SizeError as error:
+            if error.unit is not None:
                 self._refused = content, name, error.unit
                 self._again.label = f"Read it in {error.unit}"
+            self._say(error.question or str(error), error.question is None)
+        except ShapeError as error:
             self._say(str(error), True)
         else:
             self.add(obstacle)
@@ -262,7 +277,7 @@ def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[
     if suffix not in (*MESH_SUFFIXES, *CLOUD_SUFFIXES):
         raise ShapeError(name, "suffix", repr(suffix) if suffix else "no suffix", FORMATS)
     if suffix == ".ply":
-        header = content[: shapes.MAX_HEADER].partition(b"end_header")[0]
+        header = content[: plyfile.MAX_HEADER].partition(b"end_header")[0]
         is_cloud = re.search(rb"element\s+face\s+0*[1-9]", header) is None
     else:
         is_cloud = suffix in CLOUD_SUFFIXES

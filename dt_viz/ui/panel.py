@@ -143,7 +143,8 @@ class Panel:
         self._slice.connect(session)
 
     def close(self) -> None:
-        """The visitor has left: stop what plays."""
+        """The visitor has left: stop what plays, and what is read."""
+        self._obstacles.close()
         self._stack.close()
         self._saver.close()
 

@@ -17,7 +17,7 @@ from dt_viz.engine import Engine, Frame, Stage
 from dt_viz.errors import DataError
 from dt_viz.fields import Array
 from dt_viz.imitation import ImitationError
-from dt_viz.interruption import interruptible
+from dt_viz.interruption import UnwantedError, interruptible
 from dt_viz.paper_scenes import SCENES
 from dt_viz.pushing import Pushed
 from dt_viz.scenario import Scenario
@@ -65,13 +65,9 @@ _Job = tuple[Scenario, float]
 """What to compute, and when it was asked for."""
 
 
-class _UnwantedError(Exception):
-    """Nobody wants any more what is being computed."""
-
-
 def _end_if(superseded: Callable[[], bool]) -> None:
     if superseded():
-        raise _UnwantedError
+        raise UnwantedError
 
 
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
@@ -360,7 +356,7 @@ class Session:
         try:
             with interruptible(self._end_if_closed):
                 self._show_frames(job, superseded)
-        except _UnwantedError:
+        except UnwantedError:
             pass
         except Exception as error:
             with self._lock:
@@ -376,13 +372,13 @@ class Session:
 
     def _end_if_closed(self) -> None:
         if self._closed:
-            raise _UnwantedError
+            raise UnwantedError
 
     def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
         with self._lock:
             if self._stopped or self._closed or not self.scenario.learns_like(scenario):
-                raise _UnwantedError
+                raise UnwantedError
             self._learning = True
         self._display.learning(fraction, message)
 
@@ -390,7 +386,7 @@ class Session:
         """Do what is asked for; whether the frames of the scenario, which it may have interrupted, can wait."""
         try:
             pushed, failed = request.compute(scenario), False
-        except _UnwantedError:
+        except UnwantedError:
             raise
         except Exception as error:  # as in `LatestWorker`, but the frames go on
             logger.exception("the arm could not do what it was asked for")

@@ -1,0 +1,98 @@
+"""Lines and tables of text files, read one line at a time: no file makes them take more memory than its own size."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Collection, Iterator
+
+from dt_viz.errors import FormatError
+from dt_viz.interruption import checkpoint
+
+MAX_LINES = 2_000_000
+"""Largest number of lines of a file, empty ones and comments included."""
+MAX_LENGTH = 100_000
+"""Largest number of characters in a line."""
+LINES_PER_CHECKPOINT = 1000
+"""Number of lines between two checkpoints: about a millisecond."""
+
+
+def numbered_lines(content: bytes, *, errors: str = "strict", max_lines: int = MAX_LINES) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a text in UTF-8, each with its number from 1 and without the line break.
+
+    Args:
+        content: all bytes of the file.
+        errors: what is done about bytes that are no UTF-8, as in `bytes.decode`.
+        max_lines: largest number of lines.
+
+    Raises:
+        FormatError: it is no text in UTF-8, has more lines than that, or a line longer than `MAX_LENGTH`.
+    """
+    if b"\0" in content:
+        raise FormatError("file", "a zero byte", "text in UTF-8")
+    file = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", errors)
+    number = 0
+    while True:
+        try:
+            line = file.readline(MAX_LENGTH + 2)
+        except UnicodeDecodeError as error:
+            raise FormatError("file", f"bytes that are no text after line {number}", "text in UTF-8") from error
+        if not line:
+            return
+        number += 1
+        if number > max_lines:
+            raise FormatError("file", f"more than {max_lines} lines", f"at most {max_lines} lines")
+        line = line.rstrip("\n")
+        if len(line) > MAX_LENGTH:
+            raise FormatError(
+                f"line {number}", f"more than {MAX_LENGTH} characters", f"lines of at most {MAX_LENGTH} characters"
+            )
+        if number % LINES_PER_CHECKPOINT == 0:
+            checkpoint()
+        yield number, line
+
+
+def read_table(
+    content: bytes, headers: Collection[tuple[str, ...]], *, max_rows: int
+) -> tuple[tuple[str, ...], Iterator[tuple[int, list[str]]]]:
+    """Read comma-separated text: its header line at once, its rows while they are iterated over.
+
+    Args:
+        content: all bytes of the file, UTF-8.
+        headers: the names of columns, in lower case, that are accepted.
+        max_rows: largest number of lines after the header.
+
+    Returns:
+        Which of the headers it is; and, of each line that is not empty, its number and its cells without the blanks
+        around them, as many as the header has.
+
+    Raises:
+        FormatError: the header is none of them; or, while iterating, as `numbered_lines`, or a line has not as many
+            cells as the header.
+    """
+    rows = _rows(numbered_lines(content, max_lines=max_rows + 1))
+    _, cells = next(rows, (1, []))
+    header = tuple(cell.lower() for cell in cells)
+    if header not in headers:
+        found = repr(",".join(header)[:80])
+        raise FormatError("header line", found, " or ".join(f"'{','.join(names)}'" for names in headers))
+    return header, _of_width(rows, len(header))
+
+
+def _rows(lines: Iterator[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
+    for number, line in lines:
+        try:
+            # one line each: no quoted cell goes on in the next
+            row = next(csv.reader((line,), strict=True), []) if '"' in line else line.split(",")
+        except csv.Error as error:
+            raise FormatError(f"line {number}", repr(line[:60]), "comma-separated cells") from error
+        cells = [cell.strip() for cell in row]
+        if any(cells):
+            yield number, cells
+
+
+def _of_width(rows: Iterator[tuple[int, list[str]]], width: int) -> Iterator[tuple[int, list[str]]]:
+    for number, cells in rows:
+        if len(cells) != width:
+            raise FormatError(f"line {number}", f"{len(cells)} columns", f"{width}, as in the header")
+        yield number, cells

@@ -1,0 +1,309 @@
+"""Mutated files of every kind that is read, always the same ones, and a program that reads what it is given.
+
+The program takes files from its standard input and prints a line of JSON for each: why it was refused (or nothing), the
+processor time in seconds and the largest memory of the process meanwhile in MB. Another exception than the readers' own
+ends it, as a crash does. Reading is apart from the test because memory can only be measured for a whole process.
+"""
+
+import copy
+import faulthandler
+import io
+import json
+import re
+import struct
+import sys
+import time
+import zipfile
+import zlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+import trimesh
+
+from dt_viz import clouds, demos, shapes, solids
+from dt_viz.errors import DataError
+
+PROCESS = Path("/proc/self")
+"""What Linux says of this process."""
+MAX_ADDRESS_SPACE = 4 * 2**30
+"""Of the program: what goes beyond ends it before the machine suffers."""
+MAX_SECONDS = 300
+"""After which a file ends the program."""
+NUMBERS = (0, 1, -1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63, -(2**63), 10**12)
+WORDS = ("", "0", "-1", "nan", "-inf", "1e308", "-1e308", "1e-320", "999999999999", "9" * 400, "0x10", "1_0", "\u0661")
+VALUES = (None, True, -1, 0, 1, 3, 2**31, 2**63, 1e308, -0.5, "", "x" * 1000, [], {}, [[[]]], [0] * 1000)
+BYTES = (0, 1, 9, 10, 32, 44, 45, 48, 127, 128, 255)
+
+Rng = np.random.Generator
+Mutation = Callable[[bytes, Rng], bytes]
+
+
+def parts(rng: Rng, content: bytes) -> tuple[bytes, bytes, bytes]:
+    """The content in three, the middle one rather small."""
+    start = int(rng.integers(len(content) + 1))
+    end = min(len(content), start + int(rng.geometric(0.02)))
+    return content[:start], content[start:end], content[end:]
+
+
+def flipped(content: bytes, rng: Rng) -> bytes:
+    changed = bytearray(content)
+    for place in rng.integers(len(content), size=rng.integers(1, 20)) if content else ():
+        changed[place] ^= 1 << int(rng.integers(8))
+    return bytes(changed)
+
+
+def overwritten(content: bytes, rng: Rng) -> bytes:
+    before, middle, after = parts(rng, content)
+    return before + bytes([int(rng.choice(BYTES))]) * len(middle) + after
+
+
+def truncated(content: bytes, rng: Rng) -> bytes:
+    return content[: int(rng.integers(len(content) + 1))]
+
+
+def without_block(content: bytes, rng: Rng) -> bytes:
+    before, _, after = parts(rng, content)
+    return before + after
+
+
+def with_block_again(content: bytes, rng: Rng) -> bytes:
+    before, middle, after = parts(rng, content)
+    times = int(rng.choice([2, 10, 1000, 100_000]))
+    return before + middle * min(times, (shapes.MAX_BYTES - len(content)) // max(len(middle), 1)) + after
+
+
+def with_number(content: bytes, rng: Rng) -> bytes:
+    """A binary number replaced by an extreme one."""
+    number, kind = int(rng.choice(len(NUMBERS))), str(rng.choice(["<I", ">I", "<Q", "<H", "<f", "<d"]))
+    if kind[1] in "fd":
+        packed = struct.pack(kind, float(rng.choice([np.nan, np.inf, -np.inf, 1e-30, 1e30, -1e38])))
+    else:
+        size = struct.calcsize(kind)
+        packed = struct.pack(kind, NUMBERS[number] % 2 ** (8 * size))
+    place = int(rng.integers(min(len(content), int(rng.choice([100, 400, 10**9]))) + 1))  # headers rather often
+    return content[:place] + packed + content[place + len(packed) :]
+
+
+def with_word(content: bytes, rng: Rng) -> bytes:
+    """A decimal number replaced by an extreme one."""
+    found = [match.span() for match in re.finditer(rb"-?\d+(\.\d+)?(e-?\d+)?", content[:200_000])]
+    if not found:
+        return content
+    nearby = found[: int(rng.choice([5, 20, len(found)]))]
+    start, end = nearby[int(rng.integers(len(nearby)))]
+    return content[:start] + str(rng.choice(WORDS)).encode() + content[end:]
+
+
+def with_line_again(content: bytes, rng: Rng) -> bytes:
+    lines = content.split(b"\n")
+    line = lines[int(rng.integers(len(lines)))] + b"\n"
+    times = min(int(rng.choice([2, 100, 10**6, 10**8])), (shapes.MAX_BYTES - len(content)) // len(line))
+    return content + b"\n" + line * times
+
+
+def with_changed_scene(content: bytes, rng: Rng) -> bytes:
+    """A GLB file whose description is changed at some places, its lengths set right."""
+    if len(content) < 20 or content[:4] != b"glTF":
+        return content
+    (length,) = struct.unpack_from("<I", content, 12)
+    try:
+        scene = json.loads(content[20 : 20 + length])
+    except ValueError:
+        return content
+    if rng.random() < 0.3:
+        scene["nodes"] = [{"mesh": 0} for _ in range(rng.choice([100, 5000, 10_000, 50_000]))]
+        scene["scenes"] = [{"nodes": list(range(len(scene["nodes"])))}]
+    if rng.random() < 0.1:
+        scene["nodes"] = [{"mesh": 0, "children": [int(rng.integers(3))]} for _ in range(3)]
+    for _ in range(rng.integers(4)):
+        owner = scene
+        while True:
+            keys = list(owner) if isinstance(owner, dict) else list(range(len(owner)))
+            if not keys:
+                break
+            key = keys[int(rng.integers(len(keys)))]
+            inner = owner[key]
+            if isinstance(inner, dict | list) and inner and rng.random() < 0.85:
+                owner = inner
+                continue
+            owner[key] = copy.deepcopy(VALUES[int(rng.integers(len(VALUES)))])
+            break
+    text = json.dumps(scene).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    return b"glTF" + struct.pack("<III", 2, 20 + len(text) + len(rest), len(text)) + b"JSON" + text + rest
+
+
+def with_changed_members(content: bytes, rng: Rng) -> bytes:
+    """An archive packed anew with one member changed: its header, its length, or how it is packed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # damaged before
+        return content
+    if not members:
+        return content
+    name = list(members)[int(rng.integers(len(members)))]
+    data = members[name]
+    match int(rng.integers(6)):
+        case 0:
+            data = with_word(data[:128], rng) + data[128:]
+        case 1:
+            data = data[:128].replace(b"<f8", str(rng.choice(["<c16", "|O", "<U9", ">f4", "<f2", "<M8[s]"])).encode())
+        case 2:
+            data = data[:10] + b"(" * int(rng.choice([10, 1000, 60_000])) + data[10:]
+            data = data[:6] + b"\2\0" + struct.pack("<I", len(data)) + data[12:]
+        case 3:
+            data += bytes(int(rng.choice([1, 10**6, 10**8])))
+        case 4:
+            shape = str(tuple(int(n) for n in rng.choice([1, 7, 10**5, 10**9, 0], size=rng.integers(5)))).encode()
+            header = b"{'descr': '<f8', 'fortran_order': True, 'shape': " + shape + b", }\n"
+            data = b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + data[128:]
+        case _:
+            data = flipped(data, rng)
+    members[name] = data
+    methods = [zipfile.ZIP_DEFLATED] * 5 + [zipfile.ZIP_STORED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", methods[int(rng.integers(len(methods)))], compresslevel=1) as archive:
+        for key, value in members.items():
+            archive.writestr(key, value)
+        if rng.random() < 0.1:
+            for k in range(20_000):
+                archive.writestr(zipfile.ZipInfo(f"a{k}"), b"")
+    return file.getvalue()
+
+
+def with_changed_inside(content: bytes, rng: Rng) -> bytes:
+    """A MATLAB file whose compressed variables are changed inside."""
+    changed = content[:128]
+    at = 128
+    while at + 8 <= len(content):
+        kind, size = struct.unpack_from("<II", content, at)
+        data = content[at + 8 : at + 8 + size]
+        at += 8 + size
+        if kind == 15:
+            try:
+                plain = zlib.decompress(data)
+            except zlib.error:
+                return content
+            mutation = (flipped, with_number, with_block_again, without_block)[int(rng.integers(4))]
+            data = zlib.compress(mutation(plain, rng), 1)
+        changed += struct.pack("<II", kind, len(data)) + data
+    return changed
+
+
+EVERYWHERE: tuple[Mutation, ...] = (
+    *(flipped, overwritten, truncated, without_block, with_block_again, with_number, with_word, with_line_again),
+)
+
+
+def exported(mesh: trimesh.Trimesh, kind: str, **options: str) -> bytes:
+    content = mesh.export(file_type=kind, **options)
+    assert isinstance(content, str | bytes)
+    return content.encode() if isinstance(content, str) else content
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+    return file.getvalue()
+
+
+def matlab(motions: list[np.ndarray], *, compressed: bool) -> bytes:
+    cells = np.empty((1, len(motions)), dtype=object)
+    for k, positions in enumerate(motions):
+        cells[0, k] = {"pos": 1e3 * positions.T, "t": np.arange(float(len(positions)))[None], "name": "text"}
+    file = io.BytesIO()
+    scipy.io.savemat(file, {"demos": cells, "dt": 0.1}, do_compression=compressed)
+    return file.getvalue()
+
+
+@cache
+def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
+    """For each loader whose files are read how: its kind, a name, a good file, and mutations of such files only."""
+    rng = np.random.default_rng(0)
+    motions = [np.cumsum(rng.normal(scale=0.01, size=(30, d)), axis=0) for d in (2, 2)]
+    rows = [
+        "demo,t,x,y",
+        *(f"{k},{t},{x:.5g},{y:.5g}" for k, motion in enumerate(motions) for t, (x, y) in enumerate(motion)),
+    ]
+    arrays = {f"positions_{k}": motion for k, motion in enumerate(motions)}
+    arrays |= {f"times_{k}": np.arange(30.0) for k in range(2)} | {"name_0": np.array("first")}
+    ball = trimesh.creation.icosphere(2, 0.1)
+    scene = trimesh.Scene([ball, trimesh.creation.box((0.1, 0.1, 0.3))]).export(file_type="glb")
+    assert isinstance(scene, bytes)
+    points = rng.uniform(-0.1, 0.1, (400, 3))
+    labels = np.linalg.norm(points, axis=1) < 0.08
+    table = [
+        "x,y,z,occupied",
+        *(f"{x:.4f},{y:.4f},{z:.4f},{int(o)}" for (x, y, z), o in zip(points, labels, strict=True)),
+    ]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property float {axis}" for axis in "xyz")]
+    cloud = [*header, "property uchar label", "end_header", *(row.replace(",", " ") for row in table[1:])]
+    return (
+        ("demonstrations", "a.csv", "\n".join(rows).encode(), ()),
+        ("demonstrations", "a.npz", npz(**arrays), (with_changed_members,) * 4),
+        ("demonstrations", "a.mat", matlab(motions, compressed=False), ()),
+        ("demonstrations", "b.mat", matlab(motions, compressed=True), (with_changed_inside,) * 4),
+        ("mesh", "a.stl", exported(ball, "stl"), ()),
+        ("mesh", "b.stl", exported(ball, "stl_ascii"), ()),
+        ("mesh", "a.obj", exported(ball, "obj"), ()),
+        ("mesh", "a.ply", exported(ball, "ply"), ()),
+        ("mesh", "b.ply", exported(ball, "ply", encoding="ascii"), ()),
+        ("mesh", "a.glb", scene, (with_changed_scene,) * 8),
+        ("cloud", "a.npz", npz(points=points, labels=labels), (with_changed_members,) * 4),
+        ("cloud", "b.npz", npz(points=points[labels].astype(np.float32)), (with_changed_members,) * 4),
+        ("cloud", "a.csv", "\n".join(table).encode(), ()),
+        ("cloud", "a.ply", "\n".join(cloud).encode(), ()),
+    )
+
+
+def hostile_file(number: int) -> tuple[str, str, bytes]:
+    """The kind of loader, a name and the content of the file of this number."""
+    rng = np.random.default_rng((11, number))
+    kind, name, content, own = seeds()[number % len(seeds())]
+    mutations = EVERYWHERE + own
+    for _ in range(rng.integers(1, 4)):
+        content = mutations[int(rng.integers(len(mutations)))](content, rng)
+    return kind, name, content
+
+
+def read(kind: str, name: str, content: bytes) -> None:
+    """Read a file and look whether what it gives can be used."""
+    if kind == "demonstrations":
+        for demonstration in demos.read_demonstrations(content, name):
+            assert np.isfinite(demonstration.positions).all()
+            assert (np.diff(demonstration.times) > 0).all()
+        return
+    solid = shapes.read_mesh(content, name).solid if kind == "mesh" else shapes.read_cloud(content, name).cloud.solid
+    assert solid.distances.depth > 0
+    assert np.isfinite(solid.distances.values).all()
+
+
+def main() -> None:
+    import resource  # not on every system
+
+    resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESS_SPACE, MAX_ADDRESS_SPACE))
+    if "--coarse" in sys.argv:  # only reading is looked at
+        solids.NUM_NODES = clouds.NUM_NODES = 10**3
+        solids.NUM_SAMPLES = solids.NUM_PROBES = clouds.NUM_SAMPLES = 1000
+    while line := sys.stdin.buffer.readline():
+        faulthandler.dump_traceback_later(MAX_SECONDS, exit=True)
+        kind, name, size = json.loads(line)
+        content = sys.stdin.buffer.read(size)
+        PROCESS.joinpath("clear_refs").write_text("5")  # forget the largest memory so far
+        start, message = time.process_time(), ""
+        try:
+            read(kind, name, content)
+        except DataError as error:
+            message = str(error)
+        seconds = time.process_time() - start
+        (kilobytes,) = re.findall(r"VmHWM:\s+(\d+) kB", PROCESS.joinpath("status").read_text())
+        print(json.dumps([message, seconds, int(kilobytes) / 1024]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
