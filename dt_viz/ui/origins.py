@@ -48,13 +48,7 @@ class Origin:
             OriginError: it names none, or more than that.
         """
         parts = _split(text)
-        if (
-            parts is None
-            or parts.scheme not in DEFAULT_PORTS
-            or parts.path not in {"", "/"}
-            or parts.query
-            or parts.fragment
-        ):
+        if parts is None or parts.scheme not in DEFAULT_PORTS:
             raise OriginError(
                 f"found {text!r}; accepted: http:// or https://, a name or an address, and maybe a port, "
                 "such as https://demo.example.org"
@@ -102,13 +96,15 @@ class Origins:
 
 
 def _split(text: str) -> SplitResult | None:
-    """The parts of a URL, or None where there is no host, no valid port, or a user."""
+    """The parts of a URL, or None where there is no host or no valid port, and where there is more than both."""
     try:
         parts = urlsplit(text)
-        valid = parts.hostname and parts.port != 0 and "@" not in parts.netloc
+        if not parts.hostname or parts.port == 0:
+            return None
     except ValueError:
         return None
-    return parts if valid else None
+    more = "@" in parts.netloc or parts.path not in {"", "/"} or parts.query or parts.fragment
+    return None if more else parts
 
 
 def _address(host: str | None) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
