@@ -76,11 +76,13 @@ async def open_page(client):
 
 async def answers(client):
     """Whether the page still does what it is told."""
-    value = not client.controls[client.find("Table")]["value"]
-    await client.set("Table", value)
-    await client.set("Diameter [cm]", 10.0)
-    before = client.status
-    return await client.wait_for(lambda: client.status != before, PATIENCE)
+
+    def shown():
+        return client.nodes["/table"].get("visible", True)
+
+    wanted = not shown()
+    await client.set("Table", wanted)
+    return await client.wait_for(lambda: shown() == wanted, PATIENCE)
 
 
 async def status_of(url, **options):
@@ -379,7 +381,7 @@ async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
     async with ProtocolClient(url) as client:
         await open_page(client)
         with pytest.raises(LostError):
-            await client.upload(UPLOAD, "x.stl", bytes(3 * 2**20), announced=2**20)
+            await client.upload(UPLOAD, "x.stl", bytes(3 * 2**20), announced=2**20 + 1)
             assert await client.wait_until_lost(PATIENCE)
             await client.look()
 

@@ -228,6 +228,8 @@ class ProtocolClient:
         elif kind == "SceneNodeUpdateMessage":
             self.nodes.setdefault(message["name"], {}).update(message["updates"])
             self.changed(message["name"], message["updates"], now)
+        elif kind == "SetSceneNodeVisibilityMessage":
+            self.nodes.setdefault(message["name"], {})["visible"] = message["visible"]
         elif kind == "RemoveSceneNodeMessage":
             self.nodes.pop(message["name"], None)
         elif kind == "GuiUpdateMessage":
@@ -235,7 +237,7 @@ class ProtocolClient:
         elif kind == "GuiRemoveMessage":
             self.controls.pop(message["uuid"], None)
         elif "props" in message and "name" in message:
-            self.nodes[message["name"]] = {"owner": message["owner"], **message["props"]}
+            self.nodes.setdefault(message["name"], {}).update(message["props"], owner=message["owner"])
             self.changed(message["name"], message["props"], now)
         elif "props" in message and "uuid" in message:
             self.controls[message["uuid"]] = {"kind": kind, "value": message.get("value"), **message["props"]}
