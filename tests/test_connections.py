@@ -345,11 +345,12 @@ async def test_a_visitor_who_does_not_listen_costs_no_memory(url, server):
         await open_page(client)
         client._receiving.cancel()
         await client.grab()
-        for k in range(400):
-            await client.move([0.1, -0.5, 0.3 + 0.001 * k])
+        for k in range(200):
+            await client.move([0.1, -0.5, 0.3 + 0.002 * k])
             await asyncio.sleep(0.01)
         (state,) = server._server._websock_server._client_state_from_id.values()
         assert len(state.message_buffer.message_from_id) < 200
+        client._socket.transport.abort()  # who does not listen says no goodbye either
         client._receiving = asyncio.create_task(asyncio.sleep(0))
 
 

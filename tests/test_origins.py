@@ -16,8 +16,18 @@ def test_names_that_cannot_resolve_elsewhere_are_known(host):
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example:8080", "localhost.evil.example", "127.0.0.1.evil.example", "localhost@evil.example", "", ":8080"]
-    + ["localhost:0x50", "localhost:99999", "127.0.0.1:8080/evil", "2130706433"],
+    [
+        "evil.example:8080",
+        "localhost.evil.example",
+        "127.0.0.1.evil.example",
+        "localhost@evil.example",
+        "",
+        ":8080",
+        "localhost:0x50",
+        "localhost:99999",
+        "127.0.0.1:8080/evil",
+        "2130706433",
+    ],
 )
 def test_names_that_anybody_may_have_resolve_to_this_server_are_not_known(host):
     assert not LOCAL.knows(host)

@@ -34,7 +34,9 @@ def test_a_new_file_takes_the_place_of_one_that_was_given_up(upload):
     assert upload.part("b", 0, 10)
 
 
-@pytest.mark.parametrize("parts", [[(0, 600), (1, 600)], [(0, 400), (1, 400)], [(0, 500), (0, 500)], [(2, 1)], [(-1, 1)]])
+@pytest.mark.parametrize(
+    "parts", [[(0, 600), (1, 600)], [(0, 400), (1, 400)], [(0, 500), (0, 500)], [(2, 1)], [(-1, 1)]]
+)
 def test_parts_that_do_not_add_up_to_what_was_announced_come_from_no_page(upload, parts):
     upload.start("a", "x.ply", 1000, 2)
     with pytest.raises(MalformedError):
@@ -43,7 +45,8 @@ def test_parts_that_do_not_add_up_to_what_was_announced_come_from_no_page(upload
 
 
 @pytest.mark.parametrize(
-    ("num_bytes", "num_parts"), [(-1, 1), (10, 0), (10, -1), (10, 11), (0, 1), (1000, 1001), (MAX_PARTS + 1, MAX_PARTS + 1)]
+    ("num_bytes", "num_parts"),
+    [(-1, 1), (10, 0), (10, -1), (10, 11), (0, 1), (1000, 1001), (MAX_PARTS + 1, MAX_PARTS + 1)],
 )
 def test_numbers_of_parts_that_no_file_has_come_from_no_page(num_bytes, num_parts):
     with pytest.raises(MalformedError):

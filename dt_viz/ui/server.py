@@ -7,6 +7,7 @@ import socket
 import threading
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import NoReturn
 
 import viser
 
@@ -90,9 +91,10 @@ class Server:
         """Who is there."""
         return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
 
-    def wait(self) -> None:
+    def wait(self) -> NoReturn:
         """Serve until interrupted."""
-        self._server.sleep_forever()
+        while True:
+            self._server.sleep_forever()
 
     def close(self) -> None:
         """Send everybody away and stop listening."""
