@@ -19,11 +19,9 @@ import msgspec
 import numpy as np
 import websockets
 import zstandard
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
-
-from dt_viz.fields import Array
 
 ROLLOUTS, OBSTACLE = "/rollouts", "/obstacles/0"
 """Names of the rollouts' lines and of the first obstacle's gizmo in the scene tree."""
@@ -164,14 +162,14 @@ class ProtocolClient:
         """Take hold of a gizmo."""
         await self.send("TransformControlsDragStartMessage", name=name, owner=self.nodes[name]["owner"])
 
-    async def move(self, position: Array, name: str = OBSTACLE) -> None:
+    async def move(self, position: ArrayLike, name: str = OBSTACLE) -> None:
         """Drag it to a place (3,), metres."""
         await self.send(
             "TransformControlsUpdateMessage",
             name=name,
             owner=self.nodes[name]["owner"],
             wxyz=UPRIGHT,
-            position=[float(c) for c in position],
+            position=np.asarray(position, float).tolist(),
         )
 
     async def release(self, name: str = OBSTACLE) -> None:
