@@ -5,16 +5,31 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
+
+from dt_viz.ui.logs import Terse
+from dt_viz.ui.origins import Origin, OriginError
 
 MAX_PORT = 65535
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the server; returns the process' exit status."""
+    """Run the server until Ctrl-C or SIGTERM; returns the process' exit status."""
     options = _parser().parse_args(arguments)
+    try:
+        with _interruptible():
+            return _serve(options)
+    except KeyboardInterrupt:
+        return 0
+
+
+def _serve(options: argparse.Namespace) -> int:
     # several visitors share the cores; BLAS threads for small matrices cost more than they gain
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -24,9 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from dt_viz.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.obstacles import unit_sphere_map  # noqa: PLC0415
     from dt_viz.tasks import TASKS, lasa_tasks  # noqa: PLC0415
+    from dt_viz.ui.gate import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    handler = logging.StreamHandler()
+    handler.addFilter(Terse())
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
         tasks = {**TASKS, **(lasa_tasks(options.lasa) if options.lasa is not None else {})}
         if options.task not in tasks:
@@ -43,17 +61,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
             host=options.host,
             port=options.port,
             max_sessions=options.max_sessions,
+            allowed=options.allow_origin,
         )
-    except (DataError, ImitationError, AddressError) as error:
+    except (DataError, ImitationError, AddressError, GateError) as error:
         print(f"app.py: {error}", file=sys.stderr)
         return 2
     host = f"[{server.host}]" if ":" in server.host else server.host
     print(f"DT-Viz is at http://{host}:{server.port} (Ctrl-C stops it)", flush=True)
     try:
         server.wait()
-    except KeyboardInterrupt:
+    finally:
         server.close()
-    return 0
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Have SIGTERM raise KeyboardInterrupt as Ctrl-C does, once: whoever asks again does not want to wait."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread is told of signals
+        return
+    signals = signal.SIGINT, signal.SIGTERM
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        for number in signals:
+            signal.signal(number, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    before = [signal.signal(number, interrupt) for number in signals]
+    try:
+        yield
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -65,7 +104,23 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--max-sessions", type=_positive, default=8, help="visitors at a time, each with a scene (default: %(default)s)"
     )
+    parser.add_argument(
+        "--allow-origin",
+        type=_origin,
+        action="append",
+        default=[],
+        metavar="URL",
+        help="address under which browsers see the page, if it is not the server's own, such as that of a proxy: "
+        "https://demo.example.org; can be given several times",
+    )
     return parser
+
+
+def _origin(text: str) -> Origin:
+    try:
+        return Origin.parse(text)
+    except OriginError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _port(text: str) -> int:

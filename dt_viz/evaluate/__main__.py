@@ -17,7 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     from dt_viz.errors import DataError  # noqa: PLC0415
-    from dt_viz.evaluate import avoidance, imitation, latency, places, rollouts, starts  # noqa: PLC0415
+    from dt_viz.evaluate import avoidance, imitation, latency, load, places, rollouts, starts  # noqa: PLC0415
     from dt_viz.evaluate.options import InputError, with_negative_values  # noqa: PLC0415
     from dt_viz.imitation import ImitationError  # noqa: PLC0415
 
@@ -26,6 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, module in {
         "imitation": imitation,
         "latency": latency,
+        "load": load,
         "avoidance": avoidance,
         "places": places,
         "rollouts": rollouts,

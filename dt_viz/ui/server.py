@@ -6,17 +6,24 @@ import logging
 import socket
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NoReturn
 
 import viser
 
 from dt_viz.engine import Engine
 from dt_viz.fits import FitStore
 from dt_viz.robot import load_jaco
+from dt_viz.shapes import MAX_BYTES
 from dt_viz.tasks import TaskEntry
-from dt_viz.ui.visitor import Visitor
+from dt_viz.ui.gate import Gate
+from dt_viz.ui.origins import Origin, Origins
+from dt_viz.ui.visitor import NOTICE_SECONDS, Visitor
 
 logger = logging.getLogger(__name__)
+
+MAX_WAITING = 8
+"""Connections beyond the visitors, which are shown that all places are taken; any more are refused."""
 
 # a visitor may leave between two pictures of the arm; what is then sent to nobody is no news
 warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
@@ -38,6 +45,7 @@ class Server:
         host: str = "127.0.0.1",
         port: int = 8080,
         max_sessions: int = 8,
+        allowed: Sequence[Origin] = (),
     ) -> None:
         """Listen and wait for visitors.
 
@@ -48,9 +56,11 @@ class Server:
             host: address to listen on.
             port: to listen on; 0 takes any free one.
             max_sessions: visitors at a time; further ones are told to wait.
+            allowed: pages of other addresses that may connect; see `Origins`.
 
         Raises:
             AddressError: the address is not to be had.
+            GateError: this version of viser is not supported.
         """
         port = _checked_port(host, port)
         self._tasks, self._fits, self._task = tasks, fits, task
@@ -59,7 +69,10 @@ class Server:
         self._robot = load_jaco()
         self._lock = threading.Lock()
         self._visitors: dict[int, Visitor | None] = {}
-        self._server = viser.ViserServer(host=host, port=port, label="DT-Viz", verbose=False)
+        gate = Gate(
+            Origins(host, allowed), max_connections=max_sessions + MAX_WAITING, max_upload=MAX_BYTES, refused=_refuse
+        )
+        self._server = gate.open(host, port, "DT-Viz")
         if self._server.get_port() != port:  # somebody was faster than the check
             self._server.stop()
             raise AddressError(f"port {port} on {host} was taken a moment ago; choose another with --port")
@@ -78,9 +91,10 @@ class Server:
         """Who is there."""
         return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
 
-    def wait(self) -> None:
+    def wait(self) -> NoReturn:
         """Serve until interrupted."""
-        self._server.sleep_forever()
+        while True:
+            self._server.sleep_forever()
 
     def close(self) -> None:
         """Send everybody away and stop listening."""
@@ -90,6 +104,8 @@ class Server:
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         with self._lock:
+            if client.client_id not in self._server.get_clients():
+                return  # left before its turn came
             full = len(self._visitors) >= self._max_sessions
             if not full:
                 self._visitors[client.client_id] = None  # a place is taken before the page is built
@@ -119,6 +135,10 @@ class Server:
             visitor = self._visitors.pop(client.client_id, None)
         if visitor is not None:
             visitor.close()
+
+
+def _refuse(client: viser.ClientHandle, text: str) -> None:
+    client.add_notification("DT-Viz", text, color="red", auto_close_seconds=NOTICE_SECONDS)
 
 
 def _checked_port(host: str, port: int) -> int:

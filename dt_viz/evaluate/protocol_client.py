@@ -1,0 +1,264 @@
+"""A visitor without a browser: speaks viser's protocol, keeps what it is shown, and moves what can be moved.
+
+Each message from the server is one frame of a WebSocket: two lengths (little-endian, 8 bytes each), a map of msgpack
+compressed with zstd, and the arrays that stand in that map as placeholders, each beginning at a multiple of 8 bytes. A
+message to the server is one map of msgpack. Everything has a time limit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from types import TracebackType
+from typing import Any
+
+import msgspec
+import numpy as np
+import websockets
+import zstandard
+from numpy.typing import ArrayLike, NDArray
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+ROLLOUTS, OBSTACLE = "/rollouts", "/obstacles/0"
+"""Names of the rollouts' lines and of the first obstacle's gizmo in the scene tree."""
+STATUS, CHECKED = "Smallest det J", "every check holds"
+"""What the status line says of every frame, and of a frame whose certificates all hold."""
+MAX_MESSAGE = 64 * 2**20
+"""Bytes of a message from the server."""
+PART = 512 * 1024
+"""Bytes of a part of an upload, as in viser's own page."""
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+class LostError(ConnectionError):
+    """The server has closed the connection."""
+
+
+class ProtocolClient:
+    """One visitor: an asynchronous context manager, connected while it is entered."""
+
+    def __init__(self, url: str, *, origin: str | None = None, protocol: str | None = None) -> None:
+        """Visit a server.
+
+        Args:
+            url: of the WebSocket, such as ``ws://127.0.0.1:8080``.
+            origin: of the page that it pretends to be; None sends none.
+            protocol: WebSocket subprotocol; that of the installed viser if None.
+        """
+        self._url, self._origin = url, origin
+        self._protocol = Subprotocol(protocol or f"viser-v{version('viser')}")
+        self.nodes: dict[str, dict[str, Any]] = {}
+        """Properties of what is in the scene, by name; arrays are flat."""
+        self.controls: dict[str, dict[str, Any]] = {}
+        """Properties of what is in the panel, by its identifier."""
+        self.notices: list[str] = []
+        """What popped up."""
+        self.num_bytes = self.num_messages = 0
+        """Received."""
+        self.changed: Callable[[str, Mapping[str, Any], float], None] = lambda _name, _changes, _now: None
+        """Told of each node that came or changed its name, the properties, and when, seconds of `time.perf_counter`."""
+        self._news = asyncio.Event()
+        self._ended: Exception | None = None
+
+    async def __aenter__(self) -> ProtocolClient:
+        self._socket: ClientConnection = await connect(
+            self._url,
+            origin=websockets.Origin(self._origin) if self._origin is not None else None,
+            subprotocols=[self._protocol],
+            compression=None,
+            max_size=MAX_MESSAGE,
+            proxy=None,
+        )
+        self._receiving = asyncio.create_task(self._receive())
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._socket.close()
+        await self._receiving
+
+    async def send(self, kind: str, **fields: Any) -> None:  # noqa: ANN401 - as the message has them
+        """Send a message of this kind. Raises LostError."""
+        await self.send_raw(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    async def send_raw(self, raw: bytes | str) -> None:
+        """Send what may be no message. Raises LostError."""
+        try:
+            await self._socket.send(raw)
+        except websockets.ConnectionClosed as error:
+            raise LostError(str(error)) from error
+
+    async def look(self, width: int = 1280, height: int = 720) -> None:
+        """Say where the camera is; the server builds the page when it first knows."""
+        await self.send(
+            "ViewerCameraMessage",
+            wxyz=UPRIGHT,
+            position=(0.0, -2.0, 1.0),
+            fov=0.75,
+            near=0.01,
+            far=1000.0,
+            image_height=height,
+            image_width=width,
+            look_at=(0.0, 0.0, 0.0),
+            up_direction=(0.0, 0.0, 1.0),
+        )
+
+    async def wait_for(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Wait until a condition on what is shown holds; False if it does not within so many seconds.
+
+        Raises:
+            LostError: the connection ended before.
+        """
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if self._ended is not None:
+                raise LostError(str(self._ended))
+            self._news.clear()
+            try:
+                await asyncio.wait_for(self._news.wait(), max(0.0, deadline - time.monotonic()))
+            except asyncio.TimeoutError:
+                return bool(condition())
+        return True
+
+    async def wait_until_lost(self, seconds: float) -> bool:
+        """Wait until the server has closed the connection; False if it does not within so many seconds."""
+        done, _ = await asyncio.wait([self._receiving], timeout=seconds)
+        return bool(done)
+
+    @property
+    def rollouts(self) -> NDArray[np.float32] | None:
+        """Segments (K, 2, 3) of the rollouts that are shown, metres; None before there are any."""
+        points = self.nodes.get(ROLLOUTS, {}).get("points")
+        return points.reshape(-1, 2, 3) if points is not None and points.size > 6 else None  # one stands there empty
+
+    @property
+    def status(self) -> str:
+        """The status line, as HTML; empty before there is one."""
+        texts = (str(control.get("content", "")) for control in self.controls.values())
+        return next((text for text in texts if STATUS in text), "")
+
+    @property
+    def has_picture(self) -> bool:
+        """Whether motions are shown, and how far they are to be trusted."""
+        return self.rollouts is not None and bool(self.status)
+
+    def find(self, label: str) -> str:
+        """Identifier of the control with this label. Raises KeyError."""
+        for uuid, control in self.controls.items():
+            if control.get("label") == label:
+                return uuid
+        raise KeyError(label)
+
+    async def set(self, label: str, value: bool | float | str) -> None:
+        """Set a control, as a visitor does."""
+        await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
+
+    async def grab(self, name: str = OBSTACLE) -> None:
+        """Take hold of a gizmo."""
+        await self.send("TransformControlsDragStartMessage", name=name, owner=self.nodes[name]["owner"])
+
+    async def move(self, position: ArrayLike, name: str = OBSTACLE) -> None:
+        """Drag it to a place (3,), metres."""
+        await self.send(
+            "TransformControlsUpdateMessage",
+            name=name,
+            owner=self.nodes[name]["owner"],
+            wxyz=UPRIGHT,
+            position=np.asarray(position, float).tolist(),
+        )
+
+    async def release(self, name: str = OBSTACLE) -> None:
+        """Let go of it."""
+        await self.send("TransformControlsDragEndMessage", name=name, owner=self.nodes[name]["owner"])
+
+    async def upload(
+        self, label: str, name: str, content: bytes, *, announced: int | None = None, transfer: str = "transfer"
+    ) -> None:
+        """Send a file with an upload button.
+
+        Args:
+            label: of the button.
+            name: of the file.
+            content: all its bytes.
+            announced: bytes that are said to come; as many as do if None.
+            transfer: identifier of the transfer.
+        """
+        size = len(content) if announced is None else announced
+        common = {"source_component_uuid": self.find(label), "transfer_uuid": transfer}
+        parts = [content[k : k + PART] for k in range(0, len(content), PART)]
+        await self.send(
+            "FileTransferStartUpload",
+            **common,
+            filename=name,
+            mime_type="",
+            part_count=math.ceil(size / PART),
+            size_bytes=size,
+        )
+        for index, part in enumerate(parts):
+            await self.send("FileTransferPart", **common, part_index=index, content=part)
+
+    async def _receive(self) -> None:
+        try:
+            async for raw in self._socket:
+                assert isinstance(raw, bytes)
+                self.num_bytes += len(raw)
+                self.num_messages += 1
+                now = time.perf_counter()
+                for message in decoded(raw):
+                    self._apply(message, now)
+                self._news.set()
+            self._ended = LostError("the server closed the connection")
+        except websockets.ConnectionClosed as error:
+            self._ended = error
+        finally:
+            self._news.set()
+
+    def _apply(self, message: Mapping[str, Any], now: float) -> None:
+        """Keep what a message says that is shown."""
+        kind = message["type"]
+        if kind == "NotificationShowMessage":
+            self.notices.append(message["props"]["body"])
+        elif kind == "SceneNodeUpdateMessage":
+            self.nodes.setdefault(message["name"], {}).update(message["updates"])
+            self.changed(message["name"], message["updates"], now)
+        elif kind == "SetSceneNodeVisibilityMessage":
+            self.nodes.setdefault(message["name"], {})["visible"] = message["visible"]
+        elif kind == "RemoveSceneNodeMessage":
+            self.nodes.pop(message["name"], None)
+        elif kind == "GuiUpdateMessage":
+            self.controls.setdefault(message["uuid"], {}).update(message["updates"])
+        elif kind == "GuiRemoveMessage":
+            self.controls.pop(message["uuid"], None)
+        elif "props" in message and "name" in message:
+            self.nodes.setdefault(message["name"], {}).update(message["props"], owner=message["owner"])
+            self.changed(message["name"], message["props"], now)
+        elif "props" in message and "uuid" in message:
+            self.controls[message["uuid"]] = {"kind": kind, "value": message.get("value"), **message["props"]}
+
+
+def decoded(raw: bytes) -> list[dict[str, Any]]:
+    """The messages in one frame from the server, with their arrays, which are flat."""
+    num_packed = int.from_bytes(raw[8:16], "little")
+    unpacked = zstandard.ZstdDecompressor().decompress(
+        raw[16 : 16 + num_packed], max_output_size=int.from_bytes(raw[:8], "little")
+    )
+    content = msgspec.msgpack.decode(unpacked)
+    arrays, offset = [], 16 + num_packed
+    for length in content["binaryBufferLengths"]:
+        offset += -offset % 8
+        arrays.append(raw[offset : offset + length])
+        offset += length
+
+    def filled(value: Any) -> Any:  # noqa: ANN401 - whatever msgpack holds
+        if isinstance(value, dict):
+            if "__binary_index" in value:
+                return np.frombuffer(arrays[value["__binary_index"]], value["dtype"])
+            return {key: filled(item) for key, item in value.items()}
+        return [filled(item) for item in value] if isinstance(value, list) else value
+
+    return [filled(message) for message in content["messages"]]

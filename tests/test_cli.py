@@ -1,0 +1,104 @@
+"""The command line of the demo, as a process of its own."""
+
+import asyncio
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import AsyncExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+import dt_viz
+from dt_viz.cli import main
+from dt_viz.evaluate.protocol_client import ProtocolClient
+
+APP = Path(dt_viz.__file__).parent.parent / "app.py"
+PATIENCE = 120.0
+"""Seconds that anything may take: the machine may be busy."""
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@contextmanager
+def started(cache, *arguments):
+    """The process."""
+    process = subprocess.Popen(
+        [sys.executable, str(APP), "--port", "0", *arguments],
+        env=os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    guard = threading.Timer(PATIENCE, process.kill)
+    guard.start()
+    try:
+        yield process
+    finally:
+        guard.cancel()
+        process.kill()
+        process.communicate()
+
+
+def address(process):
+    """Of its WebSocket, once it answers."""
+    for line in process.stdout:
+        if found := re.search(r"DT-Viz is at http://(\S+)", line):
+            return f"ws://{found[1]}"
+    raise AssertionError(process.stderr.read())
+
+
+async def visit_and_stop(process, url, number):
+    """Send the signal while two visitors drag."""
+    async with AsyncExitStack() as stack:
+        clients = [await stack.enter_async_context(ProtocolClient(url)) for _ in range(2)]
+        for client in clients:
+            await client.look()
+        for client in clients:
+            assert await client.wait_for(lambda client=client: client.has_picture, PATIENCE)
+            await client.grab()
+        for k in range(20):
+            for client in clients:
+                await client.move([0.1, -0.5, 0.3 + 0.01 * k])
+            await asyncio.sleep(0.02)
+        process.send_signal(number)
+        for client in clients:
+            assert await client.wait_until_lost(PATIENCE)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
+def test_a_signal_ends_it_cleanly_while_visitors_drag(cache, number):
+    with started(cache) as process:
+        asyncio.run(visit_and_stop(process, address(process), number))
+        _, printed = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0
+        assert printed == ""
+
+
+def test_a_signal_ends_it_cleanly_while_it_learns(tmp_path):
+    with started(tmp_path) as process:
+        assert "Learn" in process.stdout.read(8)
+        process.terminate()
+        _, printed = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0
+        assert printed == ""
+
+
+def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert main(["--task", "nothing"]) == 2
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    assert "found 'nothing'" in capsys.readouterr().err
+
+
+def test_what_is_no_origin_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--allow-origin", "demo.example.org"])
+    assert ended.value.code == 2
+    assert "argument --allow-origin: found 'demo.example.org'; accepted: http://" in capsys.readouterr().err

@@ -1,0 +1,106 @@
+"""Many visitors at once, without browsers, and the measurement that opens and drags them."""
+
+import asyncio
+import json
+from contextlib import AsyncExitStack
+
+import numpy as np
+import pytest
+
+from dt_viz.evaluate import load
+from dt_viz.evaluate.__main__ import main
+from dt_viz.evaluate.protocol_client import ProtocolClient
+from dt_viz.tasks import TASKS
+from dt_viz.ui.server import Server
+
+NUM_VISITORS = 8
+PATIENCE = 240.0
+"""Seconds that anything may take: the machine may be busy."""
+
+
+@pytest.fixture(scope="module")
+def poses(engine):
+    return load.Poses(engine, engine.task("draw_s"))
+
+
+def shown(poses, index, *, finest=False):
+    """The rollouts of a pose as a visitor is shown them."""
+    frames = poses._frames(index)
+    frame = next(frames)
+    if finest:
+        *_, frame = frames
+    return poses._segments(frame)
+
+
+def test_a_pose_is_found_by_its_rollouts(poses):
+    assert [poses.find(shown(poses, index)) for index in (0, 41, 99)] == [0, 41, 99]
+    assert poses.find(shown(poses, 41) + np.float32(1e-3)) is None
+
+
+@pytest.mark.parametrize("finest", [False, True])
+def test_rollouts_are_of_their_own_pose_only(poses, finest):
+    rollouts = shown(poses, 7, finest=finest)
+    assert poses.has(7, rollouts)
+    assert not poses.has(8, rollouts)
+    assert not poses.has(7, None)
+
+
+async def first_pictures(url):
+    """Whether each of several visitors that come at the same instant is shown something."""
+    async with AsyncExitStack() as stack:
+        clients = [ProtocolClient(url) for _ in range(NUM_VISITORS)]
+        await asyncio.gather(*(stack.enter_async_context(client) for client in clients))
+        await asyncio.gather(*(client.look() for client in clients))
+        return await asyncio.gather(*(client.wait_for(lambda c=client: c.has_picture, PATIENCE) for client in clients))
+
+
+def test_all_who_come_at_the_same_instant_get_their_picture(fits):
+    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=NUM_VISITORS)
+    try:
+        assert all(asyncio.run(first_pictures(f"ws://127.0.0.1:{server.port}")))
+    finally:
+        server.close()
+
+
+def test_visitors_drag_in_a_started_server_and_are_shown_the_last_pose(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
+    monkeypatch.setattr(load, "PATIENCE", PATIENCE)
+    out = tmp_path / "load.json"
+    assert main(["load", "--clients", "2", "--seconds", "2", "--rounds", "2", "--out", str(out)]) == 0
+    figures = json.loads(out.read_text())
+    assert np.array(figures["first_picture_s"]).shape == (2, 2)
+    assert [visitor["last_shown"] for visitor in figures["visitors"]] == [True, True]
+    assert figures["frames"] == sum(visitor["frames"] for visitor in figures["visitors"]) > 0
+    assert 0 < figures["median_ms"] <= figures["p95_ms"]
+    printed = capsys.readouterr().out
+    assert "round 2: 2 of 2 have a picture" in printed
+    assert f"median {figures['median_ms']:.0f} ms" in printed
+
+
+def test_who_gets_no_picture_fails_the_measurement(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(load, "FIRST_PICTURE", 0.0)
+    assert main(["load", "--clients", "1", "--seconds", "1"]) == 1
+    assert "round 1: 0 of 1 have a picture" in capsys.readouterr().out
+
+
+def test_a_server_that_is_not_there_fails_the_measurement(tmp_path, monkeypatch, capsys, unused_port):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert main(["load", "--clients", "1", "--seconds", "1", "--url", f"ws://127.0.0.1:{unused_port}"]) == 1
+    assert "a visitor was lost" in capsys.readouterr().err
+
+
+@pytest.fixture
+def unused_port():
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_what_is_no_address_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        main(["load", "--url", "127.0.0.1:8080"])
+    assert "found '127.0.0.1:8080'; accepted: ws:// or wss://" in capsys.readouterr().err
