@@ -69,11 +69,19 @@ def until_drawn(visitor):
     visitor.client.get_render(height=16, width=16, timeout=PATIENCE)
 
 
+page_errors: list[str] = []
+"""What pages have complained of in their consoles."""
+OF_VISER = "Unable to preventDefault inside passive event listener"
+"""Said by viser's own page of any drag; nothing is lost."""
+
+
 def open_page(browser, server):
     """A new tab and the visitor that the server made for it, once its first scenario is drawn, without the arm."""
     known = set(server.visitors)
     page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     page.set_default_timeout(1000 * PATIENCE)
+    page.on("console", lambda message: page_errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: page_errors.append(str(error)))
     page.goto(f"http://127.0.0.1:{server.port}")
     wait_until(lambda: set(server.visitors) - known, "the page of a visitor")
     (visitor,) = set(server.visitors) - known
@@ -88,12 +96,14 @@ def open_page(browser, server):
 
 @pytest.fixture
 def visit(browser, server):
+    page_errors.clear()
     page, visitor = open_page(browser, server)
     wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
     until_drawn(visitor)
     yield page, visitor
     page.close()
     wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
+    assert [error for error in page_errors if OF_VISER not in error] == []
 
 
 def camera_rests(visitor: Visitor) -> bool:
@@ -337,6 +347,28 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     corner = np.asarray(image)[-120:, :450].reshape(-1, 3).astype(int)
     for shade in VOLUME[[0, -1]].astype(int):  # the legend's ends
         assert (np.abs(corner - shade).max(axis=1) < 4).any()
+
+
+def test_what_was_learned_of_a_sphere_without_points_is_shown(visit):
+    """The browser complains of points without colours; see the fixture."""
+    page, visitor = visit
+    visitor.session.edit("test", view=View(colour="occupancy"))
+    assert visitor.session.wait_idle(PATIENCE)
+    page.get_by_text("Show", exact=True).click()
+    page.get_by_text("Learned occupancy: how likely something is there").wait_for(timeout=1000 * PATIENCE)
+    page.wait_for_timeout(1000)
+
+
+def test_reset_brings_back_the_scene_and_the_camera(visit):
+    page, visitor = visit
+    begun = replace(visitor.session.scenario, view=View())
+    drag(page, (100, HEIGHT - 60), (260, HEIGHT - 120))
+    visitor.session.edit("test", temperature=2.0, view=View(grid=True))
+    wait_until(lambda: not camera_rests(visitor), "the camera to be turned")
+    page.wait_for_timeout(1000)
+    click_button(page, "Reset")
+    wait_until(lambda: camera_rests(visitor), "the camera to be back")
+    assert visitor.session.scenario == begun
 
 
 def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):

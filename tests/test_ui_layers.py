@@ -2,8 +2,9 @@
 
 import html
 import re
+import threading
 from dataclasses import fields, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from dt_viz.ui.picture import Arrows, Lines
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.scene import OF_A_MOTION, OF_A_TASK, Rollouts, ScenePictures
-from dt_viz.ui.session import Pace
+from dt_viz.ui.session import Pace, Session
 from dt_viz.ui.starts import Starts
 
 ROBOT = load_jaco()
@@ -308,6 +309,43 @@ def test_the_status_of_another_task_is_pale_and_says_what_is_done(server):
     assert COMPUTING in panel._status.content
     panel.fail(ValueError("nothing comes"))
     assert COMPUTING not in panel._status.content
+    panel.close()
+    server.gui.reset()
+
+
+class Begun:
+    """A session that begins what it is told to once it may."""
+
+    def __init__(self, scenario):
+        self.scenario, self.may, self.asked = scenario, threading.Event(), []
+        self.panel: Any = None
+
+    def choose_task(self, name):
+        assert self.may.wait(30)
+        self.asked.append(name)
+        if name == "push_box":
+            raise DemonstrationError("push.csv", "lines", "none", "two or more")
+        self.scenario = replace(self.scenario, task=name)
+        self.panel.adopt(self.scenario)
+
+
+@pytest.mark.parametrize(("chosen", "settles"), [("lift_box", False), ("draw_s", True), ("push_box", True)])
+def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(server, chosen, settles):
+    panel, session = panel_of(server), Begun(Scenario("draw_s", ()))
+    session.panel = panel
+    panel.connect(cast(Session, session))
+    panel.adopt(session.scenario)
+    panel.report(replace(frame(scenario=session.scenario), task=TASKS["draw_s"]()), PACE)
+    settled = panel._status.content, panel._hint.content
+    panel._begin(lambda session, name: session.choose_task(name), chosen)
+    assert COMPUTING in panel._status.content and session.asked == []
+    session.may.set()
+    assert panel._beginnings.wait_idle(30)
+    assert session.asked == [chosen]
+    assert (COMPUTING not in panel._status.content) == settles
+    assert ((panel._status.content, panel._hint.content) == settled) == settles
+    assert panel._notice.visible == (chosen == "push_box")
+    panel.close()
     server.gui.reset()
 
 

@@ -14,10 +14,11 @@ from dt_viz.collision import SELF_REACH, CollisionReport
 from dt_viz.engine import Frame, Stage
 from dt_viz.errors import DataError
 from dt_viz.imitation import ImitationError
-from dt_viz.paper_scenes import SCENES
+from dt_viz.paper_scenes import SCENES, PaperScene
 from dt_viz.robot import Robot
 from dt_viz.scenario import Scenario, View
 from dt_viz.stacking import bias_points
+from dt_viz.tasks import Task
 from dt_viz.ui.arm_layers import NUM_ARMS
 from dt_viz.ui.bias_panel import BiasPanel
 from dt_viz.ui.controls import Control, on_press
@@ -33,6 +34,7 @@ from dt_viz.ui.session import Pace, Session
 from dt_viz.ui.slice_panel import SlicePanel
 from dt_viz.ui.stack_panel import StackPanel
 from dt_viz.ui.starts_panel import StartsPanel
+from dt_viz.ui.worker import LatestWorker
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -108,6 +110,9 @@ class Panel:
         self._shows = self._waits = False
         """Whether a frame was reported at all, and whether another task or scene is computed than that of the last."""
         self._reported: Scenario | None = None
+        self._settled = "", ""
+        """Hint and status of the scenario reported last."""
+        self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
         self._adopted: Scenario | None = None
         self._status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
@@ -147,6 +152,7 @@ class Panel:
         self._obstacles.close()
         self._stack.close()
         self._saver.close()
+        self._beginnings.close()
 
     @property
     def legend(self) -> Legend | None:
@@ -167,7 +173,8 @@ class Panel:
         self.joints.visible = scenario.view.joint_plots
         self.health.visible = scenario.view.health_plots
         self._play.label = "Pause" if scenario.view.playing else "Play"
-        self._wait()
+        if self._reported is not None and not self._reported.begins_like(scenario):
+            self._wait()
 
     def report(self, frame: Frame, pace: Pace) -> None:
         """Show how the rebuild went and how far its result is to be trusted."""
@@ -189,16 +196,24 @@ class Panel:
         _set_max(self._rollout.handle, len(frame.task.demonstrations) + len(frame.scenario.starts))
         if frame.pictures.generator is not None:
             _set_max(self._flow.handle, frame.pictures.generator.num_flows)
-        self._status.content = status_html(frame, pace)
+        self._settled = hint(frame), status_html(frame, pace)
+        self._status.content = self._settled[1]
 
     def _wait(self) -> None:
         """Say that another task or scene is computed than the one reported last, whose status is pale."""
-        last = self._reported
-        if not (self._waits or last is None or self._adopted is None or last.begins_like(self._adopted)):
+        if not self._waits:
             self._waits = True
             self._give_hint("")
             said = f"<div style='{_SMALL}'>{COMPUTING}</div>"
-            self._status.content = f"{said}<div style='{_PALE}'>{self._status.content}</div>"
+            self._status.content = f"{said}<div style='{_PALE}'>{self._settled[1]}</div>"
+
+    def _settle(self) -> None:
+        """Nothing is computed that would be reported: show the status of what is shown, if that is adopted."""
+        if self._waits:
+            self._waits = False
+            stays = self._reported and self._adopted and self._reported.begins_like(self._adopted)
+            said, self._status.content = self._settled if stays else ("", "")
+            self._give_hint(said)
 
     def _give_hint(self, text: str) -> None:
         said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
@@ -213,8 +228,7 @@ class Panel:
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
-        if self._waits:
-            self._status.content = ""
+        self._settle()
         expected = isinstance(error, DataError | ImitationError)
         self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
 
@@ -280,7 +294,7 @@ class Panel:
             if title == _NO_SCENE:
                 session.leave_scene()
             else:
-                session.load(scenes[title].task, scenes[title].scenario)
+                session.load(scenes[title].task, prepared(scenes[title]))
 
         self._tie(
             self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each"),
@@ -291,13 +305,19 @@ class Panel:
 
     def _begin(self, begin: Callable[[Session, str], None], title: str) -> None:
         """Begin a task or a scene; where that cannot be, say why and stay."""
-        session = self._session
-        if session is not None:
-            try:
-                begin(session, title)
-            except DataError as error:
-                self.fail(error)
-                self.adopt(session.scenario)
+        if self._session is not None:
+            self._wait()
+            self._beginnings.submit(partial(self._begun, begin, self._session, title))
+
+    def _begun(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
+        begin(session, title)
+        if self._reported is not None and self._reported.begins_like(session.scenario):
+            self._settle()  # it was chosen again before it was left
+
+    def _stay(self, error: Exception) -> None:
+        self.fail(error)
+        if self._session is not None:
+            self.adopt(self._session.scenario)
 
     def _travel(self, button: str) -> None:
         session = self._session
@@ -375,6 +395,18 @@ class Panel:
 def _set_max(slider: Any, value: int) -> None:
     if slider.max != value:
         slider.max = value
+
+
+def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
+    """The scene's scenario for its task, once what takes seconds to draw of it is there."""
+
+    def scenario(task: Task) -> Scenario:
+        begun = scene.scenario(task)
+        for obstacle in begun.obstacles:
+            obstacle.surface()
+        return begun
+
+    return scenario
 
 
 COMPUTING = "Computing the motion…"
