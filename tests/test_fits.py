@@ -387,7 +387,7 @@ def test_what_a_server_left_half_written_an_hour_ago_is_removed_at_the_next_star
     left, fresh, whole = (tmp_path / name for name in ("a.1-2.partial", "b.3-4.partial", "c.npz"))
     for path, age in ((left, 3700), (fresh, 3500), (whole, 10**6)):
         path.touch()
-        os.utime(path, (time.time() - age,) * 2)
+        os.utime(path, (time.time() - age, time.time() - age))
     FitStore(tmp_path)
     assert set(tmp_path.iterdir()) == {fresh, whole}
 

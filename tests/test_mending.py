@@ -36,7 +36,9 @@ def bowl() -> trimesh.Trimesh:
     half, inner = BALL.slice_plane([0, 0, 0], [0, 0, -1]), trimesh.creation.icosphere(3, 0.09)
     inner.invert()
     inner = inner.slice_plane([0, 0, 0], [0, 0, -1])
-    return trimesh.util.concatenate([half, inner])
+    both = trimesh.util.concatenate([half, inner])
+    assert isinstance(both, trimesh.Trimesh)
+    return both
 
 
 @pytest.mark.parametrize(

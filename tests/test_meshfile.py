@@ -118,6 +118,7 @@ class TestGlb:
 class TestStl:
     def test_a_binary_file_may_begin_like_a_text(self):
         mesh = trimesh.Trimesh(CORNERS, FACES).export(file_type="stl")
+        assert isinstance(mesh, bytes)
         vertices, faces = read_stl(b"solid facet".ljust(80) + mesh[80:], max_triangles=4)
         np.testing.assert_allclose(vertices[faces], CORNERS[FACES])
 
