@@ -6,6 +6,7 @@ that is not small has no one right surface: a bowl is not a half ball, so such a
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from dataclasses import dataclass
 
@@ -59,23 +60,22 @@ def closed(vertices: Array, faces: Indices) -> ClosedMesh:
         FormatError: it has no area, edges that more than two triangles share, holes that are not small, or encloses
             nothing.
     """
-    size = float(np.ptp(vertices, axis=0).max())
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    size = float(np.ptp(vertices[used], axis=0).max())
     vertices, faces = _merged(vertices, faces, SAME * size)
     if not len(faces):
         raise FormatError("faces", "only triangles without area", "a closed mesh of triangles")
-    notes, once = [], np.empty((0, 2), dtype=np.intp)
+    notes = []
     sides = np.sort(_sides(faces, len(vertices)))
     if not _joins_pairs(sides):
-        vertices, faces = _merged(vertices, faces, NEAR * size)
-        faces = _different(faces, len(vertices))
-        once = _edges_of_one(faces, len(vertices))
+        vertices, faces, once = _without_seams(vertices, faces, NEAR * size)
         notes.append("open seams were closed")
-    if len(once):
-        vertices, faces, note = _filled(vertices, faces, once)
-        notes = [note]
-    checkpoint()
-    if notes:
+        if len(once):
+            vertices, faces, note = _filled(vertices, faces, once)
+            notes = [note]
         sides = np.sort(_sides(faces, len(vertices)))
+    checkpoint()
     if (sides[::2] == sides[1::2]).any():  # neighbours that run along their edge in the same direction
         turned = _turned(faces, len(vertices))
         faces = np.where(turned[:, None], faces[:, ::-1], faces)
@@ -87,12 +87,14 @@ def closed(vertices: Array, faces: Indices) -> ClosedMesh:
     return ClosedMesh(vertices, faces if volume > 0 else faces[:, ::-1], abs(volume), tuple(notes))
 
 
-def _merged(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]:
+def _merged(
+    vertices: Array, faces: Indices, cell: float, shift: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> tuple[Array, Indices]:
     """One vertex for all in the same cell of a grid; only used ones, and no triangles with two corners in one cell."""
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     kept = np.flatnonzero(used)
-    cells = np.round(vertices[kept] / max(cell, 1e-300)).astype(np.int64)
+    cells = np.round(vertices[kept] / max(cell, 1e-300) + shift).astype(np.int64)
     order = np.argsort(cells.astype(np.uint64) @ MIXERS, kind="stable")
     cells = cells[order]
     new = np.concatenate([[True], (cells[1:] != cells[:-1]).any(axis=1)])  # if sums are the same by chance, too
@@ -101,6 +103,26 @@ def _merged(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indice
     faces = number[faces]
     a, b, c = faces.T
     return vertices[kept[order[new]]], faces[(a != b) & (b != c) & (c != a)]
+
+
+def _without_seams(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices, Indices]:
+    """The surface with near vertices merged, and its open edges (E, 2).
+
+    The borders of the cells part some vertices that are near, so that the cells are shifted until nothing is open; not
+    if that changes nothing, as for triangles that have nothing to do with each other.
+    """
+    before, once = np.inf, np.empty((0, 2), dtype=np.intp)
+    for shift in itertools.product((0.0, 0.5), repeat=3):
+        checkpoint()
+        vertices, faces = _merged(vertices, faces, cell, shift)
+        if not len(faces):
+            raise FormatError("faces", "only triangles without area", "a closed mesh of triangles")
+        faces = _different(faces, len(vertices))
+        once = _edges_of_one(faces, len(vertices))
+        if not len(once) or len(once) == before:
+            break
+        before = len(once)
+    return vertices, faces, once
 
 
 def _sides(faces: Indices, num_vertices: int) -> Indices:

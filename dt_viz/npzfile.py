@@ -12,6 +12,7 @@ import math
 import re
 import zipfile
 from collections.abc import Collection
+from typing import IO
 
 import numpy as np
 
@@ -99,7 +100,7 @@ class NpzFile:
 class _Bytes:
     """Takes bytes off a member while it is unpacked."""
 
-    def __init__(self, file: zipfile.ZipExtFile, field: str) -> None:
+    def __init__(self, file: IO[bytes], field: str) -> None:
         self._file = file
         self._field = field
 

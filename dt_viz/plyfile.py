@@ -222,8 +222,8 @@ def _binary_columns(content: bytes, at: int, elements: list[_Element], order: st
             continue
         rows = _equal_rows(content, at, element, order)
         if rows is None:
-            at, columns = _unequal_rows(content, at, element, order)
-            yield element.name, columns
+            at, unequal = _unequal_rows(content, at, element, order)
+            yield element.name, unequal
             continue
         at += rows.nbytes
         columns: dict[str, Array | _Lists] = {}

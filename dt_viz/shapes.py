@@ -1,6 +1,7 @@
 """Shapes of obstacles from files: closed meshes and point clouds, checked.
 
-Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB. They must be closed; small holes and seams are mended.
+Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB. They must be closed; small holes and seams are mended
+(see `dt_viz.mending`).
 
 Point clouds, in metres (or scaled to them):
     PLY (``.ply``): the vertices, with labels if they have a property ``occupied``, ``occupancy`` or ``label``.

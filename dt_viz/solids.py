@@ -223,7 +223,7 @@ class _Surface:
         a, b, c = triangles.swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
         # triangles that are long and thin would have one sample after the other along them
-        length = sum(np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)).sum() / 2
+        length = sum(float(np.linalg.norm(side, axis=1).sum()) for side in (b - a, c - b, a - c)) / 2
         spacing = max(np.sqrt(area / NUM_SAMPLES), length / (LONGEST_ROWS * NUM_SAMPLES))
         self.samples, self._owner = surface_samples(triangles, spacing)
         self._tree = KDTree(self.samples)

@@ -294,6 +294,8 @@ def main() -> None:
         faulthandler.dump_traceback_later(MAX_SECONDS, exit=True)
         kind, name, size = json.loads(line)
         content = sys.stdin.buffer.read(size)
+        for kept in (solids._surface, solids._distances, clouds._solid):  # of files before
+            kept.cache_clear()
         PROCESS.joinpath("clear_refs").write_text("5")  # forget the largest memory so far
         start, message = time.process_time(), ""
         try:

@@ -270,7 +270,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     page.get_by_text("From a file", exact=True).click()
     upload = page.locator("input[type=file]").first
     upload.set_input_files({"name": "crate.stl", "mimeType": "model/stl", "buffer": crate})
-    page.get_by_text("is the file in millimetres").first.wait_for()
+    page.get_by_text("seems to be in millimetres: 150 × 100 × 50 units").first.wait_for()
     assert session.scenario.obstacles == ()
     click_button(page, "Read it in millimetres")
     wait_until(lambda: session.scenario.obstacles, "the mesh")

@@ -1,7 +1,9 @@
 """The store of fits: by content, once, and never from a file that is not whole."""
 
 import logging
+import os
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -379,6 +381,15 @@ def test_who_waits_can_give_up_although_the_fit_says_nothing(tmp_path, monkeypat
     visitor.join()
     assert isinstance(visitor.error, Cancelled)
     release.set()
+
+
+def test_what_a_server_left_half_written_an_hour_ago_is_removed_at_the_next_start(tmp_path):
+    left, fresh, whole = (tmp_path / name for name in ("a.1-2.partial", "b.3-4.partial", "c.npz"))
+    for path, age in ((left, 3700), (fresh, 3500), (whole, 10**6)):
+        path.touch()
+        os.utime(path, (time.time() - age, time.time() - age))
+    FitStore(tmp_path)
+    assert set(tmp_path.iterdir()) == {fresh, whole}
 
 
 def test_the_cache_folder_is_the_users(monkeypatch, tmp_path):

@@ -1,15 +1,20 @@
 """Hostile files: whatever the bytes, all loaders end soon, in bounded memory, with what they hold or a clear error."""
 
+import io
 import json
 import os
+import struct
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from hostile import PROCESS, hostile_file, seeds
 
 pytestmark = pytest.mark.skipif(not PROCESS.exists(), reason="memory is measured in Linux's way")
@@ -54,8 +59,8 @@ def reading(*arguments: str) -> Iterator[ReadingProcess]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
     environment["OPENBLAS_NUM_THREADS"] = "1"
     command = [sys.executable, "-W", "error", str(Path(__file__).with_name("hostile.py")), *arguments]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, env=environment, **pipes) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe) as process:
         try:
             yield ReadingProcess(process)
         finally:
@@ -90,6 +95,99 @@ def test_the_good_files_are_read():
     with reading("--coarse") as process:
         for kind, name, content, _ in seeds():
             assert process.read(kind, name, content).message == ""
+
+
+def bzip2_member() -> bytes:
+    """Zeros that bzip2 packs into next to nothing, and unpacks all at once."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_BZIP2) as archive, archive.open("points.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "|u1", "fortran_order": False, "shape": (6 * 10**7, 3)})
+        for _ in range(180):
+            member.write(bytes(10**6))
+    return file.getvalue()
+
+
+def lying_header() -> bytes:
+    """A deflated member of 180 MB whose directory says that it has 100 bytes."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", npz_member(7_500_000))
+    content = file.getvalue()
+    place = content.index(b"PK\x01\x02") + 24
+    return content[:place] + struct.pack("<I", 100) + content[place + 4 :]
+
+
+def npz_member(num: int) -> bytes:
+    file = io.BytesIO()
+    np.save(file, np.zeros((num, 3)))
+    return file.getvalue()
+
+
+def glb(scene: dict, data: bytes) -> bytes:
+    text = json.dumps(scene).encode()
+    text += b" " * (-len(text) % 4)
+    data += bytes(-len(data) % 4)
+    length = 28 + len(text) + len(data)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, length) + body
+
+
+def many_matrices() -> bytes:
+    """A cell array of very many empty matrices, eight bytes each."""
+    num = 1_500_000
+    flags, shape = struct.pack("<IIII", 6, 8, 1, 0), struct.pack("<IIii", 5, 8, 1, num)
+    cells = flags + shape + struct.pack("<II8s", 1, 5, b"demos") + struct.pack("<II", 14, 0) * num
+    return bytes(124) + b"\x00\x01IM" + struct.pack("<II", 14, len(cells)) + cells
+
+
+def instances() -> bytes:
+    """A mesh of 130,000 triangles in five thousand places."""
+    ball = trimesh.creation.icosphere(7, 0.1)
+    ball = trimesh.Trimesh(ball.vertices, ball.faces[:130_000], process=False)
+    vertices, faces = ball.vertices.astype("<f4").tobytes(), ball.faces.astype("<u4").tobytes()
+    views = [{"buffer": 0, "byteLength": len(vertices)}]
+    views.append({"buffer": 0, "byteOffset": len(vertices), "byteLength": len(faces)})
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": len(ball.vertices), "type": "VEC3"},
+        {"bufferView": 1, "componentType": 5125, "count": 3 * len(ball.faces), "type": "SCALAR"},
+    ]
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1}
+    scene = {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(vertices) + len(faces)}]}
+    scene |= {"meshes": [{"primitives": [primitive]}], "nodes": [{"mesh": 0}] * 5000}
+    return glb(scene | {"scenes": [{"nodes": list(range(5000))}]}, vertices + faces)
+
+
+ATTACKS = {
+    "a member that bzip2 packs": ("cloud", "a.npz", bzip2_member, "stored or deflated members", 20),
+    "a directory that lies": ("cloud", "a.npz", lying_header, "found", 20),
+    "a mesh in very many places": ("mesh", "a.glb", instances, "faces: found more than 500000, all instances", 20),
+    "short lines": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"1\n" * 9_999_990, "line 2: found 1 columns", 60),
+    "short lines of demonstrations": (
+        "demonstrations",
+        "a.csv",
+        lambda: b"t,x,y\n" + b"1\n" * 8_000_000,
+        "line 2: found 1 columns",
+        60,
+    ),
+    "short rows": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"1,1,1\n" * 3_333_331, "more than 1000001 lines", 100),
+    "empty lines": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"\n" * 19_999_990, "more than 1000001 lines", 60),
+    "short lines of text": ("mesh", "a.obj", lambda: b"f\n" * 10_000_000, "line 1: found 'f'", 60),
+    "one line": ("mesh", "a.obj", lambda: b"f " + b"1 " * 9_999_990, "more than 100000 characters", 60),
+    "many matrices": ("demonstrations", "a.mat", many_matrices, "more than 100000 values", 100),
+}
+"""Loader, name and content of a file, words of its refusal, and the largest memory that may be needed for that, MB."""
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_what_once_took_gigabytes_is_refused_for_next_to_nothing(attack):
+    kind, name, make, words, megabytes = ATTACKS[attack]
+    content = make()
+    with reading("--coarse") as process:
+        before = process.read("mesh", "a.stl", b"nothing").megabytes
+        outcome = process.read(kind, name, content)
+    assert words in outcome.message
+    assert outcome.megabytes - before < megabytes + len(content) / 1e6
+    check(outcome, name)
 
 
 def test_mutated_files_are_read_or_refused():

@@ -14,6 +14,7 @@ from dt_viz import shapes
 from dt_viz.belief import occupancy_picture
 from dt_viz.clouds import Cloud
 from dt_viz.collision import NOTHING, CollisionReport, Nearest
+from dt_viz.interruption import UnwantedError
 from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, rotation
 from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
 from dt_viz.several import Several
@@ -269,7 +270,8 @@ def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
     content = stl(BALL_MESH.copy().apply_scale(1000))
     opened.panel.load(content, "ball.stl", 1.0)
     ((text, wrong),) = opened.said
-    assert wrong and "is the file in millimetres (scale=0.001)? then that is 0.08 × 0.08 × 0.08 m" in text
+    assert not wrong  # it is a question
+    assert text == "ball.stl seems to be in millimetres: 80 × 80 × 80 units. Read it in millimetres?"
     assert opened.panel._again.visible and opened.panel._again.label == "Read it in millimetres"
     opened.panel.load_again()
     *_, added = opened.session.scenario.obstacles
@@ -277,6 +279,22 @@ def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
     assert not opened.panel._again.visible and opened.panel._unit.value == "millimetres"
     opened.panel.load_again()
     assert len(opened.session.scenario.obstacles) == 2 and len(opened.said) == 1
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e9])
+def test_a_size_that_no_unit_makes_sensible_is_an_error(opened, size):
+    opened.panel.load(stl(BALL_MESH.copy().apply_scale(size)), "ball.stl", 1.0)
+    ((text, wrong),) = opened.said
+    assert wrong and "; accepted: a largest side of 0.01 m to 1 m" in text
+    assert not opened.panel._again.visible
+
+
+def test_a_file_whose_visitor_has_left_becomes_no_obstacle(opened):
+    before = opened.session.scenario
+    opened.panel.close()
+    with pytest.raises(UnwantedError):
+        opened.panel.load(stl(BALL_MESH), "ball.stl", 1.0)
+    assert opened.session.scenario == before and not opened.said
 
 
 def test_another_file_than_there_is_room_for_is_refused(opened):
