@@ -18,6 +18,7 @@ from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles import MeshObstacle
 from dt_viz.robot import load_jaco
 from dt_viz.scenario import View
+from dt_viz.shapes import MAX_BYTES
 from dt_viz.stacking import bias_points
 from dt_viz.tasks import TASKS
 from dt_viz.ui.server import Server
@@ -294,6 +295,18 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     axis = np.abs(after.wxyz[1:]) / np.linalg.norm(after.wxyz[1:])
     np.testing.assert_allclose(axis, [0, 1, 0], atol=1e-3)  # across the drawing plane
     np.testing.assert_allclose(picture.gizmo.wxyz, after.wxyz, atol=1e-9)
+
+
+def test_a_file_that_is_too_large_is_refused_with_a_reason_and_the_next_can_be_chosen(visit):
+    page, visitor = visit
+    page.get_by_text("From a file", exact=True).click()
+    upload = page.locator("input[type=file]").first
+    upload.set_input_files({"name": "city.stl", "mimeType": "model/stl", "buffer": bytes(MAX_BYTES + 1)})
+    page.get_by_text("city.stl: file: found 20.0 MB; accepted: at most 20 MB").wait_for(timeout=1000 * PATIENCE)
+    page.get_by_text("Uploading city.stl").wait_for(state="detached", timeout=1000 * PATIENCE)
+    upload.set_input_files({"name": "no.stl", "mimeType": "model/stl", "buffer": bytes(100)})
+    page.get_by_text("no.stl: faces").first.wait_for(timeout=1000 * PATIENCE)
+    assert visitor.session.scenario.obstacles[1:] == ()
 
 
 def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_the_stack(visit):

@@ -15,6 +15,7 @@ import pytest
 import viser  # noqa: TID251 - whose version the page has
 import websockets
 from websockets.asyncio.client import connect
+from websockets.typing import Subprotocol
 
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
 from dt_viz.shapes import MAX_BYTES
@@ -87,7 +88,7 @@ async def answers(client):
 
 async def status_of(url, **options):
     """Of the handshake's answer; 101 where it became a connection."""
-    protocols = [f"viser-v{viser.__version__}"]
+    protocols = [Subprotocol(f"viser-v{viser.__version__}")]
     try:
         async with connect(url, subprotocols=protocols, proxy=None, **options):
             return 101
@@ -142,10 +143,10 @@ def test_the_page_is_not_given_out_under_such_a_name_either(url, server):
 
 @asynchronous
 async def test_a_page_of_another_version_is_told_so_as_viser_does(url, capfd):
-    async with connect(url, subprotocols=["viser-v0.0.1"], proxy=None) as client:
+    async with connect(url, subprotocols=[Subprotocol("viser-v0.0.1")], proxy=None) as client:
         with pytest.raises(websockets.ConnectionClosedError) as closed:
             await asyncio.wait_for(client.recv(), PATIENCE)
-    assert closed.value.rcvd.code == 1002
+    assert closed.value.rcvd is not None and closed.value.rcvd.code == 1002
     assert "0.0.1" not in "".join(capfd.readouterr())
 
 
@@ -372,7 +373,7 @@ async def test_a_file_that_is_announced_too_large_is_refused_before_any_of_it_is
         await open_page(client)
         await client.upload(UPLOAD, "large.stl", bytes(3 * 2**20), announced=MAX_BYTES + 1)
         assert await client.wait_for(lambda: client.notices, PATIENCE)
-        assert client.notices == ["large.stl, file: found 20.0 MB; accepted: at most 20 MB"]
+        assert client.notices == ["large.stl: file: found 20.0 MB; accepted: at most 20 MB"]
         assert await answers(client)
         assert not server.visitors[0].client.gui._current_file_upload_states
 
@@ -432,6 +433,6 @@ def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
 
 
 def test_a_viser_with_other_messages_is_refused(monkeypatch):
-    monkeypatch.delattr(viser._messages, "SceneNodeDragMessage")
+    monkeypatch.delattr("viser._messages.SceneNodeDragMessage")
     with pytest.raises(gate.GateError, match=r"SceneNodeDragMessage.*; accepted: viser 1\.1"):
         gate.Gate(gate.Origins("127.0.0.1"), max_connections=1, max_upload=1, refused=lambda *_: None)

@@ -62,8 +62,15 @@ def test_all_who_come_at_the_same_instant_get_their_picture(fits):
         server.close()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """The task is learned once, here and in the servers that are started."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 def test_visitors_drag_in_a_started_server_and_are_shown_the_last_pose(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
     monkeypatch.setattr(load, "PATIENCE", PATIENCE)
     out = tmp_path / "load.json"
@@ -78,15 +85,13 @@ def test_visitors_drag_in_a_started_server_and_are_shown_the_last_pose(tmp_path,
     assert f"median {figures['median_ms']:.0f} ms" in printed
 
 
-def test_who_gets_no_picture_fails_the_measurement(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_who_gets_no_picture_fails_the_measurement(monkeypatch, capsys):
     monkeypatch.setattr(load, "FIRST_PICTURE", 0.0)
     assert main(["load", "--clients", "1", "--seconds", "1"]) == 1
     assert "round 1: 0 of 1 have a picture" in capsys.readouterr().out
 
 
-def test_a_server_that_is_not_there_fails_the_measurement(tmp_path, monkeypatch, capsys, unused_port):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+def test_a_server_that_is_not_there_fails_the_measurement(capsys, unused_port):
     assert main(["load", "--clients", "1", "--seconds", "1", "--url", f"ws://127.0.0.1:{unused_port}"]) == 1
     assert "a visitor was lost" in capsys.readouterr().err
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from dt_viz.ui.uploads import MAX_PARTS, MalformedError, RefusedError, Upload
+from dt_viz.errors import DataError
+from dt_viz.ui.uploads import MAX_PARTS, MalformedError, Upload
 
 
 @pytest.fixture
@@ -17,7 +18,7 @@ def test_a_file_arrives_in_parts_in_any_order(upload):
 
 
 def test_a_file_that_is_announced_too_large_is_refused_and_nothing_of_it_is_wanted(upload):
-    with pytest.raises(RefusedError, match=r"x\.ply, file: found 0\.0 MB; accepted: at most 0 MB"):
+    with pytest.raises(DataError, match=r"x\.ply: file: found 0\.0 MB; accepted: at most 0 MB"):
         upload.start("a", "x.ply", 1001, 1)
     assert not upload.part("a", 0, 1)
 

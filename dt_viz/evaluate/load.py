@@ -320,7 +320,7 @@ def _print(figures: dict[str, Any]) -> None:
             _text(visitor["frames"] / settings["seconds"], ".1f"),
             _text(visitor["median_ms"], ".0f"),
             _text(visitor["p95_ms"], ".0f"),
-            f"{visitor['unknown']}",
+            f"{visitor['others']}",
             _text(visitor["megabytes"], ".1f"),
             visitor["lost"] or ("yes" if visitor["last_shown"] else "no"),
         )

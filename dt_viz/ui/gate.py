@@ -37,8 +37,9 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from dt_viz.errors import DataError
 from dt_viz.ui.origins import Origins
-from dt_viz.ui.uploads import MalformedError, RefusedError, Upload
+from dt_viz.ui.uploads import MalformedError, Upload
 
 logger = logging.getLogger(__name__)
 
@@ -251,7 +252,7 @@ class Gate:
         client.gui._drop_uploads_from_client(client._websock_connection.client_id)  # pyright: ignore[reportArgumentType]
         try:
             connection.upload.start(message.transfer_uuid, message.filename, message.size_bytes, message.part_count)
-        except RefusedError as error:
+        except DataError as error:
             # the page takes a file for under way until all of it is acknowledged
             for told in (
                 viser._messages.FileTransferPartAck(

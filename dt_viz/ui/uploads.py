@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from dt_viz.errors import DataError
+
 MAX_PARTS = 1024
 """Most parts of a file; the page sends parts of half a megabyte."""
 
 
 class MalformedError(ValueError):
     """A message that the page never sends."""
-
-
-class RefusedError(ValueError):
-    """A file that the page may offer, but that is not accepted; the message is for the user."""
 
 
 @dataclass
@@ -37,14 +35,12 @@ class Upload:
         """A file is announced. It takes the place of one that is not complete: that has been given up.
 
         Raises:
-            RefusedError: it is too large.
+            DataError: it is too large; the message is for the user.
             MalformedError: no file has so many parts.
         """
         self._transfer = None
         if num_bytes > self._max_bytes:
-            raise RefusedError(
-                f"{name}, file: found {num_bytes / 1e6:.1f} MB; accepted: at most {self._max_bytes / 1e6:.0f} MB"
-            )
+            raise DataError(name, "file", f"{num_bytes / 1e6:.1f} MB", f"at most {self._max_bytes / 1e6:.0f} MB")
         if num_bytes < 0 or not min(num_bytes, 1) <= num_parts <= min(num_bytes, MAX_PARTS):
             raise MalformedError(f"{num_parts} parts for {num_bytes} bytes")
         if num_parts:
