@@ -40,6 +40,13 @@ pytestmark = [
 ]
 
 
+UNHURRIED = """
+    const draw = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 80);
+"""
+"""Ten pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
+
+
 @pytest.fixture(scope="module")
 def browser():
     with sync_playwright() as playwright:
@@ -74,6 +81,7 @@ def open_page(browser, server):
     known = set(server.visitors)
     page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
     page.set_default_timeout(1000 * PATIENCE)
+    page.add_init_script(UNHURRIED)
     page.goto(f"http://127.0.0.1:{server.port}")
     wait_until(lambda: set(server.visitors) - known, "the page of a visitor")
     (visitor,) = set(server.visitors) - known
@@ -90,7 +98,6 @@ def open_page(browser, server):
 def visit(browser, server):
     page, visitor = open_page(browser, server)
     wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
-    until_drawn(visitor)
     yield page, visitor
     page.close()
     wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
@@ -139,7 +146,9 @@ def drag_until(page, visitor, done, reset, ends):
     while not done():
         assert time.monotonic() < deadline
         reset()
+        visitor.client.camera.position, visitor.client.camera.look_at = TASKS["draw_s"]().camera
         until_drawn(visitor)
+        wait_until(lambda: camera_rests(visitor), "the camera to be back")
         start, end = ends()
         page.mouse.move(*start)
         until_drawn(visitor)
