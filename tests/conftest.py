@@ -7,7 +7,7 @@ os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM
 
 import pytest
 import viser  # noqa: TID251 - a page for tests of pictures and controls
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from dt_viz.engine import Engine
 from dt_viz.fits import FitStore
@@ -17,7 +17,13 @@ from dt_viz.scenario import Scenario
 from dt_viz.tasks import TASKS
 
 # Nothing here is timed, and a failure must come back on the next run.
-settings.register_profile("dt-viz", deadline=None, derandomize=True, max_examples=25)
+settings.register_profile(
+    "dt-viz",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize=True,
+    max_examples=25,
+)
 settings.load_profile("dt-viz")
 
 

@@ -148,6 +148,7 @@ def test_the_grid_of_the_certificates_covers_the_box_and_half_its_size_on_every_
 def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessions, capsys, monkeypatch):
     recorders, out = [Recorder() for _ in range(sessions)], tmp_path / "latency.json"
     monkeypatch.setattr(latency, "Recorder", iter(recorders).__next__)
+    monkeypatch.setattr(latency, "WARM_UP_SECONDS", 0.1)
     task = ["--task", "Hook", "--lasa", str(lasa)]
     assert main(["latency", *task, "--sessions", str(sessions), "--seconds", "0.3", "--out", str(out)]) == 0
     figures = json.loads(out.read_text())

@@ -48,13 +48,13 @@ def test_the_obstacle_first_stands_in_the_way_of_the_motion(name, initial):
 
 
 OTHER_LETTERS = [name for name in TASKS if name.startswith("draw_") and name != "draw_s"]
-"""What both do at once for these is much the same as for S, and takes longest."""
+"""What the whole arm does for these is much the same as for S, and takes longest."""
 
 
 @pytest.mark.parametrize(
     ("name", "space"),
     [
-        pytest.param(name, space, marks=[pytest.mark.slow] * (space == "both" and name in OTHER_LETTERS))
+        pytest.param(name, space, marks=[pytest.mark.slow] * (space != "task" and name in OTHER_LETTERS))
         for name in TASKS
         for space in SPACES
     ],
