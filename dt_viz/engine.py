@@ -24,7 +24,7 @@ from dt_viz.certificates import (
 )
 from dt_viz.collision import load_collision_model
 from dt_viz.diffeo import Flow
-from dt_viz.doubts import motion_doubts, target_doubts
+from dt_viz.doubts import margin_doubts, motion_doubts, target_doubts
 from dt_viz.field_layers import Clearance, arrows_and_colour, streamlines
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
@@ -221,7 +221,7 @@ class Engine:
         for rollout in range(len(frame.rollouts)):
             arm, doubts = self._arm(frame, fine, rollout, exact=True)
             arms.append(arm)
-            health = health.doubting(*doubts)
+            health = health.doubting_arm(*doubts)
         return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
 
     def pushed(self, scenario: Scenario, q: Array, rng: np.random.Generator) -> Pushed | None:
@@ -298,8 +298,7 @@ class Engine:
                 health = self._certified(frame, fine)
             if frame.arm is not None:
                 with interruptible(checkpoint):  # out of turn: the first time it prepares meshes for seconds
-                    report = load_collision_model().report(frame.arm.q, scenario.obstacle)
-                health = replace(health, collision=report)
+                    health = _with_meshes(health, frame, fine)
             kept.health = health
         yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
 
@@ -311,9 +310,9 @@ class Engine:
         path, due = frame.rollouts[frame.chosen], frame.times[frame.chosen]
         if fine.arm is None:
             keep = arm_samples(len(path))
-            health = health.doubting(*hand_doubts(health, self._robot, frame.arm.q, path[keep]))
+            health = health.doubting_arm(*hand_doubts(health, self._robot, frame.arm.q, path[keep]))
             due = due[keep]
-        return health.doubting(*delay_doubts(self._robot, frame.arm.q, frame.arm.times, due))
+        return health.doubting_arm(*delay_doubts(self._robot, frame.arm.q, frame.arm.times, due))
 
     def _certified_hand(self, frame: Frame, fine: Solved) -> Health:
         stack, obstacle, path = fine.stack, frame.scenario.obstacle, np.concatenate(frame.rollouts)
@@ -440,7 +439,7 @@ class Engine:
             doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
         except UnreachableError as error:
             doubts = (f"the arm cannot reach the starts: {error}",)
-        return replace(frame, arm=arm, health=frame.health.doubting(*doubts))
+        return replace(frame, arm=arm, health=frame.health.doubting_arm(*doubts))
 
     def _arm(self, frame: Frame, solved: Solved, chosen: int, *, exact: bool) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
@@ -485,6 +484,18 @@ class Engine:
 
     def _any_arm(self, frame: Frame) -> Array:
         return self._robot.home[None] if frame.arm is None else frame.arm.q
+
+
+def _with_meshes(health: Health, frame: Frame, fine: Solved) -> Health:
+    """Health with what the meshes of the arm come near to: of the one that is shown, and of all that avoid."""
+    assert frame.arm is not None
+    model, scenario = load_collision_model(), frame.scenario
+    health = replace(health, collision=model.report(frame.arm.q, scenario.obstacle))
+    if fine.arm is None:
+        return health
+    hosts = range(len(frame.rollouts) - fine.ground.num_added)
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], scenario.obstacle) for host in hosts]
+    return health.doubting_arm(*margin_doubts(scenario, nearest))
 
 
 _Made = TypeVar("_Made")

@@ -45,6 +45,8 @@ class Health:
     """Whether Φ(ψ(y(t))) falls strictly along every rollout."""
     doubts: tuple[str, ...] = ()
     """Why the result is not to be trusted, in words."""
+    arm_doubts: tuple[str, ...] = ()
+    """Those of them that are about the arm that follows a rollout, not about the rollouts: nothing to who hides it."""
 
     def says(self, words: str) -> bool:
         """Whether some doubt has these words."""
@@ -53,6 +55,10 @@ class Health:
     def doubting(self, *doubts: str) -> Health:
         """This health with more doubts."""
         return replace(self, doubts=self.doubts + doubts)
+
+    def doubting_arm(self, *doubts: str) -> Health:
+        """This health with more doubts about the arm that follows a rollout."""
+        return replace(self.doubting(*doubts), arm_doubts=self.arm_doubts + doubts)
 
 
 def integration_doubts(
