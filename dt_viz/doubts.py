@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,11 +11,13 @@ import numpy as np
 from dt_viz.avoidance import BESIDE, GOAL_INSIDE, ROUNDING, STAYS_INSIDE, smallest_kept
 from dt_viz.behaviours import Motion
 from dt_viz.bias import OFF_PLANE, Biasing
+from dt_viz.collision import Nearest
 from dt_viz.cspace import LEVERS
 from dt_viz.ground import Ground, named_starts
 from dt_viz.health import in_millimetres, integration_doubts
 from dt_viz.robot import Robot
 from dt_viz.rollouts import MAX_SAMPLES
+from dt_viz.scenario import Scenario
 from dt_viz.solved import Solved
 from dt_viz.solving import Applied, Solution
 from dt_viz.stacking import WHOLE_ARM
@@ -22,6 +25,8 @@ from dt_viz.stacking import WHOLE_ARM
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
 UNSAMPLED = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"
+MARGIN_TOLERANCE = 1e-3
+"""Metres by which the arm's meshes may come nearer to the obstacle than the margin before it is said."""
 MAX_TARGET_MISS = 0.013
 """Metres by which motions that avoid may miss a bias point before it is said: a centimetre, and what the arm's joints,
 interpolated between samples, are off by while a hand moves."""
@@ -108,6 +113,23 @@ def target_doubts(solved: Solved, robot: Robot) -> tuple[str, ...]:
             who, does = "a motion" if arm is None else "the arm", "ends" if bias.point.moves_goal else "passes"
             doubts.append(f"{applied.name}: {who} gives way to the obstacle and {does} {1e3 * missed:.0f} mm from it")
     return tuple(doubts)
+
+
+def margin_doubts(scenario: Scenario, nearest: Sequence[Nearest]) -> tuple[str, ...]:
+    """What the arm's meshes keep of the margin that they are to avoid the obstacle by, in words; empty if all of it.
+
+    Args:
+        scenario: whose margin it is.
+        nearest: of each motion that the whole arm avoids with.
+    """
+    kept = min(nearest, key=lambda near: near.distance)
+    asks = scenario.avoidance and scenario.warp == 1 and scenario.duration is None
+    if not asks or kept.distance >= scenario.margin - MARGIN_TOLERANCE:
+        return ()
+    where, asked = f"on rollout {nearest.index(kept) + 1} the arm's {kept.links[0]}", in_millimetres(scenario.margin)
+    if kept.distance < 0:
+        return (f"{where} enters the obstacle by {-1e3 * kept.distance:.0f} mm; a margin of {asked} was asked for",)
+    return (f"{where} keeps {in_millimetres(kept.distance)} from the obstacle; {asked} were asked for",)
 
 
 def _says(applied: Applied, words: str) -> bool:

@@ -12,15 +12,25 @@ from typing import TypeVar
 import numpy as np
 
 from dt_viz.belief import occupancy_picture
+from dt_viz.certificates import (
+    MAX_OFF,
+    MAX_OFF_TRACKED,
+    Shown,
+    certified,
+    certified_arm,
+    clearance_doubts,
+    delay_doubts,
+    hand_doubts,
+)
 from dt_viz.collision import load_collision_model
 from dt_viz.diffeo import Flow
-from dt_viz.doubts import motion_doubts, target_doubts
+from dt_viz.doubts import margin_doubts, motion_doubts, target_doubts
 from dt_viz.field_layers import Clearance, arrows_and_colour, streamlines
 from dt_viz.fields import Array, PlacedField
 from dt_viz.fits import FitStore
-from dt_viz.following import NUM_ARM_SAMPLES, OUT_OF_REACH, ArmMotion, Follower
+from dt_viz.following import OUT_OF_REACH, ArmMotion, Follower, arm_samples
 from dt_viz.ground import Ground, Learned, named_starts
-from dt_viz.health import Health, certified, certified_arm, fold_doubts
+from dt_viz.health import Health, fold_doubts
 from dt_viz.holding import held
 from dt_viz.imitation import ImitationSettings, Progress
 from dt_viz.interruption import Checkpoint, interruptible
@@ -41,6 +51,7 @@ from dt_viz.tasks import Task, TaskEntry
 from dt_viz.tracking import UnreachableError
 from dt_viz.turns import Turns
 from dt_viz.warping import warped
+from dt_viz.whole_arm import ArmSolution
 
 
 class Stage(IntEnum):
@@ -215,7 +226,7 @@ class Engine:
         for rollout in range(len(frame.rollouts)):
             arm, doubts = self._arm(frame, fine, rollout, exact=True)
             arms.append(arm)
-            health = health.doubting(*doubts)
+            health = health.doubting_arm(*doubts)
         return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
 
     def pushed(self, scenario: Scenario, q: Array, rng: np.random.Generator) -> Pushed | None:
@@ -292,25 +303,47 @@ class Engine:
                 health = self._certified(frame, fine)
             if frame.arm is not None:
                 with interruptible(checkpoint):  # out of turn: the first time it prepares meshes for seconds
-                    report = load_collision_model().report(frame.arm.q, scenario.obstacle)
-                health = replace(health, collision=report)
+                    health = _with_meshes(health, frame, fine)
             kept.health = health
         yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
 
     def _certified(self, frame: Frame, fine: Solved) -> Health:
-        obstacle, stack, arm = frame.scenario.obstacle, fine.stack, fine.arm
-        by_hand = any(applied.made.integration.by_hand for applied in stack.built)
-        drawn_from = stack.rays.at(stack.bundle.index, stack.bundle.fraction) if by_hand else None
-        health = certified(frame.health, stack.system, stack.bundle, drawn_from)
-        if arm is None:
-            depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
-            health = replace(health, clearance=-depth if depth > 0 else health.clearance)
-        else:
-            integration = frame.scenario.integration
-            q = self._follower.whole_arm.limits.inside(arm.q)
-            health = health.doubting(*fold_doubts(WHOLE_ARM, arm.transform, integration, arm.p, q))
-            health = certified_arm(health, stack.system, arm, self._robot, q if integration.by_hand else None)
-        return health
+        """Certificates of the motions that the frame shows, with the transforms that they were solved with."""
+        health = self._certified_hand(frame, fine) if fine.arm is None else self._certified_arm(frame, fine, fine.arm)
+        if frame.arm is None or frame.chosen is None:
+            return health
+        path, due = frame.rollouts[frame.chosen], frame.times[frame.chosen]
+        if fine.arm is None:
+            keep = arm_samples(len(path))
+            health = health.doubting_arm(*hand_doubts(health, self._robot, frame.arm.q, path[keep]))
+            due = due[keep]
+        return health.doubting_arm(*delay_doubts(self._robot, frame.arm.q, frame.arm.times, due))
+
+    def _certified_hand(self, frame: Frame, fine: Solved) -> Health:
+        stack, obstacle, path = fine.stack, frame.scenario.obstacle, np.concatenate(frame.rollouts)
+        shown = Shown(stack.bundle.index, stack.bundle.fraction, np.concatenate(frame.times), path)
+        health = certified(frame.health, stack, fine.ends, shown)
+        health = health.doubting(*clearance_doubts(health.clearance, float(obstacle.signed_distance(path).min())))
+        depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
+        return replace(health, clearance=-depth if depth > 0 else health.clearance)
+
+    def _certified_arm(self, frame: Frame, fine: Solved, arm: ArmSolution) -> Health:
+        scenario, robot, whole_arm = frame.scenario, self._robot, self._follower.whole_arm
+        p, undisturbed, health = arm.p.copy(), whole_arm.limits.inside(arm.q), frame.health
+        if frame.arm is not None:
+            p[arm.index == frame.chosen] = frame.arm.q
+        path, times = np.concatenate(frame.rollouts), np.concatenate(frame.times)
+        health = health.doubting(
+            *hand_doubts(health, robot, p, path, tolerance=MAX_OFF),
+            *fold_doubts(WHOLE_ARM, arm.transform, scenario.integration, p, undisturbed),
+        )
+        by_hand = scenario.integration.by_hand
+        health, q = certified_arm(health, arm.transform, p, undisturbed, by_hand=by_hand)
+        shown = Shown(arm.index, arm.fraction, times, robot.end_effector(q))
+        health = certified(health, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
+        hosts = arm.index < len(frame.rollouts) - fine.ground.num_added
+        kept = float(whole_arm.clearance(p[hosts], scenario.obstacle).min())
+        return health.doubting(*clearance_doubts(health.clearance, kept))
 
     def _stages_without_motion(
         self, ground: Ground, scenario: Scenario, blocked: tuple[str, ...], checkpoint: Checkpoint = lambda: None
@@ -411,7 +444,7 @@ class Engine:
             doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
         except UnreachableError as error:
             doubts = (f"the arm cannot reach the starts: {error}",)
-        return replace(frame, arm=arm, health=frame.health.doubting(*doubts))
+        return replace(frame, arm=arm, health=frame.health.doubting_arm(*doubts))
 
     def _arm(self, frame: Frame, solved: Solved, chosen: int, *, exact: bool) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
@@ -423,7 +456,7 @@ class Engine:
         else:
             bundle = solved.stack.bundle
             path, fraction = frame.rollouts[chosen], bundle.split(bundle.fraction)[chosen]
-            keep = np.linspace(0, len(path) - 1, NUM_ARM_SAMPLES).round().astype(int)
+            keep = arm_samples(len(path))
             joints = self._follower.along(ground, chosen, path[keep], exact=exact)
             q, times, fraction = joints.q, times[keep], fraction[keep]
             doubts = self._follower.doubts(joints, chosen)
@@ -456,6 +489,18 @@ class Engine:
 
     def _any_arm(self, frame: Frame) -> Array:
         return self._robot.home[None] if frame.arm is None else frame.arm.q
+
+
+def _with_meshes(health: Health, frame: Frame, fine: Solved) -> Health:
+    """Health with what the meshes of the arm come near to: of the one that is shown, and of all that avoid."""
+    assert frame.arm is not None
+    model, scenario = load_collision_model(), frame.scenario
+    health = replace(health, collision=model.report(frame.arm.q, scenario.obstacle))
+    if fine.arm is None:
+        return health
+    hosts = range(len(frame.rollouts) - fine.ground.num_added)
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], scenario.obstacle) for host in hosts]
+    return health.doubting_arm(*margin_doubts(scenario, nearest))
 
 
 _Made = TypeVar("_Made")

@@ -221,6 +221,11 @@ class Follower:
         return bool(reached.error[0] <= MAX_TRACKING_ERROR)
 
 
+def arm_samples(num: int) -> Indices:
+    """Which of the `num` samples of a rollout of the end effector the arm follows, (`NUM_ARM_SAMPLES`,)."""
+    return np.linspace(0, num - 1, NUM_ARM_SAMPLES).round().astype(int)
+
+
 def room_at_rest(robot: Robot, task: Task, obstacle: Several, places: Array) -> Array:
     """Distance (N,), metres, of the arm's covering spheres from the obstacle where the hand rests at `places` (N, 3).
 

@@ -1,4 +1,4 @@
-"""Certificates: whether a stack is still a diffeomorphism and its motions still stable. Computed, never assumed."""
+"""What is known of how far a motion is to be trusted, and what integrators cost that were chosen by hand."""
 
 from __future__ import annotations
 
@@ -7,23 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.collision import CollisionReport
-from dt_viz.cspace import LEVERS
 from dt_viz.diffeo import Conjugated, Diffeomorphism, Flow
-from dt_viz.fields import Array, Indices
+from dt_viz.fields import Array
 from dt_viz.integration import Integration
-from dt_viz.robot import Robot
-from dt_viz.rollouts import Bundle
-from dt_viz.systems import Attractor, DiffeomorphicSystem
-from dt_viz.whole_arm import ArmSolution
 
 MAX_ROUND_TRIP = 1e-6
 """Metres; the workspace is about one metre wide."""
-NUM_CHECKED = 800
-"""Samples on which the certificates are computed."""
-NUM_CHECKED_POSTURES = 200
-"""The same for the whole arm."""
 NUM_CHECKED_LIVE = 300
-"""The same for what an integrator costs that was chosen by hand."""
+"""Samples on which it is computed what an integrator costs that was chosen by hand."""
 FOLDS, THERE_AND_BACK, RISES = "folds space", "there and back", "the Lyapunov value does not fall all the way"
 """Words of the doubts that name a cause; certificates that fail for it do not repeat them."""
 
@@ -54,6 +45,8 @@ class Health:
     """Whether Φ(ψ(y(t))) falls strictly along every rollout."""
     doubts: tuple[str, ...] = ()
     """Why the result is not to be trusted, in words."""
+    arm_doubts: tuple[str, ...] = ()
+    """Those of them that are about the arm that follows a rollout, not about the rollouts: nothing to who hides it."""
 
     def says(self, words: str) -> bool:
         """Whether some doubt has these words."""
@@ -63,44 +56,9 @@ class Health:
         """This health with more doubts."""
         return replace(self, doubts=self.doubts + doubts)
 
-
-def certified(health: Health, system: DiffeomorphicSystem, bundle: Bundle, drawn_from: Array | None = None) -> Health:
-    """Add the certificates of a stack along its rollouts, and a doubt for each that fails.
-
-    Args:
-        health: what is known already.
-        system: whose transform the stack is.
-        bundle: its rollouts.
-        drawn_from: (N, 3) the base points that ψ⁻¹ leads to the samples, where it is integrated by hand: coarse steps
-            there and back are no inverses, and ψ⁻¹, which is what is drawn, may fold space where ψ does not.
-    """
-    keep = np.unique(np.linspace(0, len(bundle.index) - 1, NUM_CHECKED).astype(int))
-    y, (z, J) = bundle.positions[keep], system.transform.jacobian(bundle.positions[keep])
-    det = _determinant(system.transform, J, None if drawn_from is None else drawn_from[keep])
-    round_trip = float(np.linalg.norm(system.transform.inverse(z) - y, axis=1).max())
-    falls = _falls(system.base.potential(z), bundle.index[keep], system.base)
-    return _judged(health, det, round_trip, falls)
-
-
-def certified_arm(
-    health: Health, system: DiffeomorphicSystem, arm: ArmSolution, robot: Robot, drawn_from: Array | None = None
-) -> Health:
-    """Add the certificates of the whole arm's transform to those of the end effector's stack below it.
-
-    Args:
-        health: of that stack.
-        system: the end effector's.
-        arm: the arm's motions.
-        robot: whose arm it is.
-        drawn_from: (N, 6) postures that ψ_q⁻¹ leads to the samples, where it is integrated by hand.
-    """
-    keep = np.unique(np.linspace(0, len(arm.index) - 1, NUM_CHECKED_POSTURES).astype(int))
-    p, (q, J) = arm.p[keep], arm.transform.jacobian(arm.p[keep])
-    det = _determinant(arm.transform, J, None if drawn_from is None else drawn_from[keep])
-    round_trip = float(np.linalg.norm((arm.transform.inverse(q) - p) * LEVERS, axis=1).max())
-    potential = system.lyapunov(robot.end_effector(arm.q))  # of all samples: those far apart hide a rise
-    falls = _falls(potential, arm.index, system.base)
-    return _judged(health, det, round_trip, falls)
+    def doubting_arm(self, *doubts: str) -> Health:
+        """This health with more doubts about the arm that follows a rollout."""
+        return replace(self.doubting(*doubts), arm_doubts=self.arm_doubts + doubts)
 
 
 def integration_doubts(
@@ -151,42 +109,6 @@ def fold_doubts(name: str, flow: Diffeomorphism, integration: Integration, y: Ar
     if det > 0:
         return ()
     return (f"{name}: a step of {integration} {FOLDS} (det {det:.2g}); take more steps or less time",)
-
-
-def _determinant(transform: Diffeomorphism, J: Array, drawn_from: Array | None) -> float:
-    """Smallest det J, or of ψ⁻¹'s derivative where that is not positive at what the samples are `drawn_from`."""
-    det = np.linalg.det(J)
-    if drawn_from is not None:
-        inverse = np.linalg.det(transform.inverse_jacobian(drawn_from)[1])
-        det = np.append(det, inverse[~(inverse > 0)])
-    return float(det.min())
-
-
-def _judged(health: Health, det: float, round_trip: float, falls: bool) -> Health:
-    """Health with certificates that may be worse than those it has, and a doubt for each new failure.
-
-    Where a step is known to fold space, that the Lyapunov value does not fall is none.
-    """
-    folds = health.says(FOLDS)
-    if not (det > 0 or folds):
-        health = health.doubting(f"det J falls to {det:.2g}: the map {FOLDS}, the stack is no diffeomorphism there")
-    if not round_trip <= MAX_ROUND_TRIP and not health.says(THERE_AND_BACK):
-        health = health.doubting(f"{THERE_AND_BACK} again misses by {1e3 * round_trip:.3g} mm: steps too coarse")
-    if not (falls or folds or health.says(RISES)):
-        health = health.doubting(RISES)
-    return replace(
-        health,
-        min_det_jacobian=min(det, np.inf if health.min_det_jacobian is None else health.min_det_jacobian),
-        round_trip_error=max(round_trip, health.round_trip_error or 0.0),
-        lyapunov_falls=falls and health.lyapunov_falls is not False,
-    )
-
-
-def _falls(potential: Array, index: Indices, base: Attractor) -> bool:
-    """Whether the potential falls strictly between neighbouring samples of the same rollout, until that has arrived."""
-    same = np.diff(index) == 0
-    arrived = potential[1:] <= base.potential(base.goal + MAX_ROUND_TRIP * np.eye(base.dim)[0])  # the rest is rounding
-    return bool((arrived | (np.diff(potential) < 0))[same].all())
 
 
 def in_millimetres(length: float) -> str:

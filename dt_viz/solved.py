@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from dt_viz.fields import Array
 from dt_viz.ground import Ground
 from dt_viz.scenario import Scenario
 from dt_viz.solving import Solution
@@ -26,3 +29,10 @@ class Solved:
     """None where only the end effector avoids."""
     lifted: Lift | None
     """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
+
+    @property
+    def ends(self) -> Array:
+        """(R + 1, 3) where the end effector's motions are to begin, and where all are to end, metres."""
+        goal, built = self.ground.goal, self.stack.built
+        moved = built[-1].made.goal - goal if built else np.zeros_like(goal)
+        return np.concatenate([self.ground.starts, [goal + self.scenario.warp * moved]])

@@ -7,7 +7,8 @@ import pytest
 
 from dt_viz.avoidance import BESIDE
 from dt_viz.bias import Biasing, BiasPoint, vector
-from dt_viz.doubts import MAX_GOAL_MISS
+from dt_viz.collision import Nearest, load_collision_model
+from dt_viz.doubts import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_doubts
 from dt_viz.engine import Stage
 from dt_viz.obstacles import Sphere
 from dt_viz.scenario import Layer, Scenario
@@ -128,3 +129,33 @@ def test_equal_layers_are_told_apart(engine, middle):
     assert durations[1] is not None and durations[1] > 0.1
     assert durations[2] is not None and durations[2] < 0.01  # what is there already needs no flow
     assert radii[1] is not None and radii[2] is not None
+
+
+def nearest(*distances):
+    return [Nearest(distance, (f"link {k}",), 0.0) for k, distance in enumerate(distances)]
+
+
+def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
+    scenario = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), space="cspace", margin=0.02)
+    assert margin_doubts(scenario, nearest(0.5, 0.02 - 0.9 * MARGIN_TOLERANCE)) == ()
+    assert margin_doubts(scenario, nearest(0.5, 0.0134, 0.015)) == (
+        "on rollout 2 the arm's link 1 keeps 13 mm from the obstacle; 20 mm were asked for",
+    )
+    (entered,) = margin_doubts(scenario, nearest(-0.0044))
+    assert "link 0 enters the obstacle by 4 mm" in entered
+    for asks_for_none in ({"duration": 0.3}, {"warp": 0.5}, {"avoidance": False}):
+        assert margin_doubts(replace(scenario, **asks_for_none), nearest(0.001)) == ()
+
+
+@pytest.mark.parametrize(("margin", "kept"), [(0.01, False), (0.002, True)])
+def test_the_last_frame_says_what_margin_the_meshes_keep(engine, initial, margin, kept):
+    scenario = replace(initial("draw_s"), space="cspace", margin=margin)
+    frame = stage(engine, scenario, Stage.CERTIFIED)
+    model, arm = load_collision_model(), engine._shown.arm
+    clearance = [
+        model.nearest_to_obstacle(arm.p[arm.index == k], scenario.obstacle).distance for k in range(len(frame.rollouts))
+    ]
+    assert (min(clearance) > margin - MARGIN_TOLERANCE) == kept
+    said = f"keeps {1e3 * min(clearance):.2g} mm from the obstacle; 10 mm were asked for"
+    assert [said in doubt for doubt in frame.health.arm_doubts] == ([] if kept else [True])
+    assert set(frame.health.arm_doubts) <= set(frame.health.doubts)

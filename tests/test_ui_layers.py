@@ -477,6 +477,18 @@ def test_the_status_says_what_the_arm_comes_near_to():
     assert "touches, link 2 – hand" in status_html(frame(health=Health(0.01, collision=hit)), PACE)
 
 
+@pytest.mark.parametrize(
+    ("view", "told"), [(View(), True), (View(arm=False, onion=True), True), (View(arm=False), False)]
+)
+def test_nothing_is_said_against_an_arm_that_is_hidden(view, told):
+    health = Health(0.01, collision=CLOSE).doubting_arm("the arm is odd")
+    said = status_html(frame(scenario=Scenario("draw_s", (), view=view), health=health), PACE)
+    assert ("The arm is odd" in said) == ("below the table" in said) == told
+    assert ("Every check holds" in said) == ("arm hidden" in said) == (not told)
+    rollouts = status_html(frame(scenario=Scenario("draw_s", (), view=view), health=health.doubting("it is odd")), PACE)
+    assert "It is odd" in rollouts
+
+
 @pytest.mark.parametrize(("space", "hinted"), [("task", True), ("both", False)])
 def test_an_arm_in_the_obstacle_is_told_how_to_give_way(space, hinted):
     scenario = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space)

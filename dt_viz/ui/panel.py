@@ -433,6 +433,7 @@ def hint(frame: Frame) -> str:
 def status_html(frame: Frame, pace: Pace) -> str:
     """The status line: speed, clearance, certificates, and every reason for doubt."""
     health, scenario = frame.health, frame.scenario
+    hides_arm = not (scenario.view.arm or scenario.view.onion)
     # what is not known after the last stage never will be
     unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
     off = "–" if frame.blocked else "off"
@@ -446,7 +447,7 @@ def status_html(frame: Frame, pace: Pace) -> str:
     rows = (
         ("Rebuild", _rebuild(pace)),
         ("Clearance", off if frame.blocked else _clearance(health.clearance, of)),
-        *_collision_rows(health.collision, unknown),
+        *(_collision_rows(None, "arm hidden") if hides_arm else _collision_rows(health.collision, unknown)),
         *((("Flow time t", flow_time or off),) if flow_time or not strength else ()),
         *((("Strength", strength),) if strength else ()),
         ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.2g}"),
@@ -458,10 +459,10 @@ def status_html(frame: Frame, pace: Pace) -> str:
         f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
         for name, value in rows
     )
-    warnings = list(health.doubts)
+    warnings = [doubt for doubt in health.doubts if not (hides_arm and doubt in health.arm_doubts)]
     if health.clearance < 0 and scenario.avoidance and scenario.warp == 1 and not (warnings or frame.blocked):
         warnings.append("the motions go through the obstacle at this flow time")
-    if health.collision is not None:
+    if health.collision is not None and not hides_arm:
         own = health.collision.problems_of_its_own
         entered = [problem for problem in health.collision.problems if problem not in own]
         told = {problem: problem for problem in own}
