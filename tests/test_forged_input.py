@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import dataclasses
+import inspect
 import math
 import threading
 from types import SimpleNamespace
@@ -209,7 +210,7 @@ def test_nothing_that_a_page_sends_passes_by_the_border(page):
     assert {name for name, _ in callbacks} > {"scene", "/obstacles/0/surface", "/bias/0/ball", "/starts/1", "/slice"}
     for name, callback in callbacks:
         assert callback.__module__ in BORDERS, name
-        assert asyncio.iscoroutinefunction(callback), f"{name} would wait in the pool that all visitors share"
+        assert inspect.iscoroutinefunction(callback), f"{name} would wait in the pool that all visitors share"
 
 
 @pytest.mark.parametrize("selected", range(3))
