@@ -180,39 +180,42 @@ def _fans(corners: _Lists, max_triangles: int) -> Indices:
 def _text_columns(body: bytes, elements: list[_Element]) -> Iterator[tuple[str, Columns]]:
     lines = numbered_lines(body, errors="replace")
     for element in elements:
-        values = {name: array("d") for name in element.wanted}
-        lengths = array("q")
+        names, wanted = [p.name for p in element.properties], element.wanted
+        has_lists = any(p.count for p in element.properties)
+        places = [] if has_lists else [names.index(name) for name in wanted]
+        numbers, lengths = array("d"), array("q")
         for _ in range(element.num):
             number, line = next(lines, (0, ""))
             if not number:
                 raise FormatError("file", f"an end before all of its {element.name[:40]} elements", "a complete file")
-            if values:
-                try:
-                    _text_row(element, line.split(), values, lengths)
-                except (ValueError, OverflowError) as error:
-                    raise FormatError(f"line {number} after the header", repr(line[:60]), "numbers") from error
-        if len(lengths):
-            (numbers,) = (np.asarray(column) for column in values.values())
-            whole = numbers.astype(np.intp)
-            if (whole != numbers).any():
-                raise FormatError("faces", "a number that is not whole", "indices of vertices")
-            yield element.name, {"corners": _Lists(np.asarray(lengths), whole)}
-        else:
-            yield element.name, {name: np.asarray(column) for name, column in values.items()}
+            words = line.split()
+            try:
+                if has_lists:
+                    for cells in _text_cells(element.properties, wanted, words):
+                        numbers.extend(map(float, cells))
+                        lengths.append(len(cells))
+                else:
+                    numbers.extend([float(words[place]) for place in places])
+            except (ValueError, IndexError) as error:
+                raise FormatError(f"line {number} after the header", repr(line[:60]), "numbers") from error
+        values = np.asarray(numbers)
+        if element.name == "face":
+            yield element.name, {name: _Lists(np.asarray(lengths), _whole(values)) for name in wanted}
+        elif wanted and element.num:
+            yield element.name, dict(zip(wanted, values.reshape(element.num, -1).T, strict=True))
 
 
-def _text_row(element: _Element, words: list[str], values: dict[str, array[float]], lengths: array[int]) -> None:
+def _text_cells(properties: list[_Property], wanted: tuple[str, ...], words: list[str]) -> Iterator[list[str]]:
+    """The wanted properties of an element, given its line."""
     at = 0
-    for p in element.properties:
+    for p in properties:
         num = 1
         if p.count:
-            num, at = int(words[at]) if at < len(words) else 0, at + 1
+            num, at = int(words[at]), at + 1
         if num < 0 or at + num > len(words):
             raise ValueError("a line that ends too early")
-        if p.name in values:
-            values[p.name].extend(map(float, words[at : at + num]))
-            if p.count:
-                lengths.append(num)
+        if p.name in wanted:
+            yield words[at : at + num]
         at += num
 
 
@@ -239,9 +242,10 @@ def _binary_columns(content: bytes, at: int, elements: list[_Element], order: st
 
 
 def _whole(numbers: Array) -> Indices:
-    if numbers.dtype.kind == "f":
-        raise FormatError("faces", "indices of a type with fractions", "whole numbers")
-    return numbers.astype(np.intp)
+    whole = numbers.astype(np.intp)
+    if (whole != numbers).any():
+        raise FormatError("faces", "a number that is not whole", "indices of vertices")
+    return whole
 
 
 def _equal_rows(content: bytes, at: int, element: _Element, order: str) -> np.ndarray | None:
