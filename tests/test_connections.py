@@ -322,7 +322,7 @@ async def test_a_flood_is_slowed_down(url):
         for _ in range(3 * gate.MAX_RATE):
             await client.send("NoSuchMessage")
         assert await answers(client)
-        assert time.monotonic() - began > 2
+        assert time.monotonic() - began > 1  # the second that it began in may have been over at once
 
 
 @asynchronous
