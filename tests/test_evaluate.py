@@ -14,12 +14,16 @@ from dt_viz.diffeo import Identity
 from dt_viz.engine import Stage
 from dt_viz.evaluate import latency, rollouts
 from dt_viz.evaluate.__main__ import main
+from dt_viz.evaluate.held_out import follow
 from dt_viz.evaluate.imitation import grown_grid
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
+from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
+from dt_viz.imitation import ImitationSettings, fit
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
 from dt_viz.systems import Attractor, DiffeomorphicSystem
+from dt_viz.timing import TimedAttractor
 
 NUM_DEMONSTRATIONS = 2
 
@@ -139,6 +143,60 @@ def test_imitation_takes_other_files_in_metres_and_in_space(tmp_path):
 def test_the_grid_of_the_certificates_covers_the_box_and_half_its_size_on_every_side():
     grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]))
     np.testing.assert_allclose([grid.min(axis=0), grid.max(axis=0)], [[-1, -2], [3, 6]])
+
+
+@pytest.fixture(scope="module")
+def left_out(lasa, tmp_path_factory):
+    """The folder, and what is printed."""
+    out = tmp_path_factory.mktemp("left_out")
+    with redirect_stdout(StringIO()) as printed:
+        assert main(["imitation", str(lasa / "Hook.mat"), "--leave-one-out", "--out", str(out)]) == 0
+    return out, printed.getvalue()
+
+
+def test_held_out_demonstrations_are_followed_by_what_the_others_teach(left_out):
+    """Of two demonstrations the other one is the mean of the others and the nearest, shifted to this start."""
+    out, printed = left_out
+    (figures,) = json.loads((out / "figures.json").read_text())["held_out"]
+    assert figures["folds"] == NUM_DEMONSTRATIONS
+    with np.load(out / "Hook-held-out.npz") as arrays:
+        for way in ("learned", "mean", "nearest"):
+            distances = []
+            for i in range(NUM_DEMONSTRATIONS):
+                positions = hook(i)[1]
+                path = arrays[f"{way}_{i}"]
+                np.testing.assert_allclose(path[0], positions[0], atol=1e-6)
+                a, b = (resample_by_arc_length(p, 400) for p in (path, positions))
+                distances.append(float(discrete_frechet(a, b)))
+            assert figures[f"{way}_mm"] == pytest.approx(np.mean(distances), rel=1e-6)
+        other = resample_by_arc_length(hook(1)[1], 400)
+        offset = hook(0)[1][0] - other[0]
+        np.testing.assert_allclose(arrays["mean_0"], other + np.linspace(1, 0, 400)[:, None] * offset, atol=1e-6)
+    in_sample = json.loads((out / "figures.json").read_text())["shapes"][0]["frechet_mean_mm"]
+    assert figures["learned_mm"] > 2 * in_sample  # it has not seen what it is compared with
+    row = next(line for line in printed.splitlines() if line.startswith("mean  ")).split()
+    wanted = [in_sample, *(figures[f"{way}_mm"] for way in ("learned", "mean", "nearest"))]
+    assert [float(cell) for cell in row[1:]] == pytest.approx(wanted, abs=0.006)
+
+
+def test_what_is_held_out_is_not_learned_from():
+    demonstrations = [Demonstration(*(a / 1000 if k else a for k, a in enumerate(hook(i))), str(i)) for i in range(4)]
+    learned_from = []
+
+    def fit_nothing(others, settings):
+        learned_from.append([d.name for d in others])
+        return fit(others, settings)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dt_viz.evaluate.held_out.fit", fit_nothing)
+        followed = follow(demonstrations, ImitationSettings(), folds=2)
+    assert learned_from == [["1", "3"], ["0", "2"]]
+    nearest = resample_by_arc_length(demonstrations[1].positions, 400)  # the nearest start of 1 and 3
+    np.testing.assert_allclose(
+        followed[0]["nearest"] - nearest,
+        np.linspace(1, 0, 400)[:, None] * (demonstrations[0].positions[0] - nearest[0]),
+        atol=1e-12,
+    )
 
 
 # --- latency ---
@@ -291,6 +349,33 @@ def test_the_same_seed_gives_the_same_starts(lasa, tmp_path):
     assert (starts[0] == starts[1]).all() and (starts[0] != starts[2]).any()
 
 
+@pytest.mark.parametrize("wrong", ["velocity", "flow"])
+def test_starts_fail_where_stepping_leads_elsewhere_than_the_closed_form(lasa, monkeypatch, capsys, wrong):
+    """Either side may be the wrong one: f of the base system, or its closed form; arrival alone would not tell."""
+    arguments = ["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "20", "--stepped", "20"]
+    assert main(arguments) == 0
+    assert "20 of 20" in capsys.readouterr().out.split("stepped by eq. (1)")[1]
+    real = getattr(TimedAttractor, wrong)
+    slower = {"velocity": lambda self, z: 0.97 * real(self, z), "flow": lambda self, z, t: real(self, z, 0.97 * t)}
+    monkeypatch.setattr(TimedAttractor, wrong, slower[wrong])
+    assert main(arguments) == 1
+    assert number_after(capsys.readouterr().out, "from the exact rollout, mm") > 1
+
+
+class Skewed(Identity):
+    """Gives a derivative that is not its own."""
+
+    def _map(self, s, U, *, inverse):
+        return s, U if U is None else U + 0.05 * U[:, ::-1]
+
+
+def test_a_wrong_jacobian_leads_stepped_motions_astray():
+    starts, durations = np.array([[0.3, 0.0, 0.1], [0.0, -0.2, 0.2]]), np.array([3.0, 2.5])
+    right, wrong = straight(), DiffeomorphicSystem(Skewed(3), straight().base)
+    assert stepped_beside(right, starts, durations)[1].max() < 1e-5
+    assert stepped_beside(wrong, starts, durations)[1].min() > MAX_DEPARTURE
+
+
 # --- rollouts ---
 
 
@@ -308,6 +393,10 @@ def test_rollouts_reports_both_sides_at_the_accuracy_asked_for(lasa, tmp_path, m
         assert 0 < exact["error"] <= 0.01 and 0 < stepped["error"] <= 0.01
         assert figures[scene]["ratio"] == pytest.approx(stepped["seconds"] / exact["seconds"])
         assert f"{scene}: exact rollouts are {figures[scene]['ratio']:.0f} × faster" in printed
+        apart = figures[scene]["ratios_apart"]
+        by_rollout, by_point = apart["one rollout at a time"], apart["one point at a time"]
+        assert 0 < by_point < by_rollout  # 8 evaluations against 320
+        assert f"; {by_rollout:.3g} × one rollout at a time, {by_point:.3g} × one point at a time" in printed
 
 
 def straight():
@@ -347,6 +436,7 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
         (["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"], "no: folder: found nothing that can"),
         (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),
         (["starts", *TASK, "--out", "folder.npz"], "--out: found 'folder.npz', which cannot be written"),
+        (["imitation", "Hook.mat", "--folds", "2", "--out", "out"], "--folds: found 2; accepted: it together with"),
         (["rollouts", "--task", "Draw S"], "--task: found 'Draw S'; accepted: draw_s, "),
     ],
 )
@@ -374,6 +464,10 @@ def test_what_cannot_be_used_is_named(lasa, tmp_path, monkeypatch, capsys, argum
         ),
         (["starts", *TASK, "--count", "many"], "argument --count: found 'many'; accepted: a whole number, 1 or more"),
         (["imitation", "Hook.mat"], "the following arguments are required: --out"),
+        (
+            ["imitation", "Hook.mat", "--folds", "1", "--out", "out"],
+            "argument --folds: found '1'; accepted: a whole number",
+        ),
         ([], "the following arguments are required: SUBCOMMAND"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Fit demonstrations and compare each rollout with its own demonstration.
+"""Fit demonstrations and compare each rollout with its own demonstration: in-sample, unless left out.
 
 Of each file the folder gets an npz, all lengths in the file's own unit (LASA: millimetres, others: metres):
 
@@ -11,6 +11,10 @@ Of each file the folder gets an npz, all lengths in the file's own unit (LASA: m
 ``min_det_jacobian``, ``round_trip_error``
     smallest det J and largest ‖ψ⁻¹(ψ(x)) − x‖ on a grid over the demonstrations' box grown by half its size on every
     side, computed here, not taken from the fit.
+
+With ``--leave-one-out`` each demonstration is also followed by what was learned from the others, and by two ways that
+need no learning (see `dt_viz.evaluate.held_out`): SHAPE-held-out.npz holds ``learned_i``, ``mean_i`` and ``nearest_i``
+(T, d) for each demonstration i.
 
 ``figures.json`` holds what the table shows, and ``shapes.png`` all shapes: the paper's fig. 5.
 """
@@ -29,19 +33,14 @@ import numpy as np
 
 from dt_viz.demos import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
 from dt_viz.diffeo import min_det_jacobian, round_trip_error
-from dt_viz.evaluate.options import InputError, print_table, ready_folder, write_json
+from dt_viz.evaluate.held_out import WAYS, HeldOut, follow, frechet, rollouts_from, summed_up
+from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json
 from dt_viz.evaluate.picture import Panel, draw_panels
 from dt_viz.fields import Array
 from dt_viz.imitation import Imitation, ImitationError, ImitationSettings, fit
-from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
+from dt_viz.metrics import rms_at_equal_times
 
 OBJECTIVES = ("trajectory", "velocity")
-AT_GOAL = 5e-5
-"""Metres from the goal at which a rollout ends."""
-NUM_SAMPLES = 1000
-"""Of a rollout, evenly in time."""
-NUM_COMPARED = 400
-"""Points by arc length that a Fréchet distance is taken between."""
 GRID = {2: 101, 3: 25}
 """Points a side of the grid of the certificates, by dimension."""
 
@@ -59,7 +58,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Figures:
-    """What the table says of a shape. Fréchet distances and RMS are of each rollout to its own demonstration."""
+    """What the table says of a shape, in-sample: of each rollout to the demonstration it was learned from."""
 
     name: str
     demonstrations: int
@@ -80,23 +79,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and picture")
     parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
+    parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
+    parser.add_argument(
+        "--folds", type=whole_number(2), metavar="N", help="hold out in so many folds (default: one for each)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 2 if one of the shapes could not be fitted."""
     settings = _settings(options.objective)
+    if options.folds and not options.leave_one_out:
+        raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
     sources = _sources(options.files)
+    alone = [str(source.path) for source in sources if len(source.demonstrations) == 1]
+    if options.leave_one_out and alone:
+        raise InputError("--leave-one-out", f"one demonstration only in {', '.join(alone)}", "two or more in each")
     folder = ready_folder(options.out)
     results: list[Figures] = []
+    held_out: list[HeldOut] = []
     panels: list[Panel] = []
     for source in sources:
         began = time.perf_counter()
         try:
             imitation = fit(source.demonstrations, settings)
+            seconds = time.perf_counter() - began
+            if options.leave_one_out:
+                held_out.append(_held_out(source, settings, options.folds, folder))
         except ImitationError as error:
             print(f"{source.path}: {error}", file=sys.stderr)
             continue
-        seconds = time.perf_counter() - began
         for warning in imitation.warnings:
             print(f"{source.path}: {warning}", file=sys.stderr)
         arrays = measured(imitation, source, seconds)
@@ -107,20 +118,18 @@ def run(options: argparse.Namespace) -> int:
     if results:
         _report(results)
         shapes = [asdict(figures) for figures in results]
-        write_json(folder / "figures.json", {"objective": options.objective, "shapes": shapes})
+        if held_out:
+            _report_held_out(results, held_out)
+        held = [asdict(figures) for figures in held_out]
+        write_json(folder / "figures.json", {"objective": options.objective, "shapes": shapes, "held_out": held})
         draw_panels(folder / "shapes.png", panels)
     return 0 if len(results) == len(sources) else 2
 
 
 def measured(imitation: Imitation, source: Source, fit_seconds: float) -> dict[str, Any]:
     """The arrays of the file's npz: see the module's docstring."""
-    transform, base = imitation.transform, imitation.base
-    starts = np.stack([d.positions[0] for d in source.demonstrations])
-    # near the goal ψ⁻¹ stretches by at most the norm of its Jacobian there
-    stretch = np.linalg.norm(transform.inverse_jacobian(base.goal)[1], 2)
-    ends = base.arrival_time(transform.forward(starts), float(AT_GOAL / max(stretch, 1.0)))
-    times = ends[:, None] * np.linspace(0.0, 1.0, NUM_SAMPLES)
-    rollouts = imitation.system.rollout(starts, times)
+    transform = imitation.transform
+    rollouts, times = rollouts_from(imitation, np.stack([d.positions[0] for d in source.demonstrations]))
     grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]))
     arrays: dict[str, Any] = {
         "fit_seconds": fit_seconds,
@@ -128,7 +137,7 @@ def measured(imitation: Imitation, source: Source, fit_seconds: float) -> dict[s
         "round_trip_error": round_trip_error(transform, grid) / source.unit,
         "goal": imitation.goal / source.unit,
     }
-    for i in range(len(starts)):
+    for i in range(len(rollouts)):
         arrays[f"rollout_{i}"] = rollouts[i] / source.unit
         arrays[f"times_{i}"] = times[i]
     return arrays
@@ -138,10 +147,7 @@ def compared(arrays: dict[str, Any], source: Source) -> Figures:
     """The figures that the arrays of a file's npz give."""
     demonstrations = [d.positions / source.unit for d in source.demonstrations]
     rollouts = _rollouts(arrays, len(demonstrations))
-    frechet = discrete_frechet(
-        np.stack([resample_by_arc_length(path, NUM_COMPARED) for path in rollouts]),
-        np.stack([resample_by_arc_length(path, NUM_COMPARED) for path in demonstrations]),
-    )
+    distances = frechet(rollouts, demonstrations)
     rms = [
         rms_at_equal_times(arrays[f"times_{i}"], rollouts[i], demonstration.times, demonstrations[i])
         for i, demonstration in enumerate(source.demonstrations)
@@ -151,14 +157,30 @@ def compared(arrays: dict[str, Any], source: Source) -> Figures:
     return Figures(
         name=source.path.stem,
         demonstrations=len(demonstrations),
-        frechet_mean_mm=millimetres * float(frechet.mean()),
-        frechet_max_mm=millimetres * float(frechet.max()),
+        frechet_mean_mm=millimetres * float(distances.mean()),
+        frechet_max_mm=millimetres * float(distances.max()),
         rms_mm=millimetres * float(np.mean(rms)),
         fit_seconds=arrays["fit_seconds"],
         end_error_mm=millimetres * end_error,
         round_trip_of_extent=arrays["round_trip_error"] / float(np.ptp(np.concatenate(demonstrations), axis=0).max()),
         min_det_jacobian=arrays["min_det_jacobian"],
     )
+
+
+def _held_out(source: Source, settings: ImitationSettings, folds: int | None, folder: Path) -> HeldOut:
+    """Follow each demonstration without having learned from it; the arrays go to the folder."""
+    num = len(source.demonstrations)
+    if num < 2:
+        raise InputError("--leave-one-out", f"one demonstration in {str(source.path)!r}", "two or more")
+    folds = min(folds or num, num)
+    arrays = {
+        f"{way}_{i}": path / source.unit
+        for i, followed in enumerate(follow(source.demonstrations, settings, folds))
+        for way, path in followed.items()
+    }
+    np.savez_compressed(folder / f"{source.path.stem}-held-out.npz", allow_pickle=False, **arrays)
+    demonstrations = [d.positions / source.unit for d in source.demonstrations]
+    return summed_up(source.path.stem, folds, arrays, demonstrations, 1e3 * source.unit)
 
 
 def grown_grid(points: Array) -> Array:
@@ -195,6 +217,7 @@ def _rollouts(arrays: dict[str, Any], num: int) -> list[Array]:
 
 
 def _report(results: Sequence[Figures]) -> None:
+    print("in-sample: each rollout against the demonstration that it was learned from")
     header = ("shape", "demos", "Fréchet mean mm", "max mm", "RMS mm", "fit s", "end mm", "round trip/extent", "det J")
     rows = [
         (
@@ -224,3 +247,15 @@ def _report(results: Sequence[Figures]) -> None:
     print(f"largest distance from the goal at the end {max(r.end_error_mm for r in results):.3f} mm")
     print(f"largest round trip error {max(r.round_trip_of_extent for r in results):.1e} of the extent")
     print(f"smallest det J {tightest.min_det_jacobian:.2g} ({tightest.name})")
+
+
+def _report_held_out(results: Sequence[Figures], held_out: Sequence[HeldOut]) -> None:
+    in_sample = [r.frechet_mean_mm for r in results]
+    columns = [in_sample, *([getattr(h, f"{way}_mm") for h in held_out] for way in WAYS)]
+    print("\nheld out: each demonstration against what was learned from others; Fréchet mean, mm")
+    rows = [
+        (h.name, str(h.folds), *(f"{value:.2f}" for value in values))
+        for h, *values in zip(held_out, *columns, strict=True)
+    ]
+    means = ("mean", "", *(f"{np.mean(column):.2f}" for column in columns))
+    print_table(("shape", "folds", "in-sample", "held out", "mean of others", "nearest start"), [*rows, means])

@@ -1,8 +1,13 @@
 """Start a learned motion from many random places and look whether all arrive.
 
 Starts are spread evenly over the demonstrations' box grown by half its size on every side; a drawing's stay in its
-plane. The npz file, if one is asked for, holds ``starts`` and ``ends`` (N, 3) in metres, ``min_det_jacobian`` (N,), the
-smallest det J on each rollout, and ``goal`` (3,).
+plane. Rollouts in closed form end at the goal whatever they are, if only ψ⁻¹ is the inverse of ψ. So the first of the
+starts are stepped, too: ẏ = J⁻¹ f(ψ(y)), eq. (1), knows neither the closed form nor ψ⁻¹, and must lead along the same
+rollouts to the same goal.
+
+The npz file, if one is asked for, holds ``starts`` and ``ends`` (N, 3) in metres, ``min_det_jacobian`` (N,), the
+smallest det J on each rollout, ``goal`` (3,), and of the M stepped ones ``stepped`` (M, K, 3), K places at even times
+up to arrival, and ``departures`` (M,), their largest distances from the exact rollouts, metres.
 """
 
 from __future__ import annotations
@@ -13,7 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to_write, whole_number
+from dt_viz.fields import Array
 from dt_viz.fits import FitStore, default_cache_folder
+from dt_viz.integrate import integrate_adaptive
+from dt_viz.systems import DiffeomorphicSystem
 
 AT_GOAL = 5e-5
 """Metres from the goal at which a rollout ends."""
@@ -21,18 +29,31 @@ NUM_SAMPLES = 50
 """Of each rollout, where det J is looked at."""
 CHUNK = 500
 """Rollouts at a time."""
+NUM_STEPPED_PLACES = 5
+"""Places, evenly in time, at which a stepped motion is compared with the exact rollout."""
+STEP_TOLERANCE = 1e-6
+"""Estimated error of a step of theirs, metres."""
+ARRIVED = 1e-4
+"""Metres from the goal within which a motion has arrived."""
+MAX_DEPARTURE = 1e-3
+"""Metres of a stepped motion from the exact rollout: where space is squeezed, errors of steps grow a hundredfold."""
+FAILED = 1
+"""Exit status where a motion does not arrive, or departs from the exact one."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
     add_task(parser)
     parser.add_argument("--count", type=whole_number(1), default=10_000, help="of starts (default: %(default)s)")
+    parser.add_argument(
+        "--stepped", type=whole_number(0), default=500, help="starts that are stepped, too (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of their places (default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="FILE.npz", help="for starts, ends and det J")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand."""
+    """Run the subcommand; 1 if a motion does not arrive, or if stepping leads elsewhere."""
     _, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, ".npz")
     imitation = FitStore(default_cache_folder()).get(task.demonstrations)
@@ -44,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     starts = task.to_world(lower - margin + uniform * (upper - lower + 2 * margin))
 
     stretch = np.linalg.norm(system.transform.inverse_jacobian(system.base.goal)[1], 2)
-    ends, det, missed = np.empty_like(starts), np.empty(len(starts)), 0.0
+    ends, det, missed, durations = np.empty_like(starts), np.empty(len(starts)), 0.0, np.empty(len(starts))
     for first in range(0, len(starts), CHUNK):
         chunk = slice(first, first + CHUNK)
         z0 = system.transform.forward(starts[chunk])
@@ -52,14 +73,18 @@ def run(options: argparse.Namespace) -> int:
         z = system.base.flow(z0, arrival[:, None] * np.linspace(0.0, 1.0, NUM_SAMPLES))
         paths, J_inverse = system.transform.inverse_jacobian(z)
         missed = max(missed, float(np.linalg.norm(paths[:, 0] - starts[chunk], axis=1).max()))
-        ends[chunk] = paths[:, -1]
+        ends[chunk], durations[chunk] = paths[:, -1], arrival
         det[chunk] = (1 / np.linalg.det(J_inverse)).min(axis=1)
+    stepped, departures = stepped_beside(system, starts[: options.stepped], durations[: options.stepped])
     if out is not None:
+        arrays = {"starts": starts, "ends": ends, "min_det_jacobian": det, "goal": goal}
         with out.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, starts=starts, ends=ends, min_det_jacobian=det, goal=goal)
+            np.savez_compressed(file, allow_pickle=False, **arrays, stepped=stepped, departures=departures)
 
     distance = np.linalg.norm(ends - goal, axis=1)
-    arrived = int((distance < 1e-4).sum())
+    left = np.linalg.norm(stepped[:, -1] - goal, axis=1)
+    arrived, num_stepped = int((distance < ARRIVED).sum()), len(departures)
+    arrived_stepped = int((left < ARRIVED).sum())
     print_table(
         (f"{task.name}, {options.count} starts (seed {options.seed})", ""),
         [
@@ -67,6 +92,43 @@ def run(options: argparse.Namespace) -> int:
             ("arrived within 0.1 mm", f"{arrived} of {options.count}"),
             ("smallest det J on the rollouts", f"{det.min():.4g}"),
             ("largest miss of a start (round trip), mm", f"{1e3 * missed:.1e}"),
+            ("stepped by eq. (1): arrived within 0.1 mm", f"{arrived_stepped} of {num_stepped}"),
+            ("largest distance from the exact rollout, mm", f"{1e3 * departures.max(initial=0.0):.3f}"),
         ],
     )
-    return 0
+    fine = arrived == options.count and arrived_stepped == num_stepped and not (departures > MAX_DEPARTURE).any()
+    return 0 if fine else FAILED
+
+
+def stepped_beside(system: DiffeomorphicSystem, starts: Array, durations: Array) -> tuple[Array, Array]:
+    """Step ẏ = J⁻¹ f(ψ(y)) from `starts` (M, 3), metres, for `durations` (M,), seconds, beside the exact rollouts.
+
+    Returns:
+        Places (M, K, 3) at even times, and their largest distances (M,) from the exact rollouts, metres.
+    """
+    fractions = np.arange(1, NUM_STEPPED_PLACES + 1) / NUM_STEPPED_PLACES
+    state, places = np.concatenate([starts, durations[:, None]], axis=1), []
+    for _ in fractions:
+        state, _ = integrate_adaptive(_Clocked(system), state, None, 1 / NUM_STEPPED_PLACES, STEP_TOLERANCE)
+        places.append(state[:, :-1])
+    stepped = np.stack(places, axis=1)
+    exact = system.rollout(starts, durations[:, None] * fractions)
+    return stepped, np.linalg.norm(stepped - exact, axis=-1).max(axis=1)
+
+
+class _Clocked:
+    """The field (T·ẏ, 0) of states (y, T): each motion takes its own time T, seconds, while one unit passes."""
+
+    def __init__(self, system: DiffeomorphicSystem) -> None:
+        self._system = system
+        self.dim = system.transform.dim + 1
+
+    def __call__(self, s: Array) -> Array:
+        """Velocities (N, d + 1) of the states `s` (N, d + 1)."""
+        z, J = self._system.transform.jacobian(s[:, :-1])
+        velocity = np.linalg.solve(J, self._system.base.velocity(z)[..., None])[..., 0]
+        return np.concatenate([s[:, -1:] * velocity, np.zeros((len(s), 1))], axis=1)
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """No tangents are carried along such motions."""
+        raise NotImplementedError

@@ -1,0 +1,100 @@
+"""How well motions are reproduced that were not learned from, beside what needs no learning at all.
+
+The demonstrations of a shape are dealt into folds; those of a fold are held out, and followed from their own start by
+
+``learned``
+    the motion fitted to the others;
+``mean``
+    the mean of the others by arc length, shifted to that start by an offset that fades linearly to the end;
+``nearest``
+    the one of the others that starts nearest, shifted likewise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.demos import Demonstration
+from dt_viz.fields import Array
+from dt_viz.imitation import Imitation, ImitationSettings, fit
+from dt_viz.metrics import discrete_frechet, resample_by_arc_length
+
+WAYS = ("learned", "mean", "nearest")
+AT_GOAL = 5e-5
+"""Metres from the goal at which a rollout ends."""
+NUM_SAMPLES = 1000
+"""Of a rollout, evenly in time."""
+NUM_COMPARED = 400
+"""Points by arc length that a Fréchet distance is taken between."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What the table says of a shape: mean discrete Fréchet distances to the demonstrations that were held out."""
+
+    name: str
+    folds: int
+    learned_mm: float
+    mean_mm: float
+    nearest_mm: float
+
+
+def follow(demonstrations: Sequence[Demonstration], settings: ImitationSettings, folds: int) -> list[dict[str, Array]]:
+    """Follow each demonstration in each of `WAYS` without having learned from it.
+
+    Args:
+        demonstrations: of one shape, two or more.
+        settings: of the fits.
+        folds: how many; at most as many as demonstrations.
+
+    Returns:
+        For each demonstration the paths (T, d) by their way, metres.
+
+    Raises:
+        ImitationError: nothing can be learned from the others.
+    """
+    followed: list[dict[str, Array]] = [{}] * len(demonstrations)
+    for fold in range(folds):
+        held = range(fold, len(demonstrations), folds)
+        others = [d for i, d in enumerate(demonstrations) if i not in held]
+        imitation = fit(others, settings)
+        paths = np.stack([resample_by_arc_length(d.positions, NUM_COMPARED) for d in others])
+        for i in held:
+            start = demonstrations[i].positions[0]
+            nearest = np.linalg.norm(paths[:, 0] - start, axis=1).argmin()
+            (rollout,), _ = rollouts_from(imitation, start[None])
+            shifted = (shifted_to(start, path) for path in (paths.mean(axis=0), paths[nearest]))
+            followed[i] = dict(zip(WAYS, (rollout, *shifted), strict=True))
+    return followed
+
+
+def rollouts_from(imitation: Imitation, starts: Array) -> tuple[Array, Array]:
+    """Learned motions (R, T, d) from `starts` (R, d), metres, until they are at the goal, and their times (R, T), s."""
+    transform, base = imitation.transform, imitation.base
+    # near the goal ψ⁻¹ stretches by at most the norm of its Jacobian there
+    stretch = np.linalg.norm(transform.inverse_jacobian(base.goal)[1], 2)
+    ends = base.arrival_time(transform.forward(starts), float(AT_GOAL / max(stretch, 1.0)))
+    times = ends[:, None] * np.linspace(0.0, 1.0, NUM_SAMPLES)
+    return imitation.system.rollout(starts, times), times
+
+
+def shifted_to(start: Array, path: Array) -> Array:
+    """A path (T, d) that begins at `start` (d,) instead, by an offset that fades linearly to none at its end."""
+    return path + np.linspace(1, 0, len(path))[:, None] * (start - path[0])
+
+
+def frechet(paths: Sequence[Array], references: Sequence[Array]) -> Array:
+    """Discrete Fréchet distances (R,) of paths to their references, both at `NUM_COMPARED` points by arc length."""
+    a, b = (np.stack([resample_by_arc_length(path, NUM_COMPARED) for path in these]) for these in (paths, references))
+    return discrete_frechet(a, b)
+
+
+def summed_up(
+    name: str, folds: int, arrays: Mapping[str, Array], references: Sequence[Array], millimetres: float
+) -> HeldOut:
+    """The figures of arrays ``WAY_i`` (T, d), in a unit of so many millimetres, against `references` in that unit."""
+    distances = [frechet([arrays[f"{way}_{i}"] for i in range(len(references))], references).mean() for way in WAYS]
+    return HeldOut(name, folds, *(millimetres * float(distance) for distance in distances))
