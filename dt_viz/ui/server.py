@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+import time
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import NoReturn
@@ -24,6 +25,10 @@ logger = logging.getLogger(__name__)
 
 MAX_WAITING = 8
 """Connections beyond the visitors, which are shown that all places are taken; any more are refused."""
+
+MAX_SLEEP = 0.5
+"""Longest sleep of the main thread, seconds. Only there handlers of signals run, and one that arrives just before a
+sleep, or on another thread, is looked at after it."""
 
 # a visitor may leave between two pictures of the arm; what is then sent to nobody is no news
 warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
@@ -92,9 +97,9 @@ class Server:
         return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
 
     def wait(self) -> NoReturn:
-        """Serve until interrupted."""
+        """Serve until a signal's handler raises an exception."""
         while True:
-            self._server.sleep_forever()
+            time.sleep(MAX_SLEEP)
 
     def close(self) -> None:
         """Send everybody away and stop listening."""
