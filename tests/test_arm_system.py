@@ -103,6 +103,7 @@ class TestSystem:
         assert errors[-1] < 1e-6
         assert np.polyfit(np.log(counts), -np.log(errors), 1)[0] == pytest.approx(4, abs=0.4)
 
+    @pytest.mark.slow
     def test_so_they_are_around_an_obstacle(self, case):
         """There the field's third derivatives jump, which limits the order for steps as long as these."""
         system = case.systems["an obstacle"]

@@ -81,7 +81,7 @@ def assert_said(scenario, frame):
         assert passed < MAX_TARGET_MISS + BETWEEN_SAMPLES or health.says(f"{layer.name}: "), layer
 
 
-@pytest.mark.parametrize("seed", [1, 4, 1122])  # the last one is squeezed most
+@pytest.mark.parametrize("seed", [1, 1122])  # the last one is squeezed most
 def test_a_random_stack_is_a_diffeomorphism_that_leads_to_its_goal(engine, seed):
     check(engine, seed)
 
