@@ -180,7 +180,8 @@ def test_held_out_demonstrations_are_followed_by_what_the_others_teach(left_out)
 
 
 def test_what_is_held_out_is_not_learned_from():
-    demonstrations = [Demonstration(*(a / 1000 if k else a for k, a in enumerate(hook(i))), str(i)) for i in range(4)]
+    recorded = [hook(i) for i in range(4)]
+    demonstrations = [Demonstration(times, path / 1000, str(i)) for i, (times, path) in enumerate(recorded)]
     learned_from = []
 
     def fit_nothing(others, settings):
