@@ -160,7 +160,7 @@ def test_in_a_plane_nothing_moves_out_of_it(seed):
 
 
 @pytest.mark.parametrize("task", ["draw_s", "lift_box", "push_box"])
-@pytest.mark.parametrize("num", [9, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num", [15, pytest.param(30, marks=pytest.mark.slow)])
 def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(ground, task, num):
     g, rng, off, turns = ground(task), np.random.default_rng(7), [], []
     for number in range(num):
