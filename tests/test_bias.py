@@ -172,7 +172,7 @@ def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(gro
         turns.append(max(sharpest_turn(path, 0.02) for path in solution.bundle.paths))
         if number % 3 == 0:
             assert_sound(g, solution)
-    assert max(off) > 0.05  # the targets were not all on the path
+    assert max(off) > 0.12  # the targets were not all on the path
     before = max(sharpest_turn(path, 0.02) for path in g.bundle.paths)
     assert np.median(turns) < before + 65  # on two centimetres, degrees
 
