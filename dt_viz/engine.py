@@ -143,15 +143,16 @@ def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
     """Within this block compute when it is this engine's turn, letting others go first when they are due.
 
     Args:
-        checkpoint: of what refines: others that follow a hand are due before it, and what this raises ends it.
+        checkpoint: of what refines: others that follow a hand are due before it, and what this raises ends it, also
+            while it waits for its turn.
     """
+    wanted = checkpoint or (lambda: None)
 
     def pause() -> None:
-        if checkpoint is not None:
-            checkpoint()
-        _turns.give_way()
+        wanted()
+        _turns.give_way(wanted)
 
-    with _turns.taken(patient=checkpoint is not None), interruptible(pause):
+    with _turns.taken(patient=checkpoint is not None, checkpoint=wanted), interruptible(pause):
         yield
 
 

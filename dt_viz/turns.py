@@ -8,8 +8,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from dt_viz.interruption import Checkpoint
+
 SLICE = 0.1
-"""Seconds after which who has the turn lets others go on that are in as much of a hurry."""
+"""Time slice in seconds; afterwards the holder yields to waiters of equal priority."""
+LOOK = 0.02
+"""Time in seconds between two calls of the checkpoint of a thread that waits."""
 
 _Place = tuple[bool, int]
 """In the queue: whether it is patient, and a number that grows with each who comes."""
@@ -25,30 +29,39 @@ class Turns:
         self._changed = threading.Condition()
         self._queue: list[_Place] = []
         self._numbers = itertools.count()
-        self._taken = False
+        self._holder: int | None = None
+        """Identifier of the thread that has the turn."""
         self._patient = False
-        """Whether who has the turn is."""
+        """Whether the holder is patient."""
         self._ends = 0.0
-        """When the slice of who has the turn is over, seconds."""
+        """End of the holder's time slice, seconds."""
 
     @contextmanager
-    def taken(self, *, patient: bool = False) -> Iterator[None]:
-        """Wait for the turn, and have it within this block. It is not reentrant."""
-        self._take(patient=patient)
+    def taken(self, *, patient: bool = False, checkpoint: Checkpoint = lambda: None) -> Iterator[None]:
+        """Wait for the turn, and have it within this block. It is not reentrant.
+
+        Args:
+            patient: whether those in a hurry go first.
+            checkpoint: called every `LOOK` seconds of waiting; what it raises ends the waiting.
+        """
+        self._take(checkpoint, patient=patient)
         try:
             yield
         finally:
             self._end()
 
-    def give_way(self) -> None:
-        """Called by who has the turn: join the end of the queue, and go on from there when the turn comes again.
+    def give_way(self, checkpoint: Checkpoint = lambda: None) -> None:
+        """Called by the holder: join the end of the queue, and go on from there when the turn comes again.
 
         That is done only if somebody waits who is in more of a hurry, or after a `SLICE` in as much.
+
+        Args:
+            checkpoint: as of `taken`. The turn is lost for good if it raises.
         """
         if self._is_due():
             patient = self._patient
             self._end()
-            self._take(patient=patient)
+            self._take(checkpoint, patient=patient)
 
     def let_pass(self, longest: float) -> None:
         """Called by who needs no turn, but takes the processor as well: wait while somebody in a hurry has or wants it.
@@ -60,7 +73,7 @@ class Turns:
             self._changed.wait_for(lambda: not self._is_hurried(), longest)
 
     def _is_hurried(self) -> bool:
-        return (self._taken and not self._patient) or any(not patient for patient, _ in self._queue)
+        return (self._holder is not None and not self._patient) or any(not patient for patient, _ in self._queue)
 
     def _is_due(self) -> bool:
         with self._changed:
@@ -69,15 +82,31 @@ class Turns:
             patient, _ = min(self._queue)
             return patient < self._patient or (patient == self._patient and time.monotonic() > self._ends)
 
-    def _take(self, *, patient: bool) -> None:
+    def _take(self, checkpoint: Checkpoint, *, patient: bool) -> None:
         with self._changed:
             place = patient, next(self._numbers)
             self._queue.append(place)
-            self._changed.wait_for(lambda: not self._taken and min(self._queue) == place)
+        try:
+            while not self._has_come(place):
+                checkpoint()
+        except BaseException:
+            with self._changed:
+                self._queue.remove(place)
+                self._changed.notify_all()  # another place may be the first now
+            raise
+
+    def _has_come(self, place: _Place) -> bool:
+        """Whether this thread has the turn now; waits for it `LOOK` seconds at most."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._holder is None and min(self._queue) == place, LOOK):
+                return False
             self._queue.remove(place)
-            self._taken, self._patient, self._ends = True, patient, time.monotonic() + SLICE
+            self._holder, self._patient, self._ends = threading.get_ident(), place[0], time.monotonic() + SLICE
+            return True
 
     def _end(self) -> None:
+        """Let others have the turn, if this thread has it."""
         with self._changed:
-            self._taken = False
-            self._changed.notify_all()
+            if self._holder == threading.get_ident():
+                self._holder = None
+                self._changed.notify_all()

@@ -354,6 +354,32 @@ def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
     assert followed.is_set()
 
 
+def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_turn(new_engine, initial, monkeypatch):
+    """Else a hand that moves again would wait for all others to rest."""
+
+    class UnwantedError(Exception):
+        pass
+
+    turns, unwanted, ended = Turns(), threading.Event(), threading.Event()
+    monkeypatch.setattr(engine_module, "_turns", turns)
+
+    def refuse():
+        if unwanted.is_set():
+            raise UnwantedError
+
+    def refine():
+        with pytest.raises(UnwantedError):
+            list(frames)
+        ended.set()
+
+    frames = new_engine().frames(initial("draw_s"), checkpoint=refuse)
+    assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
+    with turns.taken():  # somebody who drags on and on
+        threading.Thread(target=refine, daemon=True).start()
+        unwanted.set()
+        assert ended.wait(PATIENCE)
+
+
 @pytest.mark.parametrize("space", ["task", "both"])
 def test_engines_that_take_turns_at_every_checkpoint_all_get_their_first_frames(
     new_engine, initial, monkeypatch, space

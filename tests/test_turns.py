@@ -86,6 +86,48 @@ def test_the_turn_ends_with_an_exception(crowd):
     assert crowd.all_gone()
 
 
+class UnwantedError(Exception):
+    """What a checkpoint raises."""
+
+
+@pytest.mark.parametrize("had", [False, True])
+def test_who_is_not_wanted_any_more_waits_no_longer_and_takes_the_turn_from_nobody(crowd, had):
+    """Whether it waits for its first turn, or gave it away."""
+    turns, held, ended = crowd.turns, threading.Event(), threading.Event()
+    waits, unwanted = threading.Event(), threading.Event()
+
+    def checkpoint():
+        waits.set()
+        if unwanted.is_set():
+            raise UnwantedError
+
+    def hurry():
+        with turns.taken():
+            held.set()
+            ended.wait(PATIENCE)
+
+    def refine():
+        with pytest.raises(UnwantedError), turns.taken(patient=True, checkpoint=checkpoint):
+            first.start()
+            while not held.is_set():
+                turns.give_way(checkpoint)
+
+    first, refining = threading.Thread(target=hurry, daemon=True), threading.Thread(target=refine, daemon=True)
+    if not had:
+        first.start()
+        assert held.wait(PATIENCE)
+    refining.start()
+    assert held.wait(PATIENCE) and waits.wait(PATIENCE)
+    unwanted.set()
+    refining.join(PATIENCE)
+    assert not refining.is_alive()
+    crowd.join_queue("next")
+    assert crowd.order == []  # the first one still has the turn
+    ended.set()
+    assert crowd.all_gone()
+    assert crowd.order == ["next"]
+
+
 def test_in_a_storm_only_one_has_the_turn_and_all_get_it(over):
     turns, alone, crowded = Turns(), threading.Semaphore(1), []
 
