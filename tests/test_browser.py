@@ -296,7 +296,9 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     (mesh,) = session.scenario.obstacles
     assert isinstance(mesh, MeshObstacle) and mesh.size == pytest.approx(0.15)
 
-    picture = visitor.pictures.obstacles.items[0]
+    pictures = visitor.pictures.obstacles
+    wait_until(lambda: [item.has_handles for item in pictures.items] == [True], "its handles")
+    (picture,) = pictures.items
     angles = itertools.cycle((0.8, 0.65, 0.5))  # where one try hits another handle the next does not
     arc = 0.65 * picture.gizmo.scale  # the handles that turn are quarters of circles between the arrows
 
