@@ -12,7 +12,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import gaussian_filter1d
 
-from dt_viz.demos import Demonstration, save_demonstrations
+from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 
 FOLDER = Path(__file__).parent
 DENSE = 2001  # points of a path before it is sampled in time
@@ -23,7 +23,7 @@ PUSH_START = np.array([0.34, -0.33, 0.38])
 PUSH_CONTACT = np.array([0.30, -0.47, 0.15])  # behind the box, where the hand is down
 PUSH_GOAL = np.array([-0.34, -0.42, 0.15])
 DROP_START = np.array([0.0, -0.28, 0.42])
-DROP_GOAL = np.array([0.0, -0.52, 0.26])  # above the centre pot, `dt_viz.tasks.POTS`
+DROP_GOAL = np.array([0.0, -0.52, 0.26])  # above the centre pot, `dt_viz.scenario.tasks.POTS`
 
 
 def draw_s(num_demonstrations: int = 7, seed: int = 41) -> tuple[Demonstration, ...]:

@@ -15,9 +15,9 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from dt_viz.fits import FitStore
-from dt_viz.scenario import View
-from dt_viz.tasks import TASKS
+from dt_viz.learning.store import FitStore
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.server import Server
 
 PICTURE = Path(__file__).parent / "screenshot.png"

@@ -35,10 +35,10 @@ def _serve(options: argparse.Namespace) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # numerical libraries read these when they are first imported
     from dt_viz.errors import DataError  # noqa: PLC0415
-    from dt_viz.fits import FitStore, default_cache_folder  # noqa: PLC0415
-    from dt_viz.imitation import ImitationError  # noqa: PLC0415
-    from dt_viz.obstacles import unit_sphere_map  # noqa: PLC0415
-    from dt_viz.tasks import TASKS, lasa_tasks  # noqa: PLC0415
+    from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
+    from dt_viz.learning.store import FitStore, default_cache_folder  # noqa: PLC0415
+    from dt_viz.obstacles.shapes import unit_sphere_map  # noqa: PLC0415
+    from dt_viz.scenario.tasks import TASKS, lasa_tasks  # noqa: PLC0415
     from dt_viz.ui.gate import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 

@@ -12,8 +12,8 @@ class cached_property(Generic[_Value]):
     """A property that is computed on first use and kept in the instance, without a lock.
 
     `functools.cached_property` of Python 3.10 and 3.11 holds one lock for each class attribute while it computes. What
-    is computed here may pause at a checkpoint and let another engine go first (see `dt_viz.turns`), which would then
-    wait for that lock for ever. Threads that ask for a value at the same time each compute it, and all get the one
+    is computed here may pause at a checkpoint and let another engine go first (see `dt_viz.engine.turns`), which would
+    then wait for that lock for ever. Threads that ask for a value at the same time each compute it, and all get the one
     that was ready first.
     """
 

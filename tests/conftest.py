@@ -9,12 +9,12 @@ import pytest
 import viser  # noqa: TID251 - a page for tests of pictures and controls
 from hypothesis import HealthCheck, settings
 
-from dt_viz.engine import Engine
-from dt_viz.fits import FitStore
-from dt_viz.obstacles import Sphere
-from dt_viz.robot import Robot, load_jaco
-from dt_viz.scenario import Scenario
-from dt_viz.tasks import TASKS
+from dt_viz.arm.robot import Robot, load_jaco
+from dt_viz.engine.engine import Engine
+from dt_viz.learning.store import FitStore
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import TASKS
 
 # Nothing here is timed, and a failure must come back on the next run.
 settings.register_profile(

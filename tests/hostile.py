@@ -23,8 +23,10 @@ import numpy as np
 import scipy.io
 import trimesh
 
-from dt_viz import clouds, demos, shapes, solids
 from dt_viz.errors import DataError
+from dt_viz.learning import demonstrations as demos
+from dt_viz.obstacles import clouds, solids
+from dt_viz.obstacles import files as shapes
 
 PROCESS = Path("/proc/self")
 """What Linux says of this process."""

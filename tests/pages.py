@@ -3,10 +3,10 @@
 from dataclasses import replace
 from typing import Any
 
-from dt_viz.engine import Frame, Stage
-from dt_viz.health import Health
-from dt_viz.scenario import Scenario
-from dt_viz.tasks import TASKS
+from dt_viz.engine.engine import Frame, Stage
+from dt_viz.motion.health import Health
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import TASKS
 
 
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:

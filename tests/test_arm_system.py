@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.arm_system import ArmSystem, Section
-from dt_viz.diffeo import AdaptiveFlow, Conjugated, Flow, Identity
-from dt_viz.following import Follower
+from dt_viz.arm.arm_system import ArmSystem, Section
+from dt_viz.arm.tracking import track
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow, Identity
+from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.obstacles import Sphere
-from dt_viz.solving import LIVE
-from dt_viz.systems import Attractor, DiffeomorphicSystem
-from dt_viz.tracking import track
+from dt_viz.motion.following import Follower
+from dt_viz.motion.solve import LIVE
+from dt_viz.obstacles.shapes import Sphere
 
 ARRIVED = 0.02
 """Metres in base space from the goal at which the motions that are compared end."""

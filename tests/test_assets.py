@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dt_viz.demos import load_demonstrations
+from dt_viz.learning.demonstrations import load_demonstrations
 from dt_viz.metrics import arc_length, resample_by_arc_length, sharpest_turn
-from dt_viz.tasks import POTS
+from dt_viz.scenario.tasks import POTS
 
 ASSETS = Path(__file__).parents[1] / "assets"
 TASKS = ["draw_s", "lift_box", "push_box", "draw_j", "drop_pots", "draw_c", "draw_g", "draw_w", "draw_z"]

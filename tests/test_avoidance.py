@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.avoidance import ACCEPTED_MARGIN, MAX_DURATION, ObstacleAvoidance, _crests, clearing_duration
-from dt_viz.behaviours import Motion
-from dt_viz.integrate import integrate_adaptive
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Scenario
+from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.transforms.avoidance import ACCEPTED_MARGIN, MAX_DURATION, ObstacleAvoidance, _crests, clearing_duration
+from dt_viz.transforms.base import Motion
 
 seeds = st.integers(0, 2**32 - 1)
 SPHERE = Sphere((0.1, -0.4, 0.3), 0.15)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.belief import MAX_POINTS, NEAR, believed, occupancy_picture
-from dt_viz.clouds import Cloud
-from dt_viz.engine import Stage
-from dt_viz.obstacles import Box, CloudObstacle, Cylinder, Sphere
-from dt_viz.scenario import View
-from dt_viz.several import Several
-from dt_viz.slices import Slice
+from dt_viz.engine.engine import Stage
+from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
+from dt_viz.obstacles.union import Several
+from dt_viz.pictures.occupancy import MAX_POINTS, NEAR, believed, occupancy_picture
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.slices import Slice
 
 AREA = Slice(np.array([0.0, -0.5, 0.4]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T, (0.2, 0.15))
 SHAPES = [

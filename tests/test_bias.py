@@ -7,9 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.avoidance import ACCEPTED_MARGIN
-from dt_viz.behaviours import Motion
-from dt_viz.bias import (
+from dt_viz.flows.diffeomorphisms import Flow, round_trip_error
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.metrics import resample_by_arc_length, sharpest_turn
+from dt_viz.motion.solve import FINE, LIVE, Ground, Solution, solve
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.tasks import DRAWING_AXES, POTS
+from dt_viz.transforms.avoidance import ACCEPTED_MARGIN
+from dt_viz.transforms.base import Motion
+from dt_viz.transforms.bias import (
     ACCEPTED,
     AIM,
     MAX_DURATION,
@@ -20,13 +27,6 @@ from dt_viz.bias import (
     closest_points,
     unit_field,
 )
-from dt_viz.diffeo import Flow, round_trip_error
-from dt_viz.metrics import resample_by_arc_length, sharpest_turn
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Layer, Scenario
-from dt_viz.solving import FINE, LIVE, Ground, Solution, solve
-from dt_viz.systems import DiffeomorphicSystem
-from dt_viz.tasks import DRAWING_AXES, POTS
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from dt_viz.body import FILE, BodyPoints, load_body_points
-from dt_viz.collision import load_collision_model
-from dt_viz.obstacles import Sphere
-from dt_viz.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes
+from dt_viz.arm.body_points import FILE, BodyPoints, load_body_points
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes
+from dt_viz.obstacles.shapes import Sphere
 
 SCRIPT = Path(__file__).parents[1] / "assets" / "make_body_points.py"
 OVERSHOOT = {-1: 0.0375, 0: 0.0295, 1: 0.0455, 2: 0.043, 3: 0.031, 4: 0.031, 5: 0.0255}

@@ -13,17 +13,17 @@ import trimesh
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-import dt_viz.fits
-from dt_viz.engine import ArmMotion
+import dt_viz.learning.store
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import ArmMotion
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.obstacles import MeshObstacle
-from dt_viz.robot import load_jaco
-from dt_viz.scenario import View
-from dt_viz.shapes import MAX_BYTES
-from dt_viz.stacking import bias_points
-from dt_viz.tasks import TASKS
+from dt_viz.obstacles.files import MAX_BYTES
+from dt_viz.obstacles.shapes import MeshObstacle
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.stack import bias_points
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.server import Server
-from dt_viz.ui.slice_layers import VOLUME
 from dt_viz.ui.visitor import Visitor
 
 CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -531,7 +531,7 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
             progress(0.5, "without end")
             time.sleep(0.02)
 
-    monkeypatch.setattr(dt_viz.fits, "fit", endless)
+    monkeypatch.setattr(dt_viz.learning.store, "fit", endless)
     open_tab(page, "Stack")
     page.get_by_role("textbox", name="Settings of").or_(page.locator("input[value='Avoidance']")).first.click()
     page.get_by_role("option", name="Imitation").click()

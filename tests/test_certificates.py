@@ -5,19 +5,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from dt_viz.certificates import MAX_OFF_POSTURE, OFF_MOTION, Shown, certified
-from dt_viz.cspace import LEVERS
-from dt_viz.diffeo import Diffeomorphism, Flow, Identity
-from dt_viz.engine import Engine, Frame, Stage
-from dt_viz.fields import Array, GaussianGrid, GridRBF
-from dt_viz.health import RISES, Health
-from dt_viz.integrate import euler, implicit_euler
-from dt_viz.obstacles import Sphere
-from dt_viz.retiming import within_velocity_limits
-from dt_viz.rollouts import Bundle, Rays, evenly_sampled
-from dt_viz.solved import Solved
-from dt_viz.solving import Solution
-from dt_viz.systems import Attractor
+from dt_viz.arm.cspace import LEVERS
+from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
+from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
+from dt_viz.flows.systems import Attractor
+from dt_viz.motion.certificates import MAX_OFF_POSTURE, OFF_MOTION, Shown, certified
+from dt_viz.motion.health import RISES, Health
+from dt_viz.motion.solve import Solution
+from dt_viz.motion.solved import Solved
+from dt_viz.obstacles.shapes import Sphere
 
 BASE = Attractor(np.array([0.5, 0.2, 0.0]), 0.2, 0.05)
 RAYS = Rays(np.array([[-0.8, -0.3, 0.1], [-0.6, 0.7, -0.2]]), BASE)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dt_viz.collision import (
+from dt_viz.arm.collision import (
     SELF_REACH,
     SELF_TOLERANCE,
     TOLERANCE,
@@ -22,11 +22,11 @@ from dt_viz.collision import (
     Nearest,
     load_collision_model,
 )
-from dt_viz.link_distances import RESOLUTION, SHAPE_TOLERANCE
-from dt_viz.obstacles import Box, Cylinder, MeshObstacle, Quaternion, Sphere
-from dt_viz.robot import LinkMesh, collision_meshes, package_folder, urdf_path
-from dt_viz.solids import Solid
-from dt_viz.tracking import inverse_kinematics, track
+from dt_viz.arm.link_distances import RESOLUTION, SHAPE_TOLERANCE
+from dt_viz.arm.robot import LinkMesh, collision_meshes, package_folder, urdf_path
+from dt_viz.arm.tracking import inverse_kinematics, track
+from dt_viz.obstacles.shapes import Box, Cylinder, MeshObstacle, Quaternion, Sphere
+from dt_viz.obstacles.solids import Solid
 
 HAND = 6
 FOLDED = np.array([0.0, np.pi, 0.5, 0.0, 5.7, 0.0])  # the hand in the upper arm

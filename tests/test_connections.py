@@ -18,8 +18,8 @@ from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
-from dt_viz.shapes import MAX_BYTES
-from dt_viz.tasks import TASKS
+from dt_viz.obstacles.files import MAX_BYTES
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import gate
 from dt_viz.ui.origins import Origin
 from dt_viz.ui.server import MAX_WAITING, Server

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.body import load_body_points
-from dt_viz.cspace import (
+from dt_viz.arm.body_points import load_body_points
+from dt_viz.arm.cspace import (
     BLOCK,
     COMPLEX_STEP,
     CORE,
@@ -19,9 +19,9 @@ from dt_viz.cspace import (
     WholeArmField,
     by_complex_steps,
 )
-from dt_viz.diffeo import AdaptiveFlow, Chain, Flow, Inverse, round_trip_error
-from dt_viz.obstacles import Box, Sphere
-from dt_viz.robot import HOME, NUM_JOINTS, Robot, load_jaco
+from dt_viz.arm.robot import HOME, NUM_JOINTS, Robot, load_jaco
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow, Inverse, round_trip_error
+from dt_viz.obstacles.shapes import Box, Sphere
 
 ROBOT: Robot = load_jaco()
 BODY = load_body_points().on_moving_links
@@ -273,7 +273,7 @@ class TestJointLimits:
 
 
 class TestFlows:
-    """What `dt_viz.whole_arm` makes of the generators."""
+    """What `dt_viz.arm.whole_arm` makes of the generators."""
 
     def chain(self, field, duration, tolerance=1e-9):
         """For a duration in units in which both kinds of generators are about as fast."""

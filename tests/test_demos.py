@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dt_viz.demos import (
+from dt_viz.learning.demonstrations import (
     MAX_BYTES,
     Demonstration,
     DemonstrationError,

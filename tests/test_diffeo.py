@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.diffeo import (
+from dt_viz.flows.diffeomorphisms import (
     AdaptiveFlow,
     Chain,
     Conjugated,
@@ -16,8 +16,8 @@ from dt_viz.diffeo import (
     min_det_jacobian,
     round_trip_error,
 )
-from dt_viz.fields import GaussianGrid, GridRBF, PlacedField
-from dt_viz.integrate import euler, implicit_euler, rk4
+from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField
+from dt_viz.flows.integrators import euler, implicit_euler, rk4
 
 
 def field(dim, seed=0, strength=0.3):

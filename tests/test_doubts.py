@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.avoidance import BESIDE
-from dt_viz.bias import Biasing, BiasPoint, vector
-from dt_viz.collision import Nearest, load_collision_model
-from dt_viz.doubts import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_doubts
-from dt_viz.engine import Stage
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Layer, Scenario
-from dt_viz.stacking import aware, plane_of
+from dt_viz.arm.collision import Nearest, load_collision_model
+from dt_viz.engine.engine import Stage
+from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_doubts
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.stack import aware, plane_of
+from dt_viz.transforms.avoidance import BESIDE
+from dt_viz.transforms.bias import Biasing, BiasPoint, vector
 
 
 def stage(engine, scenario, wanted=Stage.ROLLOUTS):

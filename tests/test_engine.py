@@ -7,20 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import dt_viz.engine as engine_module
-import dt_viz.turns as turns_module
-from dt_viz import doubts, rollouts
-from dt_viz.bias import BiasPoint, vector
-from dt_viz.demos import Demonstration
-from dt_viz.doubts import MAX_TARGET_MISS, UNSAMPLED
-from dt_viz.engine import Stage
+import dt_viz.engine.engine as engine_module
+import dt_viz.engine.turns as turns_module
+from dt_viz.arm.retiming import used_fraction
+from dt_viz.engine.engine import Stage
+from dt_viz.engine.turns import Turns
+from dt_viz.flows import rollouts
 from dt_viz.interruption import interruptible
+from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.obstacles import Sphere
-from dt_viz.retiming import used_fraction
-from dt_viz.scenario import Scenario
-from dt_viz.stacking import plane_of, switched, with_bias_point
-from dt_viz.turns import Turns
+from dt_viz.motion import diagnostics as doubts
+from dt_viz.motion.diagnostics import MAX_TARGET_MISS, UNSAMPLED
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import plane_of, switched, with_bias_point
+from dt_viz.transforms.bias import BiasPoint, vector
 
 PATIENCE = 60
 """Seconds after which threads that should have ended are given up; nothing takes that long."""

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.escape import ALIKE, ON_THE_WAY, escape_directions
-from dt_viz.obstacles import Sphere
+from dt_viz.arm.escape import ALIKE, ON_THE_WAY, escape_directions
+from dt_viz.obstacles.shapes import Sphere
 
 NOWHERE = np.zeros((1, 3))  # tangents that make no direction dearer than another
 SHIFTS = np.linspace(0, 0.8, 1601)

@@ -9,9 +9,7 @@ import pytest
 import scipy.io
 from PIL import Image
 
-from dt_viz.demos import Demonstration, save_demonstrations
-from dt_viz.diffeo import Identity
-from dt_viz.engine import Stage
+from dt_viz.engine.engine import Stage
 from dt_viz.evaluate import latency, rollouts
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
@@ -20,10 +18,12 @@ from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
 from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
-from dt_viz.imitation import ImitationSettings, fit
+from dt_viz.flows.diffeomorphisms import Identity
+from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
+from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
+from dt_viz.learning.imitation import ImitationSettings, fit
+from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
-from dt_viz.systems import Attractor, DiffeomorphicSystem
-from dt_viz.timing import TimedAttractor
 
 NUM_DEMONSTRATIONS = 2
 
@@ -225,8 +225,8 @@ def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessi
 @pytest.fixture(scope="module")
 def middle(lasa):
     """The middle of the mean demonstration in the world, metres."""
-    from dt_viz.demos import load_demonstrations
-    from dt_viz.tasks import drawing_task
+    from dt_viz.learning.demonstrations import load_demonstrations
+    from dt_viz.scenario.tasks import drawing_task
 
     paths = drawing_task("Hook", "", "", load_demonstrations(lasa / "Hook.mat")).paths
     return np.mean([resample_by_arc_length(path, 101)[50] for path in paths], axis=0)
@@ -481,7 +481,7 @@ def test_arguments_that_make_no_sense_are_refused(capsys, arguments, message):
 
 def test_a_shape_that_cannot_be_fitted_does_not_keep_the_others_from_it(lasa, tmp_path, monkeypatch, capsys):
     from dt_viz.evaluate import imitation
-    from dt_viz.imitation import ImitationError
+    from dt_viz.learning.imitation import ImitationError
 
     def fit_only_in_the_plane(demonstrations, settings):
         if demonstrations[0].dimension == 3:

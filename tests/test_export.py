@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from dt_viz.ui.export import PictureSaver
+from dt_viz.ui.scene.export import PictureSaver
 
 PATIENCE = 30.0
 

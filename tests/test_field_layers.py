@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dt_viz.engine import Stage
-from dt_viz.field_layers import MAX_OFFSET, SEPARATION
-from dt_viz.scenario import SLICE_COLOURS, View
-from dt_viz.slices import SlicePose
-from dt_viz.solving import FINE, LIVE, cut_off, solve
-from dt_viz.stacking import levels, place_beside, with_bias_point
+from dt_viz.engine.engine import Stage
+from dt_viz.motion.solve import FINE, LIVE, cut_off, solve
+from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
+from dt_viz.scenario.scenario import SLICE_COLOURS, View
+from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.stack import levels, place_beside, with_bias_point
 
 TASK_NAMES = ["draw_s", "lift_box"]
 
@@ -68,8 +68,8 @@ def test_everything_lies_on_the_slice_wherever_it_is(engine, scenario, colour):
 def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, scenario, monkeypatch):
     engine = new_engine()
     before = list(engine.frames(scenario))
-    monkeypatch.setattr("dt_viz.engine.solve", lambda *_: pytest.fail("solved again"))
-    monkeypatch.setattr("dt_viz.engine.certified", lambda *_: pytest.fail("certified again"))
+    monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
+    monkeypatch.setattr("dt_viz.engine.engine.certified", lambda *_: pytest.fail("certified again"))
     moved = replace(scenario, view=View(slice=tilted(engine.task(scenario.task)), level="Imitation"))
     for old, new in zip(before, engine.frames(moved), strict=True):
         assert new.scenario == moved and new.stage is old.stage and new.level == 0

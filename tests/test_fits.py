@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import dt_viz.fits
-from dt_viz.demos import Demonstration
-from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.imitation import ImitationError, ImitationSettings, fit
+import dt_viz.learning.store
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.imitation import ImitationError, ImitationSettings, fit
+from dt_viz.learning.store import FitStore, default_cache_folder
 
 SETTINGS = ImitationSettings(num_layers=2, num_points=12, max_iterations=2)
 
@@ -40,7 +40,7 @@ def counted(monkeypatch, learned):
             progress(1.0, "done")
         return learned
 
-    monkeypatch.setattr(dt_viz.fits, "fit", quick)
+    monkeypatch.setattr(dt_viz.learning.store, "fit", quick)
     return calls
 
 
@@ -214,7 +214,7 @@ def test_a_full_disk_does_not_stop_the_fit_and_leaves_nothing_behind(tmp_path, c
         file.write(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(dt_viz.fits.np, "savez_compressed", full)
+    monkeypatch.setattr(dt_viz.learning.store.np, "savez_compressed", full)
     assert FitStore(tmp_path).get(arcs(), SETTINGS) is learned
     assert "No space left" in caplog.text
     assert list(tmp_path.iterdir()) == []
@@ -235,7 +235,7 @@ def test_a_failed_fit_is_tried_again(tmp_path, monkeypatch, learned):
             raise answer
         return answer
 
-    monkeypatch.setattr(dt_viz.fits, "fit", failing)
+    monkeypatch.setattr(dt_viz.learning.store, "fit", failing)
     store = FitStore(tmp_path)
     with pytest.raises(ImitationError, match="too short"):
         store.get(arcs(), SETTINGS)
@@ -252,7 +252,7 @@ def test_two_threads_that_want_the_same_fit_make_it_once(tmp_path, monkeypatch, 
         assert release.wait(30)
         return learned
 
-    monkeypatch.setattr(dt_viz.fits, "fit", slow)
+    monkeypatch.setattr(dt_viz.learning.store, "fit", slow)
     store, results = FitStore(tmp_path), []
     threads = [threading.Thread(target=lambda: results.append(store.get(arcs(), SETTINGS))) for _ in range(4)]
     for thread in threads:
@@ -285,7 +285,7 @@ def gated(monkeypatch, learned):
         finally:
             noted["ended"].release()
 
-    monkeypatch.setattr(dt_viz.fits, "fit", slow)
+    monkeypatch.setattr(dt_viz.learning.store, "fit", slow)
     yield gates, noted
     for gate in gates.values():
         gate.set()
@@ -375,7 +375,7 @@ def test_who_waits_can_give_up_although_the_fit_says_nothing(tmp_path, monkeypat
         assert release.wait(30)
         return learned
 
-    monkeypatch.setattr(dt_viz.fits, "fit", silent)
+    monkeypatch.setattr(dt_viz.learning.store, "fit", silent)
     visitor = Visitor(FitStore(tmp_path), 2)
     visitor.gives_up.set()
     visitor.join()

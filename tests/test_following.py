@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.engine import Engine, Stage
-from dt_viz.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
-from dt_viz.obstacles import Sphere
-from dt_viz.several import Several
-from dt_viz.solving import LIVE, solve
-from dt_viz.tasks import TASKS
-from dt_viz.tracking import UnreachableError
-from dt_viz.whole_arm import NUM_CONFIGURATIONS
+from dt_viz.arm.tracking import UnreachableError
+from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
+from dt_viz.engine.engine import Engine, Stage
+from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
+from dt_viz.motion.solve import LIVE, solve
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Several
+from dt_viz.scenario.tasks import TASKS
 
 FAR = Sphere((3.0, 3.0, 3.0))
 

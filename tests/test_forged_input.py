@@ -16,14 +16,15 @@ from pages import frame_of
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
-from dt_viz.bias import BiasPoint
-from dt_viz.engine import Engine
-from dt_viz.integration import Integration
-from dt_viz.obstacles import Box, Cylinder, Sphere
-from dt_viz.scenario import Scenario, View
-from dt_viz.stacking import with_bias_point
-from dt_viz.tasks import TASKS
-from dt_viz.ui import controls, gestures, handles
+from dt_viz.engine.engine import Engine
+from dt_viz.flows.integration import Integration
+from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import with_bias_point
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.bias import BiasPoint
+from dt_viz.ui import controls, gestures
+from dt_viz.ui.scene import handles
 from dt_viz.ui.visitor import Visitor
 
 BORDERS = {controls.__name__, gestures.__name__, handles.__name__}

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.arm_system import Section
-from dt_viz.engine import Stage
-from dt_viz.following import MAX_TRACKING_ERROR
-from dt_viz.retiming import used_fraction
-from dt_viz.solving import LIVE, solve
+from dt_viz.arm.arm_system import Section
+from dt_viz.arm.retiming import used_fraction
+from dt_viz.engine.engine import Stage
+from dt_viz.motion.following import MAX_TRACKING_ERROR
+from dt_viz.motion.solve import LIVE, solve
 
 STEPS = 6
 """Events of a drag, two centimetres apart."""

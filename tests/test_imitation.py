@@ -6,15 +6,15 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from dt_viz.demos import Demonstration
-from dt_viz.diffeo import Flow
-from dt_viz.fields import GaussianGrid, GridRBF
-from dt_viz.imitation import Imitation, ImitationSettings, fit, paper_preset
-from dt_viz.integrate import euler, implicit_euler
-from dt_viz.layers import Layer, Stack, equally_spaced_grid, min_step_determinant
-from dt_viz.preparation import ImitationError
-from dt_viz.unbend import unbending
-from dt_viz.velocity_fit import VelocityFit
+from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.fields import GaussianGrid, GridRBF
+from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.flow_chain import Layer, Stack, equally_spaced_grid, min_step_determinant
+from dt_viz.learning.imitation import Imitation, ImitationSettings, fit, paper_preset
+from dt_viz.learning.preparation import ImitationError
+from dt_viz.learning.unbending import unbending
+from dt_viz.learning.velocity import VelocityFit
 
 
 def hooks(dim, num=4, seed=0, scale=1.0):

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from dt_viz.fields import GaussianGrid, GridRBF
-from dt_viz.integrate import euler, implicit_euler, integrate, integrate_adaptive, rk4
-from dt_viz.obstacles import Sphere
+from dt_viz.flows.fields import GaussianGrid, GridRBF
+from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4
+from dt_viz.obstacles.shapes import Sphere
 
 seeds = st.integers(0, 2**32 - 1)
 STEPS = [euler, implicit_euler, rk4]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from test_stacks import random_scenario
 
-from dt_viz.diffeo import AdaptiveFlow, Conjugated, Flow
-from dt_viz.engine import Stage
-from dt_viz.fields import GaussianGrid, GridRBF
-from dt_viz.health import fold_doubts, integration_doubts
-from dt_viz.integrate import euler, rk4
-from dt_viz.integration import AUTO, METHODS, Integration
-from dt_viz.scenario import Scenario
-from dt_viz.stacking import AVOIDANCE, WHOLE_ARM, place_beside, with_bias_point
+from dt_viz.engine.engine import Stage
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow
+from dt_viz.flows.fields import GaussianGrid, GridRBF
+from dt_viz.flows.integration import AUTO, METHODS, Integration
+from dt_viz.flows.integrators import euler, rk4
+from dt_viz.motion.health import fold_doubts, integration_doubts
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import AVOIDANCE, WHOLE_ARM, place_beside, with_bias_point
 
 
 def field(strength=0.5):

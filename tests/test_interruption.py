@@ -5,8 +5,8 @@ import threading
 import numpy as np
 import pytest
 
-from dt_viz.diffeo import AdaptiveFlow, Flow
-from dt_viz.fields import GaussianGrid, GridRBF
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Flow
+from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.interruption import checkpoint, interruptible
 
 GRID = GaussianGrid.covering(np.array([[-1.0, -1.0], [1.0, 1.0]]), 0.5)

@@ -10,7 +10,7 @@ import pytest
 from dt_viz.evaluate import load
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.protocol_client import ProtocolClient
-from dt_viz.tasks import TASKS
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.server import Server
 
 NUM_VISITORS = 8

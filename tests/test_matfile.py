@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from dt_viz.matfile import MAX_UNPACKED_BYTES, MatFileError, read_variable
+from dt_viz.learning.matfile import MAX_UNPACKED_BYTES, MatFileError, read_variable
 
 NUMBERS = [np.float64, np.float32, np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.int64, np.uint64]
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dt_viz.errors import FormatError
-from dt_viz.mending import MAX_FILLED, closed
+from dt_viz.obstacles.mending import MAX_FILLED, closed
 
 BALL = trimesh.creation.icosphere(3, 0.1)
 BOX = trimesh.creation.box((0.15, 0.1, 0.08))

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 
 from dt_viz.errors import FormatError
-from dt_viz.glbfile import read_glb
-from dt_viz.meshfile import read_obj, read_stl
-from dt_viz.plyfile import read_ply
+from dt_viz.files.glb import read_glb
+from dt_viz.files.meshes import read_obj, read_stl
+from dt_viz.files.ply import read_ply
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from dt_viz.behaviours import Built, Motion
-from dt_viz.diffeo import Flow
-from dt_viz.engine import Stage
-from dt_viz.fields import Array
-from dt_viz.scenario import Layer
+from dt_viz.engine.engine import Stage
+from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.fields import Array
+from dt_viz.scenario.scenario import Layer
+from dt_viz.transforms.base import Built, Motion
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from dt_viz.errors import FormatError
-from dt_viz.npzfile import MAX_MEMBERS, MAX_NPY_HEADER, NpzFile
+from dt_viz.files.npz import MAX_MEMBERS, MAX_NPY_HEADER, NpzFile
 
 MB = 10**6
 NUMBERS = [

@@ -7,10 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dt_viz.avoidance import clearing_duration
-from dt_viz.clouds import Cloud
-from dt_viz.integrate import integrate_adaptive
-from dt_viz.obstacles import (
+from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.shapes import (
     MAX_BALLS,
     UPRIGHT,
     Box,
@@ -22,7 +21,8 @@ from dt_viz.obstacles import (
     Sphere,
     rotation,
 )
-from dt_viz.solids import Solid
+from dt_viz.obstacles.solids import Solid
+from dt_viz.transforms.avoidance import clearing_duration
 
 TILTED: Quaternion = tuple(np.roll(Rotation.from_rotvec([0.4, -0.7, 1.1]).as_quat(), 1).tolist())
 PLACE = (0.1, -0.4, 0.3)

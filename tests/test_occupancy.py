@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit
 
-from dt_viz.integrate import integrate_adaptive
-from dt_viz.obstacles import Sphere, unit_sphere_map
-from dt_viz.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels
+from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels
+from dt_viz.obstacles.shapes import Sphere, unit_sphere_map
 
 seeds = st.integers(0, 2**32 - 1)
 BALL = unit_sphere_map()

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.clouds import Cloud
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.obstacles import Box, CloudObstacle, Cylinder, Sphere
-from dt_viz.paper_scenes import SCENES, clover, in_clover
-from dt_viz.scenario import View
-from dt_viz.stacking import bias_points
-from dt_viz.tasks import POTS, TASKS
+from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
+from dt_viz.scenario.paper_scenes import SCENES, clover, in_clover
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.stack import bias_points
+from dt_viz.scenario.tasks import POTS, TASKS
 
 
 @pytest.fixture(scope="module")

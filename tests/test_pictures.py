@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dt_viz.engine import Stage
-from dt_viz.obstacles import Sphere
-from dt_viz.pictures import FINE_SPACING, LINE_SPACING
-from dt_viz.scenario import View
-from dt_viz.slices import SlicePose
-from dt_viz.solving import FINE, LIVE, solve
+from dt_viz.engine.engine import Stage
+from dt_viz.motion.solve import FINE, LIVE, solve
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.pictures.sketchbook import FINE_SPACING, LINE_SPACING
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.slices import SlicePose
 
 TASK_NAMES = ["draw_s", "lift_box"]
 ALL = View(generator=True, grid=True, base=True)

@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.body import load_body_points
-from dt_viz.engine import Stage
+from dt_viz.arm.body_points import load_body_points
+from dt_viz.engine.engine import Stage
 from dt_viz.metrics import (
     discrete_frechet,
     distance_from_path,
     maximum_collision_distance,
     resample_by_arc_length,
 )
-from dt_viz.profiles import NUM_SAMPLES, body_profile
-from dt_viz.scenario import View
-from dt_viz.ui.health_plots import HealthPlots, table_html
+from dt_viz.motion.profiles import NUM_SAMPLES, body_profile
+from dt_viz.scenario.scenario import View
+from dt_viz.ui.panel.health_plots import HealthPlots, table_html
 
 SHOWN = View(health_plots=True)
 

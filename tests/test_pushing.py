@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.engine import ArmMotion, Stage
-from dt_viz.pushing import DISTANCES, MAX_TRACKING_ERROR, PUSH_SECONDS
-from dt_viz.retiming import used_fraction
-from dt_viz.solving import FINE, solve
+from dt_viz.arm.retiming import used_fraction
+from dt_viz.engine.engine import ArmMotion, Stage
+from dt_viz.motion.pushing import DISTANCES, MAX_TRACKING_ERROR, PUSH_SECONDS
+from dt_viz.motion.solve import FINE, solve
 from dt_viz.ui import playback as playback_module
 from dt_viz.ui.playback import Playback
 

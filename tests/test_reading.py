@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from dt_viz import engine
+from dt_viz.engine import engine
 from dt_viz.interruption import UnwantedError, checkpoint
 from dt_viz.ui.reading import Reader
 

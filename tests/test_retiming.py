@@ -8,8 +8,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dt_viz.retiming import NEGLIGIBLE, RAMP, joint_velocities, used_fraction, within_velocity_limits
-from dt_viz.robot import NUM_JOINTS
+from dt_viz.arm.retiming import NEGLIGIBLE, RAMP, joint_velocities, used_fraction, within_velocity_limits
+from dt_viz.arm.robot import NUM_JOINTS
 
 LIMITS = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 0.8])
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dt_viz.robot import (
+from dt_viz.arm.robot import (
     END_EFFECTOR_FRAME,
     NUM_JOINTS,
     Robot,
@@ -69,12 +69,12 @@ class TestModel:
             assert (package_folder() / mesh.removeprefix("package://")).is_file()
 
     def test_missing_package_is_named(self, monkeypatch):
-        monkeypatch.setattr("dt_viz.robot.DISTRIBUTION", "no-such-robot-data")
+        monkeypatch.setattr("dt_viz.arm.robot.DISTRIBUTION", "no-such-robot-data")
         with pytest.raises(FileNotFoundError, match="pip install no-such-robot-data"):
             urdf_path()
 
     def test_package_without_the_urdf_is_named(self, monkeypatch):
-        monkeypatch.setattr("dt_viz.robot.DISTRIBUTION", "numpy")
+        monkeypatch.setattr("dt_viz.arm.robot.DISTRIBUTION", "numpy")
         with pytest.raises(FileNotFoundError, match=r"numpy .* holds no .*kinova\.urdf"):
             urdf_path()
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz import rollouts
-from dt_viz.rollouts import ARRIVED, Bundle, Rays, evenly_sampled, refined
-from dt_viz.systems import Attractor
+from dt_viz.flows import rollouts
+from dt_viz.flows.rollouts import ARRIVED, Bundle, Rays, evenly_sampled, refined
+from dt_viz.flows.systems import Attractor
 
 RAYS = Rays(
     np.array([[1.0, 0.0, 0.0], [0.0, 0.7, 0.2], [-0.5, -0.4, 0.3]]), Attractor(np.array([0.05, 0.02, -0.01]), 0.2, 0.05)

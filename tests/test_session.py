@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from dt_viz import interruption
-from dt_viz.bias import BiasPoint
-from dt_viz.demos import DemonstrationError
-from dt_viz.engine import Engine, Stage
-from dt_viz.imitation import ImitationError
-from dt_viz.obstacles import Box, Sphere
-from dt_viz.paper_scenes import SCENES
-from dt_viz.scenario import Layer, Scenario, View
-from dt_viz.slices import SlicePose
-from dt_viz.stacking import AVOIDANCE, IMITATION, with_bias_point, without
-from dt_viz.tasks import TASKS
-from dt_viz.tracking import UnreachableError
-from dt_viz.ui import session as session_module
-from dt_viz.ui.session import GESTURE_PAUSE, MAX_UNDO, Session
+from dt_viz.arm.tracking import UnreachableError
+from dt_viz.engine import session as session_module
+from dt_viz.engine.engine import Engine, Stage
+from dt_viz.engine.session import GESTURE_PAUSE, MAX_UNDO, Session
+from dt_viz.learning.demonstrations import DemonstrationError
+from dt_viz.learning.imitation import ImitationError
+from dt_viz.obstacles.shapes import Box, Sphere
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.scenario import Layer, Scenario, View
+from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.stack import AVOIDANCE, IMITATION, with_bias_point, without
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.bias import BiasPoint
 
 PATIENCE = 30.0
 

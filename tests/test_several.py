@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.bias import vector
-from dt_viz.obstacles import Box, Sphere
-from dt_viz.several import ROUNDING, Several
+from dt_viz.obstacles.shapes import Box, Sphere
+from dt_viz.obstacles.union import ROUNDING, Several
+from dt_viz.transforms.bias import vector
 
 PARTS = (
     Sphere((0.0, 0.0, 0.0), 0.15),

@@ -11,8 +11,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dt_viz.obstacles import CloudObstacle, MeshObstacle
-from dt_viz.shapes import MAX_BYTES, MAX_FACES, ShapeError, load_cloud, load_mesh, read_cloud, read_mesh
+from dt_viz.obstacles.files import MAX_BYTES, MAX_FACES, ShapeError, load_cloud, load_mesh, read_cloud, read_mesh
+from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle
 
 FORMATS = ("stl", "obj", "ply", "glb")
 BOX = trimesh.creation.box((0.15, 0.1, 0.05))

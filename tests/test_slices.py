@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dt_viz.slices import Slice, SlicePose, level_line
-from dt_viz.tasks import TASKS
+from dt_viz.scenario.slices import Slice, SlicePose, level_line
+from dt_viz.scenario.tasks import TASKS
 
 numbers = st.floats(-1, 1)
 poses = st.builds(

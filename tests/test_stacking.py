@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from dt_viz.avoidance import ObstacleAvoidance
-from dt_viz.bias import Biasing, BiasPoint
-from dt_viz.engine import Stage
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Layer, Scenario
-from dt_viz.stacking import (
+from dt_viz.engine.engine import Stage
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.stack import (
     AVOIDANCE,
     BESIDE,
     IMITATION,
@@ -24,7 +22,9 @@ from dt_viz.stacking import (
     with_changed_point,
     without,
 )
-from dt_viz.tasks import TASKS
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.avoidance import ObstacleAvoidance
+from dt_viz.transforms.bias import Biasing, BiasPoint
 
 PLACES = ((0.1, -0.5, 0.4), (0.2, -0.5, 0.4), (0.3, -0.5, 0.4))
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from dt_viz.avoidance import GOAL_INSIDE, STAYS_INSIDE
-from dt_viz.bias import Biasing, BiasPoint
-from dt_viz.doubts import MAX_GOAL_MISS, MAX_TARGET_MISS
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.obstacles import Box, Cylinder, Sphere
-from dt_viz.scenario import Layer, Scenario
+from dt_viz.motion.diagnostics import MAX_GOAL_MISS, MAX_TARGET_MISS
+from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.transforms.avoidance import GOAL_INSIDE, STAYS_INSIDE
+from dt_viz.transforms.bias import Biasing, BiasPoint
 
 TASK_NAMES = ("draw_s", "lift_box", "push_box")
 INSIDE = "inside the obstacle"

@@ -7,17 +7,17 @@ from typing import cast
 import numpy as np
 import pytest
 
-from dt_viz.bias import Biasing, BiasPoint
-from dt_viz.diffeo import Flow
-from dt_viz.engine import Stage
-from dt_viz.fields import PlacedField
-from dt_viz.ground import Ground
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Layer
-from dt_viz.solving import FINE, LIVE, solve
-from dt_viz.stacking import plane_of
-from dt_viz.starts import with_grid
-from dt_viz.whole_arm import MOVED
+from dt_viz.arm.whole_arm import MOVED
+from dt_viz.engine.engine import Stage
+from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.fields import PlacedField
+from dt_viz.motion.nominal import Ground
+from dt_viz.motion.solve import FINE, LIVE, solve
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Layer
+from dt_viz.scenario.stack import plane_of
+from dt_viz.scenario.starts import with_grid
+from dt_viz.transforms.bias import Biasing, BiasPoint
 
 NUM = 5
 

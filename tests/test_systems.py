@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.diffeo import AdaptiveFlow, Chain, Flow, Identity, Placed
-from dt_viz.fields import GaussianGrid, GridRBF
-from dt_viz.integrate import euler, implicit_euler
-from dt_viz.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow, Identity, Placed
+from dt_viz.flows.fields import GaussianGrid, GridRBF
+from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 
 seeds = st.integers(0, 2**32 - 1)
 

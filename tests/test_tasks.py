@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from dt_viz.demos import DemonstrationError
+from dt_viz.arm.robot import load_jaco
+from dt_viz.arm.tracking import inverse_kinematics, track
+from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.robot import load_jaco
-from dt_viz.scenario import SPACES
-from dt_viz.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
-from dt_viz.tracking import inverse_kinematics, track
+from dt_viz.scenario.scenario import SPACES
+from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
 
 
 def write_shape(path, dim):

@@ -3,8 +3,8 @@
 import pytest
 
 from dt_viz.errors import FormatError
+from dt_viz.files.text import MAX_LENGTH, numbered_lines, read_table
 from dt_viz.interruption import UnwantedError, interruptible
-from dt_viz.textfile import MAX_LENGTH, numbered_lines, read_table
 
 HEADERS = (("x", "y"), ("name", "x", "y"))
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from dt_viz.robot import NUM_JOINTS, Robot, load_jaco
-from dt_viz.tracking import STEP_TOLERANCE, JointPath, UnreachableError, inverse_kinematics, track
+from dt_viz.arm.robot import NUM_JOINTS, Robot, load_jaco
+from dt_viz.arm.tracking import STEP_TOLERANCE, JointPath, UnreachableError, inverse_kinematics, track
 
 BOX = np.array([[-0.4, -0.65, 0.05], [0.4, -0.3, 0.75]])  # where the tasks live, metres
 STEPS = 5 * STEP_TOLERANCE  # rad, that a posture may be away from the best one

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from dt_viz.avoidance import ObstacleAvoidance
-from dt_viz.bias import BiasPoint
-from dt_viz.integration import AUTO, Integration
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Layer, Scenario, View
-from dt_viz.stacking import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, with_bias_point
-from dt_viz.tuning import flow_settings, transforms, tuned, with_flow
+from dt_viz.flows.integration import AUTO, Integration
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Layer, Scenario, View
+from dt_viz.scenario.stack import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, with_bias_point
+from dt_viz.scenario.tuning import flow_settings, transforms, tuned, with_flow
+from dt_viz.transforms.avoidance import ObstacleAvoidance
+from dt_viz.transforms.bias import BiasPoint
 
 LAYERS = with_bias_point(with_bias_point((), BiasPoint((0.2, -0.5, 0.4))), BiasPoint((0.0, -0.4, 0.2), strength=0.7))
 SCENARIO = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), layers=LAYERS, space="both", duration=0.4)

@@ -4,8 +4,8 @@ import threading
 
 import pytest
 
-import dt_viz.turns as turns_module
-from dt_viz.turns import Turns
+import dt_viz.engine.turns as turns_module
+from dt_viz.engine.turns import Turns
 
 PATIENCE = 30
 """Seconds after which a test gives up; nothing takes that long."""

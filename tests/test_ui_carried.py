@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dt_viz.tasks import POTS
-from dt_viz.ui.carried import RADIUS, Carried, fallen
-from dt_viz.ui.pots import WALL
+from dt_viz.scenario.tasks import POTS
+from dt_viz.ui.scene.carried import RADIUS, Carried, fallen
+from dt_viz.ui.scene.pots import WALL
 
 LEFT = np.array([POTS[0].x, POTS[0].y, 0.25])
 BETWEEN = np.array([(POTS[0].x + POTS[1].x) / 2, POTS[0].y, 0.25])

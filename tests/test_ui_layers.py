@@ -12,30 +12,30 @@ import trimesh
 from pages import frame_of
 from viser import transforms  # noqa: TID251
 
-from dt_viz.bias import BiasPoint
-from dt_viz.body import load_body_points
-from dt_viz.collision import CollisionReport, Nearest
-from dt_viz.demos import DemonstrationError
-from dt_viz.engine import ArmMotion, Stage
-from dt_viz.health import Health
-from dt_viz.obstacles import Sphere
-from dt_viz.paper_scenes import SCENES
-from dt_viz.robot import load_jaco
-from dt_viz.scenario import Scenario, View
-from dt_viz.stacking import with_bias_point
-from dt_viz.tasks import TASKS
-from dt_viz.ui import palette
-from dt_viz.ui.arm import PEDESTAL
-from dt_viz.ui.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
-from dt_viz.ui.legend import OCCUPANCY
-from dt_viz.ui.links import CELL, bodies, light_shells, simplified
-from dt_viz.ui.panel import CHANGED, COMPUTING, PLOTS, VIEW_LABELS, Panel, hint, status_html
-from dt_viz.ui.picture import Arrows, Lines
+from dt_viz.arm.body_points import load_body_points
+from dt_viz.arm.collision import CollisionReport, Nearest
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import ArmMotion, Stage
+from dt_viz.engine.session import Pace, Session
+from dt_viz.learning.demonstrations import DemonstrationError
+from dt_viz.motion.health import Health
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import with_bias_point
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.bias import BiasPoint
+from dt_viz.ui.panel.panel import CHANGED, COMPUTING, PLOTS, VIEW_LABELS, Panel, hint, status_html
+from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.playback import at_moment
-from dt_viz.ui.plots import NUM_SAMPLES, JointPlots, joint_curves
-from dt_viz.ui.scene import OF_A_MOTION, OF_A_TASK, Rollouts, ScenePictures
-from dt_viz.ui.session import Pace, Session
-from dt_viz.ui.starts import Starts
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.arm import PEDESTAL
+from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
+from dt_viz.ui.scene.legend import OCCUPANCY
+from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
+from dt_viz.ui.scene.picture import Arrows, Lines
+from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, Rollouts, ScenePictures
+from dt_viz.ui.scene.starts import Starts
 
 ROBOT = load_jaco()
 REACHING = np.array([0.9, 3.6, 1.6, 0.4, 2.9, -0.3])

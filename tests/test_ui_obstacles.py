@@ -10,22 +10,22 @@ import pytest
 import trimesh
 from pages import Edited
 
-from dt_viz import shapes
-from dt_viz.belief import occupancy_picture
-from dt_viz.clouds import Cloud
-from dt_viz.collision import NOTHING, CollisionReport, Nearest
+from dt_viz.arm.collision import NOTHING, CollisionReport, Nearest
 from dt_viz.interruption import UnwantedError
-from dt_viz.obstacles import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, rotation
-from dt_viz.scenario import MAX_OBSTACLES, Scenario, View
-from dt_viz.several import Several
-from dt_viz.solids import Solid
-from dt_viz.tasks import TASKS
+from dt_viz.obstacles import files as shapes
+from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, rotation
+from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.union import Several
+from dt_viz.pictures.occupancy import occupancy_picture
+from dt_viz.scenario.scenario import MAX_OBSTACLES, Scenario, View
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.controls import Control
-from dt_viz.ui.handles import in_slice
-from dt_viz.ui.obstacle_panel import SHAPES, ObstaclePanel, name_of, with_room
-from dt_viz.ui.obstacles import Obstacles, shaded
-from dt_viz.ui.panel import _clearance, _collision_rows
-from dt_viz.ui.slice_layers import OccupancySlice
+from dt_viz.ui.panel.obstacles import SHAPES, ObstaclePanel, name_of, with_room
+from dt_viz.ui.panel.panel import _clearance, _collision_rows
+from dt_viz.ui.scene.handles import in_slice
+from dt_viz.ui.scene.obstacles import Obstacles, shaded
+from dt_viz.ui.scene.slice_layers import OccupancySlice
 
 BALL = Sphere((0.0, -0.5, 0.4), 0.12)
 BOX = Box((0.1, -0.5, 0.5), (0.2, 0.1, 0.06), (0.9, 0.1, 0.3, -0.3))

@@ -10,23 +10,23 @@ import pytest
 from pages import frame_of
 from PIL import Image
 
-from dt_viz.engine import Stage
-from dt_viz.field_layers import ColourPicture, FieldPicture
-from dt_viz.obstacles import Sphere, rotation
-from dt_viz.pictures import Pictures
-from dt_viz.scenario import Scenario, View
-from dt_viz.slices import SlicePose
-from dt_viz.tasks import TASKS
-from dt_viz.ui import palette
-from dt_viz.ui.bias import Biases
-from dt_viz.ui.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
-from dt_viz.ui.export import as_png
-from dt_viz.ui.legend import OCCUPANCY, legend_of
-from dt_viz.ui.obstacles import Obstacles
-from dt_viz.ui.scene import Rollouts
-from dt_viz.ui.slice import MovableSlice
-from dt_viz.ui.slice_layers import VOLUME, ColourSlice, FieldArrows, Streamlines, painted, scale_of
-from dt_viz.ui.slice_panel import WHOLE_ARM_NOTE, SlicePanel
+from dt_viz.engine.engine import Stage
+from dt_viz.obstacles.shapes import Sphere, rotation
+from dt_viz.pictures.sketchbook import Pictures
+from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.panel.slice import WHOLE_ARM_NOTE, SlicePanel
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.bias import Biases
+from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
+from dt_viz.ui.scene.export import as_png
+from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
+from dt_viz.ui.scene.obstacles import Obstacles
+from dt_viz.ui.scene.scene import Rollouts
+from dt_viz.ui.scene.slice import MovableSlice
+from dt_viz.ui.scene.slice_layers import VOLUME, ColourSlice, FieldArrows, Streamlines, painted, scale_of
 
 SCENARIO = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))

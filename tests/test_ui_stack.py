@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from pages import Edited, frame_of
 
-from dt_viz.bias import BiasPoint
-from dt_viz.health import Health
-from dt_viz.obstacles import Sphere
-from dt_viz.paper_scenes import SCENES
-from dt_viz.scenario import Scenario, View
-from dt_viz.stacking import AVOIDANCE, IMITATION, MAX_BIAS_POINTS, WHOLE_ARM, bias_points, names, with_bias_point
-from dt_viz.tasks import POTS, TASKS
-from dt_viz.ui.bias import Biases, selected_point
-from dt_viz.ui.bias_panel import BiasPanel
+from dt_viz.engine.session import Session
+from dt_viz.motion.health import Health
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import AVOIDANCE, IMITATION, MAX_BIAS_POINTS, WHOLE_ARM, bias_points, names, with_bias_point
+from dt_viz.scenario.tasks import POTS, TASKS
+from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
-from dt_viz.ui.levels import LevelRollouts
-from dt_viz.ui.pots import Pots, surface
-from dt_viz.ui.session import Session
-from dt_viz.ui.stack_panel import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, legend_html, rows
-from dt_viz.ui.transform_settings import durations
+from dt_viz.ui.panel.bias import BiasPanel
+from dt_viz.ui.panel.stack import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, legend_html, rows
+from dt_viz.ui.panel.transform_settings import durations
+from dt_viz.ui.scene.bias import Biases, selected_point
+from dt_viz.ui.scene.levels import LevelRollouts
+from dt_viz.ui.scene.pots import Pots, surface
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 SCENARIO = Scenario(

@@ -9,13 +9,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from dt_viz.engine import Frame
-from dt_viz.following import room_at_rest
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import MAX_STARTS
-from dt_viz.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
-from dt_viz.ui import palette
-from dt_viz.ui.starts import Starts
+from dt_viz.engine.engine import Frame
+from dt_viz.motion.following import room_at_rest
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import MAX_STARTS
+from dt_viz.scenario.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.starts import Starts
 
 
 def test_a_ray_meets_the_slice_where_it_is_seen(engine):

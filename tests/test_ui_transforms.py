@@ -9,20 +9,20 @@ from typing import Any, cast
 import pytest
 from pages import frame_of
 
-from dt_viz.bias import BiasPoint
-from dt_viz.collision import CollisionReport, Nearest
-from dt_viz.engine import Engine
-from dt_viz.health import Health
-from dt_viz.integration import Integration
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Scenario, View
-from dt_viz.stacking import AVOIDANCE, IMITATION, bias_points, with_bias_point
-from dt_viz.ui import warp as warp_module
+from dt_viz.arm.collision import CollisionReport, Nearest
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.session import Pace, Session
+from dt_viz.flows.integration import Integration
+from dt_viz.motion.health import Health
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import AVOIDANCE, IMITATION, bias_points, with_bias_point
+from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
-from dt_viz.ui.panel import status_html
-from dt_viz.ui.session import Pace, Session
-from dt_viz.ui.transform_settings import TransformSettings, learned_html
-from dt_viz.ui.warp import WarpPlayer
+from dt_viz.ui.panel import warp as warp_module
+from dt_viz.ui.panel.panel import status_html
+from dt_viz.ui.panel.transform_settings import TransformSettings, learned_html
+from dt_viz.ui.panel.warp import WarpPlayer
 
 LAYERS = with_bias_point((), BiasPoint((0.2, -0.5, 0.4)))
 SCENARIO = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), layers=LAYERS)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import dt_viz.engine
-from dt_viz.bias import BiasPoint
-from dt_viz.engine import Stage
+import dt_viz.engine.engine
+from dt_viz.engine.engine import Stage
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.obstacles import Sphere
-from dt_viz.paper_scenes import SCENES
-from dt_viz.scenario import Scenario, View
-from dt_viz.stacking import place_beside, with_bias_point
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import place_beside, with_bias_point
+from dt_viz.transforms.bias import BiasPoint
 
 WARPS = (0.0, 0.15, 0.5, 0.85)
 
@@ -97,8 +97,8 @@ def test_a_nearly_full_warp_is_nearly_the_stack_and_a_full_one_is_the_stack(engi
 
 def test_what_auto_chose_for_the_full_stack_stays_and_is_worked_out_once(new_engine, engine, monkeypatch):
     solved = []
-    solve = dt_viz.engine.solve
-    monkeypatch.setattr(dt_viz.engine, "solve", lambda *args: solved.append(args) or solve(*args))
+    solve = dt_viz.engine.engine.solve
+    monkeypatch.setattr(dt_viz.engine.engine, "solve", lambda *args: solved.append(args) or solve(*args))
     fresh, scenario = new_engine(), stacked(engine, "draw_s")
     full = stage(fresh, scenario, Stage.FINE)
     for warp in (0.9, 0.4, 0.0, 1.0):

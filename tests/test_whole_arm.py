@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.collision import load_collision_model
-from dt_viz.cspace import LEVERS
-from dt_viz.diffeo import Identity, min_det_jacobian
-from dt_viz.following import Follower
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.arm.cspace import LEVERS
+from dt_viz.arm.tracking import track
+from dt_viz.arm.whole_arm import MAX_DURATION, ROUNDING, ArmSolution, Lift, WholeArm
+from dt_viz.flows.diffeomorphisms import Identity, min_det_jacobian
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.obstacles import Sphere
-from dt_viz.scenario import Scenario
-from dt_viz.solving import FINE, LIVE
-from dt_viz.tracking import track
-from dt_viz.whole_arm import MAX_DURATION, ROUNDING, ArmSolution, Lift, WholeArm
+from dt_viz.motion.following import Follower
+from dt_viz.motion.solve import FINE, LIVE
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
 
 ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)
 """In the way of the forearm that pushes the box, far from where the hand goes."""

@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from dt_viz.ui.worker import LatestWorker
+from dt_viz.engine.worker import LatestWorker
 
 PATIENCE = 30.0  # seconds until a hanging test fails; nothing here takes long
 

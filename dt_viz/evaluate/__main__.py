@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from dt_viz.errors import DataError  # noqa: PLC0415
     from dt_viz.evaluate import avoidance, imitation, latency, load, places, rollouts, starts  # noqa: PLC0415
     from dt_viz.evaluate.options import InputError, with_negative_values  # noqa: PLC0415
-    from dt_viz.imitation import ImitationError  # noqa: PLC0415
+    from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
 
     parser = argparse.ArgumentParser(prog="python -m dt_viz.evaluate", description="Measure DT-Viz.")
     subcommands = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)

@@ -23,8 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.collision import CollisionReport, load_collision_model
-from dt_viz.engine import ArmMotion, Engine
+from dt_viz.arm.collision import CollisionReport, load_collision_model
+from dt_viz.arm.robot import Robot, load_jaco
+from dt_viz.arm.tracking import UnreachableError
+from dt_viz.engine.engine import ArmMotion, Engine
 from dt_viz.evaluate.options import (
     add_generator,
     add_space,
@@ -35,13 +37,11 @@ from dt_viz.evaluate.options import (
     print_table,
     ready_to_write,
 )
-from dt_viz.fields import Array
-from dt_viz.fits import FitStore, default_cache_folder
+from dt_viz.flows.fields import Array
+from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.metrics import discrete_frechet, maximum_collision_distance, resample_by_arc_length, sharpest_turn
-from dt_viz.obstacles import Sphere
-from dt_viz.robot import Robot, load_jaco
-from dt_viz.scenario import Scenario
-from dt_viz.tracking import UnreachableError
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
 
 NUM_COMPARED = 400
 """Points by arc length that a Fréchet distance is taken between."""

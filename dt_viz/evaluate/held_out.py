@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.demos import Demonstration
-from dt_viz.fields import Array
-from dt_viz.imitation import Imitation, ImitationSettings, fit
+from dt_viz.flows.fields import Array
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 
 WAYS = ("learned", "mean", "nearest")

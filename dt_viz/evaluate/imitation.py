@@ -7,7 +7,7 @@ Of each file the folder gets an npz, all lengths in the file's own unit (LASA: m
 ``goal`` (d,)
     where it ends.
 ``fit_seconds``
-    the whole of `dt_viz.imitation.fit`, certificates included, never from a cache.
+    the whole of `dt_viz.learning.imitation.fit`, certificates included, never from a cache.
 ``min_det_jacobian``, ``round_trip_error``
     smallest det J and largest ‖ψ⁻¹(ψ(x)) − x‖ on a grid over the demonstrations' box grown by half its size on every
     side, computed here, not taken from the fit.
@@ -31,13 +31,13 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.demos import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
-from dt_viz.diffeo import min_det_jacobian, round_trip_error
 from dt_viz.evaluate.held_out import WAYS, HeldOut, follow, frechet, rollouts_from, summed_up
 from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json
 from dt_viz.evaluate.picture import Panel, draw_panels
-from dt_viz.fields import Array
-from dt_viz.imitation import Imitation, ImitationError, ImitationSettings, fit
+from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
+from dt_viz.flows.fields import Array
+from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
+from dt_viz.learning.imitation import Imitation, ImitationError, ImitationSettings, fit
 from dt_viz.metrics import rms_at_equal_times
 
 OBJECTIVES = ("trajectory", "velocity")

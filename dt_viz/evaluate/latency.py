@@ -28,8 +28,10 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.bias import Biasing, BiasPoint
-from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.arm.robot import load_jaco
+from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
+from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.session import Pace, Session
 from dt_viz.evaluate.options import (
     InputError,
     add_space,
@@ -41,15 +43,13 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_json,
 )
-from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.ground import NUM_SAMPLES
-from dt_viz.obstacles import Sphere
-from dt_viz.robot import load_jaco
-from dt_viz.scenario import Layer, Scenario
-from dt_viz.stacking import plane_of
-from dt_viz.tasks import Task
-from dt_viz.ui.session import Pace, Session
-from dt_viz.whole_arm import NUM_CONFIGURATIONS
+from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.motion.nominal import NUM_SAMPLES
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.stack import plane_of
+from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.bias import Biasing, BiasPoint
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0

@@ -37,7 +37,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dt_viz.engine import Engine, Frame, Stage
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import Engine, Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
     chosen_task,
@@ -48,11 +49,10 @@ from dt_viz.evaluate.options import (
     write_json,
 )
 from dt_viz.evaluate.protocol_client import ROLLOUTS, LostError, ProtocolClient
-from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.obstacles import Point, Sphere
-from dt_viz.robot import load_jaco
-from dt_viz.scenario import Scenario
-from dt_viz.tasks import Task
+from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.obstacles.shapes import Point, Sphere
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import Task
 
 EDITS_PER_SECOND = 20
 """Edits of a drag; no page sends more."""

@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dt_viz.occupancy import GENERATORS
-from dt_viz.scenario import SPACES
-from dt_viz.tasks import TASKS, Task, TaskEntry, lasa_tasks
+from dt_viz.obstacles.occupancy import GENERATORS
+from dt_viz.scenario.scenario import SPACES
+from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, lasa_tasks
 
 
 class InputError(ValueError):

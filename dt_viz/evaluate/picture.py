@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from dt_viz.fields import Array
+from dt_viz.flows.fields import Array
 
 PANEL, LABEL, BORDER = 320, 30, 22
 """Pixels: side of a panel, height of its name, and free space around the motions."""

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.engine import Engine
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.avoidance import Measured, measure
 from dt_viz.evaluate.options import (
     add_generator,
@@ -25,12 +26,11 @@ from dt_viz.evaluate.options import (
     ready_to_write,
     whole_number,
 )
-from dt_viz.fields import Array
-from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.obstacles import Sphere
-from dt_viz.robot import load_jaco
-from dt_viz.scenario import Scenario
-from dt_viz.tasks import Task
+from dt_viz.flows.fields import Array
+from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import Task
 
 WITHIN = 0.05
 """Metres of the middle."""

@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from dt_viz.diffeo import AdaptiveFlow, Chain
-from dt_viz.engine import Engine
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.options import (
     add_task,
     chosen_task,
@@ -40,12 +40,12 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_json,
 )
-from dt_viz.fields import Array
-from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.obstacles import Sphere
-from dt_viz.robot import load_jaco
-from dt_viz.scenario import Scenario
-from dt_viz.systems import Attractor, DiffeomorphicSystem
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain
+from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
+from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
 
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 ARRIVED = 1e-4

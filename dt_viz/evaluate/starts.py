@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to_write, whole_number
-from dt_viz.fields import Array
-from dt_viz.fits import FitStore, default_cache_folder
-from dt_viz.integrate import integrate_adaptive
-from dt_viz.systems import DiffeomorphicSystem
+from dt_viz.flows.fields import Array
+from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.store import FitStore, default_cache_folder
 
 AT_GOAL = 5e-5
 """Metres from the goal at which a rollout ends."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from dt_viz.fields import Array
+from dt_viz.flows.fields import Array
 
 MAX_DISTANCE = 5.0
 """Distance from the robot's base, along each axis, beyond which nothing can be put, metres."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.engine import ArmMotion
-from dt_viz.fields import Array
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.flows.fields import Array
 
 PICTURES_PER_SECOND = 25
 REST = 0.8

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from dt_viz.engine import let_drags_pass
+from dt_viz.engine.engine import let_drags_pass
 from dt_viz.interruption import UnwantedError, interruptible
 
 logger = logging.getLogger(__name__)

@@ -12,11 +12,11 @@ from typing import NoReturn
 
 import viser
 
-from dt_viz.engine import Engine
-from dt_viz.fits import FitStore
-from dt_viz.robot import load_jaco
-from dt_viz.shapes import MAX_BYTES
-from dt_viz.tasks import TaskEntry
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import Engine
+from dt_viz.learning.store import FitStore
+from dt_viz.obstacles.files import MAX_BYTES
+from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.ui.gate import Gate
 from dt_viz.ui.origins import Origin, Origins
 from dt_viz.ui.visitor import NOTICE_SECONDS, Visitor

@@ -8,29 +8,29 @@ from functools import partial
 
 import viser
 
-from dt_viz.engine import Engine, Frame, Stage
-from dt_viz.fields import Array
-from dt_viz.obstacles import Sphere
-from dt_viz.pushing import Pushed
-from dt_viz.robot import Robot
-from dt_viz.scenario import Scenario
-from dt_viz.slices import SlicePose
-from dt_viz.stacking import bias_points, with_changed_point
-from dt_viz.starts import followed, with_moved_start, with_start
-from dt_viz.tasks import Task
-from dt_viz.ui import palette
-from dt_viz.ui.arm import ArmPicture
-from dt_viz.ui.arm_layers import Arms
-from dt_viz.ui.carried import Carried
-from dt_viz.ui.export import RESOLUTIONS, render_png
-from dt_viz.ui.grip import Grip
-from dt_viz.ui.panel import Panel
-from dt_viz.ui.picture import Colour
+from dt_viz.arm.robot import Robot
+from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.session import Pace, Session
+from dt_viz.flows.fields import Array
+from dt_viz.motion.pushing import Pushed
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.stack import bias_points, with_changed_point
+from dt_viz.scenario.starts import followed, with_moved_start, with_start
+from dt_viz.scenario.tasks import Task
+from dt_viz.ui.panel.panel import Panel
+from dt_viz.ui.panel.push import PushedPath
 from dt_viz.ui.playback import Playback
-from dt_viz.ui.push import PushedPath
-from dt_viz.ui.scene import ScenePictures
-from dt_viz.ui.session import Pace, Session
-from dt_viz.ui.starts import Starts
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.arm import ArmPicture
+from dt_viz.ui.scene.arm_layers import Arms
+from dt_viz.ui.scene.carried import Carried
+from dt_viz.ui.scene.export import RESOLUTIONS, render_png
+from dt_viz.ui.scene.grip import Grip
+from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.scene import ScenePictures
+from dt_viz.ui.scene.starts import Starts
 
 FIELD_OF_VIEW = 0.75
 """Vertical, rad."""

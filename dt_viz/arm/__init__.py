@@ -1,0 +1,1 @@
+"""The JACO: kinematics, tracking, configuration space and collision."""

@@ -1,0 +1,330 @@
+"""Collision truth: the arm's meshes against an obstacle, the table and itself, also between the samples of a path.
+
+Nothing here knows of the body points that motions are planned with. Lengths are metres, angles radians, positions in
+the robot's base frame. A path is sampled configurations, continuous joints unwrapped, with straight lines in joint
+space between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from dt_viz.arm.link_distances import (
+    SHAPE_TOLERANCE,
+    Link,
+    Measure,
+    Poses,
+    measure_above_table,
+    measure_between,
+    measure_from,
+)
+from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
+from dt_viz.interruption import checkpoint
+from dt_viz.obstacles.shapes import Obstacle, Sphere
+from dt_viz.obstacles.union import Several
+from dt_viz.properties import cached_property
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from dt_viz.flows.fields import Array, Indices
+
+
+TOLERANCE = 1e-4
+"""How much more than the smallest distance on a path may be reported, metres."""
+SELF_TOLERANCE = 1e-3
+"""The same for the distance of links from each other."""
+SELF_REACH = 0.05
+"""Links farther apart than this are not measured, metres: the wrist never has more than 7 cm between its ends."""
+SELF_MARGIN = 0.01
+"""Links nearer to each other than this are reported, metres."""
+KNOT_STRIDE = 4
+"""Samples of a path between those that a search begins with."""
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """The smallest distance on a path.
+
+    Attributes:
+        distance: metres.
+        links: names of the link, or of both links.
+        at: where on the path, in samples from its start; 2.5 is halfway from the third to the fourth.
+    """
+
+    distance: float
+    links: tuple[str, ...]
+    at: float
+
+
+NOTHING = Nearest(np.inf, (), 0.0)
+"""Where there is nothing to come near to."""
+
+
+@dataclass(frozen=True)
+class CollisionReport:
+    """What a joint path comes near to or collides with.
+
+    Attributes:
+        obstacle: smallest signed distance of the arm from an obstacle, negative inside; infinite if there is none.
+        itself: smallest distance of two links that are not neighbours, 0 where they intersect; None beyond
+            `SELF_REACH`.
+        table: smallest signed height above the table of what does not stand on it.
+    """
+
+    obstacle: Nearest
+    itself: Nearest | None
+    table: Nearest
+
+    @property
+    def depth(self) -> float:
+        """Maximum collision distance (sec. 5): how deep the arm enters the obstacle, metres; 0 when it is clear."""
+        return max(0.0, -self.obstacle.distance)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong, in words for the page; empty when nothing is."""
+        entered = f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm" if self.depth > 0 else ""
+        return ((entered,) if entered else ()) + self.problems_of_its_own
+
+    @property
+    def problems_of_its_own(self) -> tuple[str, ...]:
+        """Those that have nothing to do with the obstacle."""
+        found = []
+        if self.itself and self.itself.distance < SELF_MARGIN:
+            inner, outer = self.itself.links
+            gap = self.itself.distance
+            found.append(f"{outer} comes within {1e3 * gap:.0f} mm of {inner}" if gap > 0 else f"{outer} hits {inner}")
+        if self.table.distance < 0:
+            found.append(f"{self.table.links[0]} is {-1e3 * self.table.distance:.0f} mm below the table")
+        return tuple(found)
+
+
+class _Pieces(NamedTuple):
+    """Pieces of a path, each for one item; lower bounds of its distance at both ends."""
+
+    start: Array  # (P,) samples from the path's start
+    end: Array
+    item: Indices  # (P,)
+    at_start: Array  # (P,) metres
+    at_end: Array
+    travel: Array  # (P,) bound on how far the item's points move, metres
+
+    def take(self, which: NDArray[np.bool_]) -> _Pieces:
+        """Some of them."""
+        start, end, item, at_start, at_end, travel = self
+        return _Pieces(start[which], end[which], item[which], at_start[which], at_end[which], travel[which])
+
+    def lower(self) -> Array:
+        """(P,) bounds from below on the distances anywhere on the pieces."""
+        return (self.at_start + self.at_end - self.travel) / 2
+
+
+class _Search:
+    """Looks for the smallest distance on a path, of all items of a measure.
+
+    As `metrics.maximum_collision_distance`: a distance changes no faster than the link moves, so on a piece of the path
+    that moves the link by L it is at least (d₀ + d₁ − L)/2. Pieces that could hold less than the best are halved.
+    """
+
+    def __init__(self, robot: Robot, measure: Measure, q: Array, travel: Array, ceiling: float) -> None:
+        """Takes the path q (T, 6), bounds travel (T − 1, I) between its samples, and what the result must be below."""
+        self._robot, self._measure = robot, measure
+        self._last = len(q) - 1
+        self._q = q if self._last else np.repeat(q, 2, axis=0)  # a path of one sample becomes one that stays there
+        travel = travel if len(travel) else np.zeros((1, travel.shape[1]))
+        self._travelled = np.vstack([np.zeros(travel.shape[1]), np.cumsum(travel, axis=0)])  # (T, I) from the start
+        self._best, self._place, self._item = ceiling, 0.0, -1
+
+    def run(self, tolerance: float) -> Nearest | None:
+        """The smallest distance, too large by the tolerance at most; None where none is below the ceiling."""
+        pieces = self._first_pieces()
+        while self._best > self._measure.lowest:
+            pieces = pieces.take(pieces.lower() < self._best - tolerance)
+            if not len(pieces.item):
+                break
+            pieces = self._halved(pieces)
+        if self._item < 0:
+            return None
+        return Nearest(self._best, self._measure.names(self._item), min(self._place, float(self._last)))
+
+    def _first_pieces(self) -> _Pieces:
+        last, num_items = len(self._q) - 1, self._travelled.shape[1]
+        knots = np.append(np.arange(0, last, KNOT_STRIDE), last)
+        travel = np.diff(self._travelled[knots], axis=0)  # (K − 1, I)
+        padded = np.pad(travel, [(1, 1), (0, 0)])
+        places, items = np.repeat(knots.astype(float), num_items), np.tile(np.arange(num_items), len(knots))
+        values = self._measured(places, items, np.maximum(padded[:-1], padded[1:]).ravel())
+        return _Pieces(
+            places[:-num_items],
+            places[num_items:],
+            items[num_items:],
+            values[:-num_items],
+            values[num_items:],
+            travel.ravel(),
+        )
+
+    def _halved(self, pieces: _Pieces) -> _Pieces:
+        start, end, item, at_start, at_end, _ = pieces
+        middle = (start + end) / 2
+        first = self._travel_to(middle, item) - self._travel_to(start, item)
+        second = self._travel_to(end, item) - self._travel_to(middle, item)
+        at_middle = self._measured(middle, item, np.maximum(first, second))
+        return _Pieces(
+            np.concatenate([start, middle]),
+            np.concatenate([middle, end]),
+            np.tile(item, 2),
+            np.concatenate([at_start, at_middle]),
+            np.concatenate([at_middle, at_end]),
+            np.concatenate([first, second]),
+        )
+
+    def _travel_to(self, places: Array, items: Indices) -> Array:
+        """How far (N,) the items (N,) have moved at places (N,)."""
+        before = np.minimum(places.astype(np.intp), len(self._q) - 2)
+        fraction = places - before
+        return (1 - fraction) * self._travelled[before, items] + fraction * self._travelled[before + 1, items]
+
+    def _measured(self, places: Array, items: Indices, travel: Array) -> Array:
+        """Lower bounds (N,) of the distances of items (N,) at places (N,); exact where such travel needs it."""
+        distinct, rows = np.unique(places, return_inverse=True)
+        before = np.minimum(distinct.astype(np.intp), len(self._q) - 2)
+        fraction = (distinct - before)[:, None]
+        poses = Poses.of(self._robot, (1 - fraction) * self._q[before] + fraction * self._q[before + 1])
+        values = self._measure.lower(poses, rows, items)
+        slack = travel / 2  # from there up, the bound of the piece exceeds the best
+        for k in np.argsort(values - slack):
+            if values[k] >= self._best + slack[k]:
+                break
+            checkpoint()
+            values[k] = self._measure.distance(poses, int(rows[k]), int(items[k]), float(self._best + slack[k]))
+            if values[k] < self._best:
+                self._best, self._place, self._item = float(values[k]), float(places[k]), int(items[k])
+        return values
+
+
+class CollisionModel:
+    """The arm's links as solids.
+
+    Attributes:
+        robot: whose kinematics places them.
+        links: from the base to the finger tips.
+    """
+
+    def __init__(self, robot: Robot, meshes: Sequence[LinkMesh]) -> None:
+        self.robot = robot
+        self.links = tuple(Link(mesh) for mesh in meshes)
+
+    @cached_property
+    def reach(self) -> Array:
+        """(11, 6) bounds on the distance of each link's points from each joint's axis, in any posture, metres.
+
+        0 for the joints that do not move the link; elsewhere never less than for the joints that come later.
+        """
+        steps = np.linalg.norm(self.robot.joint_translations, axis=1)
+        sideways = np.linalg.norm(self.robot.joint_translations[:, :2], axis=1)
+        bounds = np.zeros((len(self.links), NUM_JOINTS))
+        for link, bound in zip(self.links, bounds, strict=True):
+            joint = link.frame - 1
+            if joint < 0:
+                continue
+            bound[joint] = np.linalg.norm(link.hull[:, :2], axis=1).max()
+            beyond = np.linalg.norm(link.hull, axis=1).max()  # the joint after: from its origin
+            for i in range(joint - 1, -1, -1):
+                bound[i] = max(bound[i + 1], sideways[i + 1] + beyond)
+                beyond += steps[i + 1]
+        return bounds
+
+    def obstacle_distance(self, q: ArrayLike, obstacle: Obstacle) -> tuple[Array, Indices]:
+        """Signed distance of the whole arm from the obstacle, and the nearest link.
+
+        The smallest signed distance from the obstacle of any point of the arm, so minus the depth where it enters.
+
+        Args:
+            q: (T, 6) configurations, rad.
+            obstacle: in the base frame.
+
+        Returns:
+            Distances (T,), metres, negative inside; indices (T,) into `links`.
+        """
+        q = np.asarray(q, dtype=float)
+        measure, poses = measure_from(self.links, obstacle), Poses.of(self.robot, q)
+        rows, items = (index.ravel() for index in np.indices((len(q), len(self.links))))
+        lower = measure.lower(poses, rows, items).reshape(len(q), -1)
+        distances, nearest = np.full(len(q), np.inf), np.zeros(len(q), dtype=np.intp)
+        for row, order in enumerate(np.argsort(lower, axis=1)):
+            for item in order:
+                if lower[row, item] >= distances[row]:
+                    break
+                distance = measure.distance(poses, row, int(item), float(distances[row]))
+                if distance < distances[row]:
+                    distances[row], nearest[row] = distance, item
+        return distances, nearest
+
+    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Several | Obstacle) -> Nearest:
+        """The smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.
+
+        To `TOLERANCE` for a ball; to `SHAPE_TOLERANCE` and, inside, `link_distances.RESOLUTION` for other shapes.
+        """
+        nearest = NOTHING
+        for part in obstacle.parts if isinstance(obstacle, Several) else (obstacle,):
+            tolerance = TOLERANCE if isinstance(part, Sphere) else SHAPE_TOLERANCE
+            found = self._search(measure_from(self.links, part), q, tolerance)
+            assert found is not None  # without a ceiling there always is one
+            nearest = min(nearest, found, key=lambda near: near.distance)
+        return nearest
+
+    def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:
+        """The smallest distance of two links on a path q (T, 6), rad, to `SELF_TOLERANCE`; None beyond `SELF_REACH`.
+
+        Links that a joint connects are left out.
+        """
+        return self._search(measure_between(self.links), q, SELF_TOLERANCE, SELF_REACH)
+
+    def nearest_to_table(self, q: ArrayLike) -> Nearest:
+        """The smallest height above the table z = 0 on a path q (T, 6), rad, to `TOLERANCE`.
+
+        Of all links but the base and link 1, which stand on it.
+        """
+        found = self._search(measure_above_table(self.links), q, TOLERANCE)
+        assert found is not None
+        return found
+
+    def report(self, q: ArrayLike, obstacle: Several | Obstacle) -> CollisionReport:
+        """All of it for one path q (T, 6), rad."""
+        return CollisionReport(
+            self.nearest_to_obstacle(q, obstacle), self.nearest_to_itself(q), self.nearest_to_table(q)
+        )
+
+    def _search(self, measure: Measure, q: ArrayLike, tolerance: float, ceiling: float = np.inf) -> Nearest | None:
+        q = np.asarray(q, dtype=float)
+        return _Search(self.robot, measure, q, self._travel(measure, q), ceiling).run(tolerance)
+
+    def _travel(self, measure: Measure, q: Array) -> Array:
+        """Bounds (T − 1, I) on how far points of the items' links move from sample to sample of q (T, 6)."""
+        poses, turns = Poses.of(self.robot, q), np.abs(np.diff(q, axis=0))
+        bounds = np.empty((len(turns), len(measure.bodies)))
+        for k, (body, base) in enumerate(zip(measure.bodies, measure.bases, strict=True)):
+            link = self.links[body]
+            turning = turns[:, base : link.frame]  # by the joints between the two frames
+            at_most = turning @ self.reach[body, base : link.frame]
+            # Nearly straight: the speed differs from its mean by at most half the largest acceleration, and how far
+            # a rigid body's points are displaced is convex in the point, so largest in a corner of the box.
+            inverse = poses.rotations[:, base].transpose(0, 2, 1)
+            rotation = inverse @ poses.rotations[:, link.frame]
+            origin = np.einsum("tij,tj->ti", inverse, poses.origins[:, link.frame] - poses.origins[:, base])
+            corners = link.corners @ rotation.transpose(0, 2, 1) + origin[:, None]
+            displaced = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=1)
+            bounds[:, k] = np.minimum(at_most, displaced + at_most * turning.sum(axis=1) / 2)
+        return bounds
+
+
+@lru_cache(maxsize=1)
+def load_collision_model() -> CollisionModel:
+    """The JACO's links, read once."""
+    return CollisionModel(load_jaco(), collision_meshes())

@@ -1,0 +1,416 @@
+"""Distances of the arm's links from an obstacle, from each other and from the table, one configuration at a time.
+
+The meshes are those of the URDF, taken as solids; coal measures distances to them, batched kinematics places them.
+Lengths are metres, angles radians, positions in the robot's base frame.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (coal has no stubs)
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import coal
+import numpy as np
+
+from dt_viz.arm.robot import LinkMesh, Robot
+from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Sphere, rotation
+from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
+from dt_viz.properties import cached_property
+
+if TYPE_CHECKING:
+    from dt_viz.flows.fields import Array, Indices
+
+
+SHAPE_TOLERANCE = 1e-3
+"""How much more than the smallest distance from an obstacle that is no ball may be reported, metres."""
+SURFACE_SPACING = 2e-3
+"""Of points on a link that its depth in an obstacle is found with, metres; vertices are among them."""
+INNER_SPACING = 4e-3
+"""Of points inside, which count where an obstacle is deepest inside the link."""
+RESOLUTION = 3.5e-3
+"""Metres by which the depth in an obstacle that is no ball may be larger than reported. On a link's surface 1.5 mm."""
+CERTAIN = 3e-3
+"""Depth, metres, that is more than an obstacle's signed distance is off by: what is deeper intersects it."""
+GROUP_SIZE = 0.02
+"""Of the cells in which these points are told deep or not at once, metres."""
+BALL_SIZE = 0.06
+"""Of the cells that a link is divided into for quick bounds, metres."""
+AT_ONCE = 8
+"""Cells whose points are measured at once."""
+
+
+class Poses(NamedTuple):
+    """Frames of the base and the six joints, for N configurations; a link of joint j is at j + 1."""
+
+    rotations: Array  # (N, 7, 3, 3)
+    origins: Array  # (N, 7, 3), metres
+
+    @classmethod
+    def of(cls, robot: Robot, q: Array) -> Poses:
+        """Poses at configurations q (N, 6), rad."""
+        rotations, origins = robot.forward_kinematics(q)
+        base = np.broadcast_to(np.eye(3), (len(q), 1, 3, 3))
+        return cls(np.concatenate([base, rotations], axis=1), np.pad(origins, [(0, 0), (1, 0), (0, 0)]))
+
+
+class _Groups(NamedTuple):
+    """Points, those near to each other in groups; or balls, when they have radii."""
+
+    points: Array  # (N, 3), metres, one group after the other
+    ends: Indices  # (G,) where each group ends
+    centres: Array  # (G, 3)
+    radii: Array  # (G,) metres, of the balls around the centres that hold the groups
+
+    @classmethod
+    def of(cls, points: Array, size: float, radii: Array | float = 0.0) -> _Groups:
+        """Groups of the points (N, 3) in the cells, that large, of a grid."""
+        cell = np.floor((points - points.min(axis=0)) / size).astype(np.intp)
+        _, member = np.unique(cell, axis=0, return_inverse=True)
+        order = np.argsort(member.ravel(), kind="stable")
+        points, radii = points[order], np.broadcast_to(radii, len(points))[order]
+        ends = np.cumsum(np.bincount(member.ravel()))
+        begins = np.r_[0, ends[:-1]]
+        centres = (np.minimum.reduceat(points, begins) + np.maximum.reduceat(points, begins)) / 2
+        apart = np.linalg.norm(points - np.repeat(centres, ends - begins, axis=0), axis=1) + radii
+        return cls(points, ends, centres, np.maximum.reduceat(apart, begins))
+
+    def of_group(self, group: int) -> Array:
+        """(M, 3) the points of a group."""
+        return self.points[self.ends[group - 1] if group else 0 : self.ends[group]]
+
+
+class Link:
+    """A link as a solid, in the frame of its joint.
+
+    Attributes:
+        name: as the page calls it.
+        frame: index of its frame in `Poses`.
+        surface: the mesh, as coal measures it.
+        centre: (3,) of the box around the mesh, metres.
+        half_size: (3,) of that box.
+        radius: of the ball around that centre that holds the mesh.
+        corners: (8, 3) of that box.
+        hull: (H, 3) vertices of the convex hull.
+    """
+
+    def __init__(self, mesh: LinkMesh) -> None:
+        self.name = mesh.name.split("_link_")[-1].replace("_", " ")
+        if self.name.isdecimal():
+            self.name = f"link {self.name}"
+        self.frame = mesh.joint + 1
+        self._triangles = mesh.vertices[mesh.faces]  # (F, 3, 3)
+        self._vertices = mesh.vertices
+        self.surface = _bounding_volumes(mesh.vertices, mesh.faces)
+        lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        self.centre, self.half_size = (lower + upper) / 2, (upper - lower) / 2
+        self.radius = float(np.linalg.norm(mesh.vertices - self.centre, axis=1).max())
+        signs = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, -1).T
+        self.corners = self.centre + signs * self.half_size
+        self.surface.buildConvexHull(False, "Qt")
+        self.hull = np.array(self.surface.convex.points())
+
+    @cached_property
+    def groups(self) -> _Groups:
+        """Points of the solid, so dense that none of it is farther than `RESOLUTION` from one."""
+        surface, _ = surface_samples(self._triangles, SURFACE_SPACING)
+        shape = tuple(int(n) for n in np.ceil(2 * self.half_size / INNER_SPACING) + 1)
+        origin = self.centre - INNER_SPACING * (np.array(shape) - 1) / 2
+        inside = inside_of_grid(self._triangles, origin, INNER_SPACING, shape)
+        inner = grid_nodes(origin, INNER_SPACING, shape)[inside.ravel()]
+        return _Groups.of(np.concatenate([self._vertices, surface, inner]), GROUP_SIZE)
+
+    @cached_property
+    def balls(self) -> _Groups:
+        """A few balls that hold the mesh."""
+        return _Groups.of(self.groups.centres, BALL_SIZE, self.groups.radii)
+
+    def contains(self, point: Array) -> bool:
+        """Whether a point (3,) off the surface is inside, by the winding number: the hand's mesh has small holes."""
+        if np.any(np.abs(point - self.centre) > self.half_size):
+            return False
+        a, b, c = np.moveaxis(self._triangles - point, 1, 0)
+        la, lb, lc = (np.sqrt(np.einsum("ij,ij->i", side, side)) for side in (a, b, c))
+        # Solid angles of the triangles (van Oosterom and Strackee, 1983).
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+        ab, bc, ca = np.einsum("ij,ij->i", a, b), np.einsum("ij,ij->i", b, c), np.einsum("ij,ij->i", c, a)
+        winding = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2 * np.pi)
+        return bool(abs(winding) > 0.5)
+
+
+class _Rounded(NamedTuple):
+    """An obstacle as all points within `radius` of a core.
+
+    Where the arm touches the core it counts as `radius` deep, so depth is exact for a core without volume.
+    """
+
+    core: coal.CollisionGeometry
+    rotation: Array  # (3, 3)
+    position: Array  # (3,), metres
+    extent: float  # of the core from its position, metres
+    radius: float  # metres
+
+
+def _rounded(obstacle: Sphere) -> _Rounded:
+    """The obstacle as coal knows it.
+
+    Coal's signed distance of a mesh from a ball is not its depth: once one triangle is inside, whatever else overlaps
+    is skipped. The distance from the ball's centre is positive, and so exact.
+    """
+    return _Rounded(coal.Sphere(0.0), np.eye(3), np.asarray(obstacle.position), 0.0, obstacle.radius)
+
+
+class Measure(Protocol):
+    """Distances of several items (a link, or a pair of links), as a search needs them."""
+
+    lowest: float
+    """No distance is smaller."""
+
+    @property
+    def bodies(self) -> Indices:
+        """(I,) the link of each item."""
+        ...
+
+    @property
+    def bases(self) -> Indices:
+        """(I,) the frame that its motion counts against: what it is measured from moves with that frame."""
+        ...
+
+    def names(self, item: int) -> tuple[str, ...]:
+        """Of the links of an item."""
+        ...
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        """Quick lower bounds (N,) of the distances of items (N,) at the poses in rows (N,)."""
+        ...
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        """The distance of one item, exact if it is below the ceiling; else any value from the ceiling to it."""
+        ...
+
+
+class _FromBall:
+    """Signed distances of the links from a ball."""
+
+    def __init__(self, links: Sequence[Link], obstacle: Sphere) -> None:
+        self._links, self._obstacle = links, _rounded(obstacle)
+        self._frames = np.array([link.frame for link in links])
+        self._centres = np.array([link.centre for link in links])
+        self._half_sizes = np.array([link.half_size for link in links])
+        self.bodies = np.arange(len(links))
+        self.bases = np.zeros(len(links), dtype=np.intp)
+        self.lowest = -self._obstacle.radius
+        self._known: dict[int, list[tuple[Array, float, bool]]] = {}
+
+    def names(self, item: int) -> tuple[str, ...]:
+        return (self._links[item].name,)
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        frames = self._frames[items]
+        offset = self._obstacle.position - poses.origins[rows, frames]
+        local = np.einsum("nji,nj->ni", poses.rotations[rows, frames], offset) - self._centres[items]
+        outside = np.maximum(np.abs(local) - self._half_sizes[items], 0.0)
+        return np.maximum(np.linalg.norm(outside, axis=1) - self._obstacle.extent, 0.0) - self._obstacle.radius
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        link, (core, rotation, position, _, radius) = self._links[item], self._obstacle
+        turn = poses.rotations[row, link.frame].T
+        centre = turn @ (position - poses.origins[row, link.frame])
+        place = coal.Transform3s(turn @ rotation, centre)
+        gap = _coal_distance(link.surface, coal.Transform3s(), core, place, ceiling + radius)
+        return (0.0 if gap > 0 and self._inside(item, centre, gap) else gap) - radius
+
+    def _inside(self, item: int, point: Array, gap: float) -> bool:
+        """Whether a point is inside the link, its surface at least `gap` away."""
+        known = self._known.setdefault(item, [])
+        for other, free, inside in known:
+            if np.linalg.norm(point - other) < free:  # no surface in between
+                return inside
+        inside = self._links[item].contains(point)  # slow, so remembered
+        known.append((point, gap, inside))
+        return inside
+
+
+class _FromShape:
+    """Signed distances of the links from an obstacle of any shape.
+
+    Outside, coal's distance of its surface (a mesh's, a cloud's as it is drawn) from the links', which is exact. Where
+    they intersect, the smallest signed distance, as the obstacle knows it, of points that fill the link: the depth may
+    be larger by up to `RESOLUTION`.
+    """
+
+    def __init__(self, links: Sequence[Link], obstacle: Obstacle) -> None:
+        self._links, self._obstacle = links, obstacle
+        self._core = _coal_shape(obstacle)
+        self._turn, self._position = rotation(obstacle.wxyz), np.asarray(obstacle.position)
+        self._on_surface = self._turn @ obstacle.surface()[0][0] + self._position
+        self._frames = np.array([link.frame for link in links])
+        # the balls of all links, as many for each
+        most = max(len(link.balls.radii) for link in links)
+        fill = [np.minimum(np.arange(most), len(link.balls.radii) - 1) for link in links]
+        self._centres = np.stack([link.balls.centres[k] for link, k in zip(links, fill, strict=True)])
+        self._radii = np.stack([link.balls.radii[k] for link, k in zip(links, fill, strict=True)])
+        self.bodies = np.arange(len(links))
+        self.bases = np.zeros(len(links), dtype=np.intp)
+        self.lowest = SHAPE_TOLERANCE - obstacle.depth
+
+    def names(self, item: int) -> tuple[str, ...]:
+        return (self._links[item].name,)
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        frames = self._frames[items]
+        turned = np.einsum("nij,nkj->nki", poses.rotations[rows, frames], self._centres[items])
+        centres = turned + poses.origins[rows, frames][:, None]
+        return (self._obstacle.signed_distance(centres) - self._radii[items]).min(axis=1)
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        link = self._links[item]
+        turn, origin = poses.rotations[row, link.frame], poses.origins[row, link.frame]
+        deepest = self._deepest(link, turn, origin)
+        if deepest < -CERTAIN:
+            return deepest
+        place = coal.Transform3s(turn.T @ self._turn, turn.T @ (self._position - origin))
+        gap = _coal_distance(link.surface, coal.Transform3s(), self._core, place, max(ceiling, CERTAIN))
+        if gap > 0 and not (deepest < 0 and link.contains(turn.T @ (self._on_surface - origin))):
+            return gap
+        return min(deepest, 0.0)
+
+    def _deepest(self, link: Link, turn: Array, origin: Array) -> float:
+        """The smallest signed distance of the link's points, if it is negative; else 0."""
+        groups, deepest = link.groups, 0.0
+        lower = self._obstacle.signed_distance(groups.centres @ turn.T + origin) - groups.radii
+        order = np.argsort(lower)
+        order = order[lower[order] < 0]
+        for first in range(0, len(order), AT_ONCE):
+            some = [group for group in order[first : first + AT_ONCE] if lower[group] < deepest]
+            if not some:
+                break
+            points = np.concatenate([groups.of_group(group) for group in some])
+            deepest = min(deepest, float(self._obstacle.signed_distance(points @ turn.T + origin).min()))
+        return deepest
+
+
+def _coal_shape(obstacle: Obstacle) -> coal.CollisionGeometry:
+    """The obstacle's surface in its own frame."""
+    if isinstance(obstacle, Box):
+        return coal.Box(*obstacle.sizes)
+    if isinstance(obstacle, Cylinder):
+        return coal.Cylinder(obstacle.diameter / 2, obstacle.height)
+    return _drawn(obstacle.moved((0.0, 0.0, 0.0)))
+
+
+@lru_cache(maxsize=16)
+def _drawn(obstacle: Obstacle) -> coal.CollisionGeometry:
+    return _bounding_volumes(*obstacle.surface())
+
+
+def _bounding_volumes(vertices: Array, faces: Indices) -> coal.CollisionGeometry:
+    """Triangles as coal measures them."""
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(len(faces), len(vertices))
+    model.addVertices(vertices)
+    model.addTriangles(faces)
+    model.endModel()
+    return model
+
+
+def measure_from(links: Sequence[Link], obstacle: Obstacle) -> Measure:
+    """Distances of the links from an obstacle."""
+    return _FromBall(links, obstacle) if isinstance(obstacle, Sphere) else _FromShape(links, obstacle)
+
+
+class _BetweenLinks:
+    """Distances of pairs of links."""
+
+    lowest = 0.0
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        # Neighbours touch by design. No other pair does: each is apart in 96 % or more of random postures.
+        apart = [(a, b) for a, b in combinations(range(len(links)), 2) if links[b].frame - links[a].frame > 1]
+        self._links = links
+        self._pairs = np.array(apart)
+        self._centres = np.array([link.centre for link in links])
+        self._radii = np.array([link.radius for link in links])
+        self._frames = np.array([link.frame for link in links])
+        self.bodies = self._pairs[:, 1]
+        self.bases = self._frames[self._pairs[:, 0]]
+
+    def names(self, item: int) -> tuple[str, ...]:
+        first, second = self._pairs[item]
+        return self._links[first].name, self._links[second].name
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        a, b = self._pairs[items].T
+        apart = np.linalg.norm(self._centre(poses, rows, a) - self._centre(poses, rows, b), axis=1)
+        return apart - self._radii[a] - self._radii[b]
+
+    def _centre(self, poses: Poses, rows: Indices, links: Indices) -> Array:
+        frames = self._frames[links]
+        turned = np.einsum("nij,nj->ni", poses.rotations[rows, frames], self._centres[links])
+        return turned + poses.origins[rows, frames]
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        first, second = (self._links[k] for k in self._pairs[item])
+        place, other_place = (
+            coal.Transform3s(poses.rotations[row, link.frame], poses.origins[row, link.frame])
+            for link in (first, second)
+        )
+        return _coal_distance(first.surface, place, second.surface, other_place, ceiling)
+
+
+class _AboveTable:
+    """Heights of links above the table."""
+
+    lowest = -np.inf
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        self._links = [link for link in links if link.frame > 1]  # the base and link 1 stand on it
+        self.bodies = np.array([k for k, link in enumerate(links) if link.frame > 1])
+        self.bases = np.zeros(len(self.bodies), dtype=np.intp)
+        self._frames = np.array([link.frame for link in self._links])
+        self._centres = np.array([link.centre for link in self._links])
+        self._half_sizes = np.array([link.half_size for link in self._links])
+
+    def names(self, item: int) -> tuple[str, ...]:
+        return (self._links[item].name,)
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        up = poses.rotations[rows, self._frames[items], 2]  # (N, 3)
+        sag = (up * self._centres[items] - np.abs(up) * self._half_sizes[items]).sum(axis=1)
+        return poses.origins[rows, self._frames[items], 2] + sag
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        link = self._links[item]
+        heights = link.hull @ poses.rotations[row, link.frame, 2]
+        return float(heights.min() + poses.origins[row, link.frame, 2])
+
+
+def measure_between(links: Sequence[Link]) -> Measure:
+    """Distances of those links from each other that can come near each other."""
+    return _BetweenLinks(links)
+
+
+def measure_above_table(links: Sequence[Link]) -> Measure:
+    """Heights of the links' lowest points."""
+    return _AboveTable(links)
+
+
+_REQUEST = coal.DistanceRequest()
+_REQUEST.enable_signed_distance = False
+
+
+def _coal_distance(
+    a: coal.CollisionGeometry,
+    place_a: coal.Transform3s,
+    b: coal.CollisionGeometry,
+    place_b: coal.Transform3s,
+    ceiling: float,
+) -> float:
+    """Distance of two shapes, 0 where they intersect, or the ceiling, whatever is smaller."""
+    result = coal.DistanceResult()
+    result.min_distance = ceiling  # what is farther is skipped
+    return max(0.0, coal.distance(a, place_a, b, place_b, _REQUEST, result))

@@ -1,0 +1,103 @@
+"""Joint velocity limits: a sampled motion is delayed where it is too fast, and slows down gradually before it.
+
+A positive rescaling of time changes no orbit: the arm passes through the same configurations, only later, so whatever
+holds for the path (free of obstacles, within the joint limits, ending at the goal) still holds.
+"""
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+
+RAMP = 0.3
+"""Seconds in which a motion may slow down from its own pace to a standstill, or back."""
+NEGLIGIBLE = 1e-6
+"""Seconds: a segment that is late by less waits where it is, and nothing slows down around it."""
+
+
+def within_velocity_limits(times: Array, q: Array, limits: Array) -> Array:
+    """Later times at which the same motion respects the joint velocity limits.
+
+    The progress of the motion is the rate g = dt/ds of its own time t in the new time s: at most 1, and at most what
+    each segment allows. It changes at most at the rate 1/`RAMP`, and since dg/ds = ½ d(g²)/dt, its square is the
+    largest function below the squares of what the segments allow whose slope in t nowhere exceeds 2/`RAMP`:
+
+        g²(t) = minₖ (gₖ² + 2 |t − segment k| / RAMP),     s = ∫ dt/g.
+
+    Between two samples g² rises, stays at what the segment allows, and falls, so that its integral is exact. Where a
+    motion jumps (g = 0), it comes to rest, crosses the gap at the limit, and goes on.
+
+    Args:
+        times: (T,) seconds, not decreasing.
+        q: (T, 6) joint angles, rad; those of continuous joints unwrapped.
+        limits: (6,) rad/s, greater than 0.
+
+    Returns:
+        (T,) seconds, from the same start: no interval is shorter than before, and in none is a joint's mean speed above
+        its limit (up to rounding). A motion that respects the limits keeps its times, bit for bit.
+    """
+    intervals, least = np.diff(times), _least_intervals(q, limits)
+    if (least <= intervals).all():
+        return times
+    slows = least > intervals + NEGLIGIBLE
+    allowed = np.ones_like(intervals)  # g² of each segment
+    np.divide(intervals, least, out=allowed, where=slows)
+    np.square(allowed, out=allowed)
+    slope = 2 / RAMP
+    sources = np.where(slows, allowed, np.inf)
+    behind = np.minimum.accumulate(sources - slope * times[1:]) + slope * times[1:]
+    ahead = np.minimum.accumulate((sources + slope * times[:-1])[::-1])[::-1] - slope * times[:-1]
+    nodes = np.ones_like(times)  # g² at the samples; the minima with `sources` undo rounding
+    nodes[1:] = np.minimum(np.minimum(behind, sources), nodes[1:])
+    nodes[:-1] = np.minimum(np.minimum(ahead, sources), nodes[:-1])
+    nodes = np.maximum(nodes, 0.0)
+
+    highest = np.minimum(allowed, (nodes[:-1] + nodes[1:] + slope * intervals) / 2)
+    ramps = 2 * highest - nodes[:-1] - nodes[1:]  # how much g² rises and falls within a segment
+    at_nodes, at_highest = np.sqrt(nodes), np.sqrt(highest)
+    level = np.maximum(intervals - ramps / slope, 0.0)  # of the segment, in its own time
+    np.divide(level, at_highest, out=level, where=at_highest > 0)
+    new = level + 2 / slope * (2 * at_highest - at_nodes[:-1] - at_nodes[1:])
+    delays = np.maximum(np.maximum(new, least) - intervals, 0.0)
+    return times + np.concatenate([[0.0], np.cumsum(delays)])
+
+
+def used_fraction(times: Array, q: Array, limits: Array) -> float:
+    """The largest fraction of a velocity limit that any joint uses in any segment; infinite where the motion jumps.
+
+    Args:
+        times: (T,) seconds, not decreasing.
+        q: (T, 6) joint angles, rad.
+        limits: (6,) rad/s.
+    """
+    intervals, least = np.diff(times), _least_intervals(q, limits)
+    used = np.where(least > 0, np.inf, 0.0)
+    np.divide(least, intervals, out=used, where=intervals > 0)
+    return float(used.max(initial=0.0))
+
+
+def joint_velocities(times: Array, q: Array) -> Array:
+    """Joint velocities at the samples of a motion: those of the chord between the samples before and after.
+
+    That is the mean of the two segments that meet, weighted by their durations, so it stays within limits that the
+    segments respect. Samples at one and the same time get one velocity; a motion that takes no time gets zero.
+
+    Args:
+        times: (T,) seconds, not decreasing.
+        q: (T, 6) joint angles, rad.
+
+    Returns:
+        (T, 6) rad/s, signed.
+    """
+    is_first = np.append(True, np.diff(times) > 0)
+    if is_first.sum() == 1:
+        return np.zeros_like(q)
+    first = np.flatnonzero(is_first)
+    last = np.append(first[1:], len(times)) - 1
+    before, after = np.append(0, last[:-1]), np.append(first[1:], len(times) - 1)
+    velocities = (q[after] - q[before]) / (times[after] - times[before])[:, None]
+    return velocities[np.cumsum(is_first) - 1]
+
+
+def _least_intervals(q: Array, limits: Array) -> Array:
+    """Duration (T − 1,) of each segment of q (T, 6) when its most demanding joint moves at its limit, seconds."""
+    return (np.abs(np.diff(q, axis=0)) / limits).max(axis=1)

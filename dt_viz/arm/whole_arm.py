@@ -1,0 +1,388 @@
+"""From motions of the end effector to motions of the whole arm that clear an obstacle (sec. 4.5).
+
+The joints follow the end effector by the pseudo-inverse: q(t) = Q(x(t)) with one section Q for all rollouts of a task
+(`dt_viz.arm.tracking.track` with a shared reference). It does not depend on the obstacle, so it is computed once; a
+drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from dt_viz.arm.body_points import BodyPoints
+from dt_viz.arm.cspace import LEVERS, REACH_PER_TEMPERATURE, GradientField, JointLimits, WholeArmField, squared_lengths
+from dt_viz.arm.escape import escape_directions
+from dt_viz.arm.robot import NUM_JOINTS, Robot
+from dt_viz.arm.tracking import JointPath, track
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
+from dt_viz.flows.fields import Array, Indices, Mask, Sum, VectorField
+from dt_viz.flows.integrators import rk4
+from dt_viz.flows.rollouts import Bundle, refined
+from dt_viz.interruption import checkpoint
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.union import Several
+from dt_viz.properties import cached_property
+from dt_viz.scenario.scenario import Scenario
+
+NUM_CONFIGURATIONS = 100
+"""Of each rollout before refinement."""
+MAX_DURATION = 2.0
+"""Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
+SNAPSHOT = 0.1
+"""Flow time between two looks at the clearance: contacts move by at most two centimetres in it."""
+STRIDE = 3
+"""Every which sample the duration is chosen for at first: the time that they take to leave changes slowly along a
+rollout, and the deepest are not the last."""
+MAX_ROUNDS = 4
+"""Of looking whether samples that refinement finds are clear, too, and going on if not."""
+SLOPE = 0.1
+"""Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
+OVERSHOOT = 7e-3
+"""Metres by which the covering spheres stick out of the arm, about: so much less of the margin is asked of them."""
+MOVED = 5e-3
+"""Metres beside its start where a guest's hand may begin before it is said."""
+ROUNDING = 1e-3
+"""Metres of clearance that do not count."""
+COARSE_STEP = 0.2
+"""Of flow time. An RK4 step of this length is off by a tenth of a millimetre at the hand, about."""
+TOLERANCE = 3e-9
+"""Of the fine flow's steps, rad."""
+NUM_COMPARED = 60
+"""Colliding samples that ways out are compared by."""
+BESIDE = 0.20
+"""Clearance up to which a sample is bent along with the colliding ones, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lift:
+    """The joints along each rollout: q = Q(x), a smooth function of the fraction of its base ray."""
+
+    fractions: Array
+    """(R, T) increasing along each rollout."""
+    tracked: JointPath
+    """At these fractions; its q has shape (R, T, 6)."""
+    reference: Array
+    """(6,) posture that the arm stays near to, rad."""
+    exactly: Callable[[Array, Indices, Array], Array] | None = None
+    """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
+    fractions (N,); None is content with the spline."""
+    num_guests: int = 0
+    """How many of the rollouts, the last ones, no avoidance is made for: they are carried along."""
+
+    @property
+    def num_hosts(self) -> int:
+        """How many of the rollouts, the first ones, an avoidance is made for."""
+        return len(self.fractions) - self.num_guests
+
+    @cached_property
+    def _splines(self) -> tuple[CubicSpline, ...]:
+        return tuple(CubicSpline(u, q) for u, q in zip(self.fractions, self.tracked.q, strict=True))
+
+    def at(self, index: Indices, fraction: Array) -> Array:
+        """Configurations (N, 6), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
+        q = np.empty((len(index), NUM_JOINTS))
+        for rollout, spline in enumerate(self._splines):
+            rows = index == rollout
+            q[rows] = spline(fraction[rows])
+        return q if self.exactly is None else self.exactly(q, index, fraction)
+
+    def only(self, rollout: int) -> Lift:
+        """One of the rollouts."""
+        q, error, limits_hit, manipulability, damped = (
+            getattr(self.tracked, name)[rollout : rollout + 1] for name in JointPath.__dataclass_fields__
+        )
+        tracked = JointPath(q, error, limits_hit, manipulability, damped)
+        return Lift(self.fractions[rollout : rollout + 1], tracked, self.reference)
+
+    @cached_property
+    def pins(self) -> Array:
+        """(R' + 1, 6) postures at the starts of the R' hosts and at the goal, rad."""
+        return np.concatenate([self.tracked.q[: self.num_hosts, 0], self.tracked.q[:1, -1]])
+
+
+def joined(lifts: Sequence[Lift], num_guests: int) -> Lift:
+    """The rollouts of several, one after the other, the last ones guests, with the reference of the first."""
+    tracked = JointPath(
+        *(np.concatenate([getattr(part.tracked, name) for part in lifts]) for name in JointPath.__dataclass_fields__)
+    )
+    fractions = np.concatenate([part.fractions for part in lifts])
+    return Lift(fractions, tracked, lifts[0].reference, num_guests=num_guests)
+
+
+def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:
+    """Follow rollouts with the joints.
+
+    Args:
+        robot: whose joints.
+        fractions: (R, T) where on their base rays the samples are.
+        paths: (R, T, 3) end effector there, metres.
+        reference: (6,) posture that the arm stays near to, rad.
+        initial: (R, T, 6) joints of nearby paths to begin from, rad.
+    """
+    start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
+    return Lift(fractions, track(robot, paths, start, initial, reference=start), reference)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSolution:
+    """Joint motions of all rollouts, one after the other."""
+
+    transform: Diffeomorphism
+    """ψ_q, from the configurations where the arm moves to those of the undisturbed motion."""
+    index: Indices
+    """(N,) which rollout a sample belongs to, not decreasing."""
+    fraction: Array
+    """(N,) where on its base ray it is."""
+    q: Array
+    """(N, 6) without avoidance, rad."""
+    p: Array
+    """(N, 6) the motion, rad."""
+    duration: float
+    """t of the avoidance flow."""
+    clearance: float
+    """Smallest distance of the covering spheres from the obstacle along the hosts, metres."""
+    cleared: bool
+    """Whether all samples of the hosts keep the clearance that is asked for."""
+    too_near: Indices
+    """Guests, counted among all rollouts, that do not keep it."""
+    moved: Indices
+    """Guests that begin more than `MOVED` away from their start."""
+
+
+class WholeArm:
+    """Makes the arm's motions clear an obstacle, by a diffeomorphism of configuration space."""
+
+    def __init__(self, robot: Robot, body: BodyPoints) -> None:
+        self.robot = robot
+        self.body = body.on_moving_links
+        self.limits = JointLimits(robot.lower, robot.upper)
+
+    def undisturbed(self, lifted: Lift, scenario: Scenario, spacing: float) -> ArmSolution:
+        """The motions as lifted, avoiding nothing."""
+        return _Solver(self, lifted, scenario, None, spacing, coarse=True).solution()
+
+    def avoiding(
+        self,
+        lifted: Lift,
+        scenario: Scenario,
+        spacing: float,
+        *,
+        coarse: bool,
+    ) -> ArmSolution:
+        """The motions around the scenario's obstacle.
+
+        With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
+        scenario's margin, or what the start or goal beside it has. Of several ways out the first is taken that works,
+        or the one that comes nearest to it. All this looks at the hosts only: guests do not change their motions.
+
+        Args:
+            lifted: the motions below.
+            scenario: with obstacle, margin, temperature and duration.
+            spacing: largest distance between neighbouring samples, metres at the hand, about.
+            coarse: whether the flow is integrated for the eye only, in a few equal steps.
+        """
+        best = None
+        for generator in self._generators(lifted, scenario):
+            solution = _Solver(self, lifted, scenario, generator, spacing, coarse=coarse).solution()
+            if best is None or solution.cleared or solution.clearance > best.clearance:
+                best = solution
+            if solution.cleared or scenario.duration is not None:
+                break
+        return best or self.undisturbed(lifted, scenario, spacing)
+
+    def warped(
+        self, full: ArmSolution, lifted: Lift, scenario: Scenario, fraction: float, spacing: float
+    ) -> ArmSolution:
+        """The motions with the transform of a solution run for a fraction of its duration.
+
+        Args:
+            full: whose transform it is.
+            lifted: the motions below, warped as far.
+            scenario: with obstacle and margin.
+            fraction: s, from 0 to 1.
+            spacing: as in `avoiding`.
+        """
+        solver = _Solver(self, lifted, scenario, None, spacing, coarse=True)
+        return solver.through(full.transform.scaled(fraction), full.duration)
+
+    def clearance(self, q: Array, obstacle: Several | Obstacle) -> Array:
+        """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
+        points = self.body.of_chain(self.robot.chain(q.T))
+        return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)
+
+    def _generators(self, lifted: Lift, scenario: Scenario) -> Iterator[VectorField]:
+        """The fields to try, the most promising first; none where nothing comes too near an obstacle."""
+        reach = REACH_PER_TEMPERATURE * scenario.temperature
+        q = lifted.tracked.q[: lifted.num_hosts]
+        points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
+        tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        near = scenario.obstacle.parts
+        escapes = [self._escapes(points, tangents, obstacle, scenario.margin) for obstacle in near]
+        met = [(obstacle, found) for obstacle, found in zip(near, escapes, strict=True) if found]
+        if not met:
+            return
+        if scenario.generator == "probability":
+            yield Sum(tuple(GradientField(self.robot, self.body, obstacle, reach) for obstacle, _ in met))
+            return
+        pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
+        for attempt in range(max(len(found) for _, found in met)):
+            yield Sum(
+                tuple(
+                    WholeArmField(self.robot, self.body, obstacle, found[min(attempt, len(found) - 1)], pins, reach)
+                    for obstacle, found in met
+                )
+            )
+
+    def _escapes(self, points: Array, tangents: Array, obstacle: Obstacle, margin: float) -> list[Array]:
+        """Ways out of one obstacle, the best first; none where nothing comes too near it.
+
+        Args:
+            points: (P, 3, N) body points of all samples, metres.
+            tangents: (N, 3) directions of the end effector's motion there.
+            obstacle: to escape from.
+            margin: clearance below which a sample counts, metres.
+        """
+        distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        clearance = distance.min(axis=0)
+        collides = np.flatnonzero(clearance < margin)
+        if not len(collides):
+            return []
+        bent = np.flatnonzero(clearance < BESIDE)
+        return escape_directions(
+            points[:, :, collides[:: max(1, len(collides) // NUM_COMPARED)]],
+            self.body.radius,
+            tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
+            obstacle,
+            margin,
+        )
+
+
+class _Solver:
+    """Finds the duration of one generator's flow, and the samples that show the motion."""
+
+    def __init__(
+        self,
+        arm: WholeArm,
+        lifted: Lift,
+        scenario: Scenario,
+        generator: VectorField | None,
+        spacing: float,
+        *,
+        coarse: bool,
+    ) -> None:
+        self._arm = arm
+        self._lifted = lifted
+        self._scenario = scenario
+        self._generator = generator
+        self._spacing = spacing
+        self._coarse = coarse
+        self._room = arm.clearance(lifted.pins, scenario.obstacle) - ROUNDING
+
+    def solution(self) -> ArmSolution:
+        """See `WholeArm.avoiding`."""
+        duration = self._scenario.duration
+        if self._generator is None:
+            duration = 0.0
+        elif duration is None:
+            hosts = self._lifted.tracked.q[: self._lifted.num_hosts]
+            q = self._arm.limits.inside(hosts[:, ::STRIDE].reshape(-1, NUM_JOINTS))
+            duration = self._clearing_duration(q[self._lack(q) > 0])
+        return self._with_duration(min(duration, MAX_DURATION))
+
+    def _with_duration(self, duration: float) -> ArmSolution:
+        transform = self._transform(duration)
+        bundle = self._sampled(transform)
+        p = bundle.positions / LEVERS
+        lack = self._lack(p)
+        hosts = self._of_hosts(bundle)
+        chosen = self._generator is not None and self._scenario.duration is None
+        for _ in range(MAX_ROUNDS if chosen else 0):
+            if duration >= MAX_DURATION or not (lack[hosts] > ROUNDING).any():
+                break
+            # the flow is a one-parameter group: go on from where the samples are
+            more = min(self._clearing_duration(p[hosts][lack[hosts] > 0]), MAX_DURATION - duration)
+            duration += more
+            transform = self._transform(duration)
+            if self._scenario.integration.by_hand:  # a few coarse steps are no such group
+                levels = self._evaluate(transform, bundle.index, bundle.fraction)
+            else:
+                levels = (self._transform(more).inverse(p) * LEVERS)[:, None]
+            bundle = self._refined(replace(bundle, levels=levels), transform)
+            p = bundle.positions / LEVERS
+            lack = self._lack(p)
+            hosts = self._of_hosts(bundle)
+        return self._along(bundle, transform, duration, lack)
+
+    def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
+        """The motions of a transform that is there already, of which that is the full duration."""
+        bundle = self._sampled(transform)
+        return self._along(bundle, transform, duration, self._lack(bundle.positions / LEVERS))
+
+    def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float, lack: Array) -> ArmSolution:
+        p = bundle.positions / LEVERS
+        hosts, near = self._of_hosts(bundle), lack > ROUNDING
+        clearance = float(self._arm.clearance(p[hosts], self._scenario.obstacle).min())
+        q = self._lifted.at(bundle.index, bundle.fraction)
+        cleared, too_near = not near[hosts].any(), np.unique(bundle.index[near & ~hosts])
+        away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
+        moved = np.unique(bundle.index[away & ~hosts & (bundle.fraction == 0)])
+        return ArmSolution(
+            transform, bundle.index, bundle.fraction, q, p, duration, clearance, cleared, too_near, moved
+        )
+
+    def _of_hosts(self, bundle: Bundle) -> Mask:
+        return bundle.index < self._lifted.num_hosts
+
+    def _sampled(self, transform: Diffeomorphism) -> Bundle:
+        num_rollouts, num_samples = self._lifted.fractions.shape
+        index, fraction = np.repeat(np.arange(num_rollouts), num_samples), self._lifted.fractions.ravel()
+        return self._refined(Bundle(index, fraction, self._evaluate(transform, index, fraction)), transform)
+
+    def _transform(self, duration: float) -> Diffeomorphism:
+        limits = self._arm.limits
+        if self._generator is None or duration == 0:
+            return Identity(NUM_JOINTS)
+        if self._scenario.integration.by_hand:
+            flow = self._scenario.integration.of(Flow(self._generator, duration))
+        elif self._coarse:
+            flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP), sparse=True)
+        else:
+            flow = AdaptiveFlow(self._generator, duration, TOLERANCE)
+        return Conjugated(flow, limits)
+
+    def _evaluate(self, transform: Diffeomorphism, index: Indices, fraction: Array) -> Array:
+        """Levels (N, 1, 6) of the samples: postures by their `LEVERS`, so that distances are metres."""
+        q = self._arm.limits.inside(self._lifted.at(index, fraction))
+        return (transform.inverse(q) * LEVERS)[:, None]
+
+    def _refined(self, bundle: Bundle, transform: Diffeomorphism) -> Bundle:
+        return refined(bundle, lambda i, u: self._evaluate(transform, i, u), self._spacing)
+
+    def _lack(self, p: Array) -> Array:
+        """(N,) metres by which configurations (N, 6) miss the clearance that is asked for."""
+        distance = np.sqrt(squared_lengths(p, self._lifted.pins))
+        margin = max(self._scenario.margin - OVERSHOOT, 2 * ROUNDING)
+        asked = np.minimum(margin, (self._room + SLOPE * distance).min(axis=1))
+        return asked - self._arm.clearance(p, self._scenario.obstacle)
+
+    def _clearing_duration(self, p: Array) -> float:
+        """The shortest duration after which the flow has carried configurations (N, 6) clear, or `MAX_DURATION`."""
+        assert self._generator is not None
+        limits, duration = self._arm.limits, 0.0
+        state, lack = limits.forward(p), self._lack(p)
+        while len(state):
+            if duration >= MAX_DURATION:
+                return MAX_DURATION
+            checkpoint()
+            state, _ = rk4(self._generator, state, None, -SNAPSHOT)
+            before, lack = lack, self._lack(limits.inverse(state))
+            if (lack <= 0).all():
+                return duration + SNAPSHOT * float((before / np.maximum(before - lack, 1e-12)).clip(0, 1).max())
+            state, lack, duration = state[lack > 0], lack[lack > 0], duration + SNAPSHOT
+        return duration

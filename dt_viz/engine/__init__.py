@@ -1,0 +1,1 @@
+"""Scenario to frames for one visitor, and the session that edits it."""

@@ -1,0 +1,561 @@
+"""Scenario → transforms → frames. Knows no browser; keeps what an edit leaves unchanged."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import TypeVar
+
+import numpy as np
+
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.arm.robot import Robot
+from dt_viz.arm.tracking import UnreachableError
+from dt_viz.arm.whole_arm import ArmSolution
+from dt_viz.engine.turns import Turns
+from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.fields import Array, PlacedField
+from dt_viz.flows.rollouts import Bundle
+from dt_viz.interruption import Checkpoint, interruptible
+from dt_viz.learning.imitation import ImitationSettings, Progress
+from dt_viz.learning.store import FitStore
+from dt_viz.metrics import maximum_collision_distance
+from dt_viz.motion.certificates import (
+    MAX_OFF,
+    MAX_OFF_TRACKED,
+    Shown,
+    certified,
+    certified_arm,
+    clearance_doubts,
+    delay_doubts,
+    hand_doubts,
+)
+from dt_viz.motion.diagnostics import margin_doubts, motion_doubts, target_doubts
+from dt_viz.motion.following import OUT_OF_REACH, ArmMotion, Follower, arm_samples
+from dt_viz.motion.health import Health, fold_doubts
+from dt_viz.motion.holding import held
+from dt_viz.motion.nominal import Ground, Learned, named_starts
+from dt_viz.motion.profiles import Profiles, body_profile, hand_profile
+from dt_viz.motion.pushing import Pushed, pushed
+from dt_viz.motion.solve import FINE, LIVE, Precision, Solution, cut_off, solve
+from dt_viz.motion.solved import Solved
+from dt_viz.motion.warp import warped
+from dt_viz.pictures.occupancy import occupancy_picture
+from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures, in_frame
+from dt_viz.pictures.slice_fields import Clearance, arrows_and_colour, streamlines
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.stack import WHOLE_ARM, levels
+from dt_viz.scenario.starts import followed
+from dt_viz.scenario.tasks import Task, TaskEntry
+
+
+class Stage(IntEnum):
+    """How far a frame is worked out; each stage holds all that the one before it holds."""
+
+    ROLLOUTS = 0
+    """Rollouts and their clearance."""
+    LIVE = 1
+    """Also the arm and what lies on the slice: what follows a drag."""
+    FINE = 2
+    """All of it refined, for a scenario that rests."""
+    CERTIFIED = 3
+    """Also the certificates."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All that the page draws for a scenario. Read only."""
+
+    scenario: Scenario
+    task: Task
+    stage: Stage
+    ghost: tuple[Array, ...]
+    """Undeformed rollouts, (T_i, 3)."""
+    rollouts: tuple[Array, ...]
+    """(T_i, 3), metres: first those from the task's starts, then those from added ones."""
+    times: tuple[Array, ...]
+    """(T_i,) seconds of the samples of each rollout."""
+    levels: tuple[tuple[Array, ...], ...]
+    """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3)."""
+    goal: Array
+    """(3,) where the demonstrations end."""
+    reached: Array
+    """(3,) where the motions end: elsewhere where the obstacle covers the goal or leaves no way to it."""
+    blocked: tuple[str, ...]
+    """Why there is no motion for this scenario, in words; what is shown then is the last one that there was."""
+    health: Health
+    chosen: int | None = 0
+    """Which rollout the arm follows; None where it cannot begin the one that the scenario asks for."""
+    learned_steps: tuple[int, ...] = ()
+    """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
+    layer_radii: tuple[float | None, ...] = ()
+    """Radius of the region that each layer acts in, in the order of `Scenario.layers`, metres; None where it is off or
+    acts everywhere."""
+    level: int | None = None
+    """Which of `levels` the view shows, with the pictures that are on that manifold; None is the whole stack."""
+    arm: ArmMotion | None = None
+    """None before stage LIVE, and where the arm cannot reach the start."""
+    pictures: Pictures = NO_PICTURES
+    """Of ψ itself and on the slice, as far as the view shows them; empty before stage LIVE."""
+    profiles: Profiles | None = None
+    """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
+    seconds: float = 0.0
+    """From the start of the rebuild until this frame."""
+
+    @property
+    def slice(self) -> Slice:
+        """Where the pictures lie."""
+        return self.task.slice.posed(self.scenario.view.slice)
+
+
+@dataclass
+class _Kept:
+    """What has been worked out of one motion, which is not again when only the view changes."""
+
+    scenario: Scenario
+    ground: Ground
+    solved: dict[Precision, Solved] = field(default_factory=dict)
+    rollouts: dict[Precision, Frame] = field(default_factory=dict)
+    """Frames of stage ROLLOUTS."""
+    arms: dict[Precision, Frame] = field(default_factory=dict)
+    """The same with the arm."""
+    health: Health | None = None
+    """Certified."""
+
+
+_turns = Turns()
+"""Engines take turns. Small array operations of several threads would fight for the interpreter, and all would lose:
+four sessions that drag at once get twice as many frames this way."""
+
+
+def let_drags_pass(longest: float) -> None:
+    """Wait while an engine follows a hand, at most so many seconds; called often by what takes long beside engines."""
+    _turns.let_pass(longest)
+
+
+@contextmanager
+def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
+    """Within this block compute when it is this engine's turn, letting others go first when they are due.
+
+    Args:
+        checkpoint: of what refines: others that follow a hand are due before it, and what this raises ends it, also
+            while it waits for its turn.
+    """
+    wanted = checkpoint or (lambda: None)
+
+    def pause() -> None:
+        wanted()
+        _turns.give_way(wanted)
+
+    with _turns.taken(patient=checkpoint is not None, checkpoint=wanted), interruptible(pause):
+        yield
+
+
+class Engine:
+    """Computes frames for one visitor. Not thread-safe: one worker thread calls it.
+
+    The same scenario always gives the same frame, with two exceptions. Where there is no motion for it the last one
+    that there was for the task is shown, marked by `Frame.blocked`. And up to stage LIVE joints are looked for from
+    those shown before: they differ by less than a milliradian.
+    """
+
+    def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot) -> None:
+        self._loaders = tasks
+        self._fits = fits
+        self._robot = robot
+        self._follower = Follower(robot)
+        self._tasks: dict[str, Task] = {}
+        self._learned: dict[tuple[str, bool, str], Learned] = {}
+        self._good: dict[str, tuple[Frame, Solved]] = {}
+        """The last motion of each task."""
+        self._kept: _Kept | None = None
+        """Of the newest motion."""
+        self._full: dict[Precision, Solved] = {}
+        """The last full stacks: while only the warp changes, nothing of them does."""
+        self._shown: Solved | None = None
+        """The last motion that an arm was shown for."""
+        self._live: Solved | None = None
+        """The same as it was at stage LIVE: quicker, and exact enough for a hand that moves."""
+
+    def task(self, name: str) -> Task:
+        """The task of that name, loaded on first use. Raises DemonstrationError if its file cannot be used."""
+        if name not in self._tasks:
+            self._tasks[name] = self._loaders[name]()
+        return self._tasks[name]
+
+    def frames(
+        self, scenario: Scenario, progress: Progress | None = None, checkpoint: Checkpoint = lambda: None
+    ) -> Iterator[Frame]:
+        """Frames for a scenario, one for each stage; stop iterating to skip what is not wanted any more.
+
+        Args:
+            scenario: what to show.
+            progress: called while a task is fitted for the first time; see `dt_viz.learning.imitation.fit`.
+            checkpoint: called often after stage LIVE; what it raises ends the computation.
+
+        Raises:
+            DemonstrationError: the task's demonstrations cannot be read.
+            ImitationError: nothing can be learned from them.
+        """
+        ground = self._ground(scenario, progress)
+        began = time.perf_counter()
+        for frame in self._stages(ground, scenario, checkpoint):
+            yield replace(frame, seconds=time.perf_counter() - began)
+
+    def arm_motions(self, scenario: Scenario) -> tuple[Frame, tuple[ArmMotion, ...]]:
+        """The frame of stage FINE, without pictures, and the arm's motion along each rollout; none if it is blocked.
+
+        Raises:
+            DemonstrationError, ImitationError: as `frames`.
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        ground = self._ground(scenario, None)
+        if _uses_whole_arm(scenario):
+            blocked = self._follower.obstructions(ground, scenario.obstacle)
+            if blocked:
+                *_, frame = self._stages_without_motion(ground, scenario, blocked)
+                return frame, ()
+            ground = self._follower.admitted(ground, scenario.obstacle)
+        fine = self._solved(ground, scenario, FINE)
+        frame = self._frame(scenario, fine)
+        arms, health = [], frame.health
+        for rollout in range(len(frame.rollouts)):
+            arm, doubts = self._arm(frame, fine, rollout, exact=True)
+            arms.append(arm)
+            health = health.doubting_arm(*doubts)
+        return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
+
+    def pushed(self, scenario: Scenario, q: Array, rng: np.random.Generator) -> Pushed | None:
+        """The arm's motion after the hand is pushed aside; None unless a motion of this scenario is shown.
+
+        Args:
+            scenario: whose frames were computed last.
+            q: (6,) joint angles when the push begins, rad.
+            rng: for its direction.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        if self._shown is None or not self._shown.scenario.moves_like(scenario):
+            return None
+        with _in_turn():
+            return pushed(self._follower, self._shown, q, rng)
+
+    def held(self, scenario: Scenario, q: Array, place: Array) -> Pushed | None:
+        """The arm with its hand held at a place; None unless a motion of this scenario is shown.
+
+        Args:
+            scenario: whose frames were computed last.
+            q: (6,) joint angles now, rad.
+            place: (3,) where the hand should be, metres.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        if self._live is None or not self._live.scenario.moves_like(scenario):
+            return None
+        with _in_turn():
+            return held(self._follower, self._live, q, place)
+
+    def _stages(self, ground: Ground, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
+        kept = self._kept
+        if kept is None or not kept.scenario.moves_like(scenario):
+            if _uses_whole_arm(scenario):
+                with _in_turn():
+                    blocked = self._follower.obstructions(ground, scenario.obstacle)
+                    admitted = ground if blocked else self._follower.admitted(ground, scenario.obstacle)
+                if blocked:
+                    yield from self._stages_without_motion(ground, scenario, blocked, checkpoint)
+                    return
+                ground = admitted
+            kept = self._kept = _Kept(scenario, ground)
+        ground = kept.ground
+        with _in_turn():
+            live = _once(kept.solved, LIVE, lambda: self._solved(ground, scenario, LIVE))
+            first = _once(kept.rollouts, LIVE, lambda: self._frame(scenario, live))
+            first = replace(first, scenario=scenario, level=_level(scenario, live.stack))
+        yield first
+        with _in_turn():
+            frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, live, exact=False))
+            pictures = _pictures(scenario, live, coarse=True)
+            frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.LIVE, pictures=pictures)
+            self._good[scenario.task] = frame, live
+            self._shown = self._live = live
+        yield frame
+
+        with _in_turn(checkpoint):
+            fine = _once(kept.solved, FINE, lambda: self._solved(ground, scenario, FINE))
+            exact = _once(kept.rollouts, FINE, lambda: self._frame(scenario, fine))
+            frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, fine, exact=True))
+            pictures = _pictures(scenario, fine, coarse=False)
+            frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.FINE, pictures=pictures)
+            if scenario.view.health_plots and frame.chosen is not None:
+                frame = replace(frame, profiles=self._profiles(frame, fine, frame.chosen))
+            self._good[scenario.task] = frame, fine
+            self._shown = fine
+        yield frame
+        if kept.health is None:
+            with _in_turn(checkpoint):
+                health = self._certified(frame, fine)
+            if frame.arm is not None:
+                with interruptible(checkpoint):  # out of turn: the first time it prepares meshes for seconds
+                    health = _with_meshes(health, frame, fine)
+            kept.health = health
+        yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
+
+    def _certified(self, frame: Frame, fine: Solved) -> Health:
+        """Certificates of the motions that the frame shows, with the transforms that they were solved with."""
+        health = self._certified_hand(frame, fine) if fine.arm is None else self._certified_arm(frame, fine, fine.arm)
+        if frame.arm is None or frame.chosen is None:
+            return health
+        path, due = frame.rollouts[frame.chosen], frame.times[frame.chosen]
+        if fine.arm is None:
+            keep = arm_samples(len(path))
+            health = health.doubting_arm(*hand_doubts(health, self._robot, frame.arm.q, path[keep]))
+            due = due[keep]
+        return health.doubting_arm(*delay_doubts(self._robot, frame.arm.q, frame.arm.times, due))
+
+    def _certified_hand(self, frame: Frame, fine: Solved) -> Health:
+        stack, obstacle, path = fine.stack, frame.scenario.obstacle, np.concatenate(frame.rollouts)
+        shown = Shown(stack.bundle.index, stack.bundle.fraction, np.concatenate(frame.times), path)
+        health = certified(frame.health, stack, fine.ends, shown)
+        health = health.doubting(*clearance_doubts(health.clearance, float(obstacle.signed_distance(path).min())))
+        depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
+        return replace(health, clearance=-depth if depth > 0 else health.clearance)
+
+    def _certified_arm(self, frame: Frame, fine: Solved, arm: ArmSolution) -> Health:
+        scenario, robot, whole_arm = frame.scenario, self._robot, self._follower.whole_arm
+        p, undisturbed, health = arm.p.copy(), whole_arm.limits.inside(arm.q), frame.health
+        if frame.arm is not None:
+            p[arm.index == frame.chosen] = frame.arm.q
+        path, times = np.concatenate(frame.rollouts), np.concatenate(frame.times)
+        health = health.doubting(
+            *hand_doubts(health, robot, p, path, tolerance=MAX_OFF),
+            *fold_doubts(WHOLE_ARM, arm.transform, scenario.integration, p, undisturbed),
+        )
+        by_hand = scenario.integration.by_hand
+        health, q = certified_arm(health, arm.transform, p, undisturbed, by_hand=by_hand)
+        shown = Shown(arm.index, arm.fraction, times, robot.end_effector(q))
+        health = certified(health, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
+        hosts = arm.index < len(frame.rollouts) - fine.ground.num_added
+        kept = float(whole_arm.clearance(p[hosts], scenario.obstacle).min())
+        return health.doubting(*clearance_doubts(health.clearance, kept))
+
+    def _stages_without_motion(
+        self, ground: Ground, scenario: Scenario, blocked: tuple[str, ...], checkpoint: Checkpoint = lambda: None
+    ) -> Iterator[Frame]:
+        """The last good motion at every stage, or the undisturbed one, refined, if there is none."""
+        if scenario.task not in self._good:
+            undisturbed = self._stages(ground, replace(scenario, avoidance=False), checkpoint)
+            next(frame for frame in undisturbed if frame.stage is Stage.FINE)
+        good, solved = self._good[scenario.task]
+        seen = replace(good.scenario, view=scenario.view)
+        changed = not seen.computes_like(good.scenario)
+        good = replace(good, level=_level(seen, solved.stack))
+        clearance = float(self._follower.whole_arm.clearance(self._any_arm(good), scenario.obstacle).min())
+        health = Health(clearance=clearance)
+        for stage in Stage:
+            if changed and stage in (Stage.LIVE, Stage.FINE):
+                good = replace(good, pictures=_pictures(seen, solved, coarse=stage is Stage.LIVE))
+            yield replace(good, scenario=scenario, stage=stage, blocked=blocked, health=health)
+
+    def _ground(self, scenario: Scenario, progress: Progress | None) -> Ground:
+        key = (scenario.task, scenario.imitation, scenario.objective)
+        if key not in self._learned:
+            task = self.task(scenario.task)
+            imitation = self._fits.get(task.demonstrations, ImitationSettings(scenario.objective), progress)
+            self._learned[key] = Learned.of(task, imitation, imitates=scenario.imitation)
+        return self._learned[key].ground(scenario.starts)
+
+    def _solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> Solved:
+        full = self._fully_solved(ground, replace(scenario, warp=1.0), precision)
+        if scenario.warp == 1:
+            return full
+        below = ground.warped(scenario.warp)
+        stack = warped(below, full.stack, scenario.warp, precision)
+        if full.arm is None:
+            return Solved(scenario, ground, below, stack, None, None)
+        exact = precision is not LIVE
+        lifted, whole_arm = self._follower.behaving(ground, stack, exact=exact), self._follower.whole_arm
+        arm = whole_arm.warped(full.arm, lifted, scenario, scenario.warp, precision.spacing)
+        return Solved(scenario, ground, below, stack, arm, lifted)
+
+    def _fully_solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> Solved:
+        known = self._full.get(precision)
+        if known is not None and ground.moves_like(known.ground) and scenario.moves_like(known.scenario):
+            return known
+        stack, arm, lifted, follower = solve(ground, scenario, precision), None, None, self._follower
+        if _uses_whole_arm(scenario):
+            exact = precision is not LIVE
+            lifted = follower.behaving(ground, stack, exact=exact) if stack.built else follower.undisturbed(ground)
+            arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, coarse=precision is LIVE)
+        solved = self._full[precision] = Solved(scenario, ground, ground, stack, arm, lifted)
+        return solved
+
+    def _frame(self, scenario: Scenario, solved: Solved) -> Frame:
+        """The frame of stage ROLLOUTS."""
+        ground, stack, arm = solved.ground, solved.stack, solved.arm
+        if arm is None:
+            index, fraction, positions = stack.bundle.index, stack.bundle.fraction, stack.bundle.positions
+            clearance = float(scenario.obstacle.signed_distance(positions).min())
+        else:
+            index, fraction, positions = arm.index, arm.fraction, self._robot.end_effector(arm.p)
+            clearance = arm.clearance
+        shown = Bundle(index, fraction, positions[:, None])
+        reached = positions[-1]
+        doubts = motion_doubts(solved, clearance, float(np.linalg.norm(reached - ground.goal)))
+        if scenario.avoidance and scenario.obstacles and scenario.warp == 1:
+            doubts += target_doubts(solved, self._robot)
+        return Frame(
+            scenario=scenario,
+            task=ground.task,
+            stage=Stage.ROLLOUTS,
+            ghost=ground.paths,
+            rollouts=shown.paths,
+            chosen=ground.rollout(followed(scenario, ground.num_demonstrated)),
+            times=shown.split(stack.rays.times(index, fraction)),
+            levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
+            level=_level(scenario, stack),
+            goal=ground.goal,
+            reached=reached,
+            blocked=(),
+            health=Health(
+                clearance=clearance,
+                duration=stack.duration_at(None),
+                layer_durations=tuple(stack.duration_at(place) for place in range(len(scenario.layers))),
+                arm_duration=arm.duration if arm else None,
+                doubts=doubts,
+            ),
+            learned_steps=_learned_steps(ground),
+            layer_radii=tuple(_region_radius(stack, place) for place in range(len(scenario.layers))),
+        )
+
+    def _with_arm(self, frame: Frame, solved: Solved, *, exact: bool) -> Frame:
+        ground = solved.ground
+        arm, doubts = None, ()
+        try:
+            far = self._follower.out_of_reach(ground)
+            if frame.chosen is not None and not far[frame.chosen]:
+                arm, doubts = self._arm(frame, solved, frame.chosen, exact=exact)
+            doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
+        except UnreachableError as error:
+            doubts = (f"the arm cannot reach the starts: {error}",)
+        return replace(frame, arm=arm, health=frame.health.doubting_arm(*doubts))
+
+    def _arm(self, frame: Frame, solved: Solved, chosen: int, *, exact: bool) -> tuple[ArmMotion, tuple[str, ...]]:
+        """The joint motion along a rollout, and what is wrong with it."""
+        ground, times = solved.ground, frame.times[chosen]
+        if solved.arm is not None and solved.lifted is not None:
+            rows = solved.arm.index == chosen
+            q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
+            doubts = self._follower.doubts(solved.lifted.tracked, chosen)
+        else:
+            bundle = solved.stack.bundle
+            path, fraction = frame.rollouts[chosen], bundle.split(bundle.fraction)[chosen]
+            keep = arm_samples(len(path))
+            joints = self._follower.along(ground, chosen, path[keep], exact=exact)
+            q, times, fraction = joints.q, times[keep], fraction[keep]
+            doubts = self._follower.doubts(joints, chosen)
+        without = self._follower.undisturbed(ground.only([chosen])).at(np.zeros(len(fraction), int), fraction)
+        return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), doubts
+
+    def _profiles(self, frame: Frame, solved: Solved, chosen: int) -> Profiles:
+        """Of a rollout, with and without behaviours."""
+        ground = solved.ground
+        obstacle, arm, task = frame.scenario.obstacle, solved.arm, ground.task
+        path, undisturbed = frame.rollouts[chosen], ground.paths[chosen]
+        of_mean, system = chosen >= ground.num_demonstrated, solved.stack.system
+        demonstration = task.mean_path if of_mean else task.paths[chosen]
+        if arm is None:
+            return Profiles(
+                hand_profile(path, demonstration, system, obstacle),
+                hand_profile(undisturbed, demonstration, ground.system, obstacle),
+                of_mean=of_mean,
+            )
+        p, only = arm.p[arm.index == chosen], ground.only([chosen])
+        below = self._robot.end_effector(arm.transform.forward(p))
+        q = self._follower.undisturbed(only).at(only.bundle.index, only.bundle.fraction)
+        clearance = self._follower.whole_arm.clearance
+        return Profiles(
+            body_profile(path, demonstration, system.lyapunov(below), clearance(p, obstacle)),
+            body_profile(undisturbed, demonstration, ground.system.lyapunov(undisturbed), clearance(q, obstacle)),
+            of_body=True,
+            of_mean=of_mean,
+        )
+
+    def _any_arm(self, frame: Frame) -> Array:
+        return self._robot.home[None] if frame.arm is None else frame.arm.q
+
+
+def _with_meshes(health: Health, frame: Frame, fine: Solved) -> Health:
+    """Health with what the meshes of the arm come near to: of the one that is shown, and of all that avoid."""
+    assert frame.arm is not None
+    model, scenario = load_collision_model(), frame.scenario
+    health = replace(health, collision=model.report(frame.arm.q, scenario.obstacle))
+    if fine.arm is None:
+        return health
+    hosts = range(len(frame.rollouts) - fine.ground.num_added)
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], scenario.obstacle) for host in hosts]
+    return health.doubting_arm(*margin_doubts(scenario, nearest))
+
+
+_Made = TypeVar("_Made")
+
+
+def _once(kept: dict[Precision, _Made], precision: Precision, make: Callable[[], _Made]) -> _Made:
+    """What was made at this precision, or is now."""
+    if precision not in kept:
+        kept[precision] = make()
+    return kept[precision]
+
+
+def _uses_whole_arm(scenario: Scenario) -> bool:
+    return scenario.avoidance and scenario.space != "task"
+
+
+def _learned_steps(ground: Ground) -> tuple[int, ...]:
+    flows = in_frame(ground.system.transform)
+    return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
+
+
+def _region_radius(stack: Solution, place: int) -> float | None:
+    """Radius of the region that the layer at a place acts in, if it is on and has one."""
+    applied = stack.at(place)
+    flow = applied.made.transform if applied else None
+    return flow.field.scale if isinstance(flow, Flow) and isinstance(flow.field, PlacedField) else None
+
+
+def _level(scenario: Scenario, stack: Solution) -> int | None:
+    """Which level the view names, if it is in the stack."""
+    names = levels(scenario)[: 1 + len(stack.built)]
+    return names.index(scenario.view.level) if scenario.view.level in names else None
+
+
+def _pictures(scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
+    """Those that the view shows, on its slice and of its level."""
+    ground, stack = solved.below, solved.stack
+    view, book, area = scenario.view, ground.learned.sketchbook, ground.task.slice.posed(scenario.view.slice)
+    level = _level(scenario, stack)
+    built = stack.built[:level]
+    system = stack.system if level is None else cut_off(ground, stack, level)
+    clearance = _clearance(scenario, avoided=any(applied.place is None for applied in built))
+    field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
+    return Pictures(
+        field=field,
+        streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
+        colour=colour,
+        generator=book.generator(area, view.generator_layer) if view.generator else None,
+        grid=book.grid(area, [applied.made.transform for applied in built], coarse=coarse) if view.grid else None,
+        base=book.base(stack.rays) if view.base else None,
+        occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
+    )
+
+
+def _clearance(scenario: Scenario, *, avoided: bool) -> Clearance:
+    """Distance from where no motion comes: nowhere, or into the obstacle."""
+    return scenario.obstacle.signed_distance if avoided else lambda points: np.full(len(points), np.inf)

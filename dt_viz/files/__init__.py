@@ -1,0 +1,1 @@
+"""Readers of files that anyone may have written: bounded in time and memory."""

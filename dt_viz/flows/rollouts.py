@@ -1,0 +1,143 @@
+"""Bundles of exact rollouts, sampled along their base rays and refined where the stack stretches them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.systems import Attractor
+
+ARRIVED = 1e-4
+"""Metres in base space from the goal at which a motion counts as arrived."""
+ARRIVING = 0.5
+"""The same, at most, as a part of what is left at the last sample before: a stack may stretch it to a visible way."""
+UNEVEN = 1.5
+"""How much wider than one of its neighbours a gap is that is stretched unevenly itself."""
+OVERSAMPLING = 2
+"""Times as many samples are put into such a gap as it lacks: another round costs more."""
+MAX_INSERTED = 40
+"""Samples put between two neighbours in one round of refinement."""
+MAX_SAMPLES = 60_000
+"""Samples of a bundle at which refinement ends: a stack may stretch a motion without limit."""
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The base system's motions: straight rays z = z_e + (1 − u)(z₀ − z_e), u from 0 at the start to 1 at the goal."""
+
+    z0: Array
+    """(R, d) starts in base space."""
+    base: Attractor
+
+    def at(self, index: Indices, fraction: Array) -> Array:
+        """Points (N, d) of the rays `index` (N,) at the fractions `fraction` (N,)."""
+        return self.base.goal + (1 - fraction)[:, None] * (self.z0[index] - self.base.goal)
+
+    def times(self, index: Indices, fraction: Array) -> Array:
+        """Seconds (N,) at which the motions are there, `index` not decreasing.
+
+        The goal counts as reached within `ARRIVED`, or nearer where other samples are nearer: no two share a time.
+        """
+        radius = np.linalg.norm(self.z0 - self.base.goal, axis=1)
+        left = (1 - fraction) * radius[index]
+        least = np.full(len(radius), ARRIVED)
+        np.minimum.at(least, index[left > 0], ARRIVING * left[left > 0])
+        # one row for each ray, filled up with starts: what holds for a whole ray is worked out once
+        column = np.arange(len(index)) - np.searchsorted(index, index)
+        remaining = np.repeat(radius[:, None], int(column.max()) + 1, axis=1)
+        remaining[index, column] = np.maximum(left, least[index])
+        return self.base.times_at(self.z0, remaining)[index, column]
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Sampled rollouts, one after the other, each from its start to its goal."""
+
+    index: Indices
+    """(N,) which rollout a sample belongs to, not decreasing."""
+    fraction: Array
+    """(N,) where on its base ray it is, increasing within a rollout."""
+    levels: Array
+    """(N, L, 3) positions on the manifold of each level of the stack, from the imitation up, metres."""
+
+    @property
+    def positions(self) -> Array:
+        """(N, 3) positions on the top level, where the robot moves, metres."""
+        return self.levels[:, -1]
+
+    def split(self, values: Array) -> tuple[Array, ...]:
+        """Cut an array (N, …) that belongs to the samples into one array for each rollout."""
+        return tuple(np.split(values, np.flatnonzero(np.diff(self.index)) + 1))
+
+    @property
+    def paths(self) -> tuple[Array, ...]:
+        """Positions of each rollout on the top level, (T_i, 3), metres."""
+        return self.split(self.positions)
+
+
+Evaluate = Callable[[Indices, Array], Array]
+"""Levels (N, L, 3) of the samples with ray index (N,) and fraction (N,)."""
+
+
+def evenly_sampled(evaluate: Evaluate, num_rollouts: int, num_samples: int) -> Bundle:
+    """Sample rollouts at even distances along their paths, start and goal included.
+
+    Args:
+        evaluate: where samples are.
+        num_rollouts: R.
+        num_samples: for each rollout.
+    """
+    trial = np.linspace(0, 1, 2 * num_samples)
+    index = np.repeat(np.arange(num_rollouts), len(trial))
+    paths = evaluate(index, np.tile(trial, num_rollouts))[:, -1].reshape(num_rollouts, len(trial), -1)
+    lengths = np.cumsum(np.linalg.norm(np.diff(paths, axis=1), axis=2), axis=1)
+    even = np.linspace(0, 1, num_samples)
+    fraction = np.concatenate([np.interp(even, np.r_[0, length] / length[-1], trial) for length in lengths])
+    index = np.repeat(np.arange(num_rollouts), num_samples)
+    return Bundle(index, fraction, evaluate(index, fraction))
+
+
+def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: int = 12) -> Bundle:
+    """Insert samples until neighbours are at most `spacing` apart.
+
+    Close to an obstacle's centre ψ⁻¹ stretches a path a hundredfold; without refinement a drawn segment cuts through
+    the obstacle that the motion avoids.
+
+    Args:
+        bundle: rollouts to refine.
+        evaluate: where samples are.
+        spacing: metres.
+        max_rounds: of insertion.
+
+    Returns:
+        The refined bundle. One of `MAX_SAMPLES` samples has gaps left that are wider.
+    """
+    for round_ in range(max_rounds + 1):
+        same = np.diff(bundle.index) == 0
+        gap = np.linalg.norm(np.diff(bundle.positions, axis=0), axis=1) * same
+        # a gap that rounding cannot divide any more stays: two neighbouring floats on either side of the centre
+        divisible = np.diff(bundle.fraction) > 1e-13
+        wide = np.flatnonzero((gap > spacing) & divisible)
+        room = MAX_SAMPLES - len(bundle.index)
+        if not len(wide) or round_ == max_rounds or room <= 0:
+            break
+        inside = np.r_[np.inf, np.where(same, gap, np.inf), np.inf]
+        uneven = gap[wide] > UNEVEN * np.minimum(inside[:-2], inside[2:])[wide]
+        lacking = (gap[wide] / spacing - 1) * np.where(uneven, OVERSAMPLING, 1)
+        counts = np.minimum(np.ceil(lacking).astype(int), MAX_INSERTED)
+        if counts.sum() > room:
+            widest = np.argsort(-gap[wide], kind="stable")
+            counts[widest] = np.diff(np.minimum(np.cumsum(counts[widest]), room), prepend=0)
+        within = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in counts])
+        before = np.repeat(wide, counts)
+        fraction = bundle.fraction[before] + within * (bundle.fraction[before + 1] - bundle.fraction[before])
+        index = bundle.index[before]
+        bundle = Bundle(
+            np.insert(bundle.index, before + 1, index),
+            np.insert(bundle.fraction, before + 1, fraction),
+            np.insert(bundle.levels, before + 1, evaluate(index, fraction), axis=0),
+        )
+    return bundle

@@ -1,0 +1,147 @@
+"""Dynamical systems: the base attractor and the same attractor seen through a diffeomorphism (sec. 3, eq. (1))."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.flows.diffeomorphisms import Diffeomorphism
+from dt_viz.flows.fields import Array
+
+
+@dataclass(frozen=True)
+class Attractor:
+    """The base system ż = −∇Φ(z) = −v·tanh(r/ρ)·r̂ with r = ‖z − z_e‖ and Φ = v·ρ·log cosh(r/ρ).
+
+    Smooth everywhere, and for ρ → 0 the paper's ‖z − z_e‖. It has the closed form
+    sinh(r(t)/ρ) = sinh(r₀/ρ)·exp(−v·t/ρ) on the straight ray from z(0) to the goal.
+    """
+
+    goal: Array
+    """z_e, (d,), metres."""
+    speed: float = 0.1
+    """v far from the goal, m/s."""
+    smoothing: float = 0.01
+    """ρ, metres: inside this distance the motion slows down to a stop."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return len(self.goal)
+
+    def potential(self, z: Array) -> Array:
+        """Φ(z), (*B,): zero at the goal, growing away from it, falling along every motion."""
+        ratio = np.linalg.norm(z - self.goal, axis=-1) / self.smoothing
+        log_cosh = ratio + np.log1p(np.exp(-2 * ratio)) - np.log(2)
+        return self.speed * self.smoothing * log_cosh
+
+    def velocity(self, z: Array) -> Array:
+        """ż, (*B, d), m/s."""
+        offset = z - self.goal
+        r = np.linalg.norm(offset, axis=-1, keepdims=True)
+        # tanh(r/ρ)/r tends to 1/ρ at the goal
+        gain = np.where(r > 1e-12, np.tanh(r / self.smoothing) / np.maximum(r, 1e-12), 1 / self.smoothing)
+        return -self.speed * gain * offset
+
+    def flow(self, z0: Array, times: Array) -> Array:
+        """z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T) in seconds, in closed form."""
+        offset = z0 - self.goal
+        r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
+        clock = log_sinh(r0 / self.smoothing) - self.speed * times / self.smoothing  # (*B, T)
+        r = self.smoothing * asinh_exp(clock)
+        shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
+        return self.goal + shrink[..., None] * offset[..., None, :]
+
+    def times_at(self, z0: Array, distances: Array) -> Array:
+        """Seconds, (*B, T), at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of the goal.
+
+        Zero for distances that the start is within already.
+        """
+        r0 = np.linalg.norm(z0 - self.goal, axis=-1, keepdims=True)
+        farther = np.maximum(r0, distances)
+        return self.smoothing / self.speed * (log_sinh(farther / self.smoothing) - log_sinh(distances / self.smoothing))
+
+    def arrival_time(self, z0: Array, distance: float) -> Array:
+        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (metres) of the goal."""
+        return self.times_at(z0, np.full((*z0.shape[:-1], 1), distance))[..., 0]
+
+
+@dataclass(frozen=True)
+class DiffeomorphicSystem:
+    """The natural gradient system ẏ = J(y)⁻¹·f(ψ(y)), f the base attractor (eq. (1) in exact form).
+
+    ψ is a conjugacy: z = ψ(y) obeys ż = f(z) exactly. So the system is as stable as its base and its motions are
+    images of the base's motions.
+    """
+
+    transform: Diffeomorphism
+    """ψ, from the space of the motion to the space of the base attractor."""
+    base: Attractor
+
+    def velocity(self, y: Array) -> Array:
+        """ẏ, (*B, d), m/s: the derivative of ψ⁻¹ at ψ(y) along ż. No Jacobian is formed or inverted."""
+        z = self.transform.forward(y)
+        return self.transform.inverse_tangents(z, self.base.velocity(z)[..., None])[1][..., 0]
+
+    def lyapunov(self, y: Array) -> Array:
+        """Φ(ψ(y)), (*B,): strictly falling along every motion until the goal."""
+        return self.base.potential(self.transform.forward(y))
+
+    def rollout(self, y0: Array, times: Array) -> Array:
+        """y(t) = ψ⁻¹(z(t)), (*B, T, d), from `y0` (*B, d) at `times` (T,) or (*B, T): exact, all at once."""
+        return self.transform.inverse(self.base.flow(self.transform.forward(y0), times))
+
+    def stepped_rollout(self, y0: Array, times: Array, substeps: int = 1) -> Array:
+        """The same motion by stepping ẏ = J⁻¹ f(ψ(y)) with RK4: the independent oracle for `rollout`.
+
+        Args:
+            y0: (*B, d) starts.
+            times: (T,) increasing, seconds; the first is the start's.
+            substeps: RK4 steps between neighbouring times.
+
+        Returns:
+            (*B, T, d) positions.
+        """
+        return stepped(self._velocity_by_solve, y0, times, substeps)
+
+    def _velocity_by_solve(self, y: Array) -> Array:
+        z, J = self.transform.jacobian(y)
+        return np.linalg.solve(J, self.base.velocity(z)[..., None])[..., 0]
+
+
+def stepped(velocity: Callable[[Array], Array], y0: Array, times: Array, substeps: int) -> Array:
+    """Integrate ẏ = velocity(y) with RK4.
+
+    Args:
+        velocity: takes states (*B, d).
+        y0: (*B, d) starts.
+        times: (T,) increasing, seconds; the first is the start's.
+        substeps: between neighbouring times.
+
+    Returns:
+        (*B, T, d) states.
+    """
+    y, motion = y0, [y0]
+    for h in np.diff(times) / substeps:
+        for _ in range(substeps):
+            k1 = velocity(y)
+            k2 = velocity(y + h / 2 * k1)
+            k3 = velocity(y + h / 2 * k2)
+            k4 = velocity(y + h * k3)
+            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        motion.append(y)
+    return np.stack(motion, axis=-2)
+
+
+def log_sinh(a: Array) -> Array:
+    """Logarithm of sinh(a), for a ≥ 0 without overflow; −inf at 0."""
+    with np.errstate(divide="ignore"):
+        return a + np.log(-np.expm1(-2 * a)) - np.log(2)
+
+
+def asinh_exp(b: Array) -> Array:
+    """asinh(exp(b)) without overflow."""
+    large = np.maximum(b, 0)
+    return np.where(b > 0, large + np.log1p(np.sqrt(1 + np.exp(-2 * large))), np.arcsinh(np.exp(np.minimum(b, 0))))

@@ -1,0 +1,314 @@
+"""Imitation: a stable system whose motions are the demonstrations (sec. 4.3)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Flow, min_det_jacobian, round_trip_error
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
+from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.flow_chain import Layer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
+from dt_viz.learning.preparation import ImitationError, Motions, prepare
+from dt_viz.learning.timing import TimedAttractor, learn_timing
+from dt_viz.learning.trajectory import TrajectoryFit
+from dt_viz.learning.unbending import layers_along, regress, unbending
+from dt_viz.learning.velocity import VelocityFit
+from dt_viz.metrics import arc_length, interpolate
+from dt_viz.properties import cached_property
+
+Progress = Callable[[float, str], None]
+
+Objective = Literal["trajectory", "velocity"]
+"""What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
+OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
+
+MIN_STEP_DETERMINANT = 0.05  # of an Euler step's derivative; at 0 it would fold
+STEP_LENGTH = 0.8  # how far an Euler step of the start may move a point, in σ
+MAX_LAYERS = 10
+MAX_ATTEMPTS = 5  # each smoother than the one before
+STRAYED = 0.6  # of the spread: a rollout that far off at some time is worth a word
+VELOCITY_REGULARISATION = 100.0  # how much more of it the velocity objective takes
+NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
+
+
+@dataclass(frozen=True)
+class ImitationSettings:
+    """How to fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean).
+
+    Raises:
+        ImitationError: there is no such objective.
+    """
+
+    objective: Objective = "trajectory"
+    """What is fitted: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
+    num_layers: int = 3
+    """Stationary flows that ψ is composed of, at least; motions that turn far get more. The velocity objective
+    has one, with the steps of all."""
+    steps: int = 4
+    """Euler steps of each flow."""
+    sigma: float | None = None
+    """Width of a Gaussian. None takes 1 in the plane and 0.6 in space, less for motions folded into little room; half
+    of that for the velocity objective."""
+    ell: float | None = None
+    """ℓ of the Gaussians in 1/m², instead of `sigma`."""
+    num_inducing: int | None = None
+    """Inducing points of a layer, equally spaced over a box; None takes what `spacing` and `reach` give."""
+    spacing: float = 1.0
+    """Distance between neighbouring inducing points, in σ."""
+    reach: float = 1.25
+    """Inducing points farther than this from the data are left out, in σ."""
+    regularisation: float = 3e-5
+    """Weight of the squared RKHS norm, summed over layers, against the mean squared distance."""
+    num_points: int = 30
+    """Points a demonstration that the fit looks at, at least; long motions get more."""
+    max_iterations: int = 20
+    """Of Gauss–Newton; L-BFGS, whose iterations are cheaper, may take ten times as many."""
+
+    def __post_init__(self) -> None:
+        if self.objective not in OBJECTIVES:
+            raise ImitationError(f"objective: found {self.objective!r}; accepted: {' or '.join(OBJECTIVES)}")
+
+
+def paper_preset(objective: Objective = "velocity") -> ImitationSettings:
+    """The paper's choices (sec. 5): m = 720 equally spaced states, ℓ = 0.005 with LASA in millimetres, Euler steps."""
+    return ImitationSettings(objective, ell=0.005e6, num_inducing=720)
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """A learned motion: ψ and the base attractor, in the demonstrations' own units, with certificates."""
+
+    transform: Chain
+    """ψ, from the space of the demonstrations to the space of the base attractor."""
+    base: TimedAttractor
+    """The base system; its goal is z_e = ψ(goal)."""
+    starts: Array
+    """(R, d) where the demonstrations start."""
+    goal: Array
+    """(d,) where they all end."""
+    fit_seconds: float
+    min_det_jacobian: float
+    """Smallest det J over the demonstrations' box grown by half its size."""
+    round_trip_error: float
+    """Largest ‖ψ⁻¹(ψ(x)) − x‖ there."""
+    warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def system(self) -> DiffeomorphicSystem:
+        """The learned dynamical system."""
+        return DiffeomorphicSystem(self.transform, self.base)
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Everything as plain arrays, for a file without pickle."""
+        arrays: dict[str, Any] = {
+            "starts": self.starts,
+            "goal": self.goal,
+            "base": np.concatenate([self.base.goal, [self.base.speed, self.base.smoothing]]),
+            "base_directions": self.base.directions,
+            "base_knots": self.base.knots,
+            "base_paces": self.base.paces,
+            "certificates": np.array([self.fit_seconds, self.min_det_jacobian, self.round_trip_error]),
+            "warnings": np.array(self.warnings, dtype=np.str_),
+        }
+        for index, flow in enumerate(self.transform.parts):
+            assert isinstance(flow, Flow) and isinstance(flow.field, GridRBF)
+            arrays[f"layer_{index}_weights"] = flow.field.weights
+            arrays[f"layer_{index}_ell_steps_forward"] = np.array([flow.field.grid.ell, flow.steps, flow.step is euler])
+            for axis, coordinates in enumerate(flow.field.grid.axes):
+                arrays[f"layer_{index}_axis_{axis}"] = coordinates
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> Imitation:
+        """The inverse of `to_arrays`. Raises KeyError or ValueError on arrays that are none of ours."""
+        goal = np.asarray(arrays["goal"], dtype=float)
+        d = len(goal)
+        flows: list[Diffeomorphism] = []
+        while f"layer_{len(flows)}_weights" in arrays:
+            prefix = f"layer_{len(flows)}_"
+            ell, steps, forward = arrays[prefix + "ell_steps_forward"]
+            axes = tuple(np.asarray(arrays[f"{prefix}axis_{j}"], dtype=float) for j in range(d))
+            field = GridRBF(GaussianGrid(axes, float(ell)), np.asarray(arrays[prefix + "weights"], dtype=float))
+            integrators = (euler, implicit_euler) if forward else (implicit_euler, euler)
+            flows.append(Flow(field, 1.0, int(steps), *integrators))
+        base = np.asarray(arrays["base"], dtype=float)
+        pace = {k: np.asarray(arrays[f"base_{k}"], dtype=float) for k in ("directions", "knots", "paces")}
+        seconds, min_det, error = (float(x) for x in arrays["certificates"])
+        return cls(
+            Chain(flows),
+            TimedAttractor(base[:d], float(base[d]), float(base[d + 1]), **pace),
+            np.asarray(arrays["starts"], dtype=float),
+            goal,
+            seconds,
+            min_det,
+            error,
+            tuple(str(w) for w in arrays["warnings"]),
+        )
+
+
+def fit(
+    demonstrations: Sequence[Demonstration],
+    settings: ImitationSettings | None = None,
+    progress: Progress | None = None,
+) -> Imitation:
+    """Learn a stable system from demonstrations of one motion.
+
+    Args:
+        demonstrations: at least one, all ending at (about) the same place.
+        settings: None takes the defaults.
+        progress: called with the fraction done, from 0 to 1, and what is being done. An exception that it raises, to
+            cancel, ends the fit and is let through.
+
+    Raises:
+        ImitationError: no stable system can be learned from these demonstrations.
+    """
+    settings = settings or ImitationSettings()
+    progress = progress or (lambda _fraction, _message: None)
+    began = time.perf_counter()
+    progress(0.0, "checking the demonstrations")
+    motions = prepare(demonstrations)
+    fit_transform = _fit_trajectories if settings.objective == "trajectory" else _fit_velocities
+    transform, warnings = fit_transform(motions, settings, progress)
+
+    progress(0.92, "learning the timing")
+    base = learn_timing(transform, motions.goal, motions.times, motions.positions)
+    progress(0.96, "checking that the map is invertible")
+    box = _grown_box(np.concatenate(motions.positions), 40 if transform.dim == 2 else 12)
+    result = Imitation(
+        transform,
+        base,
+        np.array([path[0] for path in motions.positions]),
+        motions.goal,
+        fit_seconds=time.perf_counter() - began,
+        min_det_jacobian=min_det_jacobian(transform.jacobian, box),
+        round_trip_error=round_trip_error(transform, box),
+        warnings=(*motions.warnings, *warnings, *_strayed(motions, DiffeomorphicSystem(transform, base))),
+    )
+    if not (result.min_det_jacobian > 0 and result.round_trip_error < 1e-9 * motions.spread):
+        raise ImitationError(
+            f"no invertible map was found: smallest det J {result.min_det_jacobian:.2g}, round trip "
+            f"{result.round_trip_error:.2g} off; more regularisation may help"
+        )
+    progress(1.0, "done")
+    return result
+
+
+def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
+    """ψ by the trajectory objective, as closely as it can be had without folding the space."""
+    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / motions.spread
+    num_points = int(np.clip(4 * length, settings.num_points, max(settings.num_points, 60)))
+    points = motions.resampled(num_points)
+    centre, scale = points.mean(axis=(0, 1)), motions.spread
+    normalised = (points - centre) / scale
+    fractions = np.broadcast_to(np.linspace(0.0, 1.0, num_points), points.shape[:2])
+    sigma = _width(motions, settings)
+
+    for attempt in range(MAX_ATTEMPTS):
+        progress(0.05, "unbending the mean demonstration")
+        regularisation, steps = settings.regularisation * 10.0**attempt, settings.steps * min(2**attempt, 4)
+        shapes = unbending(normalised, settings.num_layers - 1, STEP_LENGTH * sigma * steps, MAX_LAYERS - 1)
+        if settings.num_inducing is None:
+            layers = layers_along(shapes, sigma, spacing=settings.spacing, reach=settings.reach)
+        else:
+            flat = np.concatenate(shapes).reshape(-1, normalised.shape[-1])
+            layer = Layer.of(equally_spaced_grid(flat, settings.num_inducing, 0.5 / sigma**2))
+            layers = (layer,) * (len(shapes) - 1)
+        stack = Stack(layers, steps)
+        thetas = regress(stack, shapes, regularisation)
+
+        def report(iteration: int, rms: float) -> None:
+            done = 0.1 + 0.8 * iteration / settings.max_iterations
+            progress(done, f"fitting, {100 * rms:.1f} % of the spread off")
+
+        problem = TrajectoryFit(stack, normalised, fractions, regularisation)
+        ends = np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]])
+        thetas, ends, _ = problem.solve(thetas, ends, max_iterations=settings.max_iterations, report=report)
+        if stack.min_step_determinant(thetas) > MIN_STEP_DETERMINANT:
+            return stack.transform(thetas, centre, scale), _smoothed(attempt)
+    raise ImitationError(NOT_INVERTIBLE)
+
+
+def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
+    """ψ by the velocity objective: one flow, ψ in explicit Euler steps as in the paper and ψ⁻¹ their exact inverse."""
+    scale, duration = motions.spread, float(np.mean([t[-1] for t in motions.times]))
+    centre = motions.resampled(settings.num_points).mean(axis=(0, 1))
+    positions, velocities = [], []
+    for t, path in zip(motions.times, motions.positions, strict=True):
+        even = np.linspace(0.0, t[-1], 2 * settings.num_points)
+        positions.append(interpolate(even, t, path))
+        velocities.append(interpolate(even, t, np.gradient(path, t, axis=0)))
+    x, v = (np.concatenate(positions) - centre) / scale, np.concatenate(velocities) * duration / scale
+    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / scale
+    sigma = _width(motions, settings)
+    if settings.num_inducing is None:
+        grid = GaussianGrid.covering(x, sigma, spacing=settings.spacing, pad=settings.reach)
+    else:
+        grid = equally_spaced_grid(x, settings.num_inducing, 0.5 / sigma**2)
+    max_iterations, steps = 10 * settings.max_iterations, settings.num_layers * settings.steps
+
+    def report(iteration: int, cost: float) -> None:
+        progress(0.05 + 0.85 * iteration / max_iterations, f"fitting velocities, mean square error {cost:.3g}")
+
+    for attempt in range(MAX_ATTEMPTS):
+        problem = VelocityFit(
+            grid,
+            x,
+            v,
+            (motions.goal - centre) / scale,
+            speed=length,
+            smoothing=0.1 * length,
+            regularisation=settings.regularisation * VELOCITY_REGULARISATION * 10.0**attempt,
+            steps=steps,
+        )
+        field = GridRBF(grid, problem.solve(max_iterations, report))
+        if min_step_determinant(field, 1.0 / steps) > MIN_STEP_DETERMINANT:
+            return Chain([Flow(scaled_field(field, centre, scale), 1.0, steps, euler, implicit_euler)]), _smoothed(
+                attempt
+            )
+    raise ImitationError(NOT_INVERTIBLE)
+
+
+def _width(motions: Motions, settings: ImitationSettings) -> float:
+    """σ of the Gaussians in units of the spread."""
+    if settings.ell is not None:
+        return float(np.sqrt(0.5 / settings.ell)) / motions.spread
+    if settings.sigma is not None:
+        return settings.sigma
+    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / motions.spread
+    width = (1.0 if len(motions.goal) == 2 else 0.6) * min(1.0, 7.5 / length)
+    return width if settings.objective == "trajectory" else 0.5 * width
+
+
+def _smoothed(attempt: int) -> list[str]:
+    if attempt == 0:
+        return []
+    return [
+        f"the closest fit would fold the space over itself; regularised {10**attempt} times as much, it is invertible "
+        "and follows the demonstrations less closely"
+    ]
+
+
+def _strayed(motions: Motions, system: DiffeomorphicSystem) -> list[str]:
+    """A word on each motion that the rollouts do not follow."""
+    warnings = []
+    for name, times, path in zip(motions.names, motions.times, motions.positions, strict=True):
+        at = np.linspace(0, len(times) - 1, min(len(times), 100)).astype(int)
+        off = np.linalg.norm(system.rollout(path[0], times[at]) - path[at], axis=1).max()
+        if off > STRAYED * motions.spread:
+            warnings.append(f"the learned motion strays up to {off:.2g} from '{name}'")
+    return warnings
+
+
+def _grown_box(points: Array, num: int, growth: float = 0.5) -> Array:
+    """A regular grid (num^d, d) over the bounding box of `points` grown by `growth` times its size in all."""
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    margin = growth * (upper - lower)
+    axes = [np.linspace(a, b, num) for a, b in zip(lower - margin, upper + margin, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, points.shape[1])

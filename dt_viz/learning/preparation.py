@@ -1,0 +1,170 @@
+"""Demonstrations made ready for a fit: a common goal, clean motions, and a word on everything that had to be done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.metrics import arc_length, resample_by_arc_length
+
+# All in units of the spread, the RMS distance of the demonstrations' points from their mean.
+SAME_GOAL = 1e-3  # ends closer than this to each other are the same place
+MAX_MOVED_END = 0.3  # ends up to this far off are moved to the common goal
+AT_GOAL = 0.05  # a motion that starts closer to the goal than this has nowhere to go
+STANDING_STEP = 1e-3  # covering less than this in 1 % of the duration is standing still
+LONG_STAND = 0.1  # part of the duration from which standing still is worth a word
+
+
+class ImitationError(ValueError):
+    """Demonstrations from which no stable system can be learned; the message names the demonstration and the reason."""
+
+
+@dataclass(frozen=True)
+class Motions:
+    """What a fit works on."""
+
+    names: tuple[str, ...]
+    times: tuple[Array, ...]
+    """For each motion (T_i,) seconds, increasing from 0."""
+    positions: tuple[Array, ...]
+    """For each motion (T_i, d), the last row the goal."""
+    goal: Array
+    """(d,) where all end."""
+    spread: float
+    """RMS distance of all points from their mean."""
+    warnings: tuple[str, ...]
+    """What was done to which demonstration."""
+
+    def resampled(self, num: int) -> Array:
+        """All motions at `num` points equally spaced along each, (R, num, d)."""
+        return np.stack([resample_by_arc_length(path, num) for path in self.positions])
+
+
+def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
+    """Check demonstrations and give them a common goal.
+
+    Raises:
+        ImitationError: there are none, they are damaged, or they do not end at one place.
+    """
+    _check(demonstrations)
+    warnings: list[str] = []
+    usable = []
+    for demonstration in demonstrations:
+        if arc_length(demonstration.positions)[-1] > 0:
+            usable.append(demonstration)
+        else:
+            warnings.append(f"'{demonstration.name}' never moves; it is left out")
+    if not usable:
+        raise ImitationError("no demonstration moves; at least one must lead to the goal")
+    spread = _spread(usable)
+    usable, goal = _with_common_goal(usable, spread, warnings)
+
+    names, times, positions = [], [], []
+    for demonstration in usable:
+        t, path = demonstration.times - demonstration.times[0], _end_moved(demonstration.positions, goal)
+        away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
+        if len(away) == 0:
+            warnings.append(f"'{demonstration.name}' stays at the goal; it is left out")
+            continue
+        if np.linalg.norm(path[0] - goal) <= AT_GOAL * spread:
+            first = away[0]
+            warnings.append(
+                f"'{demonstration.name}' starts at the goal, where a stable motion ends; "
+                f"its first {t[first]:.2g} s are left out"
+            )
+            t, path = t[first:] - t[first], path[first:]
+        _remark_on(demonstration.name, t, path, spread, warnings)
+        names.append(demonstration.name)
+        times.append(t)
+        positions.append(path)
+    if not positions:
+        raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
+    return Motions(tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
+
+
+def _check(demonstrations: Sequence[Demonstration]) -> None:
+    if not demonstrations:
+        raise ImitationError("there are no demonstrations; at least one is needed")
+    d = demonstrations[0].positions.shape[-1]
+    if d not in (2, 3):
+        raise ImitationError(
+            f"'{demonstrations[0].name}' has {d} coordinates; motions in the plane or in space can be fitted"
+        )
+    for demonstration in demonstrations:
+        name, t, path = demonstration.name, demonstration.times, demonstration.positions
+        if path.shape != (len(t), d):
+            raise ImitationError(f"'{name}': positions have shape {path.shape}; ({len(t)}, {d}) was expected")
+        if len(t) < 2:
+            raise ImitationError(f"'{name}' has {len(t)} sample; at least 2 are needed")
+        if not (np.isfinite(t).all() and np.isfinite(path).all()):
+            bad = int(np.flatnonzero(~(np.isfinite(t) & np.isfinite(path).all(axis=1)))[0])
+            raise ImitationError(f"'{name}': sample {bad} is not a finite number")
+        if (np.diff(t) <= 0).any():
+            bad = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
+            raise ImitationError(f"'{name}': the time of sample {bad} is not later than the one before")
+
+
+def _spread(demonstrations: Sequence[Demonstration]) -> float:
+    points = np.concatenate([resample_by_arc_length(demonstration.positions, 100) for demonstration in demonstrations])
+    return float(np.sqrt(points.var(axis=0).sum()))
+
+
+def _with_common_goal(
+    demonstrations: list[Demonstration], spread: float, warnings: list[str]
+) -> tuple[list[Demonstration], Array]:
+    """The demonstrations that end at the place where most of them do, and that place."""
+    ends = np.array([demonstration.positions[-1] for demonstration in demonstrations])
+    near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= MAX_MOVED_END * spread
+    if 2 * near.sum() <= len(ends):
+        farthest = demonstrations[int(np.argmax(np.linalg.norm(ends - np.median(ends, axis=0), axis=1)))]
+        raise ImitationError(
+            f"the demonstrations have no common goal: most end more than {MAX_MOVED_END * spread:.2g} from where the "
+            f"others do, '{farthest.name}' the farthest"
+        )
+    goal = ends[near].mean(axis=0)
+    for demonstration, end, kept in zip(demonstrations, ends, near, strict=True):
+        off = float(np.linalg.norm(end - goal))
+        if not kept:
+            warnings.append(f"'{demonstration.name}' ends {off:.2g} from the others' goal; it is left out")
+        elif off > SAME_GOAL * spread:
+            warnings.append(f"'{demonstration.name}' ends {off:.2g} from the common goal; its end is moved there")
+    return [demonstration for demonstration, kept in zip(demonstrations, near, strict=True) if kept], goal
+
+
+def _end_moved(path: Array, goal: Array) -> Array:
+    """The path with its end moved to the goal, and the rest the less the farther it is from the end."""
+    length = arc_length(path)
+    moved = path + (length / length[-1])[:, None] ** 2 * (goal - path[-1])
+    moved[-1] = goal
+    return moved
+
+
+def _remark_on(name: str, t: Array, path: Array, spread: float, warnings: list[str]) -> None:
+    even = np.linspace(t[0], t[-1], 101)
+    steps = np.linalg.norm(np.diff([np.interp(even, t, x) for x in path.T], axis=1), axis=0)
+    standing = float((steps[1:-1] < STANDING_STEP * spread).mean())
+    if standing > LONG_STAND:
+        warnings.append(f"'{name}' stands still for {standing * t[-1]:.2g} s; the learned motion only slows down there")
+    if path.shape[1] == 2 and _crosses_itself(resample_by_arc_length(path, 120)):
+        warnings.append(
+            f"'{name}' crosses itself, which no motion of a first-order system can; the crossing is smoothed"
+        )
+
+
+def _crosses_itself(path: Array) -> bool:
+    """Whether two segments of a polyline (T, 2) that are not neighbours cross."""
+    a, b = path[:-1], path[1:]
+
+    def side(p: Array, q: Array, r: Array) -> Array:
+        u, v = q - p, r - p
+        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+    first, second = (a[:, None], b[:, None]), (a[None], b[None])
+    crossing = (side(*first, second[0]) * side(*first, second[1]) < 0) & (
+        side(*second, first[0]) * side(*second, first[1]) < 0
+    )
+    return bool(np.triu(crossing, 2).any())

@@ -1,0 +1,211 @@
+"""Learned imitations, kept in memory and in the user's cache folder by the content they were learned from."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
+
+logger = logging.getLogger(__name__)
+
+FORMAT = 1
+"""Raised whenever the fit or its file changes, so that older files are not taken for newer ones."""
+
+LONGEST_WRITE = 3600.0
+"""Age after which a file that is still being written was left behind by a server that ended meanwhile, seconds."""
+
+LONGEST_WITHOUT_REPORT = 0.2
+"""Seconds after which those who wait for a fit are told again how far it is."""
+
+
+def default_cache_folder() -> Path:
+    """`$XDG_CACHE_HOME/dt-viz`, or `~/.cache/dt-viz`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dt-viz"
+
+
+class _AbandonedError(Exception):
+    """Nobody waits for a fit any more."""
+
+
+class _RunningFit:
+    """A fit on a thread of its own, for as long as somebody waits for it."""
+
+    def __init__(self, work: Callable[[Progress], Imitation]) -> None:
+        """Begin; whoever makes it waits for it."""
+        self._work = work
+        self._changed = threading.Condition()
+        self._num_waiting = 1
+        self._num_reports, self._report = 0, (0.0, "looking whether it is known")
+        self._result: Imitation | None = None
+        self._error: Exception | None = None
+        threading.Thread(target=self._run, name="fit", daemon=True).start()
+
+    def join(self) -> bool:
+        """Wait for it, too, from now on; False if it has been abandoned."""
+        with self._changed:
+            self._num_waiting += self._num_waiting > 0
+            return self._num_waiting > 0
+
+    def wait(self, progress: Progress) -> Imitation:
+        """Its result. What `progress` raises is let through, and ends the fit if nobody else waits for it."""
+        seen = 0
+        try:
+            while True:
+                with self._changed:
+                    if not self._ended and self._num_reports == seen:
+                        self._changed.wait(LONGEST_WITHOUT_REPORT)
+                    ended, fresh = self._ended, self._num_reports > seen
+                    seen, report = self._num_reports, self._report
+                if fresh or not ended:
+                    progress(*report)
+                if self._error is not None:
+                    raise self._error
+                if self._result is not None:
+                    return self._result
+        finally:
+            with self._changed:
+                self._num_waiting -= 1
+
+    @property
+    def _ended(self) -> bool:
+        return self._result is not None or self._error is not None
+
+    def _run(self) -> None:
+        result, failed = None, None
+        try:
+            result = self._work(self._tell)
+        except Exception as error:  # whatever it is, it belongs to those who wait
+            failed = error
+        with self._changed:
+            self._result, self._error = result, failed
+            self._changed.notify_all()
+
+    def _tell(self, fraction: float, message: str) -> None:
+        with self._changed:
+            if not self._num_waiting:
+                raise _AbandonedError
+            self._num_reports += 1
+            self._report = (fraction, message)
+            self._changed.notify_all()
+
+
+class FitStore:
+    """Fits on demand, once for all visitors; a damaged file is fitted anew, never trusted.
+
+    Each fit has a thread of its own: who wants one that is known does not wait for another that is being made, and
+    who does not want to wait any more leaves it to the others.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._memory: dict[str, Imitation] = {}
+        self._running: dict[str, _RunningFit] = {}
+        self._lock = threading.Lock()
+        if folder is not None:
+            _remove_leftovers(folder)
+
+    def get(
+        self,
+        demonstrations: tuple[Demonstration, ...],
+        settings: ImitationSettings | None = None,
+        progress: Progress | None = None,
+    ) -> Imitation:
+        """The imitation of these demonstrations, fitted if it is new.
+
+        Args:
+            demonstrations: what to imitate.
+            settings: of the fit; None takes the defaults.
+            progress: see `dt_viz.learning.imitation.fit`; not called for a fit that is known. It is called repeatedly
+                while nothing is new, so that it can raise an exception to cancel: that is let through, and the fit
+                goes on only if somebody else waits for it.
+
+        Raises:
+            ImitationError: as `dt_viz.learning.imitation.fit`.
+        """
+        settings = settings or ImitationSettings()
+        key = _content_key(demonstrations, settings)
+        with self._lock:
+            if key in self._memory:
+                return self._memory[key]
+            running = self._running.get(key)
+            if running is None or not running.join():
+                running = self._running[key] = self._begin(key, demonstrations, settings)
+        return running.wait(progress or (lambda _fraction, _message: None))
+
+    def _begin(self, key: str, demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> _RunningFit:
+        """Read or fit on another thread. Called with the lock held."""
+
+        def work(progress: Progress) -> Imitation:
+            try:
+                imitation = self._read(key) or self._fit(key, demonstrations, settings, progress)
+                with self._lock:
+                    return self._memory.setdefault(key, imitation)
+            finally:
+                with self._lock:
+                    if self._running.get(key) is running:
+                        del self._running[key]
+
+        running = _RunningFit(work)
+        return running
+
+    def _fit(
+        self,
+        key: str,
+        demonstrations: tuple[Demonstration, ...],
+        settings: ImitationSettings,
+        progress: Progress,
+    ) -> Imitation:
+        imitation = fit(demonstrations, settings, progress)
+        if self._folder is not None:
+            path = self._folder / f"{key}.npz"
+            partial = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}.partial")
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                with partial.open("wb") as file:
+                    np.savez_compressed(file, allow_pickle=False, **imitation.to_arrays())
+                partial.replace(path)
+            except OSError as error:
+                logger.warning("the fit was not cached: %s", error)
+                with suppress(OSError):
+                    partial.unlink()
+        return imitation
+
+    def _read(self, key: str) -> Imitation | None:
+        path = self._folder / f"{key}.npz" if self._folder is not None else None
+        if path is None or not path.exists():
+            return None
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                if damaged := arrays.zip.testzip():  # numpy stops reading before a member's checksum is looked at
+                    raise ValueError(f"{damaged} does not match its checksum")
+                return Imitation.from_arrays(arrays)
+        except Exception as error:  # damaged bytes make zipfile, zlib and numpy raise almost anything
+            logger.warning("%s is damaged and will be fitted anew: %s", path, error)
+            return None
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove files that nobody goes on writing; those of another running server are younger."""
+    for path in folder.glob("*.partial"):
+        with suppress(OSError):  # another server may be faster
+            if time.time() - path.stat().st_mtime > LONGEST_WRITE:
+                path.unlink()
+
+
+def _content_key(demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> str:
+    digest = hashlib.sha256(f"{FORMAT} {settings!r}".encode())
+    for demonstration in demonstrations:
+        digest.update(repr(demonstration.positions.shape).encode())
+        digest.update(np.ascontiguousarray(demonstration.times, dtype=float).tobytes())
+        digest.update(np.ascontiguousarray(demonstration.positions, dtype=float).tobytes())
+    return digest.hexdigest()

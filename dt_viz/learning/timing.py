@@ -1,0 +1,263 @@
+"""When a motion is where: an attractor whose speed along its rays is learned from demonstrations.
+
+Multiplying a vector field by a positive function changes no orbit and no stability, only time. So what the transform
+has learned of the demonstrations' shape stays as it is, and their timing is learned afterwards, on the straight rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from dt_viz.flows.diffeomorphisms import Diffeomorphism
+from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import Attractor, asinh_exp, log_sinh
+from dt_viz.properties import cached_property
+
+ARRIVED = 3e-4  # part of a ray's length: a demonstration's last point counts as this far from the goal
+MIN_PACE = 0.15  # a motion is at most about seven times as fast as the plain attractor
+SMOOTHNESS = 0.03  # weight of a pace's second differences against errors in time, relative to the duration
+SHARPNESS = 0.1  # of the blend between demonstrations, relative to the distance between neighbours
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimedAttractor(Attractor):
+    """An `Attractor` that takes its own time: ż = −v·tanh(r/ρ)·r̂ / m(τ(r), r̂), m > 0.
+
+    τ(r) = ρ/v·log sinh(r/ρ) is the clock of the plain attractor (τ̇ = −1 there; here τ̇ = −1/m). The pace m is
+    Σ_i w_i(r̂)·m_i(τ): for each demonstration i a function that is linear between knots and constant beyond them,
+    blended by weights w_i that depend on the direction alone, and so stay the same along a ray. Time to go is then
+    quadratic between knots, T(τ) = ∫m dτ, and is inverted in closed form.
+    """
+
+    directions: Array
+    """(R, d) unit vectors from the goal to where the demonstrations start."""
+    knots: Array
+    """(K,) increasing and equally spaced values of τ, seconds."""
+    paces: Array
+    """(R, K) m_i at the knots, positive. At the first knot, nearest the goal, all are equal: it is smooth there."""
+
+    def velocity(self, z: Array) -> Array:
+        """ż, (*B, d), m/s."""
+        offset = z - self.goal
+        clock = self._clock(np.linalg.norm(offset, axis=-1))
+        pace = _interpolate_rows(self._position(clock), self._blended(offset))
+        return super().velocity(z) / pace[..., None]
+
+    def flow(self, z0: Array, times: Array) -> Array:
+        """z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T) in seconds, in closed form."""
+        offset = z0 - self.goal
+        r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
+        paces = self._blended(offset)
+        togo = self._time_to_go(self._clock(r0), paces) - times  # (*B, T)
+        r = self.smoothing * asinh_exp(self._clock_at(togo, paces) * self.speed / self.smoothing)
+        shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
+        return self.goal + shrink[..., None] * offset[..., None, :]
+
+    def times_at(self, z0: Array, distances: Array) -> Array:
+        """Seconds, (*B, T), at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of the goal."""
+        offset = z0 - self.goal
+        r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
+        paces = self._blended(offset)
+        togo = self._time_to_go(self._clock(np.minimum(distances, r0)), paces)
+        return self._time_to_go(self._clock(r0), paces) - togo
+
+    def placed(self, origin: Array, axes: Array, scale: float) -> TimedAttractor:
+        """The same attractor in a space of more dimensions: a point z becomes origin + scale·axes·z.
+
+        Args:
+            origin: (D,), metres.
+            axes: (D, d) orthonormal columns.
+            scale: metres for one unit of z.
+        """
+        return replace(
+            self,
+            goal=origin + scale * (axes @ self.goal),
+            speed=scale * self.speed,
+            smoothing=scale * self.smoothing,
+            directions=self.directions @ axes.T,
+        )
+
+    def _clock(self, r: Array) -> Array:
+        """τ(r); a number far below all knots at the goal itself."""
+        return self.smoothing / self.speed * log_sinh(np.maximum(r / self.smoothing, 1e-300))
+
+    @property
+    def _spacing(self) -> float:
+        return float(self.knots[1] - self.knots[0])
+
+    def _position(self, clock: Array) -> Array:
+        """Where τ lies among the knots, 0 at the first and K − 1 at the last, and there beyond them."""
+        return np.clip((clock - self.knots[0]) / self._spacing, 0.0, len(self.knots) - 1)
+
+    def _blended(self, offset: Array) -> Array:
+        """Paces m at the knots, (*B, K), for the rays on which the points goal + `offset` (*B, d) lie."""
+        radius = np.linalg.norm(offset, axis=-1, keepdims=True)
+        direction = offset / np.maximum(radius, 1e-300)
+        squared = ((direction[..., None, :] - self.directions) ** 2).sum(axis=-1)
+        # Inverse distances to the fourth power: at a demonstration's direction its own pace, far away the mean of all.
+        weights = 1.0 / (squared + self._blur**2) ** 2
+        return (weights / weights.sum(axis=-1, keepdims=True)) @ self.paces
+
+    @cached_property
+    def _blur(self) -> Array:
+        """Distances (R,) below which directions count as one demonstration's."""
+        distance = np.linalg.norm(self.directions[:, None] - self.directions, axis=-1)
+        np.fill_diagonal(distance, 1.0)
+        return np.maximum(SHARPNESS * distance.min(axis=1), 1e-4)
+
+    def _time_to_go(self, clock: Array, paces: Array) -> Array:
+        """T(τ), (*B, N), zero at the first knot, for `clock` (*B, N) on rays with `paces` (*B, K)."""
+        at_knots = _cumulative(paces, self._spacing)
+        position = self._position(clock)
+        index = np.minimum(position.astype(int), len(self.knots) - 2)
+        inside = (position - index) * self._spacing
+        start, first, second = (_take(a, index) for a in (at_knots, paces[..., :-1], paces[..., 1:]))
+        value = start + inside * (first + (second - first) * inside / (2 * self._spacing))
+        beyond = np.maximum(clock - self.knots[-1], 0) * paces[..., -1:]
+        return value + beyond + np.minimum(clock - self.knots[0], 0) * paces[..., :1]
+
+    def _clock_at(self, togo: Array, paces: Array) -> Array:
+        """The inverse of `_time_to_go`: τ (*B, N) at times to go (*B, N)."""
+        at_knots = _cumulative(paces, self._spacing)
+        index = np.clip((togo[..., None] >= at_knots[..., None, :]).sum(axis=-1) - 1, 0, len(self.knots) - 2)
+        start, first, second = (_take(a, index) for a in (at_knots, paces[..., :-1], paces[..., 1:]))
+        rest = np.clip(togo, 0, at_knots[..., -1:]) - start
+        slope = (second - first) / self._spacing
+        inside = 2 * rest / (first + np.sqrt(np.maximum(first**2 + 2 * slope * rest, 0)))
+        beyond = np.maximum(togo - at_knots[..., -1:], 0) / paces[..., -1:]
+        return self.knots[index] + inside + beyond + np.minimum(togo, 0) / paces[..., :1]
+
+
+def learn_timing(
+    transform: Diffeomorphism,
+    goal: Array,
+    times: Sequence[Array],
+    positions: Sequence[Array],
+    *,
+    num_knots: int = 48,
+    num_ray: int = 400,
+    num_samples: int = 120,
+) -> TimedAttractor:
+    """The attractor in whose time the rollouts are where the demonstrations were, as nearly as their paths allow.
+
+    Args:
+        transform: ψ, already fitted.
+        goal: (d,) common goal of the demonstrations.
+        times: for each demonstration (T_i,) seconds, increasing from 0.
+        positions: for each demonstration (T_i, d).
+        num_knots: knots of each pace function.
+        num_ray: points of a rollout that a demonstration's points may be matched with.
+        num_samples: points of a demonstration that are matched, equally spaced in time.
+    """
+    end, *images = transform.forward(np.stack([goal, *(path[0] for path in positions)]))
+    offsets = np.stack(images) - end
+    radii = np.linalg.norm(offsets, axis=1)
+    length = float(radii.mean())
+    durations = np.array([t[-1] for t in times])
+    plain = Attractor(end, speed=length / float(durations.mean()), smoothing=0.1 * length)
+
+    # Rays, denser towards the goal, where the plain attractor's clock runs fast; their last point counts as arrived.
+    fractions = np.append(np.linspace(1.0, 0.0, num_ray)[:-1], ARRIVED)
+    rays = end + fractions[:, None] * offsets[:, None]
+    rollouts = transform.inverse(rays)
+    stamps = [np.linspace(0, t[-1], num_samples) for t in times]
+    samples = np.stack(
+        [
+            np.stack([np.interp(at, t, x) for x in path.T], axis=1)
+            for at, t, path in zip(stamps, times, positions, strict=True)
+        ]
+    )
+    matched = _monotone_match(samples, rollouts)
+    clocks = plain.smoothing / plain.speed * log_sinh(fractions * radii[:, None] / plain.smoothing)
+    nearest, farthest = clocks[:, -1].min(), clocks[:, 0].max()
+    knots = np.linspace(nearest, farthest + 3 * (farthest - nearest) / (num_knots - 4), num_knots)
+    paces = np.stack(
+        [
+            _fit_pace(knots, clock[match], at, _speeds(at, sample))
+            for clock, match, at, sample in zip(clocks, matched, stamps, samples, strict=True)
+        ]
+    )
+    paces[:, 0] = paces[:, 0].mean()
+    return TimedAttractor(
+        end, plain.speed, plain.smoothing, directions=offsets / radii[:, None], knots=knots, paces=paces
+    )
+
+
+def _monotone_match(samples: Array, curves: Array) -> Array:
+    """For each sample (R, n, d) the index of a point of its curve (R, N, d), never going back, nearest in all.
+
+    Dynamic programming over all pairs; the first sample is held to the first point and the last to the last.
+    """
+    num, n = samples.shape[:2]
+    count = curves.shape[1]
+    distance = ((samples[:, :, None] - curves[:, None]) ** 2).sum(axis=-1)
+    best = np.full((num, count), np.inf)
+    best[:, 0] = 0.0
+    came_from = np.empty((n, num, count), dtype=int)
+    for k in range(1, n):
+        lowest = np.minimum.accumulate(best, axis=1)
+        came_from[k] = np.maximum.accumulate(np.where(best <= lowest, np.arange(count), 0), axis=1)
+        best = lowest + distance[:, k]
+    index = np.full(num, count - 1)
+    result = np.empty((num, n), dtype=int)
+    for k in reversed(range(n)):
+        result[:, k] = index
+        if k:
+            index = came_from[k, np.arange(num), index]
+    return result
+
+
+def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array:
+    """Pace m (K,) at the knots such that ∫m dτ from each `clock` up to the first is `elapsed`.
+
+    Weighted by the speed: an error δ in time is an error speed·δ in space. Second differences are held
+    small, for where the data say nothing.
+    """
+    spacing = knots[1] - knots[0]
+    rows = _hat_integrals((clock - knots[0]) / spacing, len(knots)) * spacing
+    rows = rows[0] - rows
+    weight = (speed / speed.mean() + 0.05)[:, None]
+    smooth = np.diff(np.eye(len(knots)), n=2, axis=0) * SMOOTHNESS * elapsed[-1]
+    A = np.concatenate([weight * rows, smooth])
+    b = np.concatenate([weight[:, 0] * elapsed, np.zeros(len(smooth))])
+    pace = lsq_linear(A, b, bounds=(MIN_PACE, np.inf), tol=1e-6).x
+    # A demonstration starts from rest. Motions that come from farther away must not be that slow all the way.
+    pace[int(np.ceil((clock[0] - knots[0]) / spacing)) + 1 :] = elapsed[-1] / (clock[0] - clock[-1])
+    return pace
+
+
+def _hat_integrals(position: Array, num: int) -> Array:
+    """∫ from 0 to each `position` (N,) of the piecewise linear hat functions at 0, 1, …, num − 1, as (N, num)."""
+    offset = position[:, None] - np.arange(num)
+    rising = np.clip(offset + 1, 0, 1)
+    falling = np.clip(offset, 0, 1)
+    integral = 0.5 * rising**2 + falling - 0.5 * falling**2
+    return integral - np.where(np.arange(num) == 0, 0.5, 0.0)
+
+
+def _speeds(times: Array, path: Array) -> Array:
+    return np.linalg.norm(np.gradient(path, times, axis=0), axis=1)
+
+
+def _cumulative(paces: Array, spacing: float) -> Array:
+    """Trapezoidal integral (*B, K) of `paces` (*B, K), zero at the first knot."""
+    areas = 0.5 * spacing * (paces[..., 1:] + paces[..., :-1])
+    return np.concatenate([np.zeros_like(paces[..., :1]), np.cumsum(areas, axis=-1)], axis=-1)
+
+
+def _take(table: Array, index: NDArray[np.integer[Any]]) -> Array:
+    """Row by row table[index], (*B, N), of `table` (*B, K) at `index` (*B, N)."""
+    return np.take_along_axis(table, index, axis=-1)
+
+
+def _interpolate_rows(position: Array, table: Array) -> Array:
+    """Linear interpolation (*B,) in the rows of `table` (*B, K) at `position` (*B,) from 0 to K − 1."""
+    index = np.minimum(position.astype(int), table.shape[-1] - 2)[..., None]
+    first, second = _take(table, index)[..., 0], _take(table, index + 1)[..., 0]
+    return first + (position - index[..., 0]) * (second - first)

@@ -1,0 +1,1 @@
+"""From a scenario to its motion, and what is to be said of it."""

@@ -1,0 +1,97 @@
+"""How a motion fares along its path (fig. 6): Lyapunov value, distance to its demonstration, clearance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.metrics import (
+    arc_length,
+    discrete_frechet,
+    distance_from_path,
+    maximum_collision_distance,
+    resample_by_arc_length,
+)
+from dt_viz.obstacles.union import Several
+
+NUM_SAMPLES = 120
+"""At even distances along a path, start and goal included."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One motion along its normalised path, at N even distances from start (0) to goal (1)."""
+
+    lyapunov: Array
+    """(N,) Φ(ψ(y)) over its value at the start."""
+    distance: Array
+    """(N,) of the end effector from the nearest point of its demonstration, metres."""
+    clearance: Array
+    """(N,) distance from the obstacles of what avoids them, metres, negative inside; infinite where there are none."""
+    frechet: float
+    """Discrete Fréchet distance of the end effector to its demonstration, metres."""
+    depth: float
+    """How deep what avoids the obstacles enters them (M.C.D.), metres; 0 when it is clear."""
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """A motion and what it would be without any behaviour."""
+
+    shown: Profile
+    undisturbed: Profile
+    of_body: bool = False
+    """Whether clearance and depth are of the spheres that cover the arm, not of the end effector."""
+    of_mean: bool = False
+    """Whether the distances are to the mean demonstration: the motion begins at an added start."""
+
+    @property
+    def along(self) -> Array:
+        """(N,) of the path, from 0 to 1."""
+        return np.linspace(0, 1, len(self.shown.lyapunov))
+
+
+def hand_profile(path: Array, demonstration: Array, system: DiffeomorphicSystem, obstacle: Several) -> Profile:
+    """Profile of a motion of the end effector.
+
+    Args:
+        path: (T, 3) its samples, on a motion of the system, metres.
+        demonstration: (M, 3), metres.
+        system: whose motion it is.
+        obstacle: that it is to keep clear of.
+    """
+    depth = maximum_collision_distance(path, obstacle.signed_distance)
+    return _profile(path, demonstration, system.lyapunov(path), obstacle.signed_distance(path), depth)
+
+
+def body_profile(path: Array, demonstration: Array, potential: Array, clearance: Array) -> Profile:
+    """Profile of a motion of the whole arm.
+
+    Args:
+        path: (T, 3) end effector at its samples, metres.
+        demonstration: (M, 3), metres.
+        potential: (T,) Lyapunov value at the samples.
+        clearance: (T,) of the spheres that cover the arm at the samples, metres.
+    """
+    return _profile(path, demonstration, potential, clearance, -float(clearance.min()))
+
+
+def _profile(path: Array, demonstration: Array, potential: Array, clearance: Array, depth: float) -> Profile:
+    length = arc_length(path)
+    moves = np.r_[True, np.diff(length) > 0]
+    places = np.linspace(0, length[-1], NUM_SAMPLES)
+
+    def along(values: Array) -> Array:
+        return np.interp(places, length[moves], values[moves])
+
+    a, b = (resample_by_arc_length(points, NUM_SAMPLES) for points in (path, demonstration))
+    return Profile(
+        lyapunov=along(potential) / (potential[0] or 1.0),  # a motion from the goal has none to lose
+        distance=distance_from_path(a, demonstration),
+        clearance=along(clearance) if np.isfinite(clearance).all() else np.full(NUM_SAMPLES, np.inf),
+        frechet=float(discrete_frechet(a, b)),
+        depth=max(0.0, depth),
+    )

@@ -1,0 +1,221 @@
+"""The stack that a scenario asks for, built for its motion, and the exact rollouts of the whole stack."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.rollouts import Bundle, Rays, refined
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.motion.nominal import Ground
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.stack import AVOIDANCE
+from dt_viz.transforms.avoidance import ObstacleAvoidance
+from dt_viz.transforms.base import Behaviour, Built, Motion
+
+MAX_ATTEMPTS = 4
+"""At a duration that clears the samples that refinement finds, too."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How exactly a motion is worked out, all in metres."""
+
+    tolerance: float
+    """Of a step of the behaviours' flows."""
+    spacing: float
+    """Largest distance between neighbouring samples."""
+    ends: float
+    """By which a rollout may miss its start and goal before the motion below is worked out again between others."""
+
+
+LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
+"""Nothing of this is seen at the size of a screen."""
+FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
+
+
+@dataclass(frozen=True)
+class Applied:
+    """A behaviour of a scenario that is on, as it was made."""
+
+    place: int | None
+    """Of its layer among the scenario's, which may be equal; None of the end effector's avoidance."""
+    name: str
+    """Of its layer."""
+    behaviour: Behaviour
+    made: Built
+    satisfied: bool
+    """Whether it finds in the motion what it was made for."""
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Of the behaviour, in words, that of a layer by its name."""
+        if self.place is None:
+            return self.made.doubts
+        return tuple(f"{self.name or 'a layer'}: {doubt}" for doubt in self.made.doubts)
+
+    @property
+    def may_improve(self) -> bool:
+        """Whether it is of use to try again."""
+        return not (self.satisfied or self.made.hopeless)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The stack that a scenario asks for, and its rollouts."""
+
+    transform: Diffeomorphism
+    rays: Rays
+    bundle: Bundle
+    built: tuple[Applied, ...]
+    """The behaviours that are on, from the inside out."""
+
+    @property
+    def system(self) -> DiffeomorphicSystem:
+        """The dynamical system whose motions these are."""
+        return DiffeomorphicSystem(self.transform, self.rays.base)
+
+    @property
+    def unsatisfied(self) -> tuple[Applied, ...]:
+        """Those that do not find what they were made for."""
+        return tuple(applied for applied in self.built if not applied.satisfied)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Of the behaviours, in words."""
+        return tuple(doubt for applied in self.built for doubt in applied.doubts)
+
+    def at(self, place: int | None) -> Applied | None:
+        """What was made of the layer at this place among the scenario's, None where that is off.
+
+        Place None is the end effector's avoidance.
+        """
+        return next((applied for applied in self.built if applied.place == place), None)
+
+    def duration_at(self, place: int | None) -> float | None:
+        """T of the flow of what is `at` this place, under a warp that of the full one; None where that is off."""
+        applied = self.at(place)
+        return applied.made.duration if applied else None
+
+    def positions_at(self, index: Indices, fraction: Array) -> Array:
+        """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
+        return self.transform.inverse(self.rays.at(index, fraction))
+
+
+def cut_off(ground: Ground, solution: Solution, level: int) -> DiffeomorphicSystem:
+    """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
+    stacked = [applied.made.transform for applied in solution.built[:level]]
+    return DiffeomorphicSystem(Chain([ground.system.transform, *stacked]), solution.rays.base)
+
+
+def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
+    """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
+    levels = [positions]
+    for transform in transforms:
+        levels.append(transform.inverse(levels[-1]))
+    return np.stack(levels, axis=1)
+
+
+def stacked(scenario: Scenario) -> tuple[tuple[int | None, Layer], ...]:
+    """What is stacked on the imitation, from the inside out, without the layers that are off.
+
+    Each comes with its place among the scenario's layers; that of the end effector's avoidance is None.
+    """
+    order: list[tuple[int | None, Layer]] = [(place, layer) for place, layer in enumerate(scenario.layers)]
+    level = len(order) if scenario.avoidance_level is None else scenario.avoidance_level
+    order.insert(level, (None, Layer(ObstacleAvoidance(), name=AVOIDANCE)))
+    return tuple((place, layer) for place, layer in order if layer.on)
+
+
+def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
+    """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
+
+    A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
+    behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not. Where
+    there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
+    """
+    solution, stack = None, stacked(scenario)
+    layers = [layer.behaviour for _, layer in stack]
+    for keeps_goal in (True, False):
+        rays, bundle = ground.rays, ground.bundle
+        ends_below = ground.ends
+        durations, above = [0.0] * len(layers), (None,) * len(layers)
+        for _ in range(MAX_ATTEMPTS):
+            lowest = Motion(
+                scenario,
+                ground.starts,
+                ground.goal,
+                bundle.index,
+                bundle.levels[:, 0],
+                keeps_goal=keeps_goal,
+                num_demonstrated=ground.num_demonstrated,
+            )
+            built = _build(layers, lowest, precision.tolerance, durations, above)
+            above = _above([made for _, made in built])
+            durations = [made.duration if made else 0.0 for _, made in built]
+            outer = [made.transform for _, made in built if made]
+            goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
+
+            ends = np.concatenate([ground.starts, [goal]])
+            below = Chain(outer).forward(ends) if outer else ends
+            if np.abs(below - ends_below).max() > precision.ends:
+                *z0, z_e = ground.images(below)
+                rays, ends_below = Rays(np.stack(z0), replace(ground.system.base, goal=z_e)), below
+                positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
+                bundle = replace(bundle, levels=positions[:, None])
+            bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
+            transforms = [ground.system.transform, *outer]
+            bundle = refined(bundle, lambda i, u, r=rays, s=transforms: climb(r.at(i, u), s)[:, 1:], precision.spacing)
+            solution = Solution(Chain(transforms), rays, bundle, _applied(stack, built, above, bundle))
+            if not any(applied.may_improve for applied in solution.built):
+                return solution
+        assert solution is not None
+        avoidance = solution.at(None)
+        if avoidance is None or not avoidance.may_improve:
+            break  # the goal has nothing to do with it
+    assert solution is not None
+    return solution
+
+
+def _build(
+    layers: Sequence[Behaviour],
+    motion: Motion,
+    tolerance: float,
+    durations: Sequence[float],
+    above: Sequence[Diffeomorphism | None],
+) -> list[tuple[Motion, Built | None]]:
+    """Each behaviour's transform, None where it is off, with the motion that it was made for."""
+    built = []
+    for k, behaviour in enumerate(layers):
+        motion = replace(motion, above=above[k])
+        made = behaviour.build(motion, tolerance, durations[k])
+        built.append((motion, made))
+        if made and k < len(layers) - 1:
+            motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
+    return built
+
+
+def _above(built: Sequence[Built | None]) -> tuple[Diffeomorphism | None, ...]:
+    """For each behaviour, the transforms of those above it."""
+    transforms = [[made.transform for made in built[k + 1 :] if made] for k in range(len(built))]
+    return tuple(Chain(stacked) if stacked else None for stacked in transforms)
+
+
+def _applied(
+    stack: Sequence[tuple[int | None, Layer]],
+    built: Sequence[tuple[Motion, Built | None]],
+    above: Sequence[Diffeomorphism | None],
+    bundle: Bundle,
+) -> tuple[Applied, ...]:
+    """The behaviours that are on, and whether they find in the bundle what they were made for."""
+    found = []
+    for (place, layer), (motion, made), outer in zip(stack, built, above, strict=True):
+        if made:
+            at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
+            satisfied = layer.behaviour.satisfied(replace(motion, index=bundle.index, **at))
+            found.append(Applied(place, layer.name, layer.behaviour, made, satisfied))
+    return tuple(found)

@@ -1,0 +1,148 @@
+"""Point clouds as solids: what is occupied between the points, and the surface around it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.obstacles.occupancy import fit_occupancy
+from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.triangles import grid_nodes
+from dt_viz.properties import cached_property
+
+NUM_NODES = 44**3
+"""Of the grid that the surface is found on, about."""
+REACH = 1.2
+"""What counts as occupied around a point without label, in distances of the sixth nearest (that nine in ten have):
+points that lie at random on a surface then leave no hole."""
+FEWEST_CELLS = 1.2
+"""The same at least, in cells of the grid: what is thinner would be full of holes."""
+KERNELS_ACROSS = 5
+"""Kernel widths along the largest side of what is labelled as occupied."""
+NUM_SAMPLES = 2000
+"""Labelled points that the map is learned from, at most."""
+REGULARISATION = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points in metres, all of them on or in something, or labelled; compared and hashed by what it holds."""
+
+    points: Array
+    """(K, 3) metres, in the cloud's own frame."""
+    labels: Array | None = None
+    """(K,) 1 occupied and 0 free; None where all are occupied."""
+
+    def __post_init__(self) -> None:
+        for name in ("points", "labels"):
+            if (values := getattr(self, name)) is not None:
+                array = np.array(values, dtype=float)
+                array.flags.writeable = False
+                object.__setattr__(self, name, array)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Of points and labels."""
+        labels = b"" if self.labels is None else self.labels.tobytes()
+        return hashlib.blake2b(self.points.tobytes() + labels, digest_size=16).digest()
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Cloud) and self.digest == other.digest)
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    @property
+    def solid(self) -> Solid:
+        """What it occupies; computed once for all equal clouds.
+
+        With labels, where the occupancy map learned from them (sec. 4.4) says p > 1/2. Without, what is within a few
+        distances between neighbours of a point, and what that encloses: a scan of a surface is filled.
+
+        Raises:
+            ValueError: nothing is occupied.
+        """
+        return _solid(self)
+
+
+@lru_cache(maxsize=16)
+def _solid(cloud: Cloud) -> Solid:
+    occupied = cloud.points if cloud.labels is None else cloud.points[cloud.labels > 0.5]
+    lower, upper = occupied.min(axis=0), occupied.max(axis=0)
+    largest = float((upper - lower).max())
+    if cloud.labels is None:
+        tree = KDTree(occupied)
+        spacing = float(np.quantile(tree.query(occupied, k=7)[0][:, 6], 0.9))
+        cell = _cell(upper - lower + 4 * REACH * spacing)
+        reach = max(REACH * spacing, FEWEST_CELLS * cell)
+        origin, nodes, shape = _grid(lower - reach, upper + reach, cell)
+        level = (tree.query(nodes)[0] - reach).reshape(shape)
+        enclosed = np.asarray(ndimage.binary_fill_holes(level < 0))
+        level = np.where(enclosed, -np.abs(level), level)
+    else:
+        some = np.random.default_rng(0).permutation(len(cloud.points))[:NUM_SAMPLES]
+        width = largest / KERNELS_ACROSS
+        occupancy = fit_occupancy(cloud.points[some], cloud.labels[some], width, regularisation=REGULARISATION)
+        cell = _cell(upper - lower + 2 * width)
+        origin, nodes, shape = _grid(lower - width, upper + width, cell)
+        level = -occupancy.logit(nodes).reshape(shape)
+    for axis in range(3):  # free all around
+        ends = np.moveaxis(level, axis, 0)
+        ends[[0, -1]] = np.maximum(ends[[0, -1]], np.abs(level).max() * 1e-3)
+    if not (level < 0).any():
+        raise ValueError("the occupancy map learned from the labels is nowhere occupied")
+    vertices, faces = zero_level(level)
+    return Solid(origin + cell * vertices, faces)
+
+
+def _cell(sizes: Array) -> float:
+    return float(np.cbrt(np.prod(np.maximum(sizes, 0.05 * sizes.max())) / NUM_NODES))
+
+
+def _grid(lower: Array, upper: Array, cell: float) -> tuple[Array, Array, tuple[int, int, int]]:
+    """A grid's first node, all its nodes (N, 3), and how many there are per axis; two cells more on each side."""
+    x, y, z = (int(num) for num in np.ceil((upper - lower) / cell) + 5)
+    origin = (lower + upper) / 2 - cell * (np.array([x, y, z]) - 1) / 2
+    return origin, grid_nodes(origin, cell, (x, y, z)), (x, y, z)
+
+
+def zero_level(level: Array) -> tuple[Array, Indices]:
+    """The closed surface between negative and positive nodes of a grid (n_x, n_y, n_z), outward (surface nets).
+
+    Each cell with nodes of both signs has one vertex, the mean of where its edges cross the level; each edge that
+    crosses it has a quadrilateral of the four cells around.
+
+    Returns:
+        Vertices (V, 3), counted in cells from the first node, and faces (F, 3).
+    """
+    inside = level < 0
+    cells = tuple(n - 1 for n in level.shape)
+    total, count = np.zeros((*cells, 3)), np.zeros(cells, dtype=np.intp)
+    edges = []
+    for axis in range(3):
+        first = tuple(slice(None, -1) if k == axis else slice(None) for k in range(3))
+        second = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
+        at = np.argwhere(inside[first] != inside[second])
+        a, b = level[first][tuple(at.T)], level[second][tuple(at.T)]
+        crossing = at + (a / (a - b))[:, None] * np.eye(3)[axis]
+        others = (axis + 1) % 3, (axis + 2) % 3
+        around = []
+        for back in ((1, 1), (0, 1), (0, 0), (1, 0)):
+            cell = at.copy()
+            cell[:, others] -= back
+            around.append(np.ravel_multi_index(tuple(cell.T), cells))
+            np.add.at(total.reshape(-1, 3), around[-1], crossing)
+            np.add.at(count.reshape(-1), around[-1], 1)
+        quads = np.stack(around, axis=1)
+        edges.append(np.where((a < 0)[:, None], quads, quads[:, ::-1]))
+    used = np.flatnonzero(count)
+    number = np.full(count.size, -1)
+    number[used] = np.arange(len(used))
+    quads = number[np.concatenate(edges)]
+    return total.reshape(-1, 3)[used] / count.reshape(-1)[used, None], quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)

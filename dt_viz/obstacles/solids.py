@@ -1,0 +1,366 @@
+"""Solids bounded by triangles: their signed distance as a smooth function that is quick to evaluate anywhere.
+
+The distance is computed once, on a grid: that of each node from the nearest triangle, with the sign of the winding
+number. Between the nodes it is a quadratic B-spline with the nodes' values as coefficients, so it has a continuous
+slope and is, like a distance, nowhere steeper than 1 but for the discretisation: a weighted mean of distances.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.obstacles.triangles import closest_on_triangles, grid_nodes, inside_of_grid, surface_samples
+from dt_viz.properties import cached_property
+
+NUM_NODES = 64**3
+"""Of a grid, about."""
+MARGIN = 0.2
+"""Of the grid around the shape, relative to the largest side of its bounding box."""
+NUM_SAMPLES = 60_000
+"""Of the surface, about, and one at least on each triangle."""
+LONGEST_ROWS = 8
+"""Bound of the number of samples in a row along all triangles, in `NUM_SAMPLES`."""
+NUM_NEAREST = 6
+"""Samples whose triangles are measured exactly for each point."""
+NUM_ROUNDS, NUM_SWEEPS = 2, 3
+"""In which the nodes of a grid tell each other which point of the surface is near."""
+WALK = 0.6
+"""Part of the way along a surface to the place that would be nearest if it were flat."""
+WALK_CELLS = 1.0
+"""Longest such step, in cells of the grid."""
+NUM_PROBES = 100_000
+"""Points at which the slope is looked at."""
+BLOCK = 2048
+"""Points that a grid is evaluated at at once: of more, what is worked out on the way leaves the cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """What closed triangles enclose, in metres; compared and hashed by its vertices and faces."""
+
+    vertices: Array
+    """(V, 3) metres, in the solid's own frame."""
+    faces: Indices
+    """(F, 3) indices of vertices."""
+
+    def __post_init__(self) -> None:
+        for name, kind in (("vertices", float), ("faces", np.intp)):
+            array = np.array(getattr(self, name), dtype=kind)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Of vertices and faces."""
+        return hashlib.blake2b(self.vertices.tobytes() + self.faces.tobytes(), digest_size=16).digest()
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Solid) and self.digest == other.digest)
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    @property
+    def distances(self) -> DistanceGrid:
+        """Its signed distance; computed once for all equal solids."""
+        return _distances(self)
+
+    @cached_property
+    def radius(self) -> float:
+        """Of the ball around the origin that holds it, metres."""
+        return float(np.linalg.norm(self.vertices, axis=1).max())
+
+    @cached_property
+    def bounds(self) -> Array:
+        """(2, 3) lower and upper corner of its bounding box, metres."""
+        return np.stack([self.used.min(axis=0), self.used.max(axis=0)])
+
+    @property
+    def used(self) -> Array:
+        """The vertices of its faces, metres."""
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.faces] = True
+        return self.vertices[used]
+
+    def nearest(self, s: Array) -> Array:
+        """The points of the surface nearest to the points `s` (N, 3), (N, 3), metres."""
+        return _surface(self).nearest(s)
+
+    def balls(self, num: int) -> tuple[Array, Array]:
+        """Centres (K, 3) and radii (K,) of at most `num` balls that together hold it, metres."""
+        centres, radii = _balls(self, num)
+        return centres.copy(), radii.copy()
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceGrid:
+    """A signed distance sampled on a grid; analytic between and beyond its nodes.
+
+    For an object of 15 cm it is off by up to 2 mm beside edges, 0.3 mm elsewhere near the surface, and 2 % far from it.
+    """
+
+    origin: Array
+    """(3,) the first node, metres."""
+    cell: float
+    """Distance between neighbouring nodes, metres."""
+    values: Array
+    """(n_x, n_y, n_z) signed distances of the nodes, metres."""
+    margin: float
+    """At least as far is the shape from the border of the grid, metres."""
+    centre: Array
+    """(3,) of the bounding box."""
+    radius: float
+    """Of the ball around it that holds the shape."""
+
+    @cached_property
+    def nodes(self) -> Array:
+        """(n_x·n_y·n_z, 3) metres, last axis fastest."""
+        return grid_nodes(self.origin, self.cell, self.values.shape)
+
+    @cached_property
+    def depth(self) -> float:
+        """How far inside the deepest point is, metres."""
+        return max(0.0, -float(self.values.min()))
+
+    @cached_property
+    def interior(self) -> Array:
+        """(N, 3) the nodes inside, metres."""
+        return self.nodes[self.values.ravel() < 0]
+
+    def __call__(self, s: Array) -> Array:
+        """Signed distance (*B,) of the points `s` (*B, 3), which may be a tiny complex step away from real ones.
+
+        Beyond the grid it is a lower bound of the distance, continuous and of a slope of at most 1: with c the nearest
+        point of the border, o = s − c and m the margin, d² = d(c)² + |o|² + 2m·Σ|o_i|; or the distance from the ball
+        that holds the shape, whatever is larger.
+        """
+        points = np.ascontiguousarray(s.real).reshape(-1, 3)
+        steps = s.imag.reshape(-1, 3) if np.iscomplexobj(s) else None
+        value, slope = self._evaluate(points, slopes=steps is not None)
+        if steps is not None:
+            value = value + 1j * np.einsum("ni,ni->n", slope, steps)
+        return value.reshape(s.shape[:-1])
+
+    def with_slope(self, s: Array) -> tuple[Array, Array]:
+        """Signed distance (N,) of real points `s` (N, 3) and its gradient (N, 3)."""
+        return self._evaluate(s, slopes=True)
+
+    @cached_property
+    def _coefficients(self) -> tuple[Array, Indices]:
+        """The values, flat and in single precision, which fits the cache; offsets of a node's neighbours."""
+        strides = np.array([self.values.shape[1] * self.values.shape[2], self.values.shape[2], 1])
+        around = (np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1) @ strides).ravel()
+        return self.values.astype(np.float32).ravel(), around
+
+    def _evaluate(self, s: Array, *, slopes: bool) -> tuple[Array, Array]:
+        """Values (N,), and gradients (N, 3) where they are wanted."""
+        if len(s) > BLOCK:
+            blocks = [self._evaluate(s[i : i + BLOCK], slopes=slopes) for i in range(0, len(s), BLOCK)]
+            values, gradients = zip(*blocks, strict=True)
+            return np.concatenate(values), np.concatenate(gradients)
+        shape = np.array(self.values.shape)[:, None]
+        t = (s.T - self.origin[:, None]) / self.cell  # the batch last, for long inner loops
+        clipped = np.minimum(np.maximum(t, 0.5), shape - 1.5)
+        node = np.minimum((clipped + 0.5).astype(np.intp), shape - 2)
+        f = clipped - node  # from −1/2 to 1/2
+        flat, around = self._coefficients
+        first = (node[0] * shape[1] + node[1]) * shape[2] + node[2]
+        block = flat.take(first + around[:, None]).astype(float).reshape(3, 3, 3, -1)  # (x, y, z, N)
+        weights = np.stack([0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2])  # (3, 3 axes, N)
+        along_z = np.einsum("xyzn,zn->xyn", block, weights[:, 2])
+        along_yz = np.einsum("xyn,yn->xn", along_z, weights[:, 1])
+        value = np.einsum("xn,xn->n", along_yz, weights[:, 0])
+        slope = np.empty((0, 3))
+        if slopes:
+            rates = np.stack([f - 0.5, -2 * f, f + 0.5]) / self.cell
+            rate_y = np.einsum("xyn,yn->xn", along_z, rates[:, 1])
+            rate_z = np.einsum("xyn,yn->xn", np.einsum("xyzn,zn->xyn", block, rates[:, 2]), weights[:, 1])
+            columns = [
+                np.einsum("xn,xn->n", along_yz, rates[:, 0]),
+                np.einsum("xn,xn->n", rate_y, weights[:, 0]),
+                np.einsum("xn,xn->n", rate_z, weights[:, 0]),
+            ]
+            slope = np.stack(columns, axis=-1)
+        outside = np.flatnonzero((t != clipped).any(axis=0))
+        if len(outside):
+            self._extend((t - clipped).T * self.cell, value, slope, outside)
+        self._raise_to_ball(s, value, slope)
+        return value, slope
+
+    def _extend(self, offset: Array, value: Array, slope: Array, outside: Indices) -> None:
+        """Corrects the values and gradients, in place, of the points outside the grid."""
+        o, g = offset[outside], np.maximum(value[outside], self.margin)
+        size = np.abs(o)
+        far = np.sqrt(g * g + np.einsum("ni,ni->n", o, o) + 2 * self.margin * (size[:, 0] + size[:, 1] + size[:, 2]))
+        value[outside] = far
+        if len(slope):
+            inner = np.where(o == 0, slope[outside], 0.0) * (g > self.margin)[:, None]
+            slope[outside] = (g[:, None] * inner + o + self.margin * np.sign(o)) / far[:, None]
+
+    def _raise_to_ball(self, s: Array, value: Array, slope: Array) -> None:
+        """Raises values, in place, that are smaller than the distance from the ball that holds the shape."""
+        offset = s - self.centre
+        apart = np.sqrt(np.einsum("ni,ni->n", offset, offset))
+        if len(slope):
+            nearer = value < apart - self.radius
+            slope[nearer] = offset[nearer] / apart[nearer, None]
+        np.maximum(value, apart - self.radius, out=value)
+
+
+class _Surface:
+    """Triangles, with samples on them that tell which ones are near."""
+
+    def __init__(self, triangles: Array) -> None:
+        self._triangles = triangles
+        a, b, c = triangles.swapaxes(0, 1)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+        # triangles that are long and thin would have one sample after the other along them
+        length = sum(float(np.linalg.norm(side, axis=1).sum()) for side in (b - a, c - b, a - c)) / 2
+        spacing = max(np.sqrt(area / NUM_SAMPLES), length / (LONGEST_ROWS * NUM_SAMPLES))
+        self.samples, self._owner = surface_samples(triangles, spacing)
+        self._tree = KDTree(self.samples)
+
+    def nearest(self, s: Array) -> Array:
+        """The points of the surface nearest to the points `s` (N, 3), (N, 3)."""
+        return self._nearest(s)[1] if len(s) else s.copy()
+
+    def _nearest(self, s: Array) -> tuple[Indices, Array]:
+        """The triangles (N,) nearest to points `s` (N, 3), and the points (N, 3) on them."""
+        _, found = self._tree.query(s, k=min(NUM_NEAREST, self._tree.n))
+        owners = self._owner[np.reshape(found, (len(s), -1))]  # (N, K)
+        points = np.stack([closest_on_triangles(s, self._triangles[owner]) for owner in owners.T], axis=1)
+        best = np.arange(len(s)), ((points - s[:, None]) ** 2).sum(axis=2).argmin(axis=1)
+        return owners[best], points[best]
+
+    def distances(self, nodes: Array, origin: Array, cell: float, shape: tuple[int, int, int]) -> Array:
+        """Distances (n_x, n_y, n_z) of a grid's nodes (N, 3) from the surface.
+
+        A node beside the surface asks the tree. From there the nearest samples are handed on from node to node: far
+        away from the surface too many are about as near for a tree to be quick.
+        """
+        beside = np.zeros(shape, dtype=bool)
+        corner = ((self.samples - origin) / cell).astype(np.intp)
+        for step in np.ndindex(2, 2, 2):
+            beside[tuple((corner + step).T)] = True
+        to = ndimage.distance_transform_edt(~beside, return_distances=False, return_indices=True)
+        assert isinstance(to, np.ndarray)
+        owner, points = np.zeros(shape, dtype=np.intp), np.empty((*shape, 3))
+        owner[beside], points[beside] = self._nearest(nodes[beside.ravel()])
+        owner, points = owner[tuple(to)], points[tuple(to)]
+        for _ in range(NUM_ROUNDS):
+            _hand_on(owner, points, nodes.reshape(*shape, 3))
+            points = closest_on_triangles(nodes, self._triangles[owner.ravel()]).reshape(*shape, 3)
+            self._walk(owner.reshape(-1), points.reshape(-1, 3), nodes, WALK_CELLS * cell)
+        return np.linalg.norm(points - nodes.reshape(*shape, 3), axis=-1)
+
+    def _walk(self, owner: Indices, points: Array, nodes: Array, longest: float) -> None:
+        """Moves points of the surface, in place, along it to where they are nearer to the nodes.
+
+        Where the surface bends like a ball of radius R around a node at distance d, the step is WALK·(1 + d/R) of the
+        way.
+        """
+        offset = nodes - points
+        a, b, c = self._triangles[owner].swapaxes(0, 1)
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        aside = offset - np.einsum("ni,ni->n", offset, normal)[:, None] * normal
+        squared, step = np.einsum("ni,ni->n", offset, offset), WALK * np.linalg.norm(aside, axis=1)
+        far = np.flatnonzero(step**2 > 1e-4 * squared)
+        aside *= (WALK * np.minimum(1, longest / np.maximum(step, 1e-300)))[:, None]
+        new = self._owner[self._tree.query(points[far] + aside[far])[1]]
+        reached = closest_on_triangles(nodes[far], self._triangles[new])
+        nearer = ((reached - nodes[far]) ** 2).sum(axis=1) < squared[far]
+        owner[far[nearer]], points[far[nearer]] = new[nearer], reached[nearer]
+
+
+def _flatten(signed: Array, cell: float) -> None:
+    """Lowers distances on a grid, in place, that are too large to be that far from their neighbours' ones."""
+    outside = signed > 0
+    for step in itertools.product(range(-2, 3), repeat=3):
+        if any(step):
+            here, there = (tuple(slice(max(sign * k, 0), min(sign * k, 0) or None) for k in step) for sign in (1, -1))
+            far, value, other = cell * float(np.linalg.norm(step)), signed[here], signed[there]
+            lowered = np.maximum(np.minimum(value, other + far), 0)
+            raised = np.minimum(np.maximum(value, other - far), 0)
+            signed[here] = np.where(outside[here], lowered, raised)
+
+
+def _hand_on(owner: Indices, points: Array, nodes: Array) -> None:
+    """Lets each node of a grid take over, in place, its neighbour's point of the surface where that is nearer."""
+    squared = ((points - nodes) ** 2).sum(axis=-1)
+    for _, axis, back in itertools.product(range(NUM_SWEEPS), range(3), (False, True)):
+        ends = slice(1, None), slice(None, -1)
+        here, there = ((*axis * (slice(None),), end) for end in (ends[::-1] if back else ends))
+        apart = ((points[there] - nodes[here]) ** 2).sum(axis=-1)
+        nearer = apart < squared[here]
+        squared[here][nearer] = apart[nearer]
+        owner[here][nearer] = owner[there][nearer]
+        points[here][nearer] = points[there][nearer]
+
+
+@lru_cache(maxsize=16)
+def _surface(solid: Solid) -> _Surface:
+    return _Surface(solid.vertices[solid.faces])
+
+
+@lru_cache(maxsize=16)
+def _distances(solid: Solid) -> DistanceGrid:
+    lower, upper = solid.bounds
+    margin = MARGIN * float((upper - lower).max())
+    size = upper - lower + 2 * margin
+    cell = float(np.cbrt(size.prod() / NUM_NODES))
+    counts = np.ceil(size / cell).astype(int) + 2  # the outermost nodes are for the spline only
+    centre = (lower + upper) / 2
+    origin = centre - cell * (counts - 1) / 2
+    shape = (int(counts[0]), int(counts[1]), int(counts[2]))
+    nodes = grid_nodes(origin, cell, shape)
+    inside = inside_of_grid(solid.vertices[solid.faces], origin, cell, shape)  # first: it refuses what takes too long
+    distance = _surface(solid).distances(nodes, origin, cell, shape)
+    radius = float(np.linalg.norm(solid.used - centre, axis=1).max())
+    signed = np.where(inside, -distance, distance)
+    _flatten(signed, cell)
+    grid = DistanceGrid(origin, cell, signed, margin, centre, radius)
+    # steeper than 1 by a percent or two beside edges
+    s = origin + cell * np.random.default_rng(0).uniform(0.5, counts - 1.5, (NUM_PROBES, 3))
+    slope = np.sqrt((grid.with_slope(s)[1] ** 2).sum(axis=1).max())
+    return replace(grid, values=grid.values / slope, margin=margin / slope) if slope > 1 else grid
+
+
+@lru_cache(maxsize=64)
+def _balls(solid: Solid, num: int) -> tuple[Array, Array]:
+    """Clusters of the grid's cells that the solid has a part in, grown by half a cell's diagonal."""
+    grid = solid.distances
+    half_diagonal = grid.cell * np.sqrt(3) / 2
+    nodes = grid.nodes[grid.values.ravel() < half_diagonal]
+    some = nodes[:: max(1, len(nodes) // 4000)]
+    centres = [some[np.linalg.norm(some - some.mean(axis=0), axis=1).argmax()]]
+    apart = np.linalg.norm(some - centres[0], axis=1)
+    while len(centres) < num:  # the farthest point first
+        centres.append(some[apart.argmax()])
+        apart = np.minimum(apart, np.linalg.norm(some - centres[-1], axis=1))
+    centres = np.array(centres)
+    for _ in range(15):
+        member = KDTree(centres).query(some)[1]
+        for k in range(num):
+            if len(mine := some[member == k]):
+                centres[k] = _middle(mine)
+    distance, member = KDTree(centres).query(nodes)
+    radii = np.array([distance[member == k].max(initial=-1.0) for k in range(num)])
+    return centres[radii >= 0], radii[radii >= 0] + half_diagonal
+
+
+def _middle(points: Array) -> Array:
+    """Centre (3,) of a small ball around points (N, 3), by steps towards the farthest one (Bădoiu and Clarkson)."""
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    for k in range(1, 20):
+        farthest = points[((points - centre) ** 2).sum(axis=1).argmax()]
+        centre = centre + (farthest - centre) / (k + 4)
+    return centre

@@ -1,0 +1,376 @@
+"""Pictures of ψ itself: the generator that was learned, the grid that ψ⁻¹ warps, and the base attractor beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Placed
+from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.flows.rollouts import Bundle, Rays, refined
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.pictures.occupancy import OccupancyPicture
+from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture
+from dt_viz.properties import cached_property
+from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.tasks import Task
+
+ARROW_SPACING = 0.027
+"""Of the generator's arrows, metres."""
+NEGLIGIBLE = 0.03
+"""Part of the largest arrow below which there is none to see."""
+LINE_SPACING = 0.035
+"""Between neighbouring lines of the grid in base space, metres."""
+TRIAL_STEP, COARSE_TRIAL_STEP = 0.004, 0.012
+"""Along a line of the grid, metres of base space: where it lies in the motion's space is looked at so closely."""
+SAMPLE_SPACING = 0.010
+"""Along a line of the grid, metres in the motion's space, before the behaviours bend it."""
+STEEPEST = 4.0
+"""Path along a line of the grid in base space, relative to that along the slice, beyond which it is torn."""
+FINE_SPACING, COARSE_SPACING = 0.006, 0.030
+"""Metres between neighbouring samples of the drawn grid."""
+TOLERANCE = 1e-6
+"""Of the behaviours' flows where they bend the grid, metres: coarser is not faster, and lines would seem to cross."""
+MAX_NEWTON, MAX_STEP, MIN_SLOPE, ON_SLICE = 6, 0.05, 0.1, 1e-6
+"""Steps to where the grid lies on the slice, the longest of them, metres, the least rise of the preimage for a rise of
+1 that is believed, and how near counts as on it, metres."""
+INSET_GAP = 0.06
+"""Between the slice and the inset, metres."""
+INSET_HALF_WIDTH = 0.21
+"""At most, metres: all of it is seen from where the task puts the camera."""
+INSET_MARGIN = 0.18
+"""Around the rays in the inset, relative to their extent."""
+INSET_ARROWS = 13
+"""Along the longer side of the inset."""
+
+
+@dataclass(frozen=True)
+class GeneratorPicture:
+    """A generator V of ψ, ψ(s) = γ(t, s), on the slice: it straightens the motion."""
+
+    points: Array
+    """(N, 3), metres."""
+    displacements: Array
+    """(N, 3) t·V, metres: about how far the flow carries a point."""
+    motions: tuple[Array, ...]
+    """The demonstrations on the manifold that this flow acts on, (T_i, 3), metres; empty for the mean of all flows."""
+    num_flows: int
+    """That ψ is composed of."""
+
+
+@dataclass(frozen=True)
+class GridPicture:
+    """Regular planes of base space where they meet what the imitation's ψ makes of the slice, through ψ⁻¹ of the stack.
+
+    In a drawing's plane they are the images of a lattice of straight lines.
+    """
+
+    lines: tuple[Array, ...]
+    """(T_i, 3), metres."""
+
+
+@dataclass(frozen=True)
+class BasePicture:
+    """The base system in an inset beside the slice, smaller if need be."""
+
+    rays: tuple[Array, ...]
+    """(2, 3), from ψ(start) to ψ(goal), metres in the world, as all that follows."""
+    points: Array
+    """(N, 3) of the vector field's arrows."""
+    velocities: Array
+    """(N, 3) m/s in base space."""
+    grid: tuple[Array, ...]
+    """(2, 3) lines of the lattice whose image is the warped grid."""
+    border: Array
+    """(5, 3) the inset's closed outline."""
+    labels: tuple[Array, Array]
+    """(3,) above the inset and above the learned system."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Those that the view asks for; None is what it does not, or what is not worked out yet."""
+
+    field: FieldPicture | None = None
+    streamlines: tuple[Array, ...] | None = None
+    """Each (T_i, 3), metres."""
+    colour: ColourPicture | None = None
+    generator: GeneratorPicture | None = None
+    grid: GridPicture | None = None
+    base: BasePicture | None = None
+    occupancy: OccupancyPicture | None = None
+
+
+NO_PICTURES = Pictures()
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """The warped grid on a slice of the manifold of the imitation, before behaviours bend it."""
+
+    area: Slice
+    index: Indices
+    """(N,) which piece a sample belongs to."""
+    images: Array
+    """(N, 3) of the samples in base space."""
+    positions: Array
+    """(N, 3) of the samples on the slice, metres."""
+
+    def images_at(self, place: Array) -> Array:
+        """Points of base space (M, 3) at places (M,) counted in samples, between them on straight lines."""
+        before = np.minimum(place.astype(int), len(self.images) - 2)
+        start, end = self.images[before], self.images[before + 1]
+        return start + (place - before)[:, None] * (end - start)
+
+
+@dataclass(frozen=True)
+class _Inset:
+    """Base space → world: z ↦ centre + scale·(z − middle)."""
+
+    middle: Array
+    centre: Array
+    scale: float
+    half: Array
+    """(2,) of the rectangle, metres in base space."""
+
+    def __call__(self, z: Array) -> Array:
+        return self.centre + self.scale * (z - self.middle)
+
+
+class Sketchbook:
+    """Makes pictures of one learned motion.
+
+    What does not depend on the obstacle is worked out when it is first shown.
+    """
+
+    def __init__(self, task: Task, flows: Chain | None, system: DiffeomorphicSystem, rays: Rays) -> None:
+        """Begin with no picture.
+
+        Args:
+            task: where the motion is.
+            flows: that ψ is composed of, in the demonstrations' own units; None where it is not in the stack.
+            system: the motion without any behaviour, in the world.
+            rays: from ψ(starts) to ψ(goal).
+        """
+        self._task, self._flows, self._system, self._rays = task, flows, system, rays
+        self._generators: dict[int, tuple[Slice, GeneratorPicture]] = {}
+        self._pieces: dict[bool, _Pieces] = {}
+        """Coarse and fine ones."""
+
+    def generator(self, area: Slice, number: int) -> GeneratorPicture | None:
+        """The generator of one of the flows: 1 is what ψ applies first, 0 stands for the mean over time of all."""
+        if self._flows is None:
+            return None
+        number = min(number, len(self._flows.parts))
+        made = self._generators.get(number)
+        if made is None or not made[0].lies_like(area):
+            made = area, self._generator(area, self._flows.parts[::-1], number)
+            self._generators[number] = made
+        return made[1]
+
+    def _generator(self, area: Slice, flows: Sequence[Diffeomorphism], number: int) -> GeneratorPicture:
+        task, chosen = self._task, [flows[number - 1]] if number else flows
+        motions: list[Array] = []
+        if number:
+            for demonstration in task.demonstrations:
+                u = demonstration.positions
+                keep = np.unique(np.linspace(0, len(u) - 1, 150).round().astype(int))
+                u = u[keep]
+                for flow in flows[: number - 1]:
+                    u = flow.forward(u)
+                motions.append(task.to_world(u))
+        lower, upper = -np.array(area.half_size), np.array(area.half_size)
+        for motion in motions:
+            across = area.across(motion)
+            lower, upper = np.minimum(lower, across.min(axis=0)), np.maximum(upper, across.max(axis=0))
+        points = area.at(_lattice(lower, upper, ARROW_SPACING))
+        k = flows[0].dim
+        u = ((points - task.origin) @ task.axes / task.scale)[:, :k]
+        total = np.zeros_like(u)
+        for flow in chosen:
+            assert isinstance(flow, Flow)
+            total += flow.duration * flow.field(u)
+        displacements = task.scale * (total / len(chosen)) @ task.axes[:, :k].T
+        size = np.linalg.norm(displacements, axis=1)
+        seen = size > NEGLIGIBLE * size.max(initial=0.0)
+        return GeneratorPicture(points[seen], displacements[seen], tuple(motions), len(flows))
+
+    def grid(self, area: Slice, behaviours: Sequence[Diffeomorphism], *, coarse: bool) -> GridPicture:
+        """The warped grid.
+
+        Args:
+            area: where to look.
+            behaviours: what is stacked on the imitation, from the inside out.
+            coarse: with fewer points, for a picture that is replaced at once.
+        """
+        pieces = self._pieces.get(coarse)
+        if pieces is None or not pieces.area.lies_like(area):
+            pieces = self._pieces[coarse] = self._cut(area, coarse=coarse)
+        drawn = [replace(b, tolerance=TOLERANCE) if isinstance(b, AdaptiveFlow) else b for b in behaviours]
+
+        def lifted(positions: Array) -> Array:
+            for transform in drawn:
+                positions = transform.inverse(positions)
+            return positions
+
+        def evaluate(_: Indices, place: Array) -> Array:
+            return lifted(self._system.transform.inverse(pieces.images_at(place)))[:, None]
+
+        if not len(pieces.index):
+            return GridPicture(())
+        bundle = Bundle(pieces.index, np.arange(float(len(pieces.index))), lifted(pieces.positions)[:, None])
+        if not coarse:
+            bundle = refined(bundle, evaluate, FINE_SPACING, max_rounds=3)
+        # where ψ⁻¹ tears neighbours far apart a straight stroke would be a lie
+        limit = 3 * (COARSE_SPACING if coarse else FINE_SPACING)
+        return GridPicture(_runs(bundle.positions, bundle.index, limit))
+
+    def _lines(self, area: Slice) -> tuple[Array, Array]:
+        """Ends (M, 2), along the slice, of the lattice's lines over all that ψ makes of it; two cross over ψ(goal)."""
+        across, middle = area.across(self._images(area)), area.across(self._system.base.goal)
+        lower = middle + LINE_SPACING * np.floor((across.min(axis=0) - middle) / LINE_SPACING)
+        upper = middle + LINE_SPACING * np.ceil((across.max(axis=0) - middle) / LINE_SPACING)
+        return _lattice_lines(lower, upper, LINE_SPACING)
+
+    def _images(self, area: Slice) -> Array:
+        """Of a lattice on the slice in base space, (N, 3)."""
+        return self._system.transform.forward(area.lattice(0.02))
+
+    def _cut(self, area: Slice, *, coarse: bool) -> _Pieces:
+        """The pieces of the lattice's lines, raised to what ψ makes of the slice, that lie on the slice."""
+        start, end = self._lines(area)
+        step = COARSE_TRIAL_STEP if coarse else TRIAL_STEP
+        counts = 2 + (np.linalg.norm(end - start, axis=1) / step).astype(int)
+        line = np.repeat(np.arange(len(start)), counts)
+        u = np.concatenate([np.linspace(0, 1, n) for n in counts])[:, None]
+        x, z, there = self._raised(area, start[line] + u * (end - start)[line])
+        inside = there & (np.abs(area.across(x)) <= area.half_size).all(axis=1)
+        # another line begins, or this one goes on in another fold of what ψ makes of the slice
+        apart = (np.diff(line) > 0) | (np.linalg.norm(np.diff(z, axis=0), axis=1) > STEEPEST * step)
+        samples = []
+        for run in _true_runs(inside):
+            for piece in np.split(run, np.flatnonzero(apart[run[:-1]]) + 1):
+                if len(piece) < 3:
+                    continue
+                along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(x[piece], axis=0), axis=1))])
+                even = np.linspace(0, along[-1], 2 + int(along[-1] / SAMPLE_SPACING))
+                samples.append(piece[np.unique(np.searchsorted(along, even - 1e-12).clip(0, len(piece) - 1))])
+        index = np.repeat(np.arange(len(samples)), [len(piece) for piece in samples])
+        chosen = np.concatenate([np.empty(0, int), *samples])
+        return _Pieces(area, index, z[chosen], x[chosen])
+
+    def _raised(self, area: Slice, across: Array) -> tuple[Array, Array, Mask]:
+        """Points of base space over the places `across` (N, 2) along the slice whose preimages lie on it.
+
+        By Newton's steps along the normal, from how high the nearest image of a lattice on the slice is.
+
+        Returns:
+            The preimages (N, 3), the points (N, 3), metres, and whether they were found (N,).
+        """
+        images, normal = self._images(area), area.normal
+        nearest = KDTree(area.across(images)).query(across)[1]
+        z = area.at(across) + ((images - area.centre) @ normal)[nearest, None] * normal
+        x, todo = np.empty_like(z), np.arange(len(z))
+        for _ in range(MAX_NEWTON):
+            normals = np.broadcast_to(normal[:, None], (len(todo), 3, 1))
+            x[todo], tangents = self._system.transform.inverse_tangents(z[todo], normals)
+            miss = (x[todo] - area.centre) @ normal
+            step = miss / np.maximum(tangents[..., 0] @ normal, MIN_SLOPE)
+            off = np.abs(miss) > ON_SLICE
+            todo = todo[off]
+            if not len(todo):
+                break
+            z[todo] -= np.clip(step[off], -MAX_STEP, MAX_STEP)[:, None] * normal
+        found = np.ones(len(z), bool)
+        found[todo] = False
+        return x, z, found
+
+    def base(self, rays: Rays) -> BasePicture:
+        """The base system; `rays` are those of the whole stack."""
+        task, inset = self._task, self._inset
+        goal = rays.base.goal
+        spacing = 2 * inset.half.max() / INSET_ARROWS
+        corner = inset.half - spacing / 2
+        z = inset.middle + _lattice(-corner, corner, spacing) @ task.slice.axes.T
+        border = replace(task.slice, centre=inset.middle, half_size=tuple(inset.half)).border
+        above = inset.centre + inset.scale * (task.slice.axes @ np.array([0.0, inset.half[1]]))
+        return BasePicture(
+            rays=tuple(inset(np.stack([z0, goal])) for z0 in rays.z0),
+            points=inset(z),
+            velocities=rays.base.velocity(z),
+            grid=self._inset_grid,
+            border=inset(border),
+            labels=(above, task.slice.at(np.array([0.0, task.slice.half_size[1]]))),
+        )
+
+    @cached_property
+    def _inset_grid(self) -> tuple[Array, ...]:
+        task, inset = self._task, self._inset
+        middle, pieces = task.slice.across(inset.middle), []
+        for a, b in zip(*self._lines(task.slice), strict=True):
+            ends = np.stack([a, b]) - middle
+            cut = np.clip(ends, -inset.half, inset.half)
+            fixed = np.abs(ends[0] - ends[1]) < 1e-9  # the coordinate along which the line does not run
+            if (np.abs(ends[0] - cut[0])[fixed] < 1e-9).all():
+                pieces.append(inset(inset.middle + cut @ task.slice.axes.T))
+        return tuple(pieces)
+
+    @cached_property
+    def _inset(self) -> _Inset:
+        """Beside the slice, on the left of who looks from where the task puts the camera; no larger than the slice."""
+        task = self._task
+        plane = task.slice.axes
+        ends = np.concatenate([self._rays.z0, [self._rays.base.goal]])
+        across = task.slice.across(ends)
+        lower, upper = across.min(axis=0), across.max(axis=0)
+        half = (upper - lower) / 2
+        half = half + INSET_MARGIN * half.max()
+        half = np.maximum(half, 0.45 * half.max())
+        # the plane of the picture goes through the goal, where all rays meet
+        normal = task.slice.normal
+        offset = (self._rays.base.goal - task.slice.centre) @ normal
+        middle = task.slice.at((lower + upper) / 2) + offset * normal
+        scale = min(1.0, INSET_HALF_WIDTH / half[0], task.slice.half_size[1] / half[1])
+        eye, target = (np.array(point) for point in task.camera)
+        right = np.cross(target - eye, [0.0, 0.0, 1.0])
+        side = -np.sign(right @ plane[:, 0])
+        centre = task.slice.centre + side * (task.slice.half_size[0] + INSET_GAP + scale * half[0]) * plane[:, 0]
+        return _Inset(middle, centre, scale, half)
+
+
+def in_frame(transform: Diffeomorphism) -> Chain | None:
+    """The chain of flows inside a placed imitation; None of the identity."""
+    return transform.inner if isinstance(transform, Placed) and isinstance(transform.inner, Chain) else None
+
+
+def _lattice(lower: Array, upper: Array, spacing: float) -> Array:
+    """Points (N, 2) over a rectangle at about this spacing."""
+    axes = [np.linspace(a, b, max(2, round((b - a) / spacing) + 1)) for a, b in zip(lower, upper, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _lattice_lines(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
+    """Ends (M, 2) of the lines of a lattice over a rectangle, whose sides are multiples of the spacing."""
+    starts, ends = [], []
+    for axis in range(2):
+        for c in np.linspace(lower[axis], upper[axis], round((upper[axis] - lower[axis]) / spacing) + 1):
+            start, end = lower.copy(), upper.copy()
+            start[axis] = end[axis] = c
+            starts.append(start)
+            ends.append(end)
+    return np.stack(starts), np.stack(ends)
+
+
+def _true_runs(mask: Mask) -> list[Indices]:
+    """Indices of each run of neighbours that are true."""
+    return [run for run in np.split(np.arange(len(mask)), np.flatnonzero(np.diff(mask)) + 1) if mask[run[0]]]
+
+
+def _runs(positions: Array, index: Indices, limit: float) -> tuple[Array, ...]:
+    """Polylines (T_i, 3) of samples of the same piece that lie within `limit` of their neighbours."""
+    far = np.linalg.norm(np.diff(positions, axis=0), axis=1) > limit
+    pieces = np.split(positions, np.flatnonzero(far | (np.diff(index) > 0)) + 1)
+    return tuple(piece for piece in pieces if len(piece) > 1)

@@ -1,0 +1,242 @@
+"""What a system does on a slice: its velocity, its streamlines, and det J or its Lyapunov value as a function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.flows.rollouts import Bundle, Rays, refined
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.scenario.scenario import SliceColour
+from dt_viz.scenario.slices import Slice, level_line
+
+ARROW_SPACING = 0.030
+"""Metres."""
+SEPARATION = 0.032
+"""Of streamlines, metres: one begins so far from all others, and ends where it comes half as close to one."""
+SEED_SPACINGS = (2.0, 1.0, 0.5)
+"""Of the lattices whose points streamlines begin at, one after the other, in separations."""
+NUM_TRIALS = 64
+"""Samples of a streamline for which it is decided where it ends."""
+MIN_LENGTH = 1.0
+"""Of a streamline, in separations."""
+MAX_OFFSET = 0.10
+"""Metres from the slice at which a streamline ends."""
+FINE_LINE, COARSE_LINE = 0.006, 0.014
+"""Metres between neighbouring samples of a drawn streamline."""
+FINE_COLOUR = 0.008
+"""Metres between neighbouring samples of a function; while a hand moves it is sampled as the arrows are."""
+LEVEL_SPACING = 0.04
+"""Between the base attractor's circles that level lines of the Lyapunov value are images of, metres."""
+
+Clearance = Callable[[Array], Array]
+"""Distance (N,) of points (N, 3) from what no motion comes into, negative inside, metres."""
+
+
+@dataclass(frozen=True)
+class FieldPicture:
+    """Velocities of a system on a slice."""
+
+    points: Array
+    """(N, 3), metres."""
+    velocities: Array
+    """(N, 3), m/s."""
+
+
+@dataclass(frozen=True)
+class ColourPicture:
+    """A function on a slice."""
+
+    what: SliceColour
+    area: Slice
+    values: Array
+    """(n, m) along the first and the second axis of the slice, from corner to corner; NaN where no motion comes. det J,
+    or the Lyapunov value in m²/s."""
+    clearance: Array
+    """(n, m) distance from where no motion comes, negative there, metres."""
+    lines: Array
+    """(K, 2, 3) segments of level lines, metres."""
+
+
+class Samples:
+    """A system at the lattice points of a slice that motions come to: what several pictures need is worked out once."""
+
+    def __init__(
+        self, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, spacing: float, *, jacobian: bool
+    ) -> None:
+        """Evaluate ψ.
+
+        Args:
+            system: whose ψ.
+            area: the slice.
+            clearance: from where no motion comes.
+            spacing: of the lattice, metres.
+            jacobian: whether to work out J, too; velocities are then had from it.
+        """
+        self.system, self.area = system, area
+        self.grid = area.grid(spacing)
+        """(n, m, 3), metres."""
+        self.clearance = clearance(self.grid.reshape(-1, 3)).reshape(self.grid.shape[:2])
+        """(n, m), metres."""
+        self.free = self.clearance > 0
+        self.points = self.grid[self.free]
+        """(N, 3) where motions come, metres."""
+        transform, self.jacobians = system.transform, None
+        if jacobian:
+            self.images, self.jacobians = transform.jacobian(self.points)
+        else:
+            self.images = transform.forward(self.points)
+
+    @property
+    def velocities(self) -> Array:
+        """(N, 3), m/s."""
+        f = self.system.base.velocity(self.images)[..., None]
+        if self.jacobians is not None:
+            return np.linalg.solve(self.jacobians, f)[..., 0]
+        return self.system.transform.inverse_tangents(self.images, f)[1][..., 0]
+
+    def spread(self, values: Array) -> Array:
+        """Values (N,) on the whole lattice (n, m), NaN where no motion comes."""
+        spread = np.full(self.free.shape, np.nan)
+        spread[self.free] = values
+        return spread
+
+
+def arrows_and_colour(
+    system: DiffeomorphicSystem, area: Slice, clearance: Clearance, colour: SliceColour, *, arrows: bool, coarse: bool
+) -> tuple[FieldPicture | None, ColourPicture | None]:
+    """Velocities on the slice, if `arrows` are wanted, and a function of it, if the `colour` is one.
+
+    Both are worked out on one lattice for a `coarse` picture, which is replaced at once.
+    """
+    function, det = colour in {"det", "lyapunov"}, colour == "det"
+    field, samples = None, None
+    if arrows or (function and coarse):
+        samples = Samples(system, area, clearance, ARROW_SPACING, jacobian=det and coarse)
+        field = FieldPicture(samples.points, samples.velocities) if arrows else None
+    if not function:
+        return field, None
+    if samples is None or not coarse:
+        samples = Samples(system, area, clearance, FINE_COLOUR, jacobian=det)
+    return field, det_jacobian(samples) if det else lyapunov_value(samples)
+
+
+def det_jacobian(samples: Samples) -> ColourPicture:
+    """The determinant of ψ's Jacobian: how much larger a small volume is in base space. Not above 0 where ψ folds."""
+    assert samples.jacobians is not None
+    values = samples.spread(np.linalg.det(samples.jacobians))
+    return ColourPicture("det", samples.area, values, samples.clearance, np.empty((0, 2, 3)))
+
+
+def lyapunov_value(samples: Samples) -> ColourPicture:
+    """Φ(ψ(y)), which falls along every motion; its level lines are images of evenly spaced circles around the goal."""
+    base = samples.system.base
+    values = samples.spread(base.potential(samples.images))
+    radius, levels = LEVEL_SPACING, []
+    # where there would be more than one line for a cell of the lattice there is none
+    sparse = np.where(_steps(values) < base.speed * LEVEL_SPACING, values, np.nan)
+    while (level := _potential(samples.system, radius)) < np.nanmax(values, initial=0.0):
+        levels.append(level_line(samples.grid, sparse - level))
+        radius += LEVEL_SPACING
+    lines = np.concatenate([np.empty((0, 2, 3)), *levels])
+    return ColourPicture("lyapunov", samples.area, values, samples.clearance, lines)
+
+
+def streamlines(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool) -> tuple[Array, ...]:
+    """Evenly spaced motions from places on the slice, each (T_i, 3), metres, as far as they stay over the slice.
+
+    Exact: by conjugacy a streamline through y is ψ⁻¹ of the ray through ψ(y). Each ends where it comes too close to one
+    before it, and what room is left is filled, after Jobard and Lefer, "Creating Evenly-Spaced Streamlines of Arbitrary
+    Density" (1997).
+    """
+    marks, starts, trials, lengths = _Marks(area), [], [], []
+    u = np.linspace(0, 1, NUM_TRIALS)
+    for spacing in SEED_SPACINGS:
+        seeds = area.lattice(spacing * SEPARATION)
+        seeds = seeds[~marks.crowded(seeds) & (clearance(seeds) > 0)]
+        # from the rim inwards: those are long, and their order stays while the motion changes
+        seeds = seeds[np.argsort(-np.abs(area.across(seeds) / area.half_size).max(axis=1).round(6), kind="stable")]
+        rays = Rays(system.transform.forward(seeds), system.base)
+        index = np.repeat(np.arange(len(seeds)), NUM_TRIALS)
+        lines = system.transform.inverse(rays.at(index, np.tile(u, len(seeds)))).reshape(-1, NUM_TRIALS, 3)
+        starts.append(rays.z0)
+        trials.append(lines)
+        lengths += [marks.take(line) for line in lines]
+
+    kept = np.arange(NUM_TRIALS) < np.reshape(lengths, (-1, 1))
+    if not kept.any():
+        return ()
+    index, sample = np.nonzero(kept)
+    rays = Rays(np.concatenate(starts), system.base)
+    bundle = Bundle(index, u[sample], np.concatenate(trials)[kept][:, None])
+    spacing, rounds = (COARSE_LINE, 1) if coarse else (FINE_LINE, 3)
+    return refined(
+        bundle, lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], spacing, max_rounds=rounds
+    ).paths
+
+
+class _Marks:
+    """Where streamlines are, on a lattice of small cubes over the slice."""
+
+    def __init__(self, area: Slice) -> None:
+        self._area, self._cell, border = area, SEPARATION / 3, 4
+        self._half = np.array([*area.half_size, MAX_OFFSET])
+        shape = np.ceil(2 * self._half / self._cell).astype(int) + 2 * border + 1
+        self._stride, self._border = np.array([shape[1] * shape[2], shape[2], 1]), border
+        self._near, self._nearer = np.zeros((2, shape.prod()), bool)
+        self._around, self._close = (self._ball(radius) for radius in (3.0, 1.5))
+
+    def _ball(self, radius: float) -> Indices:
+        """Which cubes, relative to one, have their middle within so many cubes of its middle."""
+        reach = np.arange(-int(radius), int(radius) + 1)
+        offsets = np.stack(np.meshgrid(reach, reach, reach), axis=-1).reshape(-1, 3)
+        return offsets[np.linalg.norm(offsets, axis=1) <= radius] @ self._stride
+
+    def _cells(self, points: Array) -> tuple[Mask, Indices]:
+        """Whether points (N, 3) are over the slice, and the cubes that those are in."""
+        own = np.column_stack([self._area.across(points), (points - self._area.centre) @ self._area.normal])
+        over = np.asarray((np.abs(own) <= self._half + 1e-9).all(axis=1))
+        return over, (np.round((own[over] + self._half) / self._cell).astype(int) + self._border) @ self._stride
+
+    def crowded(self, points: Array) -> Mask:
+        """Whether points (N, 3) over the slice are too near to a streamline to begin another one."""
+        return self._near[self._cells(points)[1]]
+
+    def take(self, line: Array) -> int:
+        """How many of a line's first points are to be shown; they are marked. 0 if it has too little room."""
+        along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        closely = np.arange(0, along[-1], self._cell)  # nothing slips through between samples
+        over, cells = self._cells(np.stack([np.interp(closely, along, c) for c in line.T], axis=1))
+        cells = cells[: _num_leading(over)]
+        if not len(cells) or self._near[cells[0]]:
+            return 0
+        cells = cells[: _num_leading(~self._nearer[cells])]
+        length = int(np.searchsorted(along, closely[len(cells) - 1], side="right")) if len(cells) else 0
+        if not length or along[length - 1] < MIN_LENGTH * SEPARATION:
+            return 0
+        self._near[(cells[:, None] + self._around).ravel()] = True
+        self._nearer[(cells[:, None] + self._close).ravel()] = True
+        return length
+
+
+def _num_leading(mask: Mask) -> int:
+    """How many are true before the first that is not."""
+    return len(mask) if mask.all() else int(mask.argmin())
+
+
+def _steps(values: Array) -> Array:
+    """(n, m) the largest difference of each value from its neighbours; infinite where one has none."""
+    steps = np.zeros_like(values)
+    for axis in range(2):
+        step = np.nan_to_num(np.abs(np.diff(values, axis=axis)), nan=np.inf)
+        ahead, behind = (np.insert(step, place, 0.0, axis=axis) for place in (step.shape[axis], 0))
+        steps = np.maximum(steps, np.maximum(ahead, behind))
+    return steps
+
+
+def _potential(system: DiffeomorphicSystem, radius: float) -> float:
+    """Of the base attractor at this distance from its goal."""
+    return float(system.base.potential(system.base.goal + radius * np.eye(system.base.dim)[0]))

@@ -1,0 +1,1 @@
+"""Every choice of the user as values, and edits of them."""

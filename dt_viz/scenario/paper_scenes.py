@@ -1,0 +1,207 @@
+"""The scenes of the paper, each with a line that says what to see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from dt_viz.flows.fields import Array, Mask
+from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.occupancy import sample_labels
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
+from dt_viz.scenario.scenario import Layer, Scenario, Vector, View
+from dt_viz.scenario.stack import aware, plane_of
+from dt_viz.scenario.tasks import Pot, Task
+from dt_viz.transforms.bias import Biasing, BiasPoint, vector
+
+BOTTLE = (0.07, 0.24)
+"""Diameter and height, metres."""
+CUBE = 0.10
+"""Edge, metres."""
+CLOVER_RADIUS, CLOVER_THICKNESS = 0.06, 0.06
+"""Mean radius and half the thickness, metres."""
+CLOVER_LOBES = 0.4
+"""How far its three lobes stand out, relative to the mean radius."""
+NUM_LABELS = 4000
+"""Of the clover."""
+STROKE_SPHERE = 0.10
+"""Diameter of the sphere in the strokes of fig. 5, metres."""
+STROKE_TEMPERATURE = 2.0
+"""There: its field ends soon, so that the rest of the letter stays."""
+STROKE_PLACES = {"draw_w": 0.20}
+"""Where it stands, as a fraction of the letter's length, if not where the task has its obstacle: in the middle of the W
+the arm would have to give way to it along the other strokes, too."""
+J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
+"""Of the two points beside the J: fraction of its length, and metres to the right and up as seen from the front."""
+ARM_ONLY = {"field": False}
+"""Where only the whole arm gives way: the vector field is the hand's, and goes through the obstacle."""
+HAND_ONLY = {"arm": False}
+"""Where only the path of the hand gives way: the fingers would be in the obstacle."""
+ABOVE = 0.16
+"""Metres over a pot's opening where the object is let go, as the demonstrations do over the centre pot."""
+
+
+@dataclass(frozen=True)
+class PaperScene:
+    """A scenario of one of the paper's figures."""
+
+    name: str
+    title: str
+    line: str
+    """What to see."""
+    task: str
+    """Name of its task."""
+    make: Callable[[Task], Scenario]
+    view: Mapping[str, Any] = field(default_factory=dict)
+    """What is to be seen of it: fields of `View`."""
+
+    def scenario(self, task: Task) -> Scenario:
+        """The scenario for its task."""
+        return replace(self.make(task), scene=self.name, view=replace(View(), **self.view))
+
+    def is_changed(self, scenario: Scenario, task: Task) -> bool:
+        """Whether obstacles, layers or how they act are not the scene's any more."""
+        own, followed = _own(self.name, task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
+        return not scenario.moves_like(replace(own, warp=scenario.warp, **followed))
+
+
+def _bottle_in_the_way(task: Task) -> Scenario:
+    """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
+    (x, y, _), (diameter, height) = task.obstacle_position, BOTTLE
+    return Scenario(task.name, (Cylinder((x, y, height / 2), diameter, height),), space="cspace")
+
+
+def _cube_in_the_letter(task: Task) -> Scenario:
+    """Fig. 3 (a)."""
+    return Scenario(task.name, (Box(task.obstacle_position, (CUBE, CUBE, CUBE)),), space="task")
+
+
+def in_clover(s: Array) -> Mask:
+    """Whether the points `s` (N, 3), metres, lie in a clover of three leaves around the y axis: smooth, not convex."""
+    turn = np.arctan2(s[:, 2], s[:, 0])
+    radius = CLOVER_RADIUS * (1 + CLOVER_LOBES * np.cos(3 * turn))
+    return (s[:, 0] ** 2 + s[:, 2] ** 2) / radius**2 + (s[:, 1] / CLOVER_THICKNESS) ** 2 < 1
+
+
+@lru_cache(maxsize=1)
+def clover() -> Cloud:
+    """Points labelled by whether they lie in a clover: all that is known of it."""
+    half = np.array([1 + CLOVER_LOBES, 0, 1 + CLOVER_LOBES]) * CLOVER_RADIUS + [0, CLOVER_THICKNESS, 0]
+    return Cloud(*sample_labels(in_clover, -half, half, NUM_LABELS, np.random.default_rng(0)))
+
+
+def _cloud_in_the_letter(task: Task) -> Scenario:
+    """Fig. 3 (b)."""
+    return Scenario(task.name, (CloudObstacle(task.obstacle_position, clover()),), space="task")
+
+
+def _sphere_in_the_stroke(task: Task) -> Scenario:
+    """Fig. 5."""
+    u = STROKE_PLACES.get(task.name)
+    place = task.obstacle_position if u is None else vector(task.mean_path[round(100 * u)])
+    return Scenario(task.name, (Sphere(place, STROKE_SPHERE),), space="both", temperature=STROKE_TEMPERATURE)
+
+
+def _two_points(task: Task) -> Scenario:
+    """Fig. 4."""
+    mean, plane = task.mean_path, plane_of(task)
+    places = [mean[round(100 * u)] + task.slice.axes @ offset for u, offset in J_OFFSETS]
+    layers = [Layer(Biasing(BiasPoint(vector(p), plane=plane)), name=f"Bias {k}") for k, p in enumerate(places, 1)]
+    return Scenario(task.name, (), layers=aware(layers))
+
+
+def release(pot: Pot) -> Vector:
+    """Where an object that is to fall into this pot is let go, metres."""
+    x, y, z = pot.opening
+    return x, y, z + ABOVE
+
+
+def _into_pot(index: int) -> Callable[[Task], Scenario]:
+    """Fig. 8."""
+
+    def scenario(task: Task) -> Scenario:
+        point = BiasPoint(release(task.pots[index]), moves_goal=True)
+        return Scenario(task.name, (), layers=(Layer(Biasing(point), name="Bias 1"),))
+
+    return scenario
+
+
+SCENES: Mapping[str, PaperScene] = {
+    scene.name: scene
+    for scene in (
+        PaperScene(
+            "lift",
+            "Fig. 1, 7: lift, a bottle in the way",
+            "The whole arm gives way to the bottle, and still dips before it lifts.",
+            "lift_box",
+            _bottle_in_the_way,
+            view=ARM_ONLY,
+        ),
+        PaperScene(
+            "push",
+            "Fig. 1, 7: push, a bottle in the way",
+            "The whole arm gives way to the bottle, and still ends where the demonstrations do.",
+            "push_box",
+            _bottle_in_the_way,
+            view=ARM_ONLY,
+        ),
+        PaperScene(
+            "cube",
+            "Fig. 3 (a): a cube in the S",
+            "Every stroke leaves the cube, the rest stays. Only the path gives way: avoid with “Both” for the arm.",
+            "draw_s",
+            _cube_in_the_letter,
+            view=HAND_ONLY,
+        ),
+        PaperScene(
+            "cloud",
+            "Fig. 3 (b): labelled points in the S",
+            "All that is known of the clover: which points lie in it (dark). Strokes leave what is learned from them.",
+            "draw_s",
+            _cloud_in_the_letter,
+            view=HAND_ONLY | {"colour": "occupancy", "field": False, "demonstrations": False},
+        ),
+        PaperScene(
+            "two_points",
+            "Fig. 4: a J biased to two points",
+            "Every stroke passes both points within a centimetre: drag them.",
+            "draw_j",
+            _two_points,
+        ),
+        *(
+            PaperScene(
+                f"letter_{character.lower()}",
+                f"Fig. 5: the letter {character}",
+                "Every stroke goes around the sphere, and the arm with it. Far from it the letter hardly changes.",
+                f"draw_{character.lower()}",
+                _sphere_in_the_stroke,
+            )
+            for character in "CGWZ"
+        ),
+        PaperScene(
+            "left_pot",
+            "Fig. 8: into the left pot",
+            "All demonstrations end over the centre pot; one bias point takes the goal along to the left one.",
+            "drop_pots",
+            _into_pot(0),
+        ),
+        PaperScene(
+            "right_pot",
+            "Fig. 8: into the right pot",
+            "All demonstrations end over the centre pot; one bias point takes the goal along to the right one.",
+            "drop_pots",
+            _into_pot(2),
+        ),
+    )
+}
+"""By name, in the order of the figures."""
+
+
+@lru_cache(maxsize=64)
+def _own(name: str, task: Task) -> Scenario:
+    """The scenario of a scene; a page asks for it with each frame."""
+    return SCENES[name].scenario(task)

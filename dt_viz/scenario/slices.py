@@ -1,0 +1,104 @@
+"""Slices of space: the rectangle that pictures of a vector field lie on, and lines of a function on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.shapes import Point, Quaternion, rotation
+
+
+@dataclass(frozen=True)
+class SlicePose:
+    """Where a slice lies: a value, whatever the size of the slice."""
+
+    position: Point
+    """Of its centre, metres."""
+    wxyz: Quaternion
+    """Turns x, y and z into its first axis, its second axis and its normal."""
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The rectangle on which a picture of the vector field is drawn."""
+
+    centre: Array
+    """(3,), metres."""
+    axes: Array
+    """(3, 2) orthonormal columns."""
+    half_size: tuple[float, float]
+    """Metres."""
+
+    @property
+    def normal(self) -> Array:
+        """(3,) unit vector across it."""
+        return np.cross(*self.axes.T)
+
+    @property
+    def pose(self) -> SlicePose:
+        """Where it lies."""
+        x, y, z = (float(c) for c in self.centre)
+        frame = np.column_stack([self.axes, self.normal])
+        i, j, k, w = (float(c) for c in Rotation.from_matrix(frame).as_quat())
+        return SlicePose((x, y, z), (w, i, j, k))
+
+    def posed(self, pose: SlicePose | None) -> Slice:
+        """This rectangle elsewhere; None leaves it where it is."""
+        if pose is None:
+            return self
+        return replace(self, centre=np.array(pose.position), axes=rotation(pose.wxyz)[:, :2])
+
+    def lies_like(self, other: Slice) -> bool:
+        """Whether both are the same rectangle."""
+        same_place = np.array_equal(self.centre, other.centre) and np.array_equal(self.axes, other.axes)
+        return same_place and self.half_size == other.half_size
+
+    def grid(self, spacing: float) -> Array:
+        """Points (n, m, 3) at about this spacing along the first and the second axis, from corner to corner, metres."""
+        u, v = (np.linspace(-h, h, max(2, round(2 * h / spacing) + 1)) for h in self.half_size)
+        return self.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1))
+
+    def lattice(self, spacing: float) -> Array:
+        """The points of `grid`, (N, 3), metres."""
+        return self.grid(spacing).reshape(-1, 3)
+
+    def at(self, across: Array) -> Array:
+        """World points (*B, 3) of coordinates (*B, 2) on the slice, metres."""
+        return self.centre + across @ self.axes.T
+
+    def across(self, points: Array) -> Array:
+        """Coordinates (*B, 2) on the slice of the feet of world points (*B, 3), metres."""
+        return (points - self.centre) @ self.axes
+
+    @property
+    def border(self) -> Array:
+        """(5, 3) its closed outline, metres."""
+        return self.at(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * self.half_size)
+
+
+def level_line(points: Array, values: Array) -> Array:
+    """Where a function that is linear between lattice points is zero.
+
+    Args:
+        points: (n, m, 3) of the lattice.
+        values: (n, m) of the function; NaN where it has none.
+
+    Returns:
+        (K, 2, 3) segments, one at most for each of the two triangles of a cell.
+    """
+    flat, f = points.reshape(-1, 3), values.reshape(-1)
+    index = np.arange(len(f)).reshape(values.shape)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    triangles = triangles[np.isfinite(f[triangles]).all(axis=1)]
+    above = f[triangles] > 0
+    triangles, above = (part[above.any(axis=1) & ~above.all(axis=1)] for part in (triangles, above))
+    # the corner that lies alone on its side of the line, and the two others
+    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), above.argmin(axis=1))
+    tip = np.take_along_axis(triangles, alone[:, None], axis=1)
+    others = np.take_along_axis(triangles, (alone[:, None] + [1, 2]) % 3, axis=1)
+    share = (f[tip] / (f[tip] - f[others]))[..., None]
+    return flat[tip] + share * (flat[others] - flat[tip])

@@ -1,0 +1,98 @@
+"""Where added motions begin: places on the slice, one by one or in a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.scenario.scenario import MAX_STARTS, Scenario, Vector
+from dt_viz.scenario.slices import Slice
+from dt_viz.transforms.bias import REACH, SHOULDER, vector
+
+GRID = (4, 4)
+"""Starts of a grid along the slice's first and second axis."""
+INNER = 0.8
+"""Part of the slice that a grid covers."""
+APART = 0.02
+"""Metres: a place nearer than this to another start is taken."""
+MIN_HEIGHT = 0.02
+"""Metres above the table."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid of starts, and what was left out of it."""
+
+    starts: tuple[Vector, ...]
+    """All of the scenario's, the new ones last."""
+    num_blocked: int = 0
+    """Places at or inside an obstacle, or where the arm is that is to avoid it."""
+    num_far: int = 0
+    """Places where the hand cannot be."""
+
+
+def struck(area: Slice, origin: Array, direction: Array) -> Array | None:
+    """Where a ray meets the slice, (3,), metres; None if it misses the rectangle.
+
+    Args:
+        area: the slice.
+        origin: (3,) of the ray, metres.
+        direction: (3,) of the ray.
+    """
+    slope = float(direction @ area.normal)
+    if abs(slope) < 1e-9:
+        return None
+    along = float((area.centre - origin) @ area.normal) / slope
+    place = origin + along * direction
+    return place if along > 0 and (np.abs(area.across(place)) <= area.half_size).all() else None
+
+
+def with_start(scenario: Scenario, place: Array) -> tuple[Vector, ...]:
+    """The scenario's starts with one more at `place` (3,), metres, if there is room for it."""
+    taken = len(scenario.starts) >= MAX_STARTS or _is_taken(scenario.starts, place)
+    return scenario.starts if taken else (*scenario.starts, vector(place))
+
+
+def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Vector, ...]:
+    """The scenario's starts with one of them at `place` (3,), metres; unchanged if it has gone."""
+    starts = list(scenario.starts)
+    if index < len(starts):
+        starts[index] = vector(place)
+    return tuple(starts)
+
+
+def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array]) -> Grid:
+    """The scenario's starts with a grid over the slice, without places where no motion can begin.
+
+    Args:
+        scenario: with obstacles and starts.
+        area: the slice.
+        arm_room: distance (N,) of the arm from the obstacles with its hand at places (N, 3), metres; asked where the
+            whole arm avoids them.
+    """
+    u, v = (np.linspace(-INNER * half, INNER * half, num) for half, num in zip(area.half_size, GRID, strict=True))
+    starts, blocked, far = scenario.starts, 0, 0
+    places = area.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
+    rooms = scenario.obstacle.signed_distance(places)
+    if scenario.avoidance and scenario.space != "task":
+        rooms = np.minimum(rooms, arm_room(places))
+    for place, room in zip(places, rooms, strict=True):
+        if room < scenario.margin:
+            blocked += 1
+        elif place[2] < MIN_HEIGHT or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
+            far += 1
+        elif len(starts) < MAX_STARTS and not _is_taken(starts, place):
+            starts = (*starts, vector(place))
+    return Grid(starts, blocked, far)
+
+
+def followed(scenario: Scenario, num_demonstrated: int) -> int:
+    """Number of the start whose rollout the arm follows, counted round: the same one when starts are added."""
+    return scenario.arm_rollout % (num_demonstrated + len(scenario.starts))
+
+
+def _is_taken(starts: tuple[Vector, ...], place: Array) -> bool:
+    return any(np.linalg.norm(place - np.array(start)) < APART for start in starts)

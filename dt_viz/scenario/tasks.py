@@ -1,0 +1,269 @@
+"""The named tasks: demonstrations and their place in the robot's world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.flows.diffeomorphisms import Placed
+from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
+from dt_viz.learning.imitation import Imitation
+from dt_viz.metrics import resample_by_arc_length
+from dt_viz.scenario.slices import Slice
+
+ASSETS = Path(__file__).resolve().parents[2] / "assets"
+
+DRAWING_CENTRE = np.array([0.0, -0.50, 0.42])
+"""Middle of the vertical drawing plane before the robot, metres. Whoever faces the robot sees it as a blackboard."""
+DRAWING_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
+"""Columns: right, up, and out of the plane towards the viewer."""
+DRAWING_SIZE = 0.40
+"""Metres: larger of width and height of a drawing that comes in other units."""
+
+
+@dataclass(frozen=True)
+class Pot:
+    """An open pot on the table."""
+
+    x: float
+    """Of its axis, metres."""
+    y: float
+    radius: float = 0.055
+    """Of its opening, metres."""
+    height: float = 0.10
+    """Of its rim above the table, metres."""
+
+    @property
+    def opening(self) -> tuple[float, float, float]:
+        """Middle of the opening, metres."""
+        return self.x, self.y, self.height
+
+    def catches(self, position: Array) -> bool:
+        """Whether what is let go at `position` (3,), metres, falls into it."""
+        x, y, z = (float(c) for c in position)
+        return z > self.height and float(np.hypot(x - self.x, y - self.y)) < self.radius
+
+
+POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
+"""Of `drop_pots`: left, centre and right for whoever faces the robot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Demonstrations of one motion and where in the world they belong.
+
+    A point u (k,) of the demonstrations is the world point origin + scale·axes·u; a drawing has k = 2.
+    """
+
+    name: str
+    title: str
+    hint: str
+    """One line that says what to try."""
+    demonstrations: tuple[Demonstration, ...]
+    origin: Array
+    """(3,), metres."""
+    axes: Array
+    """(3, 3) orthonormal columns."""
+    scale: float
+    slice: Slice
+    camera: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """Position and look-at, metres."""
+    obstacle_position: tuple[float, float, float]
+    """Where the obstacle first stands, metres."""
+    pots: tuple[Pot, ...] = ()
+    """That stand on the table, from left to right."""
+
+    def to_world(self, points: Array) -> Array:
+        """World points (*B, 3) of points (*B, k) of the demonstrations."""
+        return self.origin + self.scale * (points @ self.axes[:, : points.shape[-1]].T)
+
+    def system(self, imitation: Imitation) -> DiffeomorphicSystem:
+        """The motion learned from the demonstrations, as a system in the world, metres and seconds."""
+        return DiffeomorphicSystem(
+            Placed(imitation.transform, self.origin, self.axes, self.scale),
+            imitation.base.placed(self.origin, self.axes[:, : imitation.base.dim], self.scale),
+        )
+
+    @property
+    def paths(self) -> tuple[Array, ...]:
+        """Each demonstration in the world, (T_i, 3), metres."""
+        return tuple(self.to_world(d.positions) for d in self.demonstrations)
+
+    @property
+    def mean_path(self) -> Array:
+        """(101, 3) the mean demonstration by arc length, metres."""
+        return np.mean([resample_by_arc_length(path, 101) for path in self.paths], axis=0)
+
+    @property
+    def starts(self) -> Array:
+        """First points of the demonstrations in the world, (R, 3), metres."""
+        return np.stack([path[0] for path in self.paths])
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """A task to choose from. Calling it reads the demonstrations, and raises DemonstrationError if it cannot."""
+
+    title: str
+    load: Callable[[], Task]
+
+    def __call__(self) -> Task:
+        """Load the task."""
+        return self.load()
+
+
+def letter(character: str, hint: str = "Drag the sphere through the letter.", obstacle_at: float = 0.5) -> Task:
+    """Draw a letter that ships with DT-Viz, in a vertical plane before the robot (sec. 5); see `drawing_task`."""
+    name = f"draw_{character.lower()}"
+    return drawing_task(name, f"Draw {character}", hint, load_demonstrations(ASSETS / f"{name}.npz"), obstacle_at)
+
+
+def lift_box() -> Task:
+    """Reach into a box, then lift abruptly (sec. 5)."""
+    demonstrations = load_demonstrations(ASSETS / "lift_box.npz")
+    points = np.concatenate([d.positions for d in demonstrations])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    # the slice follows the motion: from the mean start towards the corner in the box, and up
+    along = np.array([0.0, -0.55, 0.0]) - np.mean([d.positions[0] for d in demonstrations], axis=0) * np.array(
+        [1.0, 1.0, 0.0]
+    )
+    along /= np.linalg.norm(along)
+    return Task(
+        name="lift_box",
+        title="Lift box",
+        hint="Put the sphere in the way into the box, or on the way up.",
+        demonstrations=demonstrations,
+        origin=np.zeros(3),
+        axes=np.eye(3),
+        scale=1.0,
+        slice=Slice(middle + np.array([0.0, 0.0, 0.02]), np.stack([along, [0.0, 0.0, 1.0]], axis=1), (0.32, 0.26)),
+        camera=((0.98, -1.60, 0.92), (0.24, -0.33, 0.28)),
+        obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.42),
+    )
+
+
+def push_box() -> Task:
+    """Come down behind a box and push it along the table (sec. 5)."""
+    demonstrations = load_demonstrations(ASSETS / "push_box.npz")
+    points = np.concatenate([d.positions for d in demonstrations])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    height = demonstrations[0].positions[-1, 2]  # of the push: the slice lies level in it
+    x, y, z = _on_mean_path(demonstrations, lambda u: u, 0.55)
+    return Task(
+        name="push_box",
+        title="Push box",
+        hint="Put the sphere where the box is pushed along the table.",
+        demonstrations=demonstrations,
+        origin=np.zeros(3),
+        axes=np.eye(3),
+        scale=1.0,
+        slice=Slice(np.array([middle[0], middle[1], height]), np.eye(3)[:, :2], (0.42, 0.20)),
+        camera=((0.70, -1.58, 0.95), (0.13, -0.32, 0.22)),
+        obstacle_position=(x, y, z - 0.02),  # a little low: the way over it is free, under it is the table
+    )
+
+
+def drop_pots() -> Task:
+    """Carry an object over the centre pot, to be biased towards the left or the right one (fig. 8)."""
+    demonstrations = load_demonstrations(ASSETS / "drop_pots.npz")
+    paths = np.stack([resample_by_arc_length(d.positions, 101) for d in demonstrations])
+    # the slice is tilted: from the mean start down to the goals above all three pots
+    down = paths[:, -1].mean(axis=0) - paths[:, 0].mean(axis=0)
+    down = np.array([0.0, down[1], down[2]]) / np.hypot(down[1], down[2])
+    return Task(
+        name="drop_pots",
+        title="Drop in pots",
+        hint="Bias the motion to the left or the right pot, its goal along with it.",
+        demonstrations=demonstrations,
+        origin=np.zeros(3),
+        axes=np.eye(3),
+        scale=1.0,
+        slice=Slice(paths.mean(axis=(0, 1)), np.stack([[1.0, 0.0, 0.0], down], axis=1), (0.30, 0.24)),
+        camera=((0.62, -1.58, 0.90), (0.06, -0.38, 0.24)),
+        obstacle_position=(0.0, -0.58, 0.36),  # beyond: where the hand comes from there is the arm, once it is there
+        pots=POTS,
+    )
+
+
+def drawing_task(
+    name: str, title: str, hint: str, demonstrations: tuple[Demonstration, ...], obstacle_at: float = 0.5
+) -> Task:
+    """A task from 2-D demonstrations, on the vertical plane before the robot.
+
+    Drawings between a half and the whole of `DRAWING_SIZE` keep their size; others are scaled to it.
+
+    Args:
+        name: of the task.
+        title: for the page.
+        hint: what to try.
+        demonstrations: of one drawing.
+        obstacle_at: where on the mean drawing the obstacle first stands, as a fraction of its length.
+    """
+    points = np.concatenate([d.positions for d in demonstrations])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    size = float((upper - lower).max())
+    scale = 1.0 if DRAWING_SIZE / 2 <= size <= 1.1 * DRAWING_SIZE else DRAWING_SIZE / size
+    origin = DRAWING_CENTRE - scale * DRAWING_AXES[:, :2] @ ((lower + upper) / 2)
+    half = scale * (upper - lower) / 2 + 0.10
+    return Task(
+        name=name,
+        title=title,
+        hint=hint,
+        demonstrations=demonstrations,
+        origin=origin,
+        axes=DRAWING_AXES,
+        scale=scale,
+        slice=Slice(DRAWING_CENTRE, DRAWING_AXES[:, :2], (float(half[0]), float(half[1]))),
+        camera=((0.79, -1.56, 0.75), (0.15, -0.33, 0.355)),
+        obstacle_position=_on_mean_path(
+            demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, obstacle_at
+        ),
+    )
+
+
+def lasa_tasks(folder: Path) -> dict[str, TaskEntry]:
+    """One drawing task for each .mat file of a folder with the LASA handwriting data, read when it is chosen.
+
+    Raises:
+        DemonstrationError: if the folder cannot be read or holds no .mat file.
+    """
+    return {
+        name: TaskEntry(f"LASA {name}", partial(_lasa_task, name, path)) for name, path in lasa_files(folder).items()
+    }
+
+
+def _lasa_task(name: str, path: Path) -> Task:
+    demonstrations = load_demonstrations(path)
+    if demonstrations[0].dimension != 2:
+        found = f"{demonstrations[0].dimension} coordinates"
+        raise DemonstrationError(path, "pos", found, "2: a drawing in the plane")
+    return drawing_task(name, f"LASA {name}", "Drag the sphere through the letter.", demonstrations)
+
+
+def _on_mean_path(
+    demonstrations: tuple[Demonstration, ...], to_world: Callable[[Array], Array], fraction: float
+) -> tuple[float, float, float]:
+    """World point at a fraction of the length of the mean demonstration."""
+    mean = np.mean([resample_by_arc_length(d.positions, 101) for d in demonstrations], axis=0)
+    x, y, z = to_world(mean[round(100 * fraction)])
+    return float(x), float(y), float(z)
+
+
+TASKS: Mapping[str, TaskEntry] = {
+    "draw_s": TaskEntry("Draw S", partial(letter, "S")),
+    "draw_j": TaskEntry("Draw J", partial(letter, "J", "Bias the letter to points beside it.")),
+    "draw_c": TaskEntry("Draw C", partial(letter, "C")),
+    "draw_g": TaskEntry("Draw G", partial(letter, "G")),
+    "draw_w": TaskEntry("Draw W", partial(letter, "W", obstacle_at=0.36)),  # not between two strokes
+    "draw_z": TaskEntry("Draw Z", partial(letter, "Z")),
+    "lift_box": TaskEntry("Lift box", lift_box),
+    "push_box": TaskEntry("Push box", push_box),
+    "drop_pots": TaskEntry("Drop in pots", drop_pots),
+}
+"""The tasks that ship with DT-Viz, by name."""

@@ -1,0 +1,1 @@
+"""Diffeomorphisms that are stacked on what was learned."""

@@ -1,0 +1,302 @@
+"""Controls of the obstacles: which there are, how large they are, and which one has handles."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import UnionType
+from typing import Any
+
+import numpy as np
+import viser
+
+from dt_viz.engine.session import Session
+from dt_viz.files import ply
+from dt_viz.obstacles import files as shapes
+from dt_viz.obstacles.files import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
+from dt_viz.obstacles.union import Several
+from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
+from dt_viz.scenario.tasks import Task
+from dt_viz.ui.controls import Control
+from dt_viz.ui.reading import Reader
+
+ORIGIN: Point = (0.0, 0.0, 0.0)
+SHAPES: Mapping[str, Obstacle] = {
+    "Sphere": Sphere(ORIGIN, 0.10),
+    "Cylinder": Cylinder(ORIGIN, 0.08, 0.16),
+    "Cube (fig. 3a)": Box(ORIGIN, (0.12, 0.12, 0.12)),
+    "Box": Box(ORIGIN, (0.16, 0.10, 0.06)),
+}
+"""What can be added, by its button."""
+ASIDE = 0.4
+"""Of its inner radius, by which a new obstacle stands beside the motion: dead ahead no side is the shorter one."""
+MIN_SIZE, MAX_SIZE = 0.03, 0.40
+"""Of a box along one axis, and of a cylinder's height, metres."""
+FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
+NONE: str = "none"
+
+Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Control]
+"""Ties a control to the scenario; see `Panel`."""
+Shape = type[Obstacle] | UnionType
+"""What an obstacle may be."""
+
+
+class ObstaclePanel:
+    """The folder "Obstacles" of one visitor's panel."""
+
+    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str, bool], None]) -> None:
+        """Build the controls; they act once `connect` has given them a session.
+
+        Args:
+            gui: of the visitor.
+            bind: ties a control to the scenario.
+            say: shows a text for a while, and whether it is about an error.
+        """
+        self._bind, self._say = bind, say
+        self._session: Session | None = None
+        self._sizes: list[tuple[Control, Shape]] = []
+        self._refused: tuple[bytes, str, str] | None = None  # content and name of a file, and the unit it may be in
+        self._reader = Reader(lambda: say("Another visitor's file is being read; yours is read after it.", False))
+        with gui.add_folder("Obstacles"):
+            hint = "the one with handles; or click it in the scene"
+            self._choice = Control(gui.add_dropdown("Selected", (NONE,), hint=hint), self._select)
+            self._add = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
+            self._change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected one")
+            diameters = 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0
+            for shape in (Sphere, Cylinder):
+                self._size(
+                    gui.add_slider("Diameter [cm]", *diameters),
+                    shape,
+                    lambda o: o.diameter,
+                    lambda o, d: replace(o, diameter=d),
+                )
+            lengths = 100 * MIN_SIZE, 100 * MAX_SIZE, 0.5, 15.0
+            self._size(
+                gui.add_slider("Height [cm]", *lengths),
+                Cylinder,
+                lambda o: o.height,
+                lambda o, size: replace(o, height=size),
+            )
+            for k, name in enumerate("xyz"):
+                self._size(
+                    gui.add_slider(f"Size {name} [cm]", *lengths),
+                    Box,
+                    lambda o, k=k: o.sizes[k],
+                    lambda o, size, k=k: replace(o, sizes=(*o.sizes[:k], size, *o.sizes[k + 1 :])),
+                )
+            self._size(
+                gui.add_slider(
+                    "Size [cm]",
+                    100 * shapes.MIN_SIZE,
+                    100 * shapes.MAX_SIZE,
+                    0.5,
+                    15.0,
+                    hint="largest side of its bounding box",
+                ),
+                MeshObstacle | CloudObstacle,
+                lambda o: o.size,
+                lambda o, size: o.resized(size),
+            )
+            bind(
+                gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
+                lambda s: round(100 * s.margin, 3),
+                lambda _s, value: {"margin": value / 100},
+            )
+            with gui.add_folder("From a file", expand_by_default=False):
+                self._unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
+                hint = f"{FORMATS}; a mesh must be closed; a csv of points begins with x,y,z or x,y,z,occupied"
+                self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
+                self._again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
+
+        @self._upload.on_upload
+        async def _(_event: viser.GuiEvent) -> None:
+            file = self._upload.value
+            self._begin(partial(self.load, file.content, file.name, UNITS[self._unit.value]))
+
+        Control(self._again, lambda _clicked: self._begin(self.load_again))
+        Control(self._add, lambda name: self.add(SHAPES[name]))
+        Control(self._change, lambda name: {"Duplicate": self.duplicate, "Delete": self.delete}[name]())
+
+    def connect(self, session: Session) -> None:
+        """Let the controls edit this session."""
+        self._session = session
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's obstacles; what is tied by `bind` shows itself."""
+        options = tuple(f"{k}: {name_of(obstacle)}" for k, obstacle in enumerate(scenario.obstacles, 1)) or (NONE,)
+        if self._choice.handle.options != options:
+            self._choice.handle.options = options
+        self._choice.value = options[scenario.selected or 0]
+        chosen = _selected(scenario)
+        for control, shape in self._sizes:
+            if control.handle.visible != isinstance(chosen, shape):
+                control.handle.visible = isinstance(chosen, shape)
+        for group, useful in (
+            (self._add, len(scenario.obstacles) < MAX_OBSTACLES),
+            (self._upload, len(scenario.obstacles) < MAX_OBSTACLES),
+            (self._change, chosen is not None),
+        ):
+            if group.visible != useful:  # groups of buttons cannot be disabled
+                group.visible = useful
+
+    def _select(self, name: str) -> None:
+        if self._session is not None and name != NONE:
+            index = self._choice.handle.options.index(name)
+            self._session.edit("select", view=replace(self._session.scenario.view, selected=index))
+
+    def add(self, obstacle: Obstacle) -> None:
+        """Put another obstacle, turned as it is, where there is room on the motion, and select it."""
+        session = self._session
+        if session is None or len(session.scenario.obstacles) >= MAX_OBSTACLES:
+            return
+        before = session.scenario.obstacles
+        added = with_room(obstacle, before, session.task)
+        self._replace((*before, added), selected=len(before))
+
+    def close(self) -> None:
+        """The visitor has left: stop reading."""
+        self._reader.close()
+
+    def _begin(self, load: Callable[[], None]) -> None:
+        if not self._reader.begin(load):
+            self._say("A file of yours is being read; load the next one after it.", False)
+
+    def load(self, content: bytes, name: str, scale: float) -> None:
+        """Add what a file holds, or ask or say why that cannot be; see `from_file`.
+
+        Raises:
+            UnwantedError: the visitor has left.
+        """
+        self._upload.disabled = True
+        try:
+            self._load(content, name, scale)
+        finally:
+            self._upload.disabled = False
+
+    def load_again(self) -> None:
+        """Add what the file holds that was refused for its size, in the unit that was suggested."""
+        if self._refused is not None:
+            content, name, unit = self._refused
+            self._unit.value = unit
+            self.load(content, name, UNITS[unit])
+
+    def _load(self, content: bytes, name: str, scale: float) -> None:
+        self._refused = None
+        try:
+            if self._session is not None and len(self._session.scenario.obstacles) >= MAX_OBSTACLES:
+                raise ShapeError(
+                    name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
+                )
+            with self._reader.turn():
+                obstacle, notes = from_file(content, name, scale)
+        except SizeError as error:
+            if error.unit is not None:
+                self._refused = content, name, error.unit
+                self._again.label = f"Read it in {error.unit}"
+            self._say(error.question or str(error), error.question is None)
+        except ShapeError as error:
+            self._say(str(error), True)
+        else:
+            self.add(obstacle)
+            if notes:
+                self._say(f"{name}: {'; '.join(notes)}", False)
+        finally:
+            self._again.visible = self._refused is not None
+
+    def duplicate(self) -> None:
+        """Add another one like the selected obstacle."""
+        chosen = None if self._session is None else _selected(self._session.scenario)
+        if chosen is not None:
+            self.add(chosen)
+
+    def delete(self) -> None:
+        """Take the selected obstacle out."""
+        if self._session is not None and (index := self._session.scenario.selected) is not None:
+            before = self._session.scenario.obstacles
+            self._replace((*before[:index], *before[index + 1 :]), selected=max(0, index - 1))
+
+    def _replace(self, obstacles: Sequence[Obstacle], selected: int) -> None:
+        """One step for undo."""
+        session = self._session
+        if session is not None:
+            view = replace(session.scenario.view, selected=selected)
+            session.edit("obstacles", obstacles=tuple(obstacles), view=view)
+            session.end_gesture()
+
+    def _size(
+        self,
+        handle: Any,  # noqa: ANN401
+        shape: Shape,
+        read: Callable[[Any], float],
+        change: Callable[[Any, float], Obstacle],
+    ) -> None:
+        """Tie a slider [cm] to a size of the selected obstacle, metres, while that has this shape."""
+
+        def shown(scenario: Scenario) -> float:
+            chosen = _selected(scenario)
+            return round(100 * read(chosen), 3) if isinstance(chosen, shape) else control.value
+
+        def changed(scenario: Scenario, value: float) -> dict[str, Any]:
+            chosen = _selected(scenario)
+            if not isinstance(chosen, shape):
+                return {}
+            index, before = scenario.selected or 0, scenario.obstacles
+            return {"obstacles": (*before[:index], change(chosen, value / 100), *before[index + 1 :])}
+
+        handle.visible = False
+        control = self._bind(handle, shown, changed)
+        self._sizes.append((control, shape))
+
+
+def _selected(scenario: Scenario) -> Obstacle | None:
+    return None if scenario.selected is None else scenario.obstacles[scenario.selected]
+
+
+def name_of(obstacle: Obstacle) -> str:
+    """As the panel calls it."""
+    if isinstance(obstacle, Box) and len(set(obstacle.sizes)) == 1:
+        return "cube"
+    return type(obstacle).__name__.removesuffix("Obstacle").lower()
+
+
+def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[str, ...]]:
+    """The obstacle that a file holds, around the origin, and what is to be said about it.
+
+    Args:
+        content: all bytes of the file.
+        name: of the file; its suffix says what it is. A PLY without faces is a point cloud.
+        scale: metres for one unit of the file.
+
+    Raises:
+        ShapeError: the file cannot be used.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix not in (*MESH_SUFFIXES, *CLOUD_SUFFIXES):
+        raise ShapeError(name, "suffix", repr(suffix) if suffix else "no suffix", FORMATS)
+    if suffix == ".ply":
+        header = content[: ply.MAX_HEADER].partition(b"end_header")[0]
+        is_cloud = re.search(rb"element\s+face\s+0*[1-9]", header) is None
+    else:
+        is_cloud = suffix in CLOUD_SUFFIXES
+    if is_cloud:
+        loaded = read_cloud(content, name, scale=scale)
+        return CloudObstacle(ORIGIN, loaded.cloud), loaded.notes
+    loaded = read_mesh(content, name, scale=scale)
+    return MeshObstacle(ORIGIN, loaded.solid), loaded.notes
+
+
+def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obstacle:
+    """The obstacle beside the mean demonstration, where that is farthest from its ends and other obstacles."""
+    mean = task.mean_path
+    ends = np.concatenate([task.starts, mean[-1:]])
+    room = np.linalg.norm(mean[:, None] - ends, axis=-1).min(axis=1)
+    room = np.minimum(room, Several(tuple(others)).signed_distance(mean))
+    best = int(room.argmax())
+    along = mean[min(best + 1, 100)] - mean[max(best - 1, 0)]
+    aside = np.cross(along, np.cross(*task.slice.axes.T))
+    x, y, z = (float(c) for c in mean[best] + ASIDE * obstacle.depth * aside / max(float(np.linalg.norm(aside)), 1e-12))
+    return obstacle.moved((x, y, z), obstacle.wxyz)

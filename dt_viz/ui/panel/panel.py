@@ -1,0 +1,532 @@
+"""Controls ↔ scenario, and the status line."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import viser
+
+from dt_viz.arm.collision import SELF_REACH, CollisionReport
+from dt_viz.arm.robot import Robot
+from dt_viz.engine.engine import Frame, Stage
+from dt_viz.engine.session import Pace, Session
+from dt_viz.engine.worker import LatestWorker
+from dt_viz.errors import DataError
+from dt_viz.learning.imitation import ImitationError
+from dt_viz.scenario.paper_scenes import SCENES, PaperScene
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import bias_points
+from dt_viz.scenario.tasks import Task
+from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.panel.bias import BiasPanel
+from dt_viz.ui.panel.health_plots import HealthPlots
+from dt_viz.ui.panel.obstacles import ObstaclePanel
+from dt_viz.ui.panel.plots import JointPlots
+from dt_viz.ui.panel.push import PushButton
+from dt_viz.ui.panel.slice import SlicePanel
+from dt_viz.ui.panel.stack import StackPanel
+from dt_viz.ui.panel.starts import StartsPanel
+from dt_viz.ui.scene.arm_layers import NUM_ARMS
+from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
+from dt_viz.ui.scene.legend import Legend
+from dt_viz.ui.scene.palette import css
+from dt_viz.ui.scene.picture import Colour
+
+VIEW_LABELS: Mapping[str, str] = {
+    "rollouts": "Rollouts",
+    "ghost": "Undisturbed (dashed)",
+    "demonstrations": "Demonstrations",
+    "field": "Vector field",
+    "streamlines": "Streamlines",
+    "arm": "Arm",
+    "ghost_arm": "Arm without avoidance",
+    "onion": "Arms along the motion",
+    "body_points": "Body points",
+    "joint_plots": "Joint plots",
+    "health_plots": "Health plots",
+    "table": "Table",
+    "grid": "Warped grid ψ⁻¹(grid)",
+    "base": "Base attractor beside it",
+    "generator": "Learned generator",
+}
+PLOTS = {"joint_plots", "health_plots"}
+"""Those of them that are in the panel, not in the scene."""
+VIEW_HINTS: Mapping[str, str] = {
+    "field": "on the slice: longer and darker is faster",
+    "streamlines": "motions from all over the slice: exact, as images of straight rays",
+    "ghost": "what was learned, without obstacles and bias points",
+    "ghost_arm": "where it would be at the same moment; left out where both are in one place",
+    "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
+    "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
+    "joint_plots": "angles and speeds over time, with their limits",
+    "health_plots": "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
+}
+_NO_SCENE = "–"
+MAX_FLOWS = 3
+"""That ψ is composed of, for a start: each picture brings its own number."""
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """A control and how it reads the scenario."""
+
+    control: Control
+    read: Callable[[Scenario], Any]
+
+
+class Panel:
+    """The control panel of one visitor."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        titles: Mapping[str, str],
+        robot: Robot,
+        save_png: Callable[[str, bool], None],
+        notify: Callable[[str, Colour], None],
+        look_home: Callable[[], None],
+    ) -> None:
+        """Build the controls; they act once `connect` has given them a session.
+
+        Args:
+            gui: of the visitor.
+            titles: of the tasks, by name.
+            robot: whose joints are plotted.
+            save_png: makes a picture, given the resolution's name and whether it is transparent.
+            notify: says something in a colour where it is seen however far the panel is scrolled.
+            look_home: puts the camera back to where the task wants it.
+        """
+        self._notify, self._look_home = notify, look_home
+        self._gui = gui
+        self._session: Session | None = None
+        self._titles = dict(titles)
+        self._bound: list[_Bound] = []
+        self._notice = gui.add_html("", visible=False)
+        self._noticed: Scenario | None = None
+        self._shows = self._waits = False
+        """Whether a frame was reported at all, and whether another task or scene is computed than that of the last."""
+        self._reported: Scenario | None = None
+        self._settled = "", ""
+        """Hint and status of the scenario reported last."""
+        self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
+        self._adopted: Scenario | None = None
+        self._status = gui.add_html("")
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
+
+        on_press(self._cancel, self._cancel_learning)
+        self._build_task()
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("World"):
+            self._obstacles = ObstaclePanel(
+                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
+            )
+            self._biases = BiasPanel(gui, self._bind)
+            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER))
+        with tabs.add_tab("Stack"):
+            self._stack = StackPanel(gui, self._bind)
+        with tabs.add_tab("Show"):
+            self._slice = SlicePanel(gui, self._bind)
+            self._build_plots(robot)
+            self._build_view()
+        with tabs.add_tab("Arm"):
+            self._build_arm()
+        with tabs.add_tab("Picture"):
+            self._build_export(save_png)
+
+    def connect(self, session: Session) -> None:
+        """Let the controls edit this session."""
+        self._session = session
+        self._obstacles.connect(session)
+        self._biases.connect(session)
+        self._starts.connect(session)
+        self._stack.connect(session)
+        self._slice.connect(session)
+
+    def close(self) -> None:
+        """The visitor has left: stop what plays, and what is read."""
+        self._obstacles.close()
+        self._stack.close()
+        self._saver.close()
+        self._beginnings.close()
+
+    @property
+    def legend(self) -> Legend | None:
+        """Of the colours on the slice."""
+        return self._slice.legend
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's choices."""
+        self._adopted = scenario
+        self._obstacles.adopt(scenario)
+        self._biases.adopt(scenario)
+        self._stack.adopt(scenario)
+        self._slice.adopt(scenario)
+        self.push.adopt(scenario)
+        for bound in self._bound:
+            bound.control.value = bound.read(scenario)
+        self._flow.handle.visible = scenario.view.generator
+        self.joints.visible = scenario.view.joint_plots
+        self.health.visible = scenario.view.health_plots
+        self._play.label = "Pause" if scenario.view.playing else "Play"
+        if self._reported is not None and not self._reported.begins_like(scenario):
+            self._wait()
+
+    def report(self, frame: Frame, pace: Pace) -> None:
+        """Show how the rebuild went and how far its result is to be trusted."""
+        if frame.stage is Stage.ROLLOUTS:
+            return  # the next stage is a few milliseconds away
+        if self._adopted is not None and not frame.scenario.begins_like(self._adopted):
+            return  # another task or scene was chosen meanwhile
+        self._reported, self._shows, self._waits = frame.scenario, True, False
+        self._learned()
+        if self._noticed is not None and frame.scenario != self._noticed:
+            self._notice.visible, self._noticed = False, None
+        self._give_hint(hint(frame))
+        self._biases.report(frame)
+        self._stack.report(frame)
+        self._slice.report(frame)
+        self.joints.draw(frame.arm)
+        self.health.draw(frame.profiles)
+        self.push.report(frame)
+        _set_max(self._rollout.handle, len(frame.task.demonstrations) + len(frame.scenario.starts))
+        if frame.pictures.generator is not None:
+            _set_max(self._flow.handle, frame.pictures.generator.num_flows)
+        self._settled = hint(frame), status_html(frame, pace)
+        self._status.content = self._settled[1]
+
+    def _wait(self) -> None:
+        """Say that another task or scene is computed than the one reported last, whose status is pale."""
+        if not self._waits:
+            self._waits = True
+            self._give_hint("")
+            said = f"<div style='{_SMALL}'>{COMPUTING}</div>"
+            self._status.content = f"{said}<div style='{_PALE}'>{self._settled[1]}</div>"
+
+    def _settle(self) -> None:
+        """Nothing is computed that would be reported: show the status of what is shown, if that is adopted."""
+        if self._waits:
+            self._waits = False
+            stays = self._reported and self._adopted and self._reported.begins_like(self._adopted)
+            said, self._status.content = self._settled if stays else ("", "")
+            self._give_hint(said)
+
+    def _give_hint(self, text: str) -> None:
+        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
+        if self._hint.content != said:
+            self._hint.content = said
+
+    def learning(self, fraction: float, message: str) -> None:
+        """Show how far learning a task is."""
+        self._bar.visible = self._cancel.visible = True
+        self._bar.value = 100 * fraction
+        self._status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
+
+    def fail(self, error: Exception) -> None:
+        """Show what went wrong; the picture stays as it was."""
+        self._settle()
+        expected = isinstance(error, DataError | ImitationError)
+        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
+
+    def cancelled(self, task: str) -> None:
+        """Show that learning a task was cancelled, and what is shown instead."""
+        if self._shows and self._adopted is not None:
+            instead = f"This is “{self._titles[self._adopted.task]}” as before."
+        else:
+            instead = "Choose another task, or move the obstacle to start again."
+        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
+
+    def _say(self, text: str, colour: Colour, background: Colour) -> None:
+        """Say something that stays until the next scenario is shown, and for a while beside the panel."""
+        self._learned()
+        self._notify(_sentence(text), colour)
+        self._notice.content, self._notice.visible = _alarm(text, colour, background), True
+        self._noticed = self._adopted
+
+    def _learned(self) -> None:
+        """Nothing is being learned any more."""
+        if self._bar.visible:
+            self._bar.visible = self._cancel.visible = False
+            self._status.content = ""
+
+    def _edit(self, gesture: str, **changes: Any) -> None:
+        if self._session is not None:
+            self._session.edit(gesture, **changes)
+
+    def _bind(
+        self, handle: Any, read: Callable[[Scenario], Any], change: Callable[[Scenario, Any], Mapping[str, Any]]
+    ) -> Control:
+        """Tie a control to the scenario: `read` gives its value, `change` the fields that a new value replaces."""
+
+        def act(value: Any) -> None:
+            if self._session is not None:
+                self._edit(handle.label, **change(self._session.scenario, value))
+
+        return self._tie(handle, read, act)
+
+    def _tie(self, handle: Any, read: Callable[[Scenario], Any], act: Callable[[Any], None]) -> Control:
+        """Have a control show what `read` gives, and `act` on new values."""
+        control = Control(handle, act)
+        self._bound.append(_Bound(control, read))
+        return control
+
+    def _cancel_learning(self) -> None:
+        if self._session is not None:
+            self._session.cancel()
+
+    def _build_task(self) -> None:
+        names = {title: name for name, title in self._titles.items()}
+
+        def choose(session: Session, title: str) -> None:
+            session.choose_task(names[title])
+
+        self._tie(
+            self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
+        )
+        self._hint = self._gui.add_html("")
+        scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
+
+        def load(session: Session, title: str) -> None:
+            if title == _NO_SCENE:
+                session.leave_scene()
+            else:
+                session.load(scenes[title].task, prepared(scenes[title]))
+
+        self._tie(
+            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each"),
+            lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
+            partial(self._begin, load),
+        )
+        Control(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+
+    def _begin(self, begin: Callable[[Session, str], None], title: str) -> None:
+        """Begin a task or a scene; where that cannot be, say why and stay."""
+        if self._session is not None:
+            self._wait()
+            self._beginnings.submit(partial(self._begun, begin, self._session, title))
+
+    def _begun(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
+        begin(session, title)
+        if self._reported is not None and self._reported.begins_like(session.scenario):
+            self._settle()  # it was chosen again before it was left
+
+    def _stay(self, error: Exception) -> None:
+        self.fail(error)
+        if self._session is not None:
+            self.adopt(self._session.scenario)
+
+    def _travel(self, button: str) -> None:
+        session = self._session
+        if session is not None:
+            {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
+            if button == "Reset":
+                self._look_home()
+
+    def _build_arm(self) -> None:
+        gui = self._gui
+        self._play = gui.add_button("Pause")
+
+        on_press(self._play, self._play_or_pause)
+        self._bind(
+            gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
+            lambda s: s.view.speed,
+            lambda s, value: {"view": replace(s.view, speed=value)},
+        )
+        self.push = PushButton(gui)
+        self._rollout = self._bind(
+            gui.add_slider("Follows rollout", 1, 8, 1, 1),
+            lambda s: s.arm_rollout + 1,
+            lambda _s, value: {"arm_rollout": int(value) - 1},
+        )
+
+    def _play_or_pause(self) -> None:
+        if self._session is not None:
+            view = self._session.scenario.view
+            self._edit("play", view=replace(view, playing=not view.playing))
+
+    def _build_plots(self, robot: Robot) -> None:
+        """Each right under its checkbox, high up in the tab, to be seen when they open."""
+        self._build_checkbox("joint_plots")
+        self.joints = JointPlots(self._gui, robot)
+        self._build_checkbox("health_plots")
+        self.health = HealthPlots(self._gui)
+
+    def _build_checkbox(self, name: str) -> None:
+        self._bind(
+            self._gui.add_checkbox(VIEW_LABELS[name], getattr(View(), name), hint=VIEW_HINTS.get(name)),
+            lambda s: getattr(s.view, name),
+            lambda s, value: {"view": replace(s.view, **{name: value})},
+        )
+
+    def _build_view(self) -> None:
+        for name in VIEW_LABELS:
+            if name not in PLOTS:
+                self._build_checkbox(name)
+        self._flow = self._bind(
+            self._gui.add_slider(
+                "Of flow",
+                0,
+                MAX_FLOWS,
+                1,
+                0,
+                visible=False,
+                hint="ψ is several flows, 1 is the first; 0: their mean",
+            ),
+            lambda s: s.view.generator_layer,
+            lambda s, value: {"view": replace(s.view, generator_layer=int(value))},
+        )
+
+    def _build_export(self, save_png: Callable[[str, bool], None]) -> None:
+        resolution = Control(self._gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
+        transparent = Control(self._gui.add_checkbox("Transparent", False))
+        save = self._gui.add_button("Save PNG", icon=viser.Icon.CAMERA)
+
+        def show(saving: bool) -> None:
+            save.disabled = saving
+
+        self._saver = PictureSaver(save_png, show, self.fail)
+        on_press(save, lambda: self._saver.request(resolution.value, transparent.value))
+
+
+def _set_max(slider: Any, value: int) -> None:
+    if slider.max != value:
+        slider.max = value
+
+
+def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
+    """The scene's scenario for its task, once what takes seconds to draw of it is there."""
+
+    def scenario(task: Task) -> Scenario:
+        begun = scene.scenario(task)
+        for obstacle in begun.obstacles:
+            obstacle.surface()
+        return begun
+
+    return scenario
+
+
+COMPUTING = "Computing the motion…"
+CHANGED = "The scene is changed. “Reset” brings it back as it was."
+WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
+HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
+_BLUE = ((29, 79, 124), (232, 241, 250))
+_GREEN = ((0, 92, 66), (230, 245, 239))
+_AMBER = ((138, 75, 0), (255, 244, 224))
+_RED = ((179, 38, 30), (253, 236, 234))
+_PALE = "opacity:0.3;filter:grayscale(1)"
+_TWO_LINES, _WARNING = "2.7em", "2.6em"
+_SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
+
+
+def hint(frame: Frame) -> str:
+    """What to try in the task, or to see in the scene of the paper."""
+    scene = SCENES.get(frame.scenario.scene)
+    if scene is None:
+        return frame.task.hint
+    return CHANGED if scene.is_changed(frame.scenario, frame.task) else scene.line
+
+
+def status_html(frame: Frame, pace: Pace) -> str:
+    """The status line: speed, clearance, certificates, and every reason for doubt."""
+    health, scenario = frame.health, frame.scenario
+    hides_arm = not (scenario.view.arm or scenario.view.onion)
+    # what is not known after the last stage never will be
+    unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
+    off = "–" if frame.blocked else "off"
+    of = "body points" if scenario.avoidance and scenario.space != "task" else "end effector"
+    durations = {"": health.duration, " arm": health.arm_duration}
+    if None not in durations.values():
+        durations = {" hand": health.duration, " arm": health.arm_duration}
+    flow_time = " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None)
+    biases, layer_times = bias_points(scenario.layers), zip(scenario.layers, health.layer_durations, strict=False)
+    strength = " · ".join(f"{t:.2f} {layer.name}" for layer, t in layer_times if layer.name in biases and t is not None)
+    rows = (
+        ("Rebuild", _rebuild(pace)),
+        ("Clearance", off if frame.blocked else _clearance(health.clearance, of)),
+        *(_collision_rows(None, "arm hidden") if hides_arm else _collision_rows(health.collision, unknown)),
+        *((("Flow time t", flow_time or off),) if flow_time or not strength else ()),
+        *((("Strength", strength),) if strength else ()),
+        ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.2g}"),
+        ("There and back", unknown if health.round_trip_error is None else _tiny(health.round_trip_error)),
+        ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[health.lyapunov_falls]),
+    )
+    cells = "".join(
+        f"<tr style='vertical-align:top'><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
+        f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
+        for name, value in rows
+    )
+    warnings = [doubt for doubt in health.doubts if not (hides_arm and doubt in health.arm_doubts)]
+    if health.clearance < 0 and scenario.avoidance and scenario.warp == 1 and not (warnings or frame.blocked):
+        warnings.append("the motions go through the obstacle at this flow time")
+    if health.collision is not None and not hides_arm:
+        own = health.collision.problems_of_its_own
+        entered = [problem for problem in health.collision.problems if problem not in own]
+        told = {problem: problem for problem in own}
+        if scenario.warp == 1:
+            advice = HAND_ONLY if scenario.avoidance and scenario.space == "task" else ""
+            told = {**{problem: problem + advice for problem in entered}, **told}
+        warnings += [text for problem, text in told.items() if not any(problem in w for w in warnings)]
+    blocked = ""
+    if frame.blocked:
+        blocked = _alarm(f"no motion: {'; '.join(frame.blocked)}. What is shown is the last good one.", *_RED)
+    warp = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
+    said = warp + "".join(_alarm(warning, *_AMBER) for warning in warnings)
+    if not (said or blocked) and frame.stage is Stage.CERTIFIED:
+        said = _alarm("every check holds", *_GREEN)
+    # its room stays while checks are made, so that what is below does not jump under the pointer
+    return f"{blocked}<table style='{_SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{said}</div>"
+
+
+def _rebuild(pace: Pace) -> str:
+    """How fast it goes."""
+    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
+    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
+
+
+def _tiny(length: float) -> str:
+    """A length in metres that should be next to nothing."""
+    return f"{1e3 * length:.0e} mm" if 0 < length < 1e-4 else f"{1e3 * length:.1f} mm"
+
+
+def _clearance(clearance: float, whose: str) -> str:
+    return "no obstacle" if clearance == float("inf") else f"{1e3 * clearance:.1f} mm, {whose}"
+
+
+def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:
+    """What the arm's meshes come near to."""
+    if report is None:
+        obstacle = itself = table = unknown
+    else:
+        obstacle = "no obstacle"
+        if report.obstacle.links:
+            obstacle = _distance(report.obstacle.distance, "enters by", report.obstacle.links)
+        itself = f"over {1e3 * SELF_REACH:.0f} mm"
+        if report.itself is not None:
+            itself = _distance(report.itself.distance, "touches", report.itself.links)
+        table = _distance(report.table.distance, "below by", report.table.links)
+    return ("Arm to obstacle", obstacle), ("Arm to itself", itself), ("Arm to table", table)
+
+
+def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
+    """A distance in metres, and of which links; `otherwise` says what one below zero means."""
+    size = f"{1e3 * abs(distance):.0f} mm"
+    if distance <= 0:
+        size = f"{otherwise} {size}" if distance < 0 else otherwise
+    return f"{size}, {' – '.join(links)}"
+
+
+def _sentence(text: str) -> str:
+    """The text with a capital letter, unless it begins with the name of a file."""
+    return text if "." in text.split(" ", 1)[0] else text[:1].upper() + text[1:]
+
+
+def _alarm(text: str, colour: Colour, background: Colour) -> str:
+    return (
+        "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
+        f"border-left:3px solid {css(colour)};color:{css(colour)};background:{css(background)}'>"
+        f"{html.escape(_sentence(text))}</div>"
+    )

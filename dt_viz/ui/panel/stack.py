@@ -1,0 +1,180 @@
+"""The stack of transforms as a list, the outermost on top: each is switched, moved, looked at and tuned."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import viser
+
+from dt_viz.engine.engine import Frame
+from dt_viz.engine.session import Session
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, levels, shifted, switched, visible_names
+from dt_viz.scenario.tuning import avoids, transforms
+from dt_viz.ui.controls import Control
+from dt_viz.ui.panel.transform_settings import Bind, TransformSettings, durations
+from dt_viz.ui.panel.warp import WarpControls
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.levels import manifold
+
+BASE = "Base attractor"
+BELOW = 1e9
+"""Order of what stands below the rows in their folder."""
+ON, OFF, UP, DOWN, SEE, SEEN = "● on", "○ off", "↑", "↓", "see", "● seen"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One transform as the list shows it."""
+
+    name: str
+    label: str
+    buttons: tuple[str, ...]
+
+
+class StackPanel:
+    """The stack, a row for each transform."""
+
+    def __init__(self, gui: viser.GuiApi, bind: Bind) -> None:
+        """Build an empty list, the warp and the settings; they act once `connect` has given them a session."""
+        self._gui = gui
+        self._session: Session | None = None
+        self._folder = gui.add_folder("Stack, the outermost on top")
+        self._rows: list[Any] = []
+        self._shown: tuple[Row, ...] = ()
+        self._scenario: Scenario | None = None
+        self._durations: dict[str, float | None] = {}
+        with self._folder:
+            self._warp = WarpControls(gui, bind, BELOW)
+            self._settings = TransformSettings(gui, bind, BELOW + 2)
+        self._legend = gui.add_html("", visible=False)  # at the end: it comes and goes, and would move what is below
+
+    def connect(self, session: Session) -> None:
+        """Let the rows edit this session."""
+        self._session = session
+        self._warp.connect(session)
+
+    def close(self) -> None:
+        """Stop what plays."""
+        self._warp.close()
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's stack."""
+        self._scenario = scenario
+        self._show(rows(scenario, self._durations))
+        text = legend_html(scenario)
+        if self._legend.content != text:
+            self._legend.content, self._legend.visible = text, bool(text)
+        self._settings.adopt(scenario)
+
+    def report(self, frame: Frame) -> None:
+        """Show which durations were chosen."""
+        self._durations = durations(frame)
+        if self._scenario is not None:
+            self._show(rows(self._scenario, self._durations))
+        self._settings.report(frame)
+
+    def _show(self, wanted: tuple[Row, ...]) -> None:
+        """Reuse the rows that there are, from the top; those that are not needed are hidden."""
+        self._shown = wanted
+        while len(self._rows) < len(wanted):
+            self._add_row(wanted[len(self._rows)])
+        for k, handle in enumerate(self._rows):
+            if k < len(wanted):
+                if handle.label != wanted[k].label:
+                    handle.label = wanted[k].label
+                if handle.options != wanted[k].buttons:
+                    handle.options = wanted[k].buttons
+            if handle.visible != (k < len(wanted)):
+                handle.visible = k < len(wanted)
+
+    def _add_row(self, row: Row) -> None:
+        k = len(self._rows)
+        with self._folder:
+            handle = self._gui.add_button_group(row.label, row.buttons)
+        self._rows.append(handle)
+
+        def pressed(button: str) -> None:
+            if k < len(self._shown):
+                self.press(self._shown[k].name, button)
+
+        Control(handle, pressed)
+
+    def press(self, name: str, button: str) -> None:
+        """Do what a button of the row of this name does."""
+        session = self._session
+        if session is None:
+            return
+        changes = _ACTIONS[button](session.scenario, name)
+        session.edit(f"{name} {button}", **changes)
+        session.end_gesture()
+
+
+def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row, ...]:
+    """The list from the top down, with the durations that the last frame had."""
+    on = {layer.name for layer in scenario.layers if layer.on} | ({AVOIDANCE} if scenario.avoidance else set())
+    seen = levels(scenario)
+    listed = []
+    order, biases = visible_names(scenario), bias_points(scenario.layers)
+    for k, name in enumerate(order):
+        moves = (UP,) * (k < len(order) - 1) + (DOWN,) * (k > 0)
+        look = (_look(scenario, name),) * (name in seen)
+        label = _label(name, durations.get(name), "strength" if name in biases else "t")
+        listed.append(Row(name, label, (ON if name in on else OFF, *moves, *look)))
+    if WHOLE_ARM in transforms(scenario):
+        label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
+        listed.append(Row(WHOLE_ARM, label, (ON if scenario.avoidance else OFF,)))
+    imitation = Row(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
+    base = Row(BASE, BASE, (SEEN if scenario.view.base else SEE,))
+    return (*reversed(listed), imitation, base)
+
+
+def legend_html(scenario: Scenario) -> str:
+    """Which lines are those of the selected level; nothing if none is shown."""
+    if scenario.view.level not in levels(scenario):
+        return ""
+    swatch = (
+        f"display:inline-block;width:1.6em;height:0.28em;vertical-align:middle;background:{palette.css(palette.LEVEL)}"
+    )
+    what = manifold(scenario)
+    return (
+        "<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em;opacity:0.85'>"
+        f"<span style='{swatch}'></span> {html.escape(what)}, without what is stacked on it: rollouts, "
+        "and all that lies on the slice. Pale: rollouts of the whole stack</div>"
+    )
+
+
+def _label(name: str, duration: float | None, what: str = "t") -> str:
+    return name if duration is None else f"{name}, {what} {duration:.2f}"
+
+
+def _look(scenario: Scenario, name: str) -> str:
+    return SEEN if scenario.view.level == name else SEE
+
+
+def _switch(scenario: Scenario, name: str) -> dict[str, Any]:
+    if name == IMITATION:
+        return {"imitation": not scenario.imitation}
+    if avoids(name):
+        return {"avoidance": not scenario.avoidance}
+    return {"layers": switched(scenario.layers, name)}
+
+
+def _select(scenario: Scenario, name: str) -> dict[str, Any]:
+    view = scenario.view
+    if name == BASE:
+        return {"view": replace(view, base=not view.base)}
+    return {"view": replace(view, level="" if view.level == name else name, tuned=name)}
+
+
+_ACTIONS: dict[str, Callable[[Scenario, str], dict[str, Any]]] = {
+    ON: _switch,
+    OFF: _switch,
+    UP: lambda scenario, name: dict(shifted(scenario, name, 1)),
+    DOWN: lambda scenario, name: dict(shifted(scenario, name, -1)),
+    SEE: _select,
+    SEEN: _select,
+}

@@ -1,0 +1,109 @@
+"""The warp: how far the flows of the stack have run, by hand or played from straight rays to the full stack."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from dt_viz.engine.session import Session
+from dt_viz.ui.controls import Control
+
+SECONDS = 5.0
+"""That playing takes."""
+STEP = 0.05
+"""Seconds between two edits: as many a second as a dragged slider sends."""
+PLAY, STOP = "0 → 1", "Stop"
+NAME = "Warp"
+"""Of the slider, and so of the gesture for undo."""
+
+
+class WarpPlayer:
+    """Moves a session's warp from 0 to 1, once, until the scenario is changed by something else."""
+
+    def __init__(self, changed: Callable[[bool], None], seconds: float = SECONDS) -> None:
+        """Wait to be started.
+
+        Args:
+            changed: told when it begins to play and when it ends.
+            seconds: that it takes.
+        """
+        self._changed = changed
+        self._seconds = seconds
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def playing(self) -> bool:
+        """Whether it is under way."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def toggle(self, session: Session) -> None:
+        """Begin, or stop where it is."""
+        if self.playing:
+            self._stop.set()
+        else:
+            self._stop.clear()
+            self._thread = threading.Thread(target=self._play, args=(session,), name="warp", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Stop, and wait for the last edit."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=1)
+
+    def _play(self, session: Session) -> None:
+        self._changed(True)
+        session.begin_gesture()
+        began, mine = time.monotonic(), None
+        while mine is None or session.scenario.moves_like(mine):  # else somebody else has taken hold
+            warp = min(1.0, (time.monotonic() - began) / self._seconds)
+            session.edit(NAME, warp=round(warp, 3))
+            mine = session.scenario
+            if warp == 1.0 or self._stop.wait(STEP):
+                session.end_gesture()
+                break
+        self._changed(False)
+
+
+class WarpControls:
+    """The slider and the button that plays it."""
+
+    def __init__(self, gui: viser.GuiApi, bind: Any, order: float) -> None:  # noqa: ANN401 - `Bind` of the panel
+        """Build them; they act once `connect` has given them a session.
+
+        Args:
+            gui: of the visitor, in the folder that they go into.
+            bind: ties the slider to the scenario.
+            order: of the first of them in the folder.
+        """
+        self._session: Session | None = None
+        self._player = WarpPlayer(self._show)
+        hint = "for how much of its time each flow runs: at 0 motions are straight and so is space, at 1 all is done"
+        bind(
+            gui.add_slider(NAME, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint),
+            lambda s: s.warp,
+            lambda _s, value: {"warp": value},
+        )
+        self._play = gui.add_button_group("Play warp", (PLAY,), order=order + 1)
+
+        Control(self._play, lambda _button: self._toggle())
+
+    def _toggle(self) -> None:
+        if self._session is not None:
+            self._player.toggle(self._session)
+
+    def connect(self, session: Session) -> None:
+        """Let them edit this session."""
+        self._session = session
+
+    def _show(self, playing: bool) -> None:
+        self._play.options = (STOP,) if playing else (PLAY,)
+
+    def close(self) -> None:
+        """Stop playing."""
+        self._player.close()

@@ -1,0 +1,131 @@
+"""The JACO arm in the browser: its meshes once, then six rotations a picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+import viser
+from viser import transforms
+
+from dt_viz.arm.robot import Robot
+from dt_viz.flows.fields import Array
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.links import bodies, light_shells
+
+PEDESTAL = 2
+"""Bodies that no motion carries away from anything: the base, and link 1, which only turns on the spot."""
+STALE_OPACITY = 0.4
+"""Of the arm while it shows a motion that is not the scenario's."""
+GHOST_OPACITY = 0.5
+MIN_APART = 0.006
+"""Metres that avoidance must move a link for its ghost to be shown: two surfaces in one place flicker."""
+
+
+class ArmFrames:
+    """The frames of the base and the six links as a tree in the scene of one visitor."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot, name: str) -> None:
+        self._robot = robot
+        self.frames: list[viser.FrameHandle] = []
+        for index, body in enumerate(bodies(robot.joint_names)):
+            name += f"/joint_{index}" if index else ""
+            pose = transforms.SE3.from_matrix(body.placement)
+            self.frames.append(
+                scene.add_frame(name, show_axes=False, wxyz=pose.rotation().wxyz, position=pose.translation())
+            )
+
+    def pose(self, q: Array) -> None:
+        """Turn to the joint angles `q` (6,), rad."""
+        for frame, wxyz in zip(self.frames[1:], self._robot.joint_frames(q), strict=True):
+            frame.wxyz = wxyz
+
+
+class ArmPicture:
+    """The arm."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        self._tree = ArmFrames(scene, robot, "/arm")
+        self.frames = self._tree.frames
+        self.meshes: list[viser.MeshHandle] = []
+        for frame, body in zip(self.frames, bodies(robot.joint_names), strict=True):
+            for part, mesh, colour in (("shell", body.shell, palette.ARM), ("rings", body.rings, palette.ARM_RING)):
+                if mesh is not None:
+                    self.meshes.append(
+                        scene.add_mesh_simple(f"{frame.name}/{part}", mesh.vertices, mesh.faces, color=colour)
+                    )
+        self._note = scene.add_label(
+            f"{self.frames[-1].name}/note",
+            "last good motion",
+            anchor="bottom-center",
+            font_screen_scale=0.8,
+            visible=False,
+        )
+        self.pose(robot.home)
+
+    def pose(self, q: Array) -> None:
+        """Show the joint angles `q` (6,), rad."""
+        self._tree.pose(q)
+
+    def show(self, *, whole: bool, pedestal: bool) -> None:
+        """Show the whole arm, or only what stands under other pictures of it, or nothing."""
+        self.frames[0].visible = whole or pedestal
+        self.frames[PEDESTAL].visible = whole
+
+    @property
+    def visible(self) -> bool:
+        """Whether the whole arm is shown."""
+        return self.frames[0].visible and self.frames[PEDESTAL].visible
+
+    @property
+    def stale(self) -> bool:
+        """Whether what it shows is not the scenario's motion: then it is translucent and says so."""
+        return self._note.visible
+
+    @stale.setter
+    def stale(self, stale: bool) -> None:
+        if stale != self._note.visible:
+            self._note.visible = stale
+            for mesh in self.meshes:
+                mesh.opacity = STALE_OPACITY if stale else None
+
+
+class GhostArm:
+    """The arm where it would be without avoidance, translucent; links that coincide with the arm's are left out."""
+
+    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+        self._robot = robot
+        self._tree = ArmFrames(scene, robot, "/ghost_arm")
+        self._tree.frames[0].visible = False
+        shells = light_shells(robot.joint_names)[PEDESTAL:]
+        self._corners = np.stack([trimesh.bounds.corners(shell.bounds) for shell in shells])  # (5, 8, 3)
+        self.links = tuple(
+            scene.add_mesh_simple(
+                f"{frame.name}/shell",
+                shell.vertices,
+                shell.faces,
+                color=palette.GHOST,
+                opacity=GHOST_OPACITY,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            for frame, shell in zip(self._tree.frames[PEDESTAL:], shells, strict=True)
+        )
+
+    def pose(self, q: Array, without: Array) -> None:
+        """Show the joint angles `without` (6,), rad, beside an arm at `q` (6,), rad."""
+        self._tree.pose(without)
+        rotations, origins = self._robot.forward_kinematics(np.stack([q, without]))
+        carried = slice(PEDESTAL - 1, None)
+        corners = self._corners @ rotations[:, carried].swapaxes(-1, -2) + origins[:, carried, None]  # (2, 5, 8, 3)
+        moved = np.linalg.norm(corners[1] - corners[0], axis=-1).max(axis=-1)
+        for link, distance in zip(self.links, moved, strict=True):
+            link.visible = bool(distance > MIN_APART)
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is shown."""
+        return self._tree.frames[0].visible
+
+    @visible.setter
+    def visible(self, visible: bool) -> None:
+        self._tree.frames[0].visible = visible

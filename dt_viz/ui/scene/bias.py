@@ -1,0 +1,177 @@
+"""Bias points in the scene: each is dragged itself, the selected one also by handles; a ring is around its region.
+
+In a drawing the handles move it in the drawing's plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+import viser
+import viser.transforms
+
+from dt_viz.engine.engine import Frame
+from dt_viz.flows.fields import Array
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import MAX_BIAS_POINTS, bias_points
+from dt_viz.transforms.bias import BiasPoint
+from dt_viz.ui import gestures
+from dt_viz.ui.gestures import Drag
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.handles import Dragged, Handles
+
+BALL_RADIUS = 0.011
+"""Of the marker, metres."""
+HANDLE_SCALE = 0.11
+"""Metres that the handles stick out, about."""
+RING_WIDTH = 1.6
+"""Pixels."""
+NUM_SEGMENTS = 96
+"""Of a ring."""
+
+Moved = Callable[[str, Array, str], None]
+"""Told which bias point was moved, by name, its position (3,), metres, and the phase of the drag."""
+
+
+class BiasPicture:
+    """One bias point, hung on a gizmo: the browser moves both together, without asking the server."""
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        number: int,
+        moved: Moved,
+        selected: Callable[[str], None],
+        along: Callable[[Drag], Array],
+    ) -> None:
+        """Hidden until `adopt` gives it a bias point.
+
+        Args:
+            scene: of the visitor.
+            number: of this picture, from 0.
+            moved: told of each new position.
+            selected: told that it was clicked or taken hold of.
+            along: how far (3,) an event drags what it has grabbed, metres.
+        """
+        self.name = ""
+        """Of the bias point."""
+        node = f"/bias/{number}"
+        self.gizmo = scene.add_transform_controls(
+            node, line_width=3.0, disable_rotations=True, depth_test=False, visible=False
+        )
+        self.handles = Handles(self.gizmo, HANDLE_SCALE)
+        self.ball = scene.add_icosphere(f"{node}/ball", radius=BALL_RADIUS, color=palette.BIAS)
+        # lines, not a surface: what lies behind and inside, such as colours on the slice, stays as it is
+        self.region = scene.add_line_segments(
+            f"{node}/region",
+            _rings(flat=True),
+            palette.REGION,
+            thickness=RING_WIDTH,
+            thickness_units="screen",
+            visible=False,
+        )
+        self._flat = True
+        self._label = scene.add_label(
+            f"{node}/label",
+            "",
+            position=(0.0, 0.0, 0.0),
+            anchor="top-left",
+            font_screen_scale=0.8,
+        )
+
+        def put(position: Array, _wxyz: Array, phase: str) -> None:
+            moved(self.name, position, phase)
+
+        def dragged(drag: Drag) -> None:
+            if drag.phase == "start":
+                selected(self.name)
+            self.handles.drag(drag, along(drag), put)
+
+        self.handles.on_move(put)
+        gestures.on_drag(self.ball, dragged)
+        gestures.on_click(self.ball, lambda: selected(self.name))
+
+    def adopt(self, name: str, point: BiasPoint, *, on: bool, selected: bool) -> None:
+        """Stand where the bias point does, unless that is where the browser has put it already."""
+        self.handles.stand(point.position, viser.transforms.SO3.from_matrix(point.axes()).wxyz)
+        flat = point.plane is not None
+        if self.gizmo.active_axes[2] == flat:
+            self.gizmo.active_axes = (True, True, not flat)
+        if self._flat != flat:
+            self._flat, self.region.points = flat, _rings(flat=flat)
+        self.name = name
+        label = f"{name.lower()}: goal" if point.moves_goal else name.lower()
+        if self._label.text != label:
+            self._label.text = label
+        colour = palette.BIAS if on else palette.STALE
+        if tuple(self.ball.color) != colour:
+            self.ball.color = colour
+            self.region.colors = np.array(palette.REGION if on else palette.STALE, dtype=np.uint8)
+        self.handles.show(selected)
+        if not self.gizmo.visible:
+            self.gizmo.visible = True
+
+    def show_region(self, point: BiasPoint, used: float | None) -> None:
+        """Show how far it acts: the radius that was used, or the one asked for; nothing while neither is known."""
+        radius = used or point.radius
+        shown = radius is not None
+        if shown:
+            scale = (radius, radius, radius)
+            if self.region.scale != scale:
+                self.region.scale = scale
+        if self.region.visible != shown:
+            self.region.visible = shown
+
+    def hide(self) -> None:
+        """There is no such bias point."""
+        self.name = ""
+        if self.gizmo.visible:
+            self.gizmo.visible = False
+
+
+def _rings(*, flat: bool) -> Array:
+    """Segments (K, 2, 3) of a circle of radius 1 in the plane of the first two axes, or in those of any two."""
+    turn = np.linspace(0, 2 * np.pi, NUM_SEGMENTS + 1)
+    circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
+    circles = [circle] if flat else [np.roll(circle, shift, axis=1) for shift in range(3)]
+    return np.concatenate([np.stack([c[:-1], c[1:]], axis=1) for c in circles]).astype(np.float32)
+
+
+class Biases(Dragged):
+    """All bias points of a scenario."""
+
+    def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[str], None]) -> None:
+        """Begin with none; see `BiasPicture`."""
+        super().__init__(scene.add_frame("/bias", show_axes=False))
+        self._points: Mapping[str, BiasPoint] = {}
+        self.items = tuple(BiasPicture(scene, k, moved, selected, self.along) for k in range(MAX_BIAS_POINTS))
+
+    @property
+    def handles(self) -> Iterable[Handles]:
+        """See `Dragged`."""
+        return [item.handles for item in self.items]
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`: the regions, and the slice to be dragged in."""
+        super().draw(frame)
+        radii = dict(zip((layer.name for layer in frame.scenario.layers), frame.layer_radii, strict=False))
+        for item, (name, point) in zip(self.items, self._points.items(), strict=False):
+            item.show_region(point, radii.get(name))
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's bias points where they stand."""
+        points = bias_points(scenario.layers)
+        self._points = points
+        on = {layer.name for layer in scenario.layers if layer.on}
+        selected = None if scenario.view.move_slice else selected_point(scenario)
+        for item, (name, point) in zip(self.items, points.items(), strict=False):
+            item.adopt(name, point, on=name in on, selected=name == selected)
+        for item in self.items[len(points) :]:
+            item.hide()
+
+
+def selected_point(scenario: Scenario) -> str | None:
+    """Name of the bias point that has the handles: the chosen one, or else the newest."""
+    points = bias_points(scenario.layers)
+    return scenario.view.bias if scenario.view.bias in points else next(reversed(points), None)

@@ -1,0 +1,58 @@
+"""The ball that the hand carries to the pots, and lets go of at the goal (fig. 8)."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+
+from dt_viz.flows.fields import Array
+from dt_viz.scenario.tasks import Pot
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.pots import WALL
+
+RADIUS = 0.022
+"""Of the ball, metres."""
+GRAVITY = 9.81
+"""Metres per second squared."""
+
+
+def fallen(place: Array, pots: tuple[Pot, ...], seconds: float) -> Array:
+    """Middle (3,) of a ball that was let go at `place` (3,), metres, so many seconds ago.
+
+    It comes to rest on the bottom of the pot that catches it, or on the table.
+    """
+    bottom = WALL if any(pot.catches(place) for pot in pots) else 0.0
+    x, y, z = place
+    return np.array([x, y, min(z, max(bottom + RADIUS, z - GRAVITY * seconds**2 / 2))])
+
+
+class Carried:
+    """A ball in the hand, in a task with pots, as long as the arm is shown."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self.ball = scene.add_icosphere("/carried", radius=RADIUS, color=palette.CARRIED, visible=False)
+        self._pots: tuple[Pot, ...] = ()
+        self._arm = True
+        self._posed = False
+
+    def stand(self, pots: tuple[Pot, ...]) -> None:
+        """Be what is carried to these pots, if there are any."""
+        self._pots = pots
+        self._show()
+
+    def show(self, *, arm: bool) -> None:
+        """Show it with the arm only."""
+        self._arm = arm
+        self._show()
+
+    def pose(self, hand: Array, resting: float) -> None:
+        """Be in the hand at `hand` (3,), metres, or on its way down once that has rested at the goal for seconds."""
+        if self._pots:
+            self.ball.position = fallen(hand, self._pots, resting)
+            self._posed = True
+            self._show()
+
+    def _show(self) -> None:
+        shown = bool(self._pots) and self._arm and self._posed
+        if self.ball.visible != shown:
+            self.ball.visible = shown

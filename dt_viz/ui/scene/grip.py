@@ -1,0 +1,96 @@
+"""The ball at the arm's hand by which the user holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import viser
+
+from dt_viz.arm.robot import Robot
+from dt_viz.engine.engine import Frame
+from dt_viz.flows.fields import Array
+from dt_viz.scenario.slices import Slice
+from dt_viz.ui import gestures
+from dt_viz.ui.gestures import Drag
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.handles import in_slice
+
+RADIUS = 0.016
+"""Metres: easy to hit, hardly wider than the fingers."""
+
+Held = Callable[[Array, str], None]
+"""Told where the hand should be, (3,), metres, and the phase of the drag: "start", "update" or "end"."""
+
+
+class Grip:
+    """Moves with the hand, and is dragged parallel to the slice."""
+
+    def __init__(
+        self, scene: viser.SceneApi, robot: Robot, hand: str, where: Callable[[], Array | None], held: Held
+    ) -> None:
+        """Hang the ball on the hand.
+
+        Args:
+            scene: of the visitor.
+            robot: whose hand it is.
+            hand: node of its last joint.
+            where: the hand is now, (3,), metres; None before it moves.
+            held: told what the user does.
+        """
+        self.ball = scene.add_icosphere(
+            f"{hand}/grip",
+            radius=RADIUS,
+            color=palette.PUSHED,
+            position=robot.end_effector_offset,
+            opacity=0.85,
+            cast_shadow=False,
+        )
+        self._note = scene.add_label(
+            f"{hand}/grip/note",
+            "",
+            position=(0.0, 0.0, 0.0),
+            anchor="bottom-left",
+            font_screen_scale=0.8,
+            visible=False,
+        )
+        self.ball.visible = False
+        self._slice: Slice | None = None
+        self._grabbed, self._offset, self._place = np.zeros(3), np.zeros(3), np.zeros(3)
+
+        def dragged(drag: Drag) -> None:
+            if drag.phase == "start":
+                self._grabbed, hand = drag.grabbed, where()
+                self._offset = np.zeros(3) if hand is None else hand - self._grabbed
+                self._place = self._grabbed + self._offset
+            shift = in_slice(self._slice, drag.camera, self._grabbed, drag.pointer)
+            place = gestures.place(self._grabbed + self._offset + shift)
+            if place is not None:
+                self._place = place
+            held(self._place, drag.phase)
+
+        gestures.on_drag(self.ball, dragged)
+
+    def draw(self, frame: Frame) -> None:
+        """Show the ball where there is a motion to go on with, and remember the slice to be dragged in."""
+        self._slice = frame.slice
+        shown = frame.arm is not None and not frame.blocked
+        if self.ball.visible != shown:
+            self.ball.visible = shown
+
+    def say(self, doubt: str) -> None:
+        """Say beside the hand what is wrong; nothing if it is empty."""
+        if doubt and self._note.text != doubt:
+            self._note.text = doubt
+        if self._note.visible != bool(doubt):
+            self._note.visible = bool(doubt)
+
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide the ball for as long as a picture takes."""
+        shown, self.ball.visible = self.ball.visible, False
+        try:
+            yield
+        finally:
+            self.ball.visible = shown

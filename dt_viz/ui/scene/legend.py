@@ -1,0 +1,103 @@
+"""What the colours on the slice mean: in the panel, and on the pictures that visitors take home."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from dt_viz.pictures.slice_fields import ColourPicture
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale
+from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
+
+INK, PAPER = (52, 58, 68), (255, 255, 255, 225)
+HEIGHT = 0.022
+"""Of a line of text on a picture, of the picture's height."""
+
+
+@dataclass(frozen=True)
+class Legend:
+    """A scale of colours with numbers, from left to right. Texts are ASCII: Pillow's own font has hardly more."""
+
+    title: str
+    """What is shown, with its unit."""
+    scale: Scale
+    ticks: tuple[tuple[float, str], ...]
+    """Values and how they are written."""
+    note: str = ""
+    """Said below."""
+    swatch: Colour | None = None
+    """A colour that the note names."""
+
+    @property
+    def html(self) -> str:
+        """For the panel."""
+        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in self.scale.shades[:: NUM_SHADES // 16].tolist())
+        numbers = "".join(
+            f"<span style='position:absolute;left:{at:.1f}%;transform:translateX(-{at:.1f}%)'>"
+            f"{html.escape(text)}</span>"
+            for at, text in ((100 * self.scale.relative(value), text) for value, text in self.ticks)
+        )
+        mark = ""
+        if self.swatch:
+            look = f"display:inline-block;width:1.2em;height:0.7em;background:{palette.css(self.swatch)}"
+            mark = f"<span style='{look}'></span> "
+        return (
+            f"<div style='font-size:0.8em;padding:0.2em 1.6em 0.5em;line-height:1.4'>{html.escape(self.title)}"
+            f"<div style='height:0.8em;border-radius:2px;background:linear-gradient(to right,{stops})'></div>"
+            f"<div style='position:relative;height:1.5em'>{numbers}</div>{mark}{html.escape(self.note)}</div>"
+        )
+
+    def drawn_onto(self, image: Image.Image) -> Image.Image:
+        """The RGBA image with the legend in its lower left corner, as tall as suits its height."""
+        em = round(HEIGHT * image.height)
+        line, left, width = round(1.45 * em), round(1.6 * em), 24 * em
+        font = ImageFont.load_default(em)
+        plate = Image.new("RGBA", (width + 2 * left, (4 + bool(self.note)) * line))
+        draw = ImageDraw.Draw(plate)
+        draw.rounded_rectangle((0, 0, plate.width - 1, plate.height - 1), radius=em // 2, fill=PAPER)
+        draw.text((left, line), self.title, INK, font, anchor="lm")
+        shades = Image.fromarray(self.scale.shades[None]).resize((width, round(0.8 * em)), Image.Resampling.BILINEAR)
+        plate.paste(shades, (left, round(1.55 * line)))
+        for value, text in self.ticks:
+            draw.text((left + self.scale.relative(value) * width, round(2.9 * line)), text, INK, font, anchor="mm")
+        if self.note:
+            start = left
+            if self.swatch:
+                low = 3.95 * line
+                draw.rectangle((left, low - 0.35 * em, left + 1.2 * em, low + 0.35 * em), fill=self.swatch)
+                start += round(1.7 * em)
+            draw.text((start, round(3.95 * line)), self.note, INK, font, anchor="lm")
+        whole = image.copy()
+        whole.alpha_composite(plate, (em, image.height - em - plate.height))
+        return whole
+
+
+OCCUPANCY = Legend(
+    "Learned occupancy: how likely something is there",
+    OCCUPANCY_SCALE,
+    tuple((p, f"{p:g}") for p in (0, 0.25, 0.5, 0.75, 1)),
+    "Bold line: its level 0.5. Thin line: the true outline",
+)
+
+
+def legend_of(picture: ColourPicture) -> Legend:
+    """What the colours of a picture mean."""
+    scale = scale_of(picture)
+    if picture.what == "det":
+        decades = range(-DET_DECADES, DET_DECADES + 1)
+        return Legend(
+            "det J: volume in base space for volume here",
+            scale,
+            tuple((d, f"{10.0**d:g}") for d in decades),
+            "0 or less: folded, no diffeomorphism",
+            palette.FOLDED,
+        )
+    ticks = np.linspace(0, scale.high, 5).tolist()
+    return Legend(
+        "Lyapunov value, square cm per second", scale, tuple((v, f"{v:g}") for v in ticks), "Every motion goes down"
+    )

@@ -1,0 +1,166 @@
+"""The obstacles in the scene: each can be dragged itself, the selected one also by handles that move and turn it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import trimesh
+import viser
+from numpy.typing import NDArray
+
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Sphere
+from dt_viz.scenario.scenario import MAX_DIAMETER, Scenario
+from dt_viz.ui import gestures
+from dt_viz.ui.gestures import Drag
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.handles import Dragged, Handles
+from dt_viz.ui.scene.links import simplified
+
+HANDLE_SCALE = 0.2
+"""Metres that the handles stick out, about."""
+OPACITY, OPACITY_FAINT, OPACITY_OPENED = 0.8, 0.3, 0.12
+"""The path that an obstacle blocks shines through; more so while it is not avoided, and most while its map is shown."""
+CREASE = 0.6
+"""Angle between neighbouring faces above which their edge is drawn sharp, rad."""
+MAX_FACES = 30_000
+"""That are drawn in full."""
+FINEST = 0.035
+"""Size of what is left of a larger mesh, in radii."""
+
+Moved = Callable[[int, Array, Array, str], None]
+"""Told which obstacle was moved, its position (3,), metres, and quaternion (4,), and the phase of the drag."""
+
+
+class ObstaclePicture:
+    """One obstacle, hung on a gizmo: the browser moves both together, without asking the server."""
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        index: int,
+        moved: Moved,
+        selected: Callable[[int], None],
+        along: Callable[[Drag], Array],
+    ) -> None:
+        """Draw nothing yet.
+
+        Args:
+            scene: of the visitor.
+            index: in the scenario.
+            moved: told of each new pose.
+            selected: told that this obstacle was clicked.
+            along: how far (3,) an event drags what it has grabbed, metres.
+        """
+        self.gizmo = scene.add_transform_controls(f"/obstacles/{index}", line_width=3.0, depth_test=False)
+        self.handles = Handles(self.gizmo, HANDLE_SCALE)
+        self.mesh = scene.add_mesh_simple(
+            f"/obstacles/{index}/surface",
+            np.zeros((3, 3), np.float32),
+            np.array([[0, 1, 2]], np.uint32),
+            color=palette.OBSTACLE,
+            opacity=OPACITY,
+        )
+        self._look: Obstacle | None = None
+
+        def dragged(drag: Drag) -> None:
+            if drag.phase == "start":
+                selected(index)
+            self.handles.drag(drag, along(drag), partial(moved, index))
+
+        self.handles.on_move(partial(moved, index))
+        gestures.on_drag(self.mesh, dragged)
+        gestures.on_click(self.mesh, partial(selected, index))
+
+    @property
+    def has_handles(self) -> bool:
+        """Whether handles are shown."""
+        return self.handles.shown
+
+    def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool, opened: bool) -> None:
+        """Look like the obstacle and stand where it does, unless that is where the browser has put it already.
+
+        Args:
+            obstacle: to show.
+            selected: whether it has handles.
+            avoided: whether motions avoid it.
+            opened: whether its nearer half is left out, to show what is inside.
+        """
+        self.handles.stand(obstacle.position, obstacle.wxyz)
+        look, scale = unscaled(obstacle.moved((0.0, 0.0, 0.0)))
+        if look != self._look:
+            self._look = look
+            self.mesh.vertices, self.mesh.faces = shaded(look)
+            self.gizmo.disable_rotations = isinstance(look, Sphere)
+        if self.mesh.scale != scale:
+            self.mesh.scale = scale
+        self.handles.scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
+        self.handles.show(selected)
+        side = "back" if opened else "front"
+        if self.mesh.side != side:
+            self.mesh.side = side
+        opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
+        if self.mesh.opacity != opacity:
+            self.mesh.opacity = opacity
+
+    def remove(self) -> None:
+        """Take it out of the scene."""
+        self.gizmo.remove()
+
+
+class Obstacles(Dragged):
+    """All obstacles of a scenario."""
+
+    def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[int], None]) -> None:
+        """Begin with none.
+
+        Args:
+            scene: of the visitor.
+            moved: told of a new pose of one of them; the phase is "start", "update" or "end".
+            selected: told which one the user has clicked or taken hold of.
+        """
+        super().__init__(scene.add_frame("/obstacles", show_axes=False))
+        self._scene = scene
+        self._moved, self._selected = moved, selected
+        self.items: list[ObstaclePicture] = []
+        """In the order of the scenario."""
+
+    @property
+    def handles(self) -> Iterable[Handles]:
+        """See `Dragged`."""
+        return [item.handles for item in self.items]
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's obstacles where they stand."""
+        while len(self.items) > len(scenario.obstacles):
+            self.items.pop().remove()
+        while len(self.items) < len(scenario.obstacles):
+            index = len(self.items)
+            self.items.append(ObstaclePicture(self._scene, index, self._moved, self._selected, self.along))
+        for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
+            item.adopt(
+                obstacle,
+                selected=index == scenario.selected and not scenario.view.move_slice,
+                avoided=scenario.avoidance,
+                opened=scenario.view.colour == "occupancy",
+            )
+
+
+def unscaled(obstacle: Obstacle) -> tuple[Obstacle, float]:
+    """The obstacle as its triangles are kept, and by how much the browser is to scale them."""
+    if isinstance(obstacle, MeshObstacle | CloudObstacle):
+        return replace(obstacle, scale=1.0), obstacle.scale
+    return obstacle, 1.0
+
+
+def shaded(obstacle: Obstacle) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Vertices (V, 3), metres, and faces (F, 3) of its surface, with vertices of their own along sharp edges."""
+    mesh = trimesh.Trimesh(*obstacle.surface(), process=False)
+    if len(mesh.faces) > MAX_FACES:
+        mesh = simplified(mesh, FINEST * obstacle.radius)
+    if not isinstance(obstacle, Sphere):
+        mesh = trimesh.graph.smooth_shade(mesh, angle=CREASE)
+    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)

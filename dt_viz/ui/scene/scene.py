@@ -1,0 +1,273 @@
+"""Frame → scene handles. Each picture is a class with `draw(frame)` and `visible`."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import viser
+
+from dt_viz.arm.robot import Robot
+from dt_viz.engine.engine import Frame
+from dt_viz.motion.diagnostics import MAX_GOAL_MISS
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import bias_points
+from dt_viz.scenario.tasks import Task
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.arm_layers import Onion
+from dt_viz.ui.scene.bias import BALL_RADIUS, Biases
+from dt_viz.ui.scene.bias import Moved as BiasMoved
+from dt_viz.ui.scene.handles import Moved as SliceMoved
+from dt_viz.ui.scene.levels import LevelRollouts
+from dt_viz.ui.scene.manifold import BaseInset, Generator, WarpedGrid
+from dt_viz.ui.scene.obstacles import Moved, Obstacles
+from dt_viz.ui.scene.picture import Lines, Picture
+from dt_viz.ui.scene.pots import Pots
+from dt_viz.ui.scene.slice import MovableSlice
+from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
+from dt_viz.ui.scene.starts import Starts
+
+BOLD, THIN = 0.0048, 0.0026
+"""Of the rollouts of the whole stack, metres: by themselves, and beside those of a level."""
+GOAL, OLD_GOAL = "goal", "demonstrated goal"
+"""Labels of where the demonstrations end: if motions end there, and if they do not."""
+ADDED = 0.0022
+"""Thickness of rollouts from added starts, metres."""
+OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
+"""What the view shows of a motion, and nothing says that it may be of another one: rollouts are grey then."""
+OF_A_TASK = {"demonstrations", "ghost"}
+"""The same of what belongs to a task or a scene."""
+COMPUTING = "computing"
+
+
+class Demonstrations(Picture):
+    """What was shown to the robot, thin."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._lines = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018)
+        super().__init__(self._lines.node)
+        self._task: Task | None = None
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        if frame.task is not self._task:
+            self._task = frame.task
+            self._lines.show(frame.task.paths)
+
+
+class Rollouts(Picture):
+    """What the robot will do, bold, with a dot at each start; thin and pale beside those of a level of the stack.
+
+    Motions that begin at added starts are thin.
+    """
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, BOLD)
+        super().__init__(self.lines.node)
+        self.added = Lines(scene, "/rollouts/added", palette.ROLLOUT, ADDED)
+        self._starts = scene.add_point_cloud(
+            "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
+        )
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        num = len(frame.task.demonstrations)
+        for lines, paths, first in ((self.lines, frame.rollouts[:num], 0), (self.added, frame.rollouts[num:], num)):
+            chosen = None if frame.chosen is None else frame.chosen - first
+            if frame.blocked:
+                lines.show(paths, chosen, mark=palette.GHOST, colour=palette.STALE)
+            elif frame.level is not None:
+                lines.show(paths, colour=palette.ROLLOUT_BESIDE)
+            else:
+                lines.show(paths, chosen)
+        thickness = BOLD if frame.level is None else THIN
+        if self.lines.node.thickness != thickness:
+            self.lines.node.thickness = thickness
+        self._starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
+        self._starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
+
+
+class Ghost(Picture):
+    """The undeformed rollouts, dashed."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._lines = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012)
+        super().__init__(self._lines.node)
+        self._shown: object = None
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        if frame.ghost is not self._shown:
+            self._shown = frame.ghost
+            self._lines.show(frame.ghost[: len(frame.task.demonstrations)])
+
+
+class Goal(Picture):
+    """Where the motions should end, and a second ball where they do if something covers the goal."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._goal = scene.add_frame("/goal", show_axes=False)
+        super().__init__(self._goal)
+        label = {"position": (0.0, 0.0, 0.02), "anchor": "bottom-center", "font_screen_scale": 0.8}
+        scene.add_icosphere("/goal/ball", radius=0.012, color=palette.GOAL)
+        self.label = scene.add_label("/goal/label", GOAL, **label)
+        self._end = scene.add_frame("/end", show_axes=False, visible=False)
+        scene.add_icosphere("/end/ball", radius=0.009, color=palette.ROLLOUT)
+        scene.add_label("/end/label", "end", **label)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        self._goal.position = frame.goal
+        self._end.position = frame.reached
+        elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
+        text = OLD_GOAL if elsewhere else GOAL
+        if self.label.text != text:
+            self.label.text = text
+        # a bias point that moves the goal says so itself
+        biases = [point for point in bias_points(frame.scenario.layers).values() if point.moves_goal]
+        marked = any(np.linalg.norm(frame.reached - point.position) < BALL_RADIUS for point in biases)
+        if self._end.visible != (elsewhere and not marked):
+            self._end.visible = elsewhere and not marked
+
+
+class Table(Picture):
+    """The work table under the arm."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        box = scene.add_box(
+            "/table",
+            dimensions=(1.10, 0.96, 0.03),
+            position=(0.0, -0.27, -0.0155),
+            color=palette.TABLE,
+            cast_shadow=False,  # on itself it would show as stripes
+            receive_shadow=0.2,
+        )
+        super().__init__(box)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`: it never changes."""
+
+
+def set_lights(scene: viser.SceneApi) -> None:
+    """Lights that look the same on the screen and in an exported picture, which has no environment map."""
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map(hdri=None)
+    scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(214, 208, 200), intensity=1.8)
+    scene.add_light_directional("/lights/key", position=(0.8, -1.6, 2.4), intensity=2.2, cast_shadow=True)
+    scene.add_light_directional("/lights/fill", position=(-1.6, -1.0, 1.2), intensity=0.8)
+
+
+class ScenePictures:
+    """Everything in the scene of one visitor that is drawn from frames."""
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        robot: Robot,
+        moved: Moved,
+        selected: Callable[[int], None],
+        bias_moved: BiasMoved,
+        bias_selected: Callable[[str], None],
+        slice_moved: SliceMoved,
+        starts: Starts,
+    ) -> None:
+        """Build the scene of this robot; the others are told what the user does, see their pictures."""
+        set_lights(scene)
+        self.obstacles = Obstacles(scene, moved, selected)
+        self.biases = Biases(scene, bias_moved, bias_selected)
+        self.slice = MovableSlice(scene, slice_moved)
+        self.starts = starts
+        self._always: tuple[Picture, ...] = (
+            self.obstacles,
+            self.biases,
+            self.slice,
+            self.starts,
+            LevelRollouts(scene),
+            Goal(scene),
+            Pots(scene),
+        )
+        self._by_view: dict[str, Picture] = {
+            "demonstrations": Demonstrations(scene),
+            "rollouts": Rollouts(scene),
+            "ghost": Ghost(scene),
+            "field": FieldArrows(scene),
+            "streamlines": Streamlines(scene),
+            "table": Table(scene),
+            "generator": Generator(scene),
+            "grid": WarpedGrid(scene),
+            "base": BaseInset(scene),
+            "onion": Onion(scene, robot),
+        }
+        self._view, self._blocked = View(), False
+        self._showing = threading.Lock()  # whoever changes the view is not who draws
+        self._drawing = threading.Lock()
+        self._frame: Frame | None = None
+        self._adopted: Scenario | None = None
+        self._grey = False
+        """Whether it was drawn as `stale`."""
+        function = ColourSlice(scene)
+        self._by_colour: dict[str, Picture] = {
+            "det": function,
+            "lyapunov": function,
+            "occupancy": OccupancySlice(scene),
+        }
+
+    def layer(self, view: str) -> Picture:
+        """The picture that this field of `View` shows or hides."""
+        return self._by_view[view]
+
+    @property
+    def stale(self) -> bool:
+        """Whether the last frame belongs to another task or scene than the scenario adopted since."""
+        return not (self._frame is None or self._adopted is None or self._frame.scenario.begins_like(self._adopted))
+
+    def draw(self, frame: Frame) -> None:
+        """Assign fresh arrays to the handles."""
+        with self._drawing:
+            self._frame = frame
+            self._draw(frame)
+
+    def _draw(self, frame: Frame) -> None:
+        """Draw a frame, a stale one grey: as one that there is no motion for."""
+        before, self._grey = (self._blocked, self._grey), self.stale
+        if self._grey:
+            frame = replace(frame, blocked=(*frame.blocked, COMPUTING))
+        for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
+            picture.draw(frame)
+        if (bool(frame.blocked), self._grey) != before:
+            with self._showing:
+                self._blocked = bool(frame.blocked)
+                self._show()
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
+        self._adopted = scenario
+        self.obstacles.adopt(scenario)
+        self.biases.adopt(scenario)
+        self.slice.adopt(scenario)
+        self.starts.adopt(scenario)
+        with self._showing:
+            self._view = scenario.view
+            self._show()
+        if self.stale != self._grey:  # who draws at this moment has seen one of both, or is waited for
+            with self._drawing:
+                if self._frame is not None:
+                    self._draw(self._frame)
+
+    def _show(self) -> None:
+        """Show what the view says; nothing that belongs to another motion while the scenario has none."""
+        for name, picture in self._by_view.items():
+            hidden = (self._blocked and name in OF_A_MOTION) or (self._grey and name in OF_A_TASK)
+            picture.visible = getattr(self._view, name) and not hidden
+        shown = None if self._blocked else self._by_colour.get(self._view.colour)
+        for picture in self._by_colour.values():
+            picture.visible = picture is shown
+
+    @contextmanager
+    def without_handles(self) -> Iterator[None]:
+        """Hide all handles for as long as a picture takes."""
+        with self.obstacles.without_handles(), self.biases.without_handles(), self.slice.without_handles():
+            yield

@@ -1,0 +1,194 @@
+"""What lies on the slice: arrows, streamlines, and det J, the Lyapunov value or the learned occupancy as colour."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, map_coordinates
+from viser import transforms
+
+from dt_viz.engine.engine import Frame
+from dt_viz.flows.fields import Array
+from dt_viz.pictures.slice_fields import ColourPicture
+from dt_viz.scenario.slices import Slice
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale, diverging, ramp
+from dt_viz.ui.scene.picture import Arrows, Lines, Picture, assign
+
+ARROW_LENGTH = 0.024
+"""Of the fastest arrow, metres."""
+HEAD_LENGTH = 0.012
+"""Of the arrow heads on streamlines, metres."""
+PIXEL = 0.004
+"""Of the colours, metres."""
+OPACITY = 0.5
+"""Of the colours: arm and rollouts behind them are seen through."""
+MOST_OPAQUE = 0.85
+"""Opacity where the map is sure that something is there."""
+POINT_SIZE = 0.0016
+"""Of a cloud's points, metres."""
+DET_DECADES = 2
+"""Of det J to either side of 1; what is beyond has the last colour."""
+CM2 = 1e4
+"""Square centimetres in a square metre."""
+
+VOLUME, LYAPUNOV = diverging(palette.VOLUME), ramp(palette.LYAPUNOV)
+_LIKELY = np.linspace(0, MOST_OPAQUE, NUM_SHADES)[:, None]
+OCCUPANCY_SCALE = Scale(np.round(255 + _LIKELY * (np.array(palette.OCCUPANCY) - 255)).astype(np.uint8), 0.0, 1.0)
+"""As it looks on white."""
+
+
+class FieldArrows(Picture):
+    """The vector field on the slice: longer and darker is faster."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._arrows = Arrows(scene, "/field", palette.ARROW_SLOW, palette.ARROW_FAST, ARROW_LENGTH)
+        super().__init__(self._arrows.node)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        field = frame.pictures.field
+        if field is not None:
+            self._arrows.show(field.points, field.velocities)
+
+
+class Streamlines(Picture):
+    """Motions from all over the slice, thin, with a head in the middle of each."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(scene.add_frame("/streamlines", show_axes=False))
+        self.lines = Lines(scene, "/streamlines/lines", palette.STREAMLINE, 0.0015)
+        colour = palette.linear(palette.STREAMLINE)
+        self.heads = Arrows(scene, "/streamlines/heads", colour, colour, HEAD_LENGTH)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        lines = frame.pictures.streamlines
+        if lines is not None:
+            self.lines.show(lines)
+            middles = [len(line) // 2 for line in lines]
+            points = np.reshape([line[k] for line, k in zip(lines, middles, strict=True)], (-1, 3))
+            ahead = np.reshape([line[k] - line[k - 1] for line, k in zip(lines, middles, strict=True)], (-1, 3))
+            self.heads.show(points, ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12))
+
+
+class _Image:
+    """Pixels on a slice."""
+
+    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+        self._scene, self._name = scene, name
+        self.handle: viser.ImageHandle | None = None
+        self._size: tuple[float, float] | None = None
+
+    def show(self, area: Slice, pixels: NDArray[np.uint8]) -> None:
+        """Show pixels (n, m, 4) along the first and the second axis of the slice."""
+        pixels = pixels.swapaxes(0, 1)[::-1]  # the first row is the upper one
+        right, up = area.axes.T
+        turn = transforms.SO3.from_matrix(np.stack([right, -up, np.cross(right, -up)], axis=1))
+        if self.handle is not None and self._size == area.half_size:
+            self.handle.image = pixels
+            if not np.allclose(self.handle.wxyz, turn.wxyz, rtol=0, atol=1e-12):
+                self.handle.wxyz = turn.wxyz
+            if not np.array_equal(self.handle.position, area.centre):
+                self.handle.position = area.centre
+            return
+        self._size = area.half_size
+        width, height = (2 * half for half in area.half_size)
+        self.handle = self._scene.add_image(
+            self._name,
+            pixels,
+            width,
+            height,
+            format="png",
+            wxyz=turn.wxyz,
+            position=area.centre,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+class ColourSlice(Picture):
+    """det J or the Lyapunov value as colour, the latter with level lines."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(scene.add_frame("/colour", show_axes=False))
+        self.image = _Image(scene, "/colour/image")
+        self.lines = Lines(scene, "/colour/lines", palette.LEVEL_LINE, 0.0012)
+        self._shown: object = None
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        picture = frame.pictures.colour
+        if picture is not None and picture is not self._shown:
+            self._shown = picture
+            self.image.show(picture.area, painted(picture))
+            self.lines.show_segments(picture.lines)
+
+
+def scale_of(picture: ColourPicture) -> Scale:
+    """Of det J its decimal logarithm, the same for all; of the Lyapunov value cm²/s from zero to the largest."""
+    if picture.what == "det":
+        return Scale(VOLUME, -DET_DECADES, DET_DECADES)
+    return Scale(LYAPUNOV, 0.0, _rounded_up(CM2 * float(np.nanmax(picture.values, initial=1e-9))))
+
+
+def painted(picture: ColourPicture) -> NDArray[np.uint8]:
+    """Pixels (n, m, 4) along the axes of the slice: smooth between samples, nothing where no motion comes."""
+    values, unknown = picture.values, np.isnan(picture.values)
+    shape = tuple(max(2, round(2 * half / PIXEL)) for half in picture.area.half_size)
+    if unknown.all():
+        return np.zeros((*shape, 4), np.uint8)
+    if unknown.any():  # what is next to it goes on, for the sake of the border
+        nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+        values = values[tuple(np.asarray(nearest))]
+    # samples lie on the corners of the slice, pixels half a pixel inside
+    axes = [(np.arange(p) + 0.5) / p * (n - 1) for p, n in zip(shape, values.shape, strict=True)]
+    at = np.meshgrid(*axes, indexing="ij")
+    shown = np.log10(np.maximum(values, 10.0 ** (-2 * DET_DECADES))) if picture.what == "det" else CM2 * values
+    pixels = np.empty((*shape, 4), np.uint8)
+    pixels[..., :3] = scale_of(picture).colours(map_coordinates(shown, at, order=1))
+    room = map_coordinates(np.minimum(picture.clearance, 1.0), at, order=1)
+    pixels[..., 3] = np.round(255 * OPACITY * np.clip(room / PIXEL + 0.5, 0, 1))
+    if picture.what == "det":
+        pixels[map_coordinates(values, at, order=0) <= 0] = (*palette.FOLDED, 255)
+    return pixels
+
+
+def _rounded_up(value: float) -> float:
+    """The next number that is easily read: 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * next(step for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * power >= value * (1 - 1e-9)))
+
+
+class OccupancySlice(Picture):
+    """What the map believes, as colour on the slice: the more opaque the more likely."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(scene.add_frame("/occupancy", show_axes=False))
+        self.image = _Image(scene, "/occupancy/image")
+        self.level = Lines(scene, "/occupancy/level", palette.OCCUPANCY_LEVEL, 0.0025)
+        self.outline = Lines(scene, "/occupancy/outline", palette.OUTLINE, 0.0030)
+        self.points = scene.add_point_cloud(
+            "/occupancy/points", np.zeros((0, 3), np.float32), palette.FREE, point_size=POINT_SIZE, point_shape="circle"
+        )
+        self._shown: object = None
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        picture = frame.pictures.occupancy
+        if picture is None or picture is self._shown:
+            return
+        self._shown = picture
+        self.image.show(picture.area, _of_probability(picture.probability))
+        self.level.show_segments(picture.level)
+        self.outline.show_segments(picture.outline)
+        colours = np.where(picture.occupied[:, None], palette.OCCUPIED, palette.FREE).astype(np.uint8)
+        assign(self.points, picture.points, colours)
+
+
+def _of_probability(probability: Array) -> NDArray[np.uint8]:
+    pixels = np.empty((*probability.shape, 4), np.uint8)
+    pixels[..., :3] = palette.OCCUPANCY
+    pixels[..., 3] = np.round(255 * MOST_OPAQUE * probability)
+    return pixels
