@@ -1,6 +1,8 @@
 """Who may import whom: found in the sources, not in what happens to be loaded."""
 
 import ast
+import graphlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -9,8 +11,51 @@ import dt_viz
 
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-BROWSERLESS_UI = {"session.py", "worker.py"}
-MAY_IMPORT_UI = ("cli.py", "evaluate")
+FOUNDATION = {"errors", "interruption", "metrics", "properties"}
+"""Modules of no package, which import each other only."""
+BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "transforms"}
+BELOW_ENGINE = BELOW_SCENARIO | {"arm", "scenario", "motion", "pictures"}
+MAY_IMPORT: Mapping[str, set[str]] = {
+    "foundation": set(),
+    "flows": {"foundation"},
+    "files": {"foundation", "flows"},
+    "learning": {"foundation", "flows", "files"},
+    "obstacles": {"foundation", "flows", "files"},
+    "transforms": {"foundation", "flows", "learning", "obstacles"},
+    "arm": {"foundation", "flows", "files", "obstacles", "transforms"},
+    "scenario": BELOW_SCENARIO - {"files"},
+    "motion": BELOW_SCENARIO | {"arm", "scenario"},
+    "pictures": BELOW_SCENARIO | {"arm", "scenario"},
+    "engine": BELOW_ENGINE,
+    "ui": BELOW_ENGINE | {"engine"},
+    "evaluate": BELOW_ENGINE | {"engine", "ui"},
+    "cli": BELOW_ENGINE | {"engine", "ui"},
+}
+"""The packages from the bottom up, and which of those below each may import."""
+UI_MAY_IMPORT: Mapping[str, set[str]] = {
+    "ui": {"ui", "ui/scene", "ui/panel"},
+    "ui/scene": {"ui/scene", "ui"},
+    "ui/panel": {"ui/panel", "ui/scene", "ui"},
+}
+"""The parts of the page: what lies in the scene knows no controls."""
+ONLY_IMPORTERS: Mapping[str, set[str]] = {
+    "pinocchio": {"arm/robot.py"},
+    "coal": {"arm/link_distances.py"},
+    "matplotlib": set(),
+    "torch": set(),
+    "jax": set(),
+    "pickle": set(),
+    "functools.cached_property": set(),
+}
+"""Modules that only these files import."""
+
+
+def named(path: Path) -> str:
+    """The full name of a file's module."""
+    return ".".join(["dt_viz", *path.relative_to(PACKAGE).with_suffix("").parts])
+
+
+MODULES = {named(path).removesuffix(".__init__"): path for path in SOURCES}
 
 
 def imported(path: Path) -> set[str]:
@@ -27,59 +72,69 @@ def imported(path: Path) -> set[str]:
     return names
 
 
-def imports(path: Path, module: str) -> bool:
-    return any(name == module or name.startswith(f"{module}.") for name in imported(path))
+def our_modules(path: Path) -> set[str]:
+    """Names of this project's modules that a file imports, packages themselves left out."""
+    return {name for name in imported(path) if name in MODULES and MODULES[name].name != "__init__.py"}
+
+
+def package_of(path: Path) -> str:
+    first, *others = path.relative_to(PACKAGE).parts
+    name = first if others else path.stem
+    return "foundation" if name in FOUNDATION else name
+
+
+def part_of_ui(path: Path) -> str:
+    return path.relative_to(PACKAGE).parent.as_posix()
 
 
 def importers(module: str) -> set[str]:
-    return {path.relative_to(PACKAGE).as_posix() for path in SOURCES if imports(path, module)}
+    return {
+        path.relative_to(PACKAGE).as_posix()
+        for path in SOURCES
+        if any(name == module or name.startswith(f"{module}.") for name in imported(path))
+    }
 
 
-def test_only_the_ui_talks_to_the_browser():
+def test_every_module_has_a_package():
+    assert {package_of(path) for path in SOURCES} - {"__init__"} == set(MAY_IMPORT)
+
+
+def test_the_table_has_no_circle():
+    tuple(graphlib.TopologicalSorter(MAY_IMPORT).static_order())
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_a_module_imports_only_what_is_below_it(path):
+    own = package_of(path)
+    if own == "__init__":
+        return
+    upwards = {name for name in our_modules(path) if package_of(MODULES[name]) not in MAY_IMPORT[own] | {own}}
+    assert not upwards
+    if own == "ui":
+        allowed = UI_MAY_IMPORT[part_of_ui(path)]
+        assert not {
+            name
+            for name in our_modules(path)
+            if package_of(MODULES[name]) == "ui" and part_of_ui(MODULES[name]) not in allowed
+        }
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    graph = {name: our_modules(path) for name, path in MODULES.items()}
+    tuple(graphlib.TopologicalSorter(graph).static_order())
+
+
+def test_a_circle_would_be_found():
+    with pytest.raises(graphlib.CycleError):
+        tuple(graphlib.TopologicalSorter({"a": {"b"}, "b": {"c"}, "c": {"a"}}).static_order())
+
+
+def test_only_the_page_talks_to_the_browser():
     found = importers("viser")
     assert found
     assert all(name.startswith("ui/") for name in found)
-    assert not {f"ui/{name}" for name in BROWSERLESS_UI} & found
 
 
-def test_session_and_worker_reach_no_browser_through_their_imports():
-    """Also not by way of what they import."""
-    reached, todo = set(), [PACKAGE / "ui" / name for name in BROWSERLESS_UI]
-    while todo:
-        path = todo.pop()
-        if path in reached:
-            continue
-        reached.add(path)
-        for name in imported(path):
-            candidate = PACKAGE.parent / Path(*name.split(".")).with_suffix(".py")
-            if name.startswith("dt_viz") and candidate.exists():
-                todo.append(candidate)
-    assert PACKAGE / "engine.py" in reached
-    assert not [path.name for path in reached if imports(path, "viser")]
-
-
-def test_only_the_robot_talks_to_pinocchio():
-    assert importers("pinocchio") == {"robot.py"}
-
-
-def test_only_the_distances_of_links_talk_to_coal():
-    assert importers("coal") == {"link_distances.py"}
-
-
-def test_computing_never_imports_the_ui():
-    outside = {name for name in importers("dt_viz.ui") if not name.startswith("ui/")}
-    assert not [name for name in outside if not name.startswith(MAY_IMPORT_UI)]
-
-
-@pytest.mark.parametrize("module", ["matplotlib", "torch", "jax", "pickle", "functools.cached_property"])
-def test_nothing_imports(module):
-    assert importers(module) == set()
-
-
-def test_the_scenario_knows_no_engine():
-    """Values are below what computes with them."""
-    for name in ("fields.py", "integrate.py", "diffeo.py", "systems.py", "occupancy.py", "obstacles.py", "scenario.py"):
-        for module in ("engine", "behaviours", "avoidance", "robot", "tasks", "fits"):
-            if (name, module) == ("scenario.py", "behaviours"):
-                continue  # layers are values of behaviours; only their type is known
-            assert not imports(PACKAGE / name, f"dt_viz.{module}"), f"{name} imports {module}"
+@pytest.mark.parametrize("module", ONLY_IMPORTERS)
+def test_only_one_place_talks_to(module):
+    assert importers(module) == ONLY_IMPORTERS[module]

@@ -26,12 +26,12 @@ class Case:
         x, y, z = (float(c) for c in mean[50])
         scenario = replace(scenario, space="cspace", obstacles=(Sphere((x, y, z), 0.15),))
         follower = Follower(robot)
-        self.ground = engine._ground(scenario, None)
-        self.lifted = follower.undisturbed(self.ground)
+        self.nominal = engine._nominal(scenario, None)
+        self.lifted = follower.undisturbed(self.nominal)
         self.section = Section(robot, self.lifted.reference)
         # the learned pace is not smooth enough for RK4 to show its order: a plain attractor takes its place
-        base = Attractor(self.ground.system.base.goal, speed=0.2, smoothing=0.05)
-        hand = DiffeomorphicSystem(self.ground.system.transform, base)
+        base = Attractor(self.nominal.system.base.goal, speed=0.2, smoothing=0.05)
+        hand = DiffeomorphicSystem(self.nominal.system.transform, base)
         solution = follower.whole_arm.avoiding(self.lifted, scenario, LIVE.spacing, coarse=True)
         avoids = solution.transform
         assert isinstance(avoids, Conjugated) and isinstance(avoids.inner, Flow)
@@ -43,11 +43,11 @@ class Case:
             "an obstacle": ArmSystem(hand, self.section, avoiding),
         }
         self.times = np.linspace(
-            0, base.arrival_time(hand.transform.forward(self.ground.task.starts), ARRIVED).max(), 4
+            0, base.arrival_time(hand.transform.forward(self.nominal.task.starts), ARRIVED).max(), 4
         )
 
     def starts(self, system, num=2):
-        return system.postures(self.ground.task.starts[:num, None])[:, 0]
+        return system.postures(self.nominal.task.starts[:num, None])[:, 0]
 
 
 @pytest.fixture(scope="module", name="case")
@@ -65,21 +65,21 @@ class TestSection:
         q = case.lifted.tracked.q
         exact = case.section.postures(case.section.robot.end_effector(q))
         assert np.abs(exact - q).max() < 1e-3  # where a waypoint of `track` is done
-        paths = case.ground.bundle.positions.reshape(len(q), -1, 3)
+        paths = case.nominal.bundle.positions.reshape(len(q), -1, 3)
         np.testing.assert_allclose(
             case.section.robot.end_effector(case.section.postures(paths)), paths, rtol=0, atol=1e-13
         )
 
     def test_no_posture_beside_it_with_the_hand_in_place_is_better(self, case, robot):
         """Tracking that begins there goes nowhere, but for the damping of its pseudo-inverse."""
-        paths = case.ground.bundle.positions.reshape(len(case.lifted.fractions), -1, 3)[:2, ::10]
+        paths = case.nominal.bundle.positions.reshape(len(case.lifted.fractions), -1, 3)[:2, ::10]
         exact = case.section.postures(paths)
         start = np.broadcast_to(case.lifted.reference, (2, 6))
         tracked = track(robot, paths, start, exact, reference=start).q
         np.testing.assert_allclose(tracked, exact, rtol=0, atol=1e-5)
 
     def test_velocities_are_derivatives(self, case):
-        paths, h = case.ground.bundle.positions.reshape(len(case.lifted.fractions), -1, 3)[:, ::20], 1e-4
+        paths, h = case.nominal.bundle.positions.reshape(len(case.lifted.fractions), -1, 3)[:, ::20], 1e-4
         for direction in np.eye(3):
             numerical = (
                 case.section.postures(paths + h * direction) - case.section.postures(paths - h * direction)
@@ -130,25 +130,25 @@ class TestSystem:
         images = system.hand.transform.forward(
             robot.end_effector(system.transform.forward(system.rollout(p0, case.times)))
         )
-        z0 = system.hand.transform.forward(case.ground.task.starts)
+        z0 = system.hand.transform.forward(case.nominal.task.starts)
         np.testing.assert_allclose(images, system.hand.base.flow(z0, case.times), rtol=0, atol=1e-5)
 
     def test_the_lyapunov_value_falls_strictly_and_the_goal_is_reached(self, case, system):
         times = np.append(np.linspace(0, case.times[-1], 60), 100.0)
         motion = system.rollout(case.starts(system, 7), times)
         assert (np.diff(system.lyapunov(motion[:, :60]), axis=-1) < 0).all()
-        goal = system.postures(case.ground.goal[None])[0]
+        goal = system.postures(case.nominal.goal[None])[0]
         np.testing.assert_allclose(motion[:, -1], np.broadcast_to(goal, (7, 6)), rtol=0, atol=1e-6)
         np.testing.assert_allclose(system.velocity(goal), 0, rtol=0, atol=1e-6)
 
     def test_the_goal_is_the_task_s_and_no_obstacle_moves_it(self, case, system, robot):
-        goal = system.postures(case.ground.goal[None])[0]
-        np.testing.assert_allclose(robot.end_effector(goal), case.ground.goal, rtol=0, atol=1e-6)
+        goal = system.postures(case.nominal.goal[None])[0]
+        np.testing.assert_allclose(robot.end_effector(goal), case.nominal.goal, rtol=0, atol=1e-6)
 
     def test_with_the_learned_pace_too_and_the_flow_that_the_page_shows(self, case):
         avoids = case.systems["an obstacle"].transform
         flow = replace(avoids, inner=AdaptiveFlow(case.field, case.duration, 3e-8))
-        system = ArmSystem(case.ground.system, case.section, flow)
+        system = ArmSystem(case.nominal.system, case.section, flow)
         p0, h = case.starts(system, 7), 1e-3
         before, at, after = np.moveaxis(system.rollout(p0, np.array([1.0 - h, 1.0, 1.0 + h])), -2, 0)
         velocity = (after - before) / (2 * h)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dt_viz.flows.diffeomorphisms import Flow, round_trip_error
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
-from dt_viz.motion.solve import FINE, LIVE, Ground, Solution, solve
+from dt_viz.motion.solve import FINE, LIVE, Nominal, Solution, solve
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import DRAWING_AXES, POTS
@@ -22,7 +22,7 @@ from dt_viz.transforms.bias import (
     MAX_DURATION,
     Biasing,
     BiasPoint,
-    Vector,
+    Point,
     closest_distances,
     closest_points,
     unit_field,
@@ -31,12 +31,12 @@ from dt_viz.transforms.bias import (
 seeds = st.integers(0, 2**32 - 1)
 
 
-def vector(v) -> Vector:
+def as_point(v) -> Point:
     x, y, z = (float(c) for c in v)
     return x, y, z
 
 
-PLANE = vector(DRAWING_AXES[:, 0]), vector(DRAWING_AXES[:, 1])
+PLANE = as_point(DRAWING_AXES[:, 0]), as_point(DRAWING_AXES[:, 1])
 MAX_OFF = 0.15
 
 
@@ -45,36 +45,38 @@ def plane_of(task):
 
 
 @pytest.fixture(scope="session")
-def ground(fits, engine):
+def nominal(fits, engine):
     """The undisturbed motion of a task."""
     made = {}
 
-    def ground(task) -> Ground:
+    def nominal(task) -> Nominal:
         if task not in made:
-            made[task] = engine._ground(Scenario(task, ()), None)
+            made[task] = engine._nominal(Scenario(task, ()), None)
         return made[task]
 
-    return ground
+    return nominal
 
 
-def biased(ground, *behaviours, precision=FINE, **changes) -> Solution:
+def biased(nominal, *behaviours, precision=FINE, **changes) -> Solution:
     changes = {"avoidance": False, **changes}
-    scenario = Scenario(ground.task.name, changes.pop("obstacles", ()), layers=tuple(map(Layer, behaviours)), **changes)
-    return solve(ground, scenario, precision)
+    scenario = Scenario(
+        nominal.task.name, changes.pop("obstacles", ()), layers=tuple(map(Layer, behaviours)), **changes
+    )
+    return solve(nominal, scenario, precision)
 
 
-def motion_of(ground, solution) -> Motion:
-    scenario = Scenario(ground.task.name, ())
-    return Motion(scenario, ground.task.starts, ground.goal, solution.bundle.index, solution.bundle.positions)
+def motion_of(nominal, solution) -> Motion:
+    scenario = Scenario(nominal.task.name, ())
+    return Motion(scenario, nominal.task.starts, nominal.goal, solution.bundle.index, solution.bundle.positions)
 
 
-def missed(ground, solution, point) -> float:
-    return float(closest_distances(point, motion_of(ground, solution)).max())
+def missed(nominal, solution, point) -> float:
+    return float(closest_distances(point, motion_of(nominal, solution)).max())
 
 
-def beside(ground, rng, plane=None):
+def beside(nominal, rng, plane=None):
     """A target up to 15 cm off a place in the middle three quarters of a rollout, above the table."""
-    path = resample_by_arc_length(ground.bundle.paths[rng.integers(len(ground.bundle.paths))], 201)
+    path = resample_by_arc_length(nominal.bundle.paths[rng.integers(len(nominal.bundle.paths))], 201)
     k = int(rng.integers(25, 175))
     tangent, aside = path[k + 1] - path[k - 1], rng.normal(size=3)
     if plane is not None:
@@ -82,16 +84,16 @@ def beside(ground, rng, plane=None):
     aside = aside - (aside @ tangent) / (tangent @ tangent) * tangent
     x, y, z = path[k] + rng.uniform(0.0, MAX_OFF) * aside / np.linalg.norm(aside)
     if z < 0:
-        return beside(ground, rng, plane)
+        return beside(nominal, rng, plane)
     return float(x), float(y), float(z)
 
 
-def assert_sound(ground, solution, goal=None):
+def assert_sound(nominal, solution, goal=None):
     """Ends kept, a diffeomorphism along the rollouts, there and back again exact."""
     paths, y = solution.bundle.paths, solution.bundle.positions
-    np.testing.assert_allclose([path[0] for path in paths], ground.task.starts, atol=1e-6)
+    np.testing.assert_allclose([path[0] for path in paths], nominal.task.starts, atol=1e-6)
     np.testing.assert_allclose(
-        [path[-1] for path in paths], [ground.goal if goal is None else goal] * len(paths), atol=1e-6
+        [path[-1] for path in paths], [nominal.goal if goal is None else goal] * len(paths), atol=1e-6
     )
     assert np.linalg.det(solution.transform.jacobian(y)[1]).min() > 0
     assert round_trip_error(solution.transform, y) < 1e-6
@@ -161,8 +163,8 @@ def test_in_a_plane_nothing_moves_out_of_it(seed):
 
 @pytest.mark.parametrize("task", ["draw_s", "lift_box", "push_box"])
 @pytest.mark.parametrize("num", [15, pytest.param(30, marks=pytest.mark.slow)])
-def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(ground, task, num):
-    g, rng, off, turns = ground(task), np.random.default_rng(7), [], []
+def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(nominal, task, num):
+    g, rng, off, turns = nominal(task), np.random.default_rng(7), [], []
     for number in range(num):
         point = BiasPoint(beside(g, rng, plane_of(task)), plane=plane_of(task))
         solution = biased(g, Biasing(point), precision=FINE if number % 3 == 0 else LIVE)
@@ -177,14 +179,14 @@ def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(gro
     assert np.median(turns) < before + 65  # on two centimetres, degrees
 
 
-def test_a_drawing_stays_in_its_plane(ground):
-    g = ground("draw_s")
+def test_a_drawing_stays_in_its_plane(nominal):
+    g = nominal("draw_s")
     solution = biased(g, Biasing(BiasPoint(beside(g, np.random.default_rng(1), PLANE), plane=PLANE)))
     assert np.ptp(solution.bundle.positions[:, 1]) < 1e-12
 
 
-def test_a_biased_motion_is_still_the_motion_of_a_stable_system(ground):
-    g = ground("lift_box")
+def test_a_biased_motion_is_still_the_motion_of_a_stable_system(nominal):
+    g = nominal("lift_box")
     solution = biased(g, Biasing(BiasPoint(beside(g, np.random.default_rng(2)))))
     system: DiffeomorphicSystem = solution.system
     for path in solution.bundle.paths:
@@ -251,11 +253,11 @@ def test_a_chosen_strength_is_taken_as_it_is():
 
 @pytest.mark.parametrize("order", [1, -1])
 @pytest.mark.parametrize("task", ["draw_s", "draw_j", "lift_box", "push_box"])
-def test_two_bias_points_in_either_order(ground, task, order):
-    g, plane = ground(task), plane_of(task)
+def test_two_bias_points_in_either_order(nominal, task, order):
+    g, plane = nominal(task), plane_of(task)
     path = resample_by_arc_length(g.bundle.paths[0], 101)
     aside = 0.06 * np.array([1.0, 0.0, 0.0])
-    points = [BiasPoint(vector(path[k] + aside), plane=plane) for k in (35, 75)][::order]
+    points = [BiasPoint(as_point(path[k] + aside), plane=plane) for k in (35, 75)][::order]
     solution = biased(g, Biasing(points[0]), Biasing(points[1], below=(points[0].position,)))
     assert not solution.unsatisfied
     for point in points:
@@ -263,11 +265,11 @@ def test_two_bias_points_in_either_order(ground, task, order):
     assert_sound(g, solution)
 
 
-def test_fig_4_a_letter_biased_to_two_points(ground):
-    g = ground("draw_j")
+def test_fig_4_a_letter_biased_to_two_points(nominal):
+    g = nominal("draw_j")
     path = resample_by_arc_length(np.mean([resample_by_arc_length(p, 201) for p in g.bundle.paths], axis=0), 101)
-    first = vector(path[30] + [-0.10, 0.0, 0.0])  # into the letter
-    second = vector(path[70] + [0.0, 0.0, -0.08])  # below its bow
+    first = as_point(path[30] + [-0.10, 0.0, 0.0])  # into the letter
+    second = as_point(path[70] + [0.0, 0.0, -0.08])  # below its bow
     points = [BiasPoint(first, plane=PLANE), BiasPoint(second, plane=PLANE)]
     solution = biased(g, Biasing(points[0]), Biasing(points[1], below=(first,)))
     assert [missed(g, solution, point) <= ACCEPTED for point in points] == [True, True]
@@ -275,8 +277,8 @@ def test_fig_4_a_letter_biased_to_two_points(ground):
 
 
 @pytest.mark.parametrize("pot", POTS[::2])
-def test_fig_8_the_object_falls_into_the_chosen_pot(ground, pot):
-    g = ground("drop_pots")
+def test_fig_8_the_object_falls_into_the_chosen_pot(nominal, pot):
+    g = nominal("drop_pots")
     assert POTS[1].catches(g.goal) and not pot.catches(g.goal)
     point = BiasPoint((pot.x, pot.y, float(g.goal[2])), moves_goal=True)
     solution = biased(g, Biasing(point))
@@ -288,10 +290,10 @@ def test_fig_8_the_object_falls_into_the_chosen_pot(ground, pot):
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_bias_and_avoidance_in_either_order(ground, level):
-    g = ground("draw_s")
+def test_bias_and_avoidance_in_either_order(nominal, level):
+    g = nominal("draw_s")
     path = resample_by_arc_length(g.bundle.paths[0], 101)
-    point, sphere = BiasPoint(vector(path[75] + [0.0, 0.0, -0.06]), plane=PLANE), Sphere(vector(path[35]), 0.10)
+    point, sphere = BiasPoint(as_point(path[75] + [0.0, 0.0, -0.06]), plane=PLANE), Sphere(as_point(path[35]), 0.10)
     solution = biased(g, Biasing(point), obstacles=(sphere,), avoidance=True, avoidance_level=level)
     assert not solution.unsatisfied
     assert missed(g, solution, point) <= ACCEPTED
@@ -327,16 +329,16 @@ def test_a_misplaced_bias_point_is_doubted(place, doubt):
     assert any(doubt in said for said in built.doubts)
 
 
-def test_a_target_off_the_plane_of_a_drawing_is_doubted(ground):
-    g = ground("draw_s")
+def test_a_target_off_the_plane_of_a_drawing_is_doubted(nominal):
+    g = nominal("draw_s")
     x, _, z = g.bundle.positions[100]
     point = BiasPoint((float(x), -0.45, float(z)), plane=PLANE)
     solution = biased(g, Biasing(point), precision=LIVE)
     assert any("5 cm before or behind the plane" in doubt for doubt in solution.doubts)
 
 
-def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(ground):
-    g = ground("drop_pots")
+def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(nominal):
+    g = nominal("drop_pots")
     point = BiasPoint((0.0, -0.52, 0.14))
     solution = biased(g, Biasing(point), precision=LIVE)
     assert solution.unsatisfied

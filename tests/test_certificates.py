@@ -15,8 +15,7 @@ from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor
 from dt_viz.motion.certificates import MAX_OFF_POSTURE, OFF_MOTION, Shown, certified
 from dt_viz.motion.health import RISES, Health
-from dt_viz.motion.solve import Solution
-from dt_viz.motion.solved import Solved
+from dt_viz.motion.solve import Solution, Solved
 from dt_viz.obstacles.shapes import Sphere
 
 BASE = Attractor(np.array([0.5, 0.2, 0.0]), 0.2, 0.05)

@@ -18,10 +18,10 @@ from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion import diagnostics as doubts
 from dt_viz.motion.diagnostics import MAX_TARGET_MISS, UNSAMPLED
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import plane_of, switched, with_bias_point
-from dt_viz.transforms.bias import BiasPoint, vector
+from dt_viz.transforms.bias import BiasPoint
 
 PATIENCE = 60
 """Seconds after which threads that should have ended are given up; nothing takes that long."""
@@ -255,7 +255,7 @@ def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
 def test_times_increase_where_a_strong_bias_stretches_space_at_the_goal(engine, initial, robot, beyond, radius):
     scenario = replace(initial("drop_pots"), obstacles=())
     target = mean_end(engine.task("drop_pots")) + np.array(beyond)
-    point = BiasPoint(vector(target), radius=radius, strength=4.0)
+    point = BiasPoint(as_point(target), radius=radius, strength=4.0)
     frames = engine.frames(replace(scenario, layers=with_bias_point((), point)))
     for frame in itertools.islice(frames, Stage.CERTIFIED):  # certificates change no times
         for times in frame.times:
@@ -470,7 +470,7 @@ def test_a_task_is_loaded_once(engine):
 def test_a_bias_point_that_motions_pass_giving_way_is_said_with_the_distance(engine, initial, space):
     scenario = initial("draw_s")
     target = np.add(scenario.obstacles[0].position, (0.10, 0.0, 0.0))
-    point = BiasPoint(vector(target), plane=plane_of(engine.task("draw_s")))
+    point = BiasPoint(as_point(target), plane=plane_of(engine.task("draw_s")))
     scenario = replace(scenario, space=space, layers=with_bias_point((), point))
     frame = stage(engine, scenario, Stage.ROLLOUTS)
     missed = max(np.linalg.norm(path - target, axis=1).min() for path in frame.rollouts)

@@ -11,7 +11,7 @@ from dt_viz.engine.engine import Engine, Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
 from dt_viz.motion.solve import LIVE, solve
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import TASKS
 
 FAR = Sphere((3.0, 3.0, 3.0))
@@ -26,9 +26,9 @@ def placed(scenario, *obstacles, **changes):
     return replace(scenario, obstacles=obstacles, space="cspace", **changes)
 
 
-@pytest.fixture(scope="module", name="ground")
-def _ground(engine, initial):
-    return engine._ground(initial("push_box"), None)
+@pytest.fixture(scope="module", name="nominal")
+def _nominal(engine, initial):
+    return engine._nominal(initial("push_box"), None)
 
 
 @pytest.fixture(scope="module", name="follower")
@@ -48,63 +48,63 @@ def _too_far(fits, robot):
 
 
 class TestObstructions:
-    def reasons(self, follower, ground, obstacle):
-        return follower.obstructions(ground, Several((obstacle,)))
+    def reasons(self, follower, nominal, obstacle):
+        return follower.obstructions(nominal, Union((obstacle,)))
 
-    def test_nothing_is_in_the_way_of_what_has_to_be_avoided(self, follower, ground, initial):
-        assert follower.obstructions(ground, initial("push_box").obstacle) == ()
-        assert self.reasons(follower, ground, FAR) == ()
-        assert follower.obstructions(ground, Several()) == ()
+    def test_nothing_is_in_the_way_of_what_has_to_be_avoided(self, follower, nominal, initial):
+        assert follower.obstructions(nominal, initial("push_box").obstacle) == ()
+        assert self.reasons(follower, nominal, FAR) == ()
+        assert follower.obstructions(nominal, Union()) == ()
 
-    def test_a_covered_start_is_named(self, follower, ground):
-        away = np.linalg.norm(ground.task.starts - ground.task.starts[2], axis=1)
-        (reason,) = self.reasons(follower, ground, around(ground.task.starts[2], 0.12))
+    def test_a_covered_start_is_named(self, follower, nominal):
+        away = np.linalg.norm(nominal.task.starts - nominal.task.starts[2], axis=1)
+        (reason,) = self.reasons(follower, nominal, around(nominal.task.starts[2], 0.12))
         assert reason.startswith("start") and "3" in reason and "inside the obstacle" in reason
         assert (away[[k for k in range(7) if str(k + 1) in reason]] < 0.15).all()
 
-    def test_a_covered_goal_is_named(self, follower, ground):
-        assert self.reasons(follower, ground, around(ground.goal, 0.15)) == (
+    def test_a_covered_goal_is_named(self, follower, nominal):
+        assert self.reasons(follower, nominal, around(nominal.goal, 0.15)) == (
             "the goal is inside the obstacle: the arm there touches it",
         )
 
-    def test_what_fits_between_the_fingers_does_not_cover_the_goal(self, follower, ground):
-        assert self.reasons(follower, ground, around(ground.goal, 0.04)) == ()
+    def test_what_fits_between_the_fingers_does_not_cover_the_goal(self, follower, nominal):
+        assert self.reasons(follower, nominal, around(nominal.goal, 0.04)) == ()
 
     @pytest.mark.parametrize(("height", "name"), [(0.05, "base"), (0.2, "link 1")])
-    def test_what_touches_the_pedestal_is_said_to(self, follower, ground, height, name):
-        (reason,) = self.reasons(follower, ground, around((0.0, 0.08, height), 0.1))
+    def test_what_touches_the_pedestal_is_said_to(self, follower, nominal, height, name):
+        (reason,) = self.reasons(follower, nominal, around((0.0, 0.08, height), 0.1))
         assert name in reason and "cannot move away" in reason
 
-    def test_the_spheres_that_cover_the_arm_are_no_reason_while_its_meshes_are_free(self, follower, ground):
+    def test_the_spheres_that_cover_the_arm_are_no_reason_while_its_meshes_are_free(self, follower, nominal):
         """An obstacle between the sphere and the mesh of a hand at rest."""
-        pins = follower.undisturbed(ground).pins
+        pins = follower.undisturbed(nominal).pins
         clear_of_meshes = 0
         for dy in np.linspace(0.0, 0.2, 41):
-            obstacle = around(ground.goal + np.array([0.0, -dy, 0.0]), 0.1)
+            obstacle = around(nominal.goal + np.array([0.0, -dy, 0.0]), 0.1)
             covered = follower.whole_arm.clearance(pins, obstacle).min() < 0
-            if covered and not self.reasons(follower, ground, obstacle):
+            if covered and not self.reasons(follower, nominal, obstacle):
                 clear_of_meshes += 1
         assert clear_of_meshes >= 1
 
     def test_demonstrations_out_of_reach_are_named(self, too_far, initial, robot):
-        ground = too_far._ground(initial("push_box"), None)
+        nominal = too_far._nominal(initial("push_box"), None)
         follower = Follower(robot)
-        (reason,) = follower.obstructions(ground, Several((FAR,)))
+        (reason,) = follower.obstructions(nominal, Union((FAR,)))
         assert "cannot reach the starts" in reason and "no configuration reaches" in reason
         for _ in range(2):  # the second answer is the remembered one
             with pytest.raises(UnreachableError):
-                follower.undisturbed(ground)
+                follower.undisturbed(nominal)
 
 
 class TestFollowing:
-    def test_the_undisturbed_motion_is_lifted_once(self, follower, ground):
-        assert follower.undisturbed(ground) is follower.undisturbed(ground)
-        assert follower.undisturbed(ground).tracked.error.max() < MAX_TRACKING_ERROR
+    def test_the_undisturbed_motion_is_lifted_once(self, follower, nominal):
+        assert follower.undisturbed(nominal) is follower.undisturbed(nominal)
+        assert follower.undisturbed(nominal).tracked.error.max() < MAX_TRACKING_ERROR
 
     @pytest.mark.parametrize(("exact", "tolerance"), [(False, 1e-3), (True, 1e-8)])
-    def test_behaviours_of_the_hand_are_followed(self, follower, ground, initial, robot, exact, tolerance):
-        solution = solve(ground, replace(initial("push_box"), space="both"), LIVE)
-        lifted = follower.behaving(ground, solution, exact=exact)
+    def test_behaviours_of_the_hand_are_followed(self, follower, nominal, initial, robot, exact, tolerance):
+        solution = solve(nominal, replace(initial("push_box"), space="both"), LIVE)
+        lifted = follower.behaving(nominal, solution, exact=exact)
         assert lifted.fractions.shape == (7, NUM_CONFIGURATIONS)
         assert (np.diff(lifted.fractions, axis=1) > 0).all()
         index = np.repeat(np.arange(7), 60)
@@ -114,23 +114,23 @@ class TestFollowing:
 
     @pytest.mark.parametrize(("exact", "tolerance"), [(False, 2e-3), (True, 0)])
     def test_what_was_followed_before_changes_nothing_that_is_seen(
-        self, follower, ground, initial, robot, exact, tolerance
+        self, follower, nominal, initial, robot, exact, tolerance
     ):
-        wanted = solve(ground, replace(initial("push_box"), space="both"), LIVE)
+        wanted = solve(nominal, replace(initial("push_box"), space="both"), LIVE)
         x, y, z = initial("push_box").obstacles[0].position
         other = replace(initial("push_box"), space="both", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
-        follower.behaving(ground, solve(ground, other, LIVE), exact=False)
-        again = follower.behaving(ground, wanted, exact=exact).tracked.q
-        fresh = Follower(robot).behaving(ground, wanted, exact=exact).tracked.q
+        follower.behaving(nominal, solve(nominal, other, LIVE), exact=False)
+        again = follower.behaving(nominal, wanted, exact=exact).tracked.q
+        fresh = Follower(robot).behaving(nominal, wanted, exact=exact).tracked.q
         np.testing.assert_allclose(again, fresh, rtol=0, atol=tolerance)
 
-    def test_doubts_say_what_misses_its_path(self, follower, ground):
+    def test_doubts_say_what_misses_its_path(self, follower, nominal):
         path = np.linspace([0.0, -0.5, 0.2], [0.0, -1.2, 0.2], NUM_ARM_SAMPLES)
-        joints = follower.along(ground, 0, path, exact=False)
+        joints = follower.along(nominal, 0, path, exact=False)
         doubts = follower.doubts(joints, 4)
         assert any("misses the path of rollout 5" in doubt for doubt in doubts)
         assert any("stretched out" in doubt for doubt in doubts)
-        assert follower.doubts(follower.undisturbed(ground).tracked, 0) == ()
+        assert follower.doubts(follower.undisturbed(nominal).tracked, 0) == ()
 
 
 class TestBlocked:

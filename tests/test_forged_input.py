@@ -17,7 +17,7 @@ from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
 from dt_viz.engine.engine import Engine
-from dt_viz.flows.integration import Integration
+from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import with_bias_point

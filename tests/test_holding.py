@@ -60,7 +60,7 @@ def test_the_hand_is_where_it_is_held_and_goes_on_to_the_goal(engine, initial, r
 
 def test_the_motion_from_there_is_one_of_the_system(engine, initial, robot, task):
     scenario = initial(task)
-    system = solve(engine._ground(scenario, None), scenario, LIVE).system
+    system = solve(engine._nominal(scenario, None), scenario, LIVE).system
     for _, _, place, found in drags(engine, scenario, robot):
         np.testing.assert_allclose(found.path[0], place, atol=1e-3)
         z = system.transform.forward(found.path)
@@ -75,7 +75,7 @@ def test_the_arm_gives_way_by_its_transform_while_it_is_held(engine, initial, ro
     scenario = replace(initial("push_box"), space="cspace")
     for _, _, _, found in drags(engine, scenario, robot):
         solved = engine._live
-        section = Section(robot, engine._follower.reference(solved.ground))
+        section = Section(robot, engine._follower.reference(solved.nominal))
         q = solved.arm.transform.forward(found.motion.q[::30])
         np.testing.assert_allclose(section.postures(robot.end_effector(q)[:, None])[:, 0], q, atol=5e-3)
 

@@ -7,9 +7,8 @@ import pytest
 from test_stacks import random_scenario
 
 from dt_viz.engine.engine import Stage
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow
+from dt_viz.flows.diffeomorphisms import AUTO, METHODS, AdaptiveFlow, Conjugated, Flow, Integration
 from dt_viz.flows.fields import GaussianGrid, GridRBF
-from dt_viz.flows.integration import AUTO, METHODS, Integration
 from dt_viz.flows.integrators import euler, rk4
 from dt_viz.motion.health import fold_doubts, integration_doubts
 from dt_viz.scenario.scenario import Scenario

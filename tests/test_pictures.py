@@ -65,7 +65,7 @@ def test_the_warped_grid_is_made_of_images_of_points_of_planes(engine, scenario,
     """ψ by another way, the forward side of the whole stack, makes the lines straight again, seen along the normal."""
     scenario = replace(scenario, avoidance=avoidance)
     frame, pictures = picture_at(engine, scenario, wanted)
-    stack = solve(engine._ground(scenario, None), scenario, LIVE if wanted is Stage.LIVE else FINE)
+    stack = solve(engine._nominal(scenario, None), scenario, LIVE if wanted is Stage.LIVE else FINE)
     middle, obstacle = [], scenario.obstacle
     for line in pictures.grid.lines:
         outside = line[obstacle.signed_distance(line) > 0.005]  # nearer, ψ magnifies what the picture rounds
@@ -154,7 +154,7 @@ def turned(path):
 
 def test_the_mean_generator_is_the_mean_of_the_flows(engine, initial):
     scenario = initial("draw_s")
-    imitation = engine._ground(scenario, None).imitation
+    imitation = engine._nominal(scenario, None).imitation
     _, pictures = picture_at(engine, replace(scenario, view=ALL), Stage.LIVE)
     task, mean = engine.task("draw_s"), pictures.generator
     u = ((mean.points - task.origin) @ task.axes / task.scale)[:, :2]

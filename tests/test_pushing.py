@@ -54,7 +54,7 @@ def test_the_hand_is_pushed_aside_and_still_reaches_the_goal(engine, initial, ro
 
 def test_after_the_push_it_is_a_motion_of_the_system(engine, initial, task):
     scenario = initial(task)
-    system = solve(engine._ground(scenario, None), scenario, FINE).system
+    system = solve(engine._nominal(scenario, None), scenario, FINE).system
     for _, _, pushed in pushes(engine, scenario):
         after = pushed.path[pushed.begins :]
         assert (np.diff(system.lyapunov(after)) < 0).all()

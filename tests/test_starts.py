@@ -11,7 +11,7 @@ from dt_viz.arm.whole_arm import MOVED
 from dt_viz.engine.engine import Stage
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import PlacedField
-from dt_viz.motion.nominal import Ground
+from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.solve import FINE, LIVE, solve
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Layer
@@ -48,7 +48,7 @@ def test_added_rollouts_are_motions_of_the_system_and_end_at_the_goal(engine, in
     scenario = initial(task)
     scenario = replace(scenario, starts=random_starts(engine, scenario))
     frame, num = frame_of(engine, scenario), len(engine.task(task).demonstrations)
-    system = solve(engine._ground(scenario, None), scenario, FINE).system
+    system = solve(engine._nominal(scenario, None), scenario, FINE).system
     assert len(frame.rollouts) == num + NUM
     for start, path, times in zip(scenario.starts, frame.rollouts[num:], frame.times[num:], strict=True):
         np.testing.assert_allclose(path[0], start, atol=1e-6)
@@ -76,7 +76,7 @@ def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(eng
     layers = (Layer(Biasing(BiasPoint((x, y, z), plane=plane_of(engine.task(task)))), name="Bias 1"),)
     before = replace(initial(task), obstacles=(), layers=layers)
     after = replace(before, starts=random_starts(engine, before, seed=2))
-    solutions = [solve(engine._ground(scenario, None), scenario, FINE) for scenario in (before, after)]
+    solutions = [solve(engine._nominal(scenario, None), scenario, FINE) for scenario in (before, after)]
     (a,), (b,) = ([applied.made for applied in solution.built] for solution in solutions)
     assert a.duration == b.duration and a.doubts == b.doubts == ()
     assert isinstance(a.transform, Flow) and isinstance(b.transform, Flow)
@@ -109,7 +109,7 @@ def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it
         assert max(np.linalg.norm(other - point, axis=1).min() for point in path) < 5e-3
     assert not any("finds no way" in doubt for doubt in frame.health.doubts)
     named = " ".join(frame.health.doubts)
-    numbers, arm = engine._kept.ground.numbers, engine._kept.solved[LIVE].arm
+    numbers, arm = engine._kept.nominal.numbers, engine._kept.solved[LIVE].arm
     doubtful = np.union1d(arm.too_near, arm.moved)
     assert len(doubtful)
     for guest in doubtful:
@@ -155,7 +155,7 @@ def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
 
 def test_an_added_start_at_the_goal_stays_there(engine, initial):
     scenario = replace(initial("draw_s"), obstacles=())
-    goal = engine._ground(scenario, None).goal
+    goal = engine._nominal(scenario, None).goal
     frame = frame_of(engine, replace(scenario, starts=(tuple(float(c) for c in goal),), arm_rollout=7))
     np.testing.assert_allclose(frame.rollouts[-1], np.broadcast_to(goal, frame.rollouts[-1].shape), atol=1e-6)
     assert frame.arm is not None and np.isfinite(frame.arm.q).all()
@@ -165,10 +165,10 @@ def test_dragging_a_start_keeps_only_the_newest_rollouts(new_engine, initial):
     engine, scenario = new_engine(), initial("draw_s")
     for x in np.linspace(-0.1, 0.1, 200):
         moved = replace(scenario, starts=((float(x), -0.5, 0.45),))
-        assert isinstance(engine._ground(moved, None), Ground)
-    learned = engine._ground(scenario, None).learned
+        assert isinstance(engine._nominal(moved, None), Nominal)
+    learned = engine._nominal(scenario, None).learned
     assert learned._added.cache_info().currsize < 100
-    assert learned._grounds.cache_info().currsize < 10
+    assert learned._nominals.cache_info().currsize < 10
 
 
 def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine, new_engine, initial):
@@ -183,11 +183,11 @@ def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine,
 
 
 def test_the_ground_keeps_what_it_has_of_the_demonstrations(engine, initial):
-    ground = engine._ground(initial("lift_box"), None)
-    more = ground.learned.ground(((0.1, -0.5, 0.3),))
-    assert ground.learned.ground(()) is ground
-    np.testing.assert_array_equal(more.starts[:-1], ground.starts)
-    np.testing.assert_allclose(more.images(more.ends)[[0, -1]], ground.images(ground.ends)[[0, -1]], atol=1e-9)
+    nominal = engine._nominal(initial("lift_box"), None)
+    more = nominal.learned.nominal(((0.1, -0.5, 0.3),))
+    assert nominal.learned.nominal(()) is nominal
+    np.testing.assert_array_equal(more.starts[:-1], nominal.starts)
+    np.testing.assert_allclose(more.images(more.ends)[[0, -1]], nominal.images(nominal.ends)[[0, -1]], atol=1e-9)
     moved = more.ends + 0.01
     np.testing.assert_allclose(more.system.transform.inverse(more.images(moved)), moved, atol=1e-8)
     assert more.only([0, 7]).rollout(7) == 1 and more.only([0, 7]).rollout(3) is None
@@ -199,6 +199,6 @@ def test_a_motion_that_begins_inside_the_obstacle_needs_no_longer_flow_than_the_
     scenario = initial("draw_s")
     (obstacle,) = scenario.obstacles
     inside = tuple(c + d for c, d in zip(obstacle.position, (0.0, 0.0, 0.07), strict=True))
-    before, after = (solve(engine._ground(s, None), s, LIVE) for s in (scenario, replace(scenario, starts=(inside,))))
+    before, after = (solve(engine._nominal(s, None), s, LIVE) for s in (scenario, replace(scenario, starts=(inside,))))
     assert after.unsatisfied == before.unsatisfied == ()
     assert cast(float, after.duration_at(None)) < 1.5 * cast(float, before.duration_at(None))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from dt_viz.flows.integration import AUTO, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, Integration
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, with_bias_point

@@ -16,7 +16,7 @@ from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, rotation
 from dt_viz.obstacles.solids import Solid
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.scenario.scenario import MAX_OBSTACLES, Scenario, View
 from dt_viz.scenario.tasks import TASKS
@@ -319,7 +319,7 @@ def test_obstacles_are_called_by_number_and_shape():
 
 
 def test_the_status_says_that_there_is_no_obstacle():
-    assert _clearance(float(Several().signed_distance(np.zeros((4, 3))).min()), "end effector") == "no obstacle"
+    assert _clearance(float(Union().signed_distance(np.zeros((4, 3))).min()), "end effector") == "no obstacle"
     report = CollisionReport(NOTHING, None, Nearest(0.034, ("hand",), 4.0))
     assert _collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
 

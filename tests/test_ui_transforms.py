@@ -12,7 +12,7 @@ from pages import frame_of
 from dt_viz.arm.collision import CollisionReport, Nearest
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.session import Pace, Session
-from dt_viz.flows.integration import Integration
+from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.health import Health
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Scenario, View

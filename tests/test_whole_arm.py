@@ -33,10 +33,10 @@ class Case:
         self.middle = Sphere((float(x), float(y), float(z)), 0.15)
         self.robot = robot
         self.scenario = placed(replace(initial, space="cspace"), self.middle)
-        self.ground = engine._ground(self.scenario, None)
+        self.nominal = engine._nominal(self.scenario, None)
         self.follower = Follower(robot)
         self.arm: WholeArm = self.follower.whole_arm
-        self.lifted: Lift = self.follower.undisturbed(self.ground)
+        self.lifted: Lift = self.follower.undisturbed(self.nominal)
         self._known: dict[tuple[Scenario, bool], ArmSolution] = {}
 
     def avoiding(self, obstacle=None, *, coarse=False, **changes) -> ArmSolution:
@@ -88,7 +88,7 @@ class TestLift:
         fractions = case.lifted.fractions
         between = np.sort(np.concatenate([fractions, (fractions[:, :-1] + fractions[:, 1:]) / 2], axis=1))
         index = np.repeat(np.arange(len(between)), between.shape[1])
-        paths = case.ground.system.transform.inverse(case.ground.rays.at(index, between.ravel()))
+        paths = case.nominal.system.transform.inverse(case.nominal.rays.at(index, between.ravel()))
         start = np.broadcast_to(case.lifted.reference, (len(between), 6))
         direct = track(case.robot, paths.reshape(*between.shape, 3), start, reference=start).q.reshape(-1, 6)
         q = case.lifted.at(index, between.ravel())
@@ -102,7 +102,7 @@ class TestLift:
         np.testing.assert_allclose(last, np.broadcast_to(last[0], last.shape), rtol=0, atol=1e-4)
         np.testing.assert_array_equal(case.lifted.pins[-1], last[0])
         np.testing.assert_array_equal(case.lifted.pins[:-1], case.lifted.tracked.q[:, 0])
-        np.testing.assert_allclose(case.robot.end_effector(case.lifted.pins), case.ground.ends, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(case.robot.end_effector(case.lifted.pins), case.nominal.ends, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("coarse", [True, False])
@@ -121,8 +121,8 @@ class TestAroundTheMiddle:
         solution = case.avoiding(coarse=coarse)
         np.testing.assert_allclose(solution.p[ends(solution)], solution.q[ends(solution)], rtol=0, atol=1e-6)
         hand = case.robot.end_effector(solution.p[ends(solution)]).reshape(-1, 2, 3)
-        np.testing.assert_allclose(hand[:, 0], case.ground.task.starts, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(hand[:, 1], np.broadcast_to(case.ground.goal, hand[:, 1].shape), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(hand[:, 0], case.nominal.task.starts, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(hand[:, 1], np.broadcast_to(case.nominal.goal, hand[:, 1].shape), rtol=0, atol=1e-5)
 
     def test_joint_limits_are_kept(self, case, coarse):
         p = case.avoiding(coarse=coarse).p
@@ -207,7 +207,7 @@ class TestElbow:
         solution = push.avoiding(ELBOW)
         hand, before = push.robot.end_effector(solution.p), push.robot.end_effector(solution.q)
         np.testing.assert_allclose(
-            hand[ends(solution)][1::2], np.broadcast_to(push.ground.goal, (7, 3)), rtol=0, atol=1e-4
+            hand[ends(solution)][1::2], np.broadcast_to(push.nominal.goal, (7, 3)), rtol=0, atol=1e-4
         )
         assert np.linalg.norm(hand - before, axis=1).max() < 0.04
         assert np.abs(solution.p - solution.q).max() > 0.05

@@ -26,7 +26,7 @@ from dt_viz.arm.link_distances import (
 from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle, Sphere
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.properties import cached_property
 
 if TYPE_CHECKING:
@@ -266,13 +266,13 @@ class CollisionModel:
                     distances[row], nearest[row] = distance, item
         return distances, nearest
 
-    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Several | Obstacle) -> Nearest:
+    def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle) -> Nearest:
         """The smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.
 
         To `TOLERANCE` for a ball; to `SHAPE_TOLERANCE` and, inside, `link_distances.RESOLUTION` for other shapes.
         """
         nearest = NOTHING
-        for part in obstacle.parts if isinstance(obstacle, Several) else (obstacle,):
+        for part in obstacle.parts if isinstance(obstacle, Union) else (obstacle,):
             tolerance = TOLERANCE if isinstance(part, Sphere) else SHAPE_TOLERANCE
             found = self._search(measure_from(self.links, part), q, tolerance)
             assert found is not None  # without a ceiling there always is one
@@ -295,7 +295,7 @@ class CollisionModel:
         assert found is not None
         return found
 
-    def report(self, q: ArrayLike, obstacle: Several | Obstacle) -> CollisionReport:
+    def report(self, q: ArrayLike, obstacle: Union | Obstacle) -> CollisionReport:
         """All of it for one path q (T, 6), rad."""
         return CollisionReport(
             self.nearest_to_obstacle(q, obstacle), self.nearest_to_itself(q), self.nearest_to_table(q)

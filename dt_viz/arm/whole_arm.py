@@ -25,7 +25,7 @@ from dt_viz.flows.integrators import rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.properties import cached_property
 from dt_viz.scenario.scenario import Scenario
 
@@ -210,7 +210,7 @@ class WholeArm:
         solver = _Solver(self, lifted, scenario, None, spacing, coarse=True)
         return solver.through(full.transform.scaled(fraction), full.duration)
 
-    def clearance(self, q: Array, obstacle: Several | Obstacle) -> Array:
+    def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
         points = self.body.of_chain(self.robot.chain(q.T))
         return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -38,20 +39,20 @@ from dt_viz.motion.diagnostics import margin_doubts, motion_doubts, target_doubt
 from dt_viz.motion.following import OUT_OF_REACH, ArmMotion, Follower, arm_samples
 from dt_viz.motion.health import Health, fold_doubts
 from dt_viz.motion.holding import held
-from dt_viz.motion.nominal import Ground, Learned, named_starts
+from dt_viz.motion.nominal import Learned, Nominal
 from dt_viz.motion.profiles import Profiles, body_profile, hand_profile
 from dt_viz.motion.pushing import Pushed, pushed
-from dt_viz.motion.solve import FINE, LIVE, Precision, Solution, cut_off, solve
-from dt_viz.motion.solved import Solved
+from dt_viz.motion.solve import FINE, LIVE, Precision, Solution, Solved, cut_off, solve
 from dt_viz.motion.warp import warped
 from dt_viz.pictures.occupancy import occupancy_picture
-from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures, in_frame
+from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures, Sketchbook, in_frame
 from dt_viz.pictures.slice_fields import Clearance, arrows_and_colour, streamlines
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import WHOLE_ARM, levels
 from dt_viz.scenario.starts import followed
 from dt_viz.scenario.tasks import Task, TaskEntry
+from dt_viz.transforms.base import named_starts
 
 
 class Stage(IntEnum):
@@ -118,7 +119,7 @@ class _Kept:
     """What has been worked out of one motion, which is not again when only the view changes."""
 
     scenario: Scenario
-    ground: Ground
+    nominal: Nominal
     solved: dict[Precision, Solved] = field(default_factory=dict)
     rollouts: dict[Precision, Frame] = field(default_factory=dict)
     """Frames of stage ROLLOUTS."""
@@ -181,6 +182,7 @@ class Engine:
         """The last motion that an arm was shown for."""
         self._live: Solved | None = None
         """The same as it was at stage LIVE: quicker, and exact enough for a hand that moves."""
+        self._sketchbook = lru_cache(maxsize=2)(_sketchbook)
 
     def task(self, name: str) -> Task:
         """The task of that name, loaded on first use. Raises DemonstrationError if its file cannot be used."""
@@ -202,9 +204,9 @@ class Engine:
             DemonstrationError: the task's demonstrations cannot be read.
             ImitationError: nothing can be learned from them.
         """
-        ground = self._ground(scenario, progress)
+        nominal = self._nominal(scenario, progress)
         began = time.perf_counter()
-        for frame in self._stages(ground, scenario, checkpoint):
+        for frame in self._stages(nominal, scenario, checkpoint):
             yield replace(frame, seconds=time.perf_counter() - began)
 
     def arm_motions(self, scenario: Scenario) -> tuple[Frame, tuple[ArmMotion, ...]]:
@@ -214,14 +216,14 @@ class Engine:
             DemonstrationError, ImitationError: as `frames`.
             UnreachableError: the arm cannot get to where the motions start.
         """
-        ground = self._ground(scenario, None)
+        nominal = self._nominal(scenario, None)
         if _uses_whole_arm(scenario):
-            blocked = self._follower.obstructions(ground, scenario.obstacle)
+            blocked = self._follower.obstructions(nominal, scenario.obstacle)
             if blocked:
-                *_, frame = self._stages_without_motion(ground, scenario, blocked)
+                *_, frame = self._stages_without_motion(nominal, scenario, blocked)
                 return frame, ()
-            ground = self._follower.admitted(ground, scenario.obstacle)
-        fine = self._solved(ground, scenario, FINE)
+            nominal = self._follower.admitted(nominal, scenario.obstacle)
+        fine = self._solved(nominal, scenario, FINE)
         frame = self._frame(scenario, fine)
         arms, health = [], frame.health
         for rollout in range(len(frame.rollouts)):
@@ -262,37 +264,37 @@ class Engine:
         with _in_turn():
             return held(self._follower, self._live, q, place)
 
-    def _stages(self, ground: Ground, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
+    def _stages(self, nominal: Nominal, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
         kept = self._kept
         if kept is None or not kept.scenario.moves_like(scenario):
             if _uses_whole_arm(scenario):
                 with _in_turn():
-                    blocked = self._follower.obstructions(ground, scenario.obstacle)
-                    admitted = ground if blocked else self._follower.admitted(ground, scenario.obstacle)
+                    blocked = self._follower.obstructions(nominal, scenario.obstacle)
+                    admitted = nominal if blocked else self._follower.admitted(nominal, scenario.obstacle)
                 if blocked:
-                    yield from self._stages_without_motion(ground, scenario, blocked, checkpoint)
+                    yield from self._stages_without_motion(nominal, scenario, blocked, checkpoint)
                     return
-                ground = admitted
-            kept = self._kept = _Kept(scenario, ground)
-        ground = kept.ground
+                nominal = admitted
+            kept = self._kept = _Kept(scenario, nominal)
+        nominal = kept.nominal
         with _in_turn():
-            live = _once(kept.solved, LIVE, lambda: self._solved(ground, scenario, LIVE))
+            live = _once(kept.solved, LIVE, lambda: self._solved(nominal, scenario, LIVE))
             first = _once(kept.rollouts, LIVE, lambda: self._frame(scenario, live))
             first = replace(first, scenario=scenario, level=_level(scenario, live.stack))
         yield first
         with _in_turn():
             frame = _once(kept.arms, LIVE, lambda: self._with_arm(first, live, exact=False))
-            pictures = _pictures(scenario, live, coarse=True)
+            pictures = self._pictures(scenario, live, coarse=True)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.LIVE, pictures=pictures)
             self._good[scenario.task] = frame, live
             self._shown = self._live = live
         yield frame
 
         with _in_turn(checkpoint):
-            fine = _once(kept.solved, FINE, lambda: self._solved(ground, scenario, FINE))
+            fine = _once(kept.solved, FINE, lambda: self._solved(nominal, scenario, FINE))
             exact = _once(kept.rollouts, FINE, lambda: self._frame(scenario, fine))
             frame = _once(kept.arms, FINE, lambda: self._with_arm(exact, fine, exact=True))
-            pictures = _pictures(scenario, fine, coarse=False)
+            pictures = self._pictures(scenario, fine, coarse=False)
             frame = replace(frame, scenario=scenario, level=first.level, stage=Stage.FINE, pictures=pictures)
             if scenario.view.health_plots and frame.chosen is not None:
                 frame = replace(frame, profiles=self._profiles(frame, fine, frame.chosen))
@@ -342,16 +344,16 @@ class Engine:
         health, q = certified_arm(health, arm.transform, p, undisturbed, by_hand=by_hand)
         shown = Shown(arm.index, arm.fraction, times, robot.end_effector(q))
         health = certified(health, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
-        hosts = arm.index < len(frame.rollouts) - fine.ground.num_added
+        hosts = arm.index < len(frame.rollouts) - fine.nominal.num_added
         kept = float(whole_arm.clearance(p[hosts], scenario.obstacle).min())
         return health.doubting(*clearance_doubts(health.clearance, kept))
 
     def _stages_without_motion(
-        self, ground: Ground, scenario: Scenario, blocked: tuple[str, ...], checkpoint: Checkpoint = lambda: None
+        self, nominal: Nominal, scenario: Scenario, blocked: tuple[str, ...], checkpoint: Checkpoint = lambda: None
     ) -> Iterator[Frame]:
         """The last good motion at every stage, or the undisturbed one, refined, if there is none."""
         if scenario.task not in self._good:
-            undisturbed = self._stages(ground, replace(scenario, avoidance=False), checkpoint)
+            undisturbed = self._stages(nominal, replace(scenario, avoidance=False), checkpoint)
             next(frame for frame in undisturbed if frame.stage is Stage.FINE)
         good, solved = self._good[scenario.task]
         seen = replace(good.scenario, view=scenario.view)
@@ -361,45 +363,45 @@ class Engine:
         health = Health(clearance=clearance)
         for stage in Stage:
             if changed and stage in (Stage.LIVE, Stage.FINE):
-                good = replace(good, pictures=_pictures(seen, solved, coarse=stage is Stage.LIVE))
+                good = replace(good, pictures=self._pictures(seen, solved, coarse=stage is Stage.LIVE))
             yield replace(good, scenario=scenario, stage=stage, blocked=blocked, health=health)
 
-    def _ground(self, scenario: Scenario, progress: Progress | None) -> Ground:
+    def _nominal(self, scenario: Scenario, progress: Progress | None) -> Nominal:
         key = (scenario.task, scenario.imitation, scenario.objective)
         if key not in self._learned:
             task = self.task(scenario.task)
             imitation = self._fits.get(task.demonstrations, ImitationSettings(scenario.objective), progress)
             self._learned[key] = Learned.of(task, imitation, imitates=scenario.imitation)
-        return self._learned[key].ground(scenario.starts)
+        return self._learned[key].nominal(scenario.starts)
 
-    def _solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> Solved:
-        full = self._fully_solved(ground, replace(scenario, warp=1.0), precision)
+    def _solved(self, nominal: Nominal, scenario: Scenario, precision: Precision) -> Solved:
+        full = self._fully_solved(nominal, replace(scenario, warp=1.0), precision)
         if scenario.warp == 1:
             return full
-        below = ground.warped(scenario.warp)
+        below = nominal.warped(scenario.warp)
         stack = warped(below, full.stack, scenario.warp, precision)
         if full.arm is None:
-            return Solved(scenario, ground, below, stack, None, None)
+            return Solved(scenario, nominal, below, stack, None, None)
         exact = precision is not LIVE
-        lifted, whole_arm = self._follower.behaving(ground, stack, exact=exact), self._follower.whole_arm
+        lifted, whole_arm = self._follower.behaving(nominal, stack, exact=exact), self._follower.whole_arm
         arm = whole_arm.warped(full.arm, lifted, scenario, scenario.warp, precision.spacing)
-        return Solved(scenario, ground, below, stack, arm, lifted)
+        return Solved(scenario, nominal, below, stack, arm, lifted)
 
-    def _fully_solved(self, ground: Ground, scenario: Scenario, precision: Precision) -> Solved:
+    def _fully_solved(self, nominal: Nominal, scenario: Scenario, precision: Precision) -> Solved:
         known = self._full.get(precision)
-        if known is not None and ground.moves_like(known.ground) and scenario.moves_like(known.scenario):
+        if known is not None and nominal.moves_like(known.nominal) and scenario.moves_like(known.scenario):
             return known
-        stack, arm, lifted, follower = solve(ground, scenario, precision), None, None, self._follower
+        stack, arm, lifted, follower = solve(nominal, scenario, precision), None, None, self._follower
         if _uses_whole_arm(scenario):
             exact = precision is not LIVE
-            lifted = follower.behaving(ground, stack, exact=exact) if stack.built else follower.undisturbed(ground)
+            lifted = follower.behaving(nominal, stack, exact=exact) if stack.built else follower.undisturbed(nominal)
             arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, coarse=precision is LIVE)
-        solved = self._full[precision] = Solved(scenario, ground, ground, stack, arm, lifted)
+        solved = self._full[precision] = Solved(scenario, nominal, nominal, stack, arm, lifted)
         return solved
 
     def _frame(self, scenario: Scenario, solved: Solved) -> Frame:
         """The frame of stage ROLLOUTS."""
-        ground, stack, arm = solved.ground, solved.stack, solved.arm
+        nominal, stack, arm = solved.nominal, solved.stack, solved.arm
         if arm is None:
             index, fraction, positions = stack.bundle.index, stack.bundle.fraction, stack.bundle.positions
             clearance = float(scenario.obstacle.signed_distance(positions).min())
@@ -408,20 +410,20 @@ class Engine:
             clearance = arm.clearance
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
-        doubts = motion_doubts(solved, clearance, float(np.linalg.norm(reached - ground.goal)))
+        doubts = motion_doubts(solved, clearance, float(np.linalg.norm(reached - nominal.goal)))
         if scenario.avoidance and scenario.obstacles and scenario.warp == 1:
             doubts += target_doubts(solved, self._robot)
         return Frame(
             scenario=scenario,
-            task=ground.task,
+            task=nominal.task,
             stage=Stage.ROLLOUTS,
-            ghost=ground.paths,
+            ghost=nominal.paths,
             rollouts=shown.paths,
-            chosen=ground.rollout(followed(scenario, ground.num_demonstrated)),
+            chosen=nominal.rollout(followed(scenario, nominal.num_demonstrated)),
             times=shown.split(stack.rays.times(index, fraction)),
             levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
             level=_level(scenario, stack),
-            goal=ground.goal,
+            goal=nominal.goal,
             reached=reached,
             blocked=(),
             health=Health(
@@ -431,25 +433,25 @@ class Engine:
                 arm_duration=arm.duration if arm else None,
                 doubts=doubts,
             ),
-            learned_steps=_learned_steps(ground),
+            learned_steps=_learned_steps(nominal),
             layer_radii=tuple(_region_radius(stack, place) for place in range(len(scenario.layers))),
         )
 
     def _with_arm(self, frame: Frame, solved: Solved, *, exact: bool) -> Frame:
-        ground = solved.ground
+        nominal = solved.nominal
         arm, doubts = None, ()
         try:
-            far = self._follower.out_of_reach(ground)
+            far = self._follower.out_of_reach(nominal)
             if frame.chosen is not None and not far[frame.chosen]:
                 arm, doubts = self._arm(frame, solved, frame.chosen, exact=exact)
-            doubts += tuple(named_starts(np.flatnonzero(far), ground.num_demonstrated, OUT_OF_REACH))
+            doubts += tuple(named_starts(np.flatnonzero(far), nominal.num_demonstrated, OUT_OF_REACH))
         except UnreachableError as error:
             doubts = (f"the arm cannot reach the starts: {error}",)
         return replace(frame, arm=arm, health=frame.health.doubting_arm(*doubts))
 
     def _arm(self, frame: Frame, solved: Solved, chosen: int, *, exact: bool) -> tuple[ArmMotion, tuple[str, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
-        ground, times = solved.ground, frame.times[chosen]
+        nominal, times = solved.nominal, frame.times[chosen]
         if solved.arm is not None and solved.lifted is not None:
             rows = solved.arm.index == chosen
             q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
@@ -458,34 +460,59 @@ class Engine:
             bundle = solved.stack.bundle
             path, fraction = frame.rollouts[chosen], bundle.split(bundle.fraction)[chosen]
             keep = arm_samples(len(path))
-            joints = self._follower.along(ground, chosen, path[keep], exact=exact)
+            joints = self._follower.along(nominal, chosen, path[keep], exact=exact)
             q, times, fraction = joints.q, times[keep], fraction[keep]
             doubts = self._follower.doubts(joints, chosen)
-        without = self._follower.undisturbed(ground.only([chosen])).at(np.zeros(len(fraction), int), fraction)
+        without = self._follower.undisturbed(nominal.only([chosen])).at(np.zeros(len(fraction), int), fraction)
         return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), doubts
 
     def _profiles(self, frame: Frame, solved: Solved, chosen: int) -> Profiles:
         """Of a rollout, with and without behaviours."""
-        ground = solved.ground
-        obstacle, arm, task = frame.scenario.obstacle, solved.arm, ground.task
-        path, undisturbed = frame.rollouts[chosen], ground.paths[chosen]
-        of_mean, system = chosen >= ground.num_demonstrated, solved.stack.system
+        nominal = solved.nominal
+        obstacle, arm, task = frame.scenario.obstacle, solved.arm, nominal.task
+        path, undisturbed = frame.rollouts[chosen], nominal.paths[chosen]
+        of_mean, system = chosen >= nominal.num_demonstrated, solved.stack.system
         demonstration = task.mean_path if of_mean else task.paths[chosen]
         if arm is None:
             return Profiles(
                 hand_profile(path, demonstration, system, obstacle),
-                hand_profile(undisturbed, demonstration, ground.system, obstacle),
+                hand_profile(undisturbed, demonstration, nominal.system, obstacle),
                 of_mean=of_mean,
             )
-        p, only = arm.p[arm.index == chosen], ground.only([chosen])
+        p, only = arm.p[arm.index == chosen], nominal.only([chosen])
         below = self._robot.end_effector(arm.transform.forward(p))
         q = self._follower.undisturbed(only).at(only.bundle.index, only.bundle.fraction)
         clearance = self._follower.whole_arm.clearance
         return Profiles(
             body_profile(path, demonstration, system.lyapunov(below), clearance(p, obstacle)),
-            body_profile(undisturbed, demonstration, ground.system.lyapunov(undisturbed), clearance(q, obstacle)),
+            body_profile(undisturbed, demonstration, nominal.system.lyapunov(undisturbed), clearance(q, obstacle)),
             of_body=True,
             of_mean=of_mean,
+        )
+
+    def _pictures(self, scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
+        """Those that the view shows, on its slice and of its level."""
+        nominal, stack = solved.below, solved.stack
+        view, book, area = (
+            scenario.view,
+            self._sketchbook(nominal.learned),
+            nominal.task.slice.posed(scenario.view.slice),
+        )
+        level = _level(scenario, stack)
+        built = stack.built[:level]
+        system = stack.system if level is None else cut_off(nominal, stack, level)
+        clearance = _clearance(scenario, avoided=any(applied.place is None for applied in built))
+        field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
+        return Pictures(
+            field=field,
+            streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
+            colour=colour,
+            generator=book.generator(area, view.generator_layer) if view.generator else None,
+            grid=book.grid(area, [applied.made.transform for applied in built], coarse=coarse) if view.grid else None,
+            base=book.base(stack.rays) if view.base else None,
+            occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse)
+            if view.colour == "occupancy"
+            else None,
         )
 
     def _any_arm(self, frame: Frame) -> Array:
@@ -499,7 +526,7 @@ def _with_meshes(health: Health, frame: Frame, fine: Solved) -> Health:
     health = replace(health, collision=model.report(frame.arm.q, scenario.obstacle))
     if fine.arm is None:
         return health
-    hosts = range(len(frame.rollouts) - fine.ground.num_added)
+    hosts = range(len(frame.rollouts) - fine.nominal.num_added)
     nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], scenario.obstacle) for host in hosts]
     return health.doubting_arm(*margin_doubts(scenario, nearest))
 
@@ -518,8 +545,8 @@ def _uses_whole_arm(scenario: Scenario) -> bool:
     return scenario.avoidance and scenario.space != "task"
 
 
-def _learned_steps(ground: Ground) -> tuple[int, ...]:
-    flows = in_frame(ground.system.transform)
+def _learned_steps(nominal: Nominal) -> tuple[int, ...]:
+    flows = in_frame(nominal.system.transform)
     return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
 
 
@@ -536,24 +563,9 @@ def _level(scenario: Scenario, stack: Solution) -> int | None:
     return names.index(scenario.view.level) if scenario.view.level in names else None
 
 
-def _pictures(scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
-    """Those that the view shows, on its slice and of its level."""
-    ground, stack = solved.below, solved.stack
-    view, book, area = scenario.view, ground.learned.sketchbook, ground.task.slice.posed(scenario.view.slice)
-    level = _level(scenario, stack)
-    built = stack.built[:level]
-    system = stack.system if level is None else cut_off(ground, stack, level)
-    clearance = _clearance(scenario, avoided=any(applied.place is None for applied in built))
-    field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
-    return Pictures(
-        field=field,
-        streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
-        colour=colour,
-        generator=book.generator(area, view.generator_layer) if view.generator else None,
-        grid=book.grid(area, [applied.made.transform for applied in built], coarse=coarse) if view.grid else None,
-        base=book.base(stack.rays) if view.base else None,
-        occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
-    )
+def _sketchbook(learned: Learned) -> Sketchbook:
+    """What makes the pictures of ψ."""
+    return Sketchbook(learned.task, in_frame(learned.system.transform), learned.system, learned.demonstrated.rays)
 
 
 def _clearance(scenario: Scenario, *, avoided: bool) -> Clearance:

@@ -1,1 +1,1 @@
-"""Vector fields, their flows, and systems seen through them."""
+"""Point fields, their flows, and systems seen through them."""

@@ -1,4 +1,4 @@
-"""Vector fields that generate flows, and the separable Gaussian basis they are made of."""
+"""Point fields that generate flows, and the separable Gaussian basis they are made of."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def second_orders(dim: int) -> dict[tuple[int, int], tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class GridRBF:
-    """Vector field V(s) = Wᵀ k(s, ŝ) on a Gaussian grid (sec. 4.3; the printed kernel with its norm squared)."""
+    """Point field V(s) = Wᵀ k(s, ŝ) on a Gaussian grid (sec. 4.3; the printed kernel with its norm squared)."""
 
     grid: GaussianGrid
     weights: Array

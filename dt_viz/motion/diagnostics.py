@@ -13,13 +13,12 @@ from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import Robot
 from dt_viz.flows.rollouts import MAX_SAMPLES
 from dt_viz.motion.health import in_millimetres, integration_doubts
-from dt_viz.motion.nominal import Ground, named_starts
-from dt_viz.motion.solve import Applied, Solution
-from dt_viz.motion.solved import Solved
+from dt_viz.motion.nominal import Nominal
+from dt_viz.motion.solve import Applied, Solution, Solved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.transforms.avoidance import BESIDE, GOAL_INSIDE, ROUNDING, STAYS_INSIDE, smallest_kept
-from dt_viz.transforms.base import Motion
+from dt_viz.transforms.base import Motion, named_starts
 from dt_viz.transforms.bias import OFF_PLANE, Biasing
 
 MAX_GOAL_MISS = 1e-3
@@ -40,13 +39,13 @@ def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str,
         clearance: of the motion, metres.
         missed: metres by which it ends beside the goal.
     """
-    ground, scenario, stack, arm = solved.ground, solved.scenario, solved.stack, solved.arm
-    doubts = [*ground.imitation.warnings, *stack.doubts]
+    nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
+    doubts = [*nominal.imitation.warnings, *stack.doubts]
     if max(len(stack.bundle.index), len(arm.index) if arm else 0) >= MAX_SAMPLES:
         doubts.append(UNSAMPLED)
     integration = _of_integration(solved)
     if scenario.warp < 1:  # what does not do yet what it is made for has not failed
-        return (*doubts, *integration, *ground.doubts)
+        return (*doubts, *integration, *nominal.doubts)
     covered = any(GOAL_INSIDE in doubt for doubt in doubts)
     if arm is not None:
         if not arm.cleared:
@@ -55,7 +54,7 @@ def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str,
                 if scenario.duration is None
                 else "a motion of the arm comes too near to the obstacle at this flow time"
             )
-        numbers, num = np.array(ground.numbers), ground.num_demonstrated
+        numbers, num = np.array(nominal.numbers), nominal.num_demonstrated
         doubts += named_starts(numbers[arm.too_near], num, "without a way around the obstacle for the arm")
         beside = np.setdiff1d(arm.moved, arm.too_near)
         doubts += named_starts(numbers[beside], num, "so near to the obstacle that the arm begins elsewhere")
@@ -65,11 +64,11 @@ def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str,
         if applied.place is not None and not (applied.made.hopeless and applied.made.doubts):
             doubts.append(f"{applied.name or 'a layer'}: not every motion does what it asks for")
     doubts += integration
-    if missed > MAX_GOAL_MISS and not covered and not _moves_goal(ground, stack):
+    if missed > MAX_GOAL_MISS and not covered and not _moves_goal(nominal, stack):
         # what an integrator loses there and back it loses at the goal, too
         cause = "" if integration else "the obstacle leaves no way to the goal: "
         doubts.append(f"{cause}motions end {1e3 * missed:.0f} mm beside {'it' if cause else 'the goal'}")
-    return (*doubts, *ground.doubts)
+    return (*doubts, *nominal.doubts)
 
 
 def _of_clearance(solved: Solved, clearance: float) -> tuple[str, ...]:
@@ -77,8 +76,8 @@ def _of_clearance(solved: Solved, clearance: float) -> tuple[str, ...]:
     avoidance = solved.stack.at(None)
     if avoidance is None or (clearance >= 0 and avoidance.satisfied):
         return ()
-    ground, bundle = solved.ground, solved.stack.bundle
-    kept = smallest_kept(Motion(solved.scenario, ground.starts, ground.goal, bundle.index, bundle.positions))
+    nominal, bundle = solved.nominal, solved.stack.bundle
+    kept = smallest_kept(Motion(solved.scenario, nominal.starts, nominal.goal, bundle.index, bundle.positions))
     # where a goal is covered, what ends nearly on the surface is beside it
     if kept < (-BESIDE if _says(avoidance, GOAL_INSIDE) else -ROUNDING):
         said = _says(avoidance, STAYS_INSIDE)
@@ -95,11 +94,11 @@ def target_doubts(solved: Solved, robot: Robot) -> tuple[str, ...]:
 
     In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
     """
-    ground, scenario, stack, arm = solved.ground, solved.scenario, solved.stack, solved.arm
+    nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
     bundle = stack.bundle if arm is None else arm
     positions = stack.bundle.positions if arm is None else robot.end_effector(arm.p)
     motion = Motion(
-        scenario, ground.starts, ground.goal, bundle.index, positions, num_demonstrated=ground.num_demonstrated
+        scenario, nominal.starts, nominal.goal, bundle.index, positions, num_demonstrated=nominal.num_demonstrated
     )
     doubts = []
     for applied in stack.built:
@@ -149,8 +148,8 @@ def _of_integration(solved: Solved) -> tuple[str, ...]:
     return tuple(doubts)
 
 
-def _moves_goal(ground: Ground, stack: Solution) -> bool:
+def _moves_goal(nominal: Nominal, stack: Solution) -> bool:
     """Whether some behaviour other than avoidance means to end elsewhere."""
-    goals = [ground.goal, *(applied.made.goal for applied in stack.built)]
+    goals = [nominal.goal, *(applied.made.goal for applied in stack.built)]
     moves = (bool(np.any(a != b)) for a, b in pairwise(goals))
     return any(m and applied.place is not None for m, applied in zip(moves, stack.built, strict=True))

@@ -14,12 +14,13 @@ from dt_viz.arm.tracking import JointPath, UnreachableError, drawn_onto, inverse
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.metrics import arc_length
-from dt_viz.motion.nominal import Ground, Learned, Strand, named_starts
+from dt_viz.motion.nominal import Learned, Nominal, Strand
 from dt_viz.motion.solve import Solution
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.base import named_starts
 
 BY_FRACTION = 0.3
 """Part of the even spacing of postures that goes by the fraction of the base ray, not by the length of the path."""
@@ -54,13 +55,13 @@ class Follower:
         self._added, self._reaches = newest(self._lift_added), newest(self._gets_to)
         self._joined = lru_cache(maxsize=4)(self._join)
 
-    def undisturbed(self, ground: Ground) -> Lift:
+    def undisturbed(self, nominal: Nominal) -> Lift:
         """The joints along the motion without any behaviour.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        learned = ground.learned
+        learned = nominal.learned
         if learned not in self._lifts:
             try:
                 self._lifts[learned] = self._lift_demonstrated(learned)
@@ -69,23 +70,23 @@ class Follower:
         lifted = self._lifts[learned]
         if isinstance(lifted, UnreachableError):
             raise lifted
-        if ground is learned.demonstrated:
+        if nominal is learned.demonstrated:
             return lifted
-        return self._joined(ground)
+        return self._joined(nominal)
 
-    def reference(self, ground: Ground) -> Array:
+    def reference(self, nominal: Nominal) -> Array:
         """The posture (6,), rad, that the arm stays near to.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        return self.undisturbed(ground.learned.demonstrated).reference
+        return self.undisturbed(nominal.learned.demonstrated).reference
 
-    def behaving(self, ground: Ground, solution: Solution, *, exact: bool) -> Lift:
+    def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool) -> Lift:
         """The joints along the motion with the behaviours of the end effector.
 
         Args:
-            ground: what it begins from.
+            nominal: what it begins from.
             solution: that motion.
             exact: whether the end effector is on that motion between the samples, too, whatever was shown before; else
                 it may be off by millimetres where the stack stretches space, and begins from what was shown before.
@@ -98,11 +99,11 @@ class Follower:
             fraction.append(np.interp(np.linspace(0, 1, NUM_CONFIGURATIONS), place, fractions))
         index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
         paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)
-        reference, initial = self.reference(ground), self._before.get((ground.learned, None))
+        reference, initial = self.reference(nominal), self._before.get((nominal.learned, None))
         if exact or (initial is not None and len(initial) != len(paths)):
             initial = None  # starts have come or gone
-        lifted = replace(lift(self.robot, np.stack(fraction), paths, reference, initial), num_guests=ground.num_added)
-        self._before[ground.learned, None] = lifted.tracked.q
+        lifted = replace(lift(self.robot, np.stack(fraction), paths, reference, initial), num_guests=nominal.num_added)
+        self._before[nominal.learned, None] = lifted.tracked.q
         if not exact:
             return lifted
 
@@ -111,21 +112,21 @@ class Follower:
 
         return replace(lifted, exactly=exactly)
 
-    def along(self, ground: Ground, rollout: int, path: Array, *, exact: bool) -> JointPath:
+    def along(self, nominal: Nominal, rollout: int, path: Array, *, exact: bool) -> JointPath:
         """The joints along one path (T, 3) of the end effector, metres, T being `NUM_ARM_SAMPLES`.
 
         They begin from what was shown before, unless `exact`.
         """
-        number = ground.numbers[rollout]
-        before = None if exact else self._before.get((ground.learned, number))
-        joints = track(self.robot, path, self.reference(ground), before)
-        self._before[ground.learned, number] = joints.q
+        number = nominal.numbers[rollout]
+        before = None if exact else self._before.get((nominal.learned, number))
+        joints = track(self.robot, path, self.reference(nominal), before)
+        self._before[nominal.learned, number] = joints.q
         return joints
 
-    def obstructions(self, ground: Ground, obstacle: Several) -> tuple[str, ...]:
+    def obstructions(self, nominal: Nominal, obstacle: Union) -> tuple[str, ...]:
         """Why the whole arm cannot move from the task's starts to the goal, in words; empty where nothing does."""
         try:
-            lifted = self.undisturbed(ground.learned.demonstrated)
+            lifted = self.undisturbed(nominal.learned.demonstrated)
         except UnreachableError as error:
             return (f"the arm cannot reach the starts: {error}",)
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
@@ -136,36 +137,36 @@ class Follower:
             reasons += self._touching(lifted.pins, part)
         return tuple(reasons)
 
-    def out_of_reach(self, ground: Ground) -> Mask:
+    def out_of_reach(self, nominal: Nominal) -> Mask:
         """(R,) bool: which rollouts begin at an added start that the arm cannot get to.
 
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
-        num_demonstrated = ground.num_demonstrated
-        added = ground.strands[num_demonstrated:]
-        return np.array([False] * num_demonstrated + [not self._reaches(ground.learned, strand) for strand in added])
+        num_demonstrated = nominal.num_demonstrated
+        added = nominal.strands[num_demonstrated:]
+        return np.array([False] * num_demonstrated + [not self._reaches(nominal.learned, strand) for strand in added])
 
-    def admitted(self, ground: Ground, obstacle: Several) -> Ground:
+    def admitted(self, nominal: Nominal, obstacle: Union) -> Nominal:
         """The rollouts that the whole arm can begin: without those from added starts where it is out of reach or room.
 
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
-        num, far = ground.num_demonstrated, self.out_of_reach(ground)
+        num, far = nominal.num_demonstrated, self.out_of_reach(nominal)
         touches = np.zeros_like(far)
         candidates = np.flatnonzero(~far)[num:]
         if len(candidates):
-            postures = self.undisturbed(ground.only(candidates)).tracked.q[:, 0]
+            postures = self.undisturbed(nominal.only(candidates)).tracked.q[:, 0]
             near = self.whole_arm.clearance(postures, obstacle) < 0
             for rollout, posture in zip(candidates[near], postures[near], strict=True):
                 gaps = [load_collision_model().obstacle_distance(posture[None], part)[0][0] for part in obstacle.parts]
                 touches[rollout] = min(gaps) < 0
         if not (far | touches).any():
-            return ground
-        numbers = np.array(ground.numbers)
+            return nominal
+        numbers = np.array(nominal.numbers)
         doubts = named_starts(numbers[far], num, OUT_OF_REACH) + named_starts(numbers[touches], num, TOUCHES)
-        return ground.only(np.flatnonzero(~(far | touches)), doubts)
+        return nominal.only(np.flatnonzero(~(far | touches)), doubts)
 
     def _touching(self, pins: Array, obstacle: Obstacle) -> list[str]:
         """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6), in words."""
@@ -204,12 +205,12 @@ class Follower:
         reference = inverse_kinematics(self.robot, starts.mean(axis=0))
         return lift(self.robot, fractions, paths, reference)
 
-    def _join(self, ground: Ground) -> Lift:
-        learned, num_demonstrated = ground.learned, ground.num_demonstrated
+    def _join(self, nominal: Nominal) -> Lift:
+        learned, num_demonstrated = nominal.learned, nominal.num_demonstrated
         whole = self.undisturbed(learned.demonstrated)
-        parts = zip(ground.numbers, ground.strands, strict=True)
+        parts = zip(nominal.numbers, nominal.strands, strict=True)
         lifts = [whole.only(n) if n < num_demonstrated else self._added(learned, strand) for n, strand in parts]
-        return joined(lifts, ground.num_added)
+        return joined(lifts, nominal.num_added)
 
     def _lift_added(self, learned: Learned, strand: Strand) -> Lift:
         path, fraction = strand.positions, strand.fraction
@@ -226,7 +227,7 @@ def arm_samples(num: int) -> Indices:
     return np.linspace(0, num - 1, NUM_ARM_SAMPLES).round().astype(int)
 
 
-def room_at_rest(robot: Robot, task: Task, obstacle: Several, places: Array) -> Array:
+def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Array:
     """Distance (N,), metres, of the arm's covering spheres from the obstacle where the hand rests at `places` (N, 3).
 
     Raises:

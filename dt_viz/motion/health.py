@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.arm.collision import CollisionReport
-from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow
+from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array
-from dt_viz.flows.integration import Integration
 
 MAX_ROUND_TRIP = 1e-6
 """Metres; the workspace is about one metre wide."""

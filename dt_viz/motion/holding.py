@@ -17,7 +17,7 @@ from dt_viz.arm.whole_arm import ArmSolution
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import MAX_TRACKING_ERROR, Follower
 from dt_viz.motion.pushing import Pushed, below, onwards
-from dt_viz.motion.solved import Solved
+from dt_viz.motion.solve import Solved
 
 ARRIVED = 2e-4
 """Metres from the pointer at which the hand counts as there."""
@@ -54,7 +54,7 @@ def held(
         UnreachableError: the arm cannot get to where the motions start.
     """
     robot, scenario, arm = follower.robot, solved.scenario, solved.arm
-    posture, reference = below(follower, solved, q), follower.reference(solved.ground)
+    posture, reference = below(follower, solved, q), follower.reference(solved.nominal)
     target = place
     if arm is not None:
         target = _place_below(_hands(follower, arm, posture, reference), robot.end_effector(posture), place)

@@ -13,9 +13,9 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.imitation import Imitation
-from dt_viz.pictures.sketchbook import Sketchbook, in_frame
+from dt_viz.obstacles.shapes import Point
 from dt_viz.properties import cached_property
-from dt_viz.scenario.scenario import MAX_STARTS, Vector
+from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
@@ -59,19 +59,19 @@ class Learned:
         return cls(task, imitation, system, goal)
 
     @cached_property
-    def demonstrated(self) -> Ground:
+    def demonstrated(self) -> Nominal:
         """The rollouts from the task's starts."""
-        return Ground(self, self._strands(self.task.starts, NUM_SAMPLES))
+        return Nominal(self, self._strands(self.task.starts, NUM_SAMPLES))
 
-    def ground(self, added: tuple[Vector, ...]) -> Ground:
+    def nominal(self, added: tuple[Point, ...]) -> Nominal:
         """The rollouts from the task's starts and from `added` ones, metres."""
-        return self._grounds(added) if added else self.demonstrated
+        return self._nominals(added) if added else self.demonstrated
 
     @cached_property
-    def _grounds(self) -> Callable[[tuple[Vector, ...]], Ground]:
+    def _nominals(self) -> Callable[[tuple[Point, ...]], Nominal]:
         """The newest ones with added starts."""
         strands = self.demonstrated.strands
-        return lru_cache(maxsize=4)(lambda added: Ground(self, strands + tuple(map(self._added, added))))
+        return lru_cache(maxsize=4)(lambda added: Nominal(self, strands + tuple(map(self._added, added))))
 
     def warped(self, fraction: float) -> Learned:
         """The same with the imitation's flows run for a fraction of their durations."""
@@ -88,17 +88,12 @@ class Learned:
         return replace(self, system=DiffeomorphicSystem(transform, base))
 
     @cached_property
-    def sketchbook(self) -> Sketchbook:
-        """Makes the pictures of ψ."""
-        return Sketchbook(self.task, in_frame(self.system.transform), self.system, self.demonstrated.rays)
-
-    @cached_property
     def at_goal(self) -> tuple[Array, Array]:
         """ψ (1, 3) and its derivative (1, 3, 3) at the goal."""
         return self.system.transform.jacobian(self.goal[None])
 
     @cached_property
-    def _added(self) -> Callable[[Vector], Strand]:
+    def _added(self) -> Callable[[Point], Strand]:
         """The rollout from an added start; only the newest are kept, so that a dragged one leaves nothing behind."""
         return lru_cache(maxsize=2 * MAX_STARTS)(lambda start: self._strands(np.array([start]), NUM_ADDED_SAMPLES)[0])
 
@@ -113,7 +108,7 @@ class Learned:
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class Nominal:
     """What a scenario's behaviours are stacked on: what was learned, and the rollouts from some starts."""
 
     learned: Learned
@@ -164,17 +159,17 @@ class Ground:
         """Which rollout begins at the start of this number; None if it has none."""
         return self.numbers.index(number) if number in self.numbers else None
 
-    def only(self, rollouts: Sequence[int] | Indices, doubts: Sequence[str] = ()) -> Ground:
+    def only(self, rollouts: Sequence[int] | Indices, doubts: Sequence[str] = ()) -> Nominal:
         """Some of the rollouts, and why the others are left out."""
         kept = {self.numbers[k] for k in rollouts}
         left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
-        return Ground(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(doubts))
+        return Nominal(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(doubts))
 
-    def moves_like(self, other: Ground) -> bool:
+    def moves_like(self, other: Nominal) -> bool:
         """Whether both have the same rollouts."""
         return self.learned is other.learned and self.strands == other.strands
 
-    def warped(self, fraction: float) -> Ground:
+    def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""
         learned = self.learned.warped(fraction)
         images, jacobians = learned.system.transform.jacobian(self.starts)
@@ -226,13 +221,3 @@ class Ground:
             if np.abs(error).max() <= IMAGE_TOLERANCE:
                 return images
         return self.system.transform.forward(ends)
-
-
-def named_starts(which: Indices, num_demonstrated: int, how: str) -> list[str]:
-    """What there is to say of starts, counted from 0, the task's first: they are all `how`; empty if it is of none."""
-    said = []
-    for numbers, kind in ((which[which < num_demonstrated], ""), (which[which >= num_demonstrated], "added ")):
-        counted = ", ".join(str(k + 1 - (num_demonstrated if kind else 0)) for k in numbers)
-        if len(numbers):
-            said.append(f"{kind}start {counted} is {how}" if len(numbers) == 1 else f"{kind}starts {counted} are {how}")
-    return said

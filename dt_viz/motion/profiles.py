@@ -15,7 +15,7 @@ from dt_viz.metrics import (
     maximum_collision_distance,
     resample_by_arc_length,
 )
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 
 NUM_SAMPLES = 120
 """At even distances along a path, start and goal included."""
@@ -54,7 +54,7 @@ class Profiles:
         return np.linspace(0, 1, len(self.shown.lyapunov))
 
 
-def hand_profile(path: Array, demonstration: Array, system: DiffeomorphicSystem, obstacle: Several) -> Profile:
+def hand_profile(path: Array, demonstration: Array, system: DiffeomorphicSystem, obstacle: Union) -> Profile:
     """Profile of a motion of the end effector.
 
     Args:

@@ -17,7 +17,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.motion.following import MAX_TRACKING_ERROR, ArmMotion, Follower
-from dt_viz.motion.solved import Solved
+from dt_viz.motion.solve import Solved
 from dt_viz.scenario.scenario import Scenario
 
 DISTANCES = (0.06, 0.03, 0.015)
@@ -158,7 +158,7 @@ def onwards(
     path = np.concatenate([aside[:-1], bundle.positions])
     times = np.concatenate([seconds[:-1], seconds[-1] + rays.times(bundle.index, bundle.fraction)])
 
-    tracked = track(robot, path, posture, reference=follower.reference(solved.ground))
+    tracked = track(robot, path, posture, reference=follower.reference(solved.nominal))
     joints = tracked.q
     if arm is not None:
         joints = arm.transform.inverse(follower.whole_arm.limits.inside(joints))

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.arm.whole_arm import ArmSolution, Lift
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.motion.nominal import Ground
+from dt_viz.motion.nominal import Nominal
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import AVOIDANCE
 from dt_viz.transforms.avoidance import ObstacleAvoidance
@@ -106,10 +107,35 @@ class Solution:
         return self.transform.inverse(self.rays.at(index, fraction))
 
 
-def cut_off(ground: Ground, solution: Solution, level: int) -> DiffeomorphicSystem:
+@dataclass(frozen=True)
+class Solved:
+    """A scenario's motion: the end effector's stack, and how the whole arm avoids on top of it."""
+
+    scenario: Scenario
+    """It, or one that moves like it."""
+    nominal: Nominal
+    """The undisturbed motion."""
+    below: Nominal
+    """The same, warped as far as the stack is that is built on it."""
+    stack: Solution
+    """Of the end effector, before the whole arm avoids anything."""
+    arm: ArmSolution | None
+    """None where only the end effector avoids."""
+    lifted: Lift | None
+    """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
+
+    @property
+    def ends(self) -> Array:
+        """(R + 1, 3) where the end effector's motions are to begin, and where all are to end, metres."""
+        goal, built = self.nominal.goal, self.stack.built
+        moved = built[-1].made.goal - goal if built else np.zeros_like(goal)
+        return np.concatenate([self.nominal.starts, [goal + self.scenario.warp * moved]])
+
+
+def cut_off(nominal: Nominal, solution: Solution, level: int) -> DiffeomorphicSystem:
     """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
     stacked = [applied.made.transform for applied in solution.built[:level]]
-    return DiffeomorphicSystem(Chain([ground.system.transform, *stacked]), solution.rays.base)
+    return DiffeomorphicSystem(Chain([nominal.system.transform, *stacked]), solution.rays.base)
 
 
 def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
@@ -131,7 +157,7 @@ def stacked(scenario: Scenario) -> tuple[tuple[int | None, Layer], ...]:
     return tuple((place, layer) for place, layer in order if layer.on)
 
 
-def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
+def solve(nominal: Nominal, scenario: Scenario, precision: Precision) -> Solution:
     """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
 
     A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
@@ -141,34 +167,34 @@ def solve(ground: Ground, scenario: Scenario, precision: Precision) -> Solution:
     solution, stack = None, stacked(scenario)
     layers = [layer.behaviour for _, layer in stack]
     for keeps_goal in (True, False):
-        rays, bundle = ground.rays, ground.bundle
-        ends_below = ground.ends
+        rays, bundle = nominal.rays, nominal.bundle
+        ends_below = nominal.ends
         durations, above = [0.0] * len(layers), (None,) * len(layers)
         for _ in range(MAX_ATTEMPTS):
             lowest = Motion(
                 scenario,
-                ground.starts,
-                ground.goal,
+                nominal.starts,
+                nominal.goal,
                 bundle.index,
                 bundle.levels[:, 0],
                 keeps_goal=keeps_goal,
-                num_demonstrated=ground.num_demonstrated,
+                num_demonstrated=nominal.num_demonstrated,
             )
             built = _build(layers, lowest, precision.tolerance, durations, above)
             above = _above([made for _, made in built])
             durations = [made.duration if made else 0.0 for _, made in built]
             outer = [made.transform for _, made in built if made]
-            goal = next((made.goal for _, made in reversed(built) if made), ground.goal)
+            goal = next((made.goal for _, made in reversed(built) if made), nominal.goal)
 
-            ends = np.concatenate([ground.starts, [goal]])
+            ends = np.concatenate([nominal.starts, [goal]])
             below = Chain(outer).forward(ends) if outer else ends
             if np.abs(below - ends_below).max() > precision.ends:
-                *z0, z_e = ground.images(below)
-                rays, ends_below = Rays(np.stack(z0), replace(ground.system.base, goal=z_e)), below
-                positions = ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
+                *z0, z_e = nominal.images(below)
+                rays, ends_below = Rays(np.stack(z0), replace(nominal.system.base, goal=z_e)), below
+                positions = nominal.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
                 bundle = replace(bundle, levels=positions[:, None])
             bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
-            transforms = [ground.system.transform, *outer]
+            transforms = [nominal.system.transform, *outer]
             bundle = refined(bundle, lambda i, u, r=rays, s=transforms: climb(r.at(i, u), s)[:, 1:], precision.spacing)
             solution = Solution(Chain(transforms), rays, bundle, _applied(stack, built, above, bundle))
             if not any(applied.may_improve for applied in solution.built):

@@ -13,15 +13,15 @@ import numpy as np
 
 from dt_viz.flows.diffeomorphisms import Chain
 from dt_viz.flows.rollouts import Rays, refined
-from dt_viz.motion.nominal import Ground
+from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.solve import Precision, Solution, climb
 
 
-def warped(ground: Ground, full: Solution, fraction: float, precision: Precision) -> Solution:
+def warped(nominal: Nominal, full: Solution, fraction: float, precision: Precision) -> Solution:
     """The rollouts of a stack whose flows run for a fraction of their durations.
 
     Args:
-        ground: warped by the same fraction.
+        nominal: warped by the same fraction.
         full: the stack whose flows they are. Where it moves the goal, motions end that fraction of the way.
         fraction: s, from 0 to 1.
         precision: as it was solved with.
@@ -31,17 +31,17 @@ def warped(ground: Ground, full: Solution, fraction: float, precision: Precision
         replace(applied, made=replace(applied.made, transform=transform))
         for applied, transform in zip(full.built, outer, strict=True)
     )
-    moved = built[-1].made.goal - ground.goal if built else np.zeros_like(ground.goal)
-    ends = np.concatenate([ground.starts, [ground.goal + fraction * moved]])
+    moved = built[-1].made.goal - nominal.goal if built else np.zeros_like(nominal.goal)
+    ends = np.concatenate([nominal.starts, [nominal.goal + fraction * moved]])
     below = Chain(outer).forward(ends) if outer else ends
-    rays, bundle = ground.rays, ground.bundle
-    if np.abs(below - ground.ends).max() > precision.ends:
-        *z0, z_e = ground.system.transform.forward(below)
+    rays, bundle = nominal.rays, nominal.bundle
+    if np.abs(below - nominal.ends).max() > precision.ends:
+        *z0, z_e = nominal.system.transform.forward(below)
         rays = Rays(np.stack(z0), replace(rays.base, goal=z_e))
         bundle = replace(
-            bundle, levels=ground.system.transform.inverse(rays.at(bundle.index, bundle.fraction))[:, None]
+            bundle, levels=nominal.system.transform.inverse(rays.at(bundle.index, bundle.fraction))[:, None]
         )
     bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
-    stack = [ground.system.transform, *outer]
+    stack = [nominal.system.transform, *outer]
     bundle = refined(bundle, lambda i, u: climb(rays.at(i, u), stack)[:, 1:], precision.spacing)
     return Solution(Chain(stack), rays, bundle, built)

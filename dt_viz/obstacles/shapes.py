@@ -52,6 +52,12 @@ takes the principal ones."""
 T = TypeVar("T", bound="Obstacle")
 
 
+def as_point(v: Array) -> Point:
+    """An array (3,) as a value."""
+    x, y, z = (float(c) for c in v)
+    return x, y, z
+
+
 class Obstacle(Protocol):
     """A solid somewhere in the world: a value, cheap to move, compared and hashed by what it is."""
 

@@ -1,4 +1,4 @@
-"""Several obstacles as one."""
+"""Union obstacles as one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class Several:
+class Union:
     """The union of any number of obstacles, also none: what is inside one of them is inside."""
 
     parts: tuple[Obstacle, ...] = ()

@@ -10,7 +10,7 @@ import numpy as np
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.occupancy import AvoidanceField, StretchedField
 from dt_viz.obstacles.shapes import CloudObstacle, Obstacle
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.scenario.slices import Slice, level_line
 
 SPACING, COARSE_SPACING = 0.004, 0.010
@@ -52,7 +52,7 @@ def occupancy_picture(area: Slice, obstacles: Sequence[Obstacle], *, coarse: boo
     for obstacle in obstacles:
         free *= 1 - believed(obstacle, points)
     probability = 1 - free.reshape(shape)
-    distance = Several(tuple(obstacles)).signed_distance(points).reshape(shape)
+    distance = Union(tuple(obstacles)).signed_distance(points).reshape(shape)
     return OccupancyPicture(
         area,
         probability,

@@ -12,11 +12,11 @@ import numpy as np
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
-from dt_viz.scenario.scenario import Layer, Scenario, Vector, View
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Point, Sphere, as_point
+from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import aware, plane_of
 from dt_viz.scenario.tasks import Pot, Task
-from dt_viz.transforms.bias import Biasing, BiasPoint, vector
+from dt_viz.transforms.bias import Biasing, BiasPoint
 
 BOTTLE = (0.07, 0.24)
 """Diameter and height, metres."""
@@ -102,7 +102,7 @@ def _cloud_in_the_letter(task: Task) -> Scenario:
 def _sphere_in_the_stroke(task: Task) -> Scenario:
     """Fig. 5."""
     u = STROKE_PLACES.get(task.name)
-    place = task.obstacle_position if u is None else vector(task.mean_path[round(100 * u)])
+    place = task.obstacle_position if u is None else as_point(task.mean_path[round(100 * u)])
     return Scenario(task.name, (Sphere(place, STROKE_SPHERE),), space="both", temperature=STROKE_TEMPERATURE)
 
 
@@ -110,11 +110,11 @@ def _two_points(task: Task) -> Scenario:
     """Fig. 4."""
     mean, plane = task.mean_path, plane_of(task)
     places = [mean[round(100 * u)] + task.slice.axes @ offset for u, offset in J_OFFSETS]
-    layers = [Layer(Biasing(BiasPoint(vector(p), plane=plane)), name=f"Bias {k}") for k, p in enumerate(places, 1)]
+    layers = [Layer(Biasing(BiasPoint(as_point(p), plane=plane)), name=f"Bias {k}") for k, p in enumerate(places, 1)]
     return Scenario(task.name, (), layers=aware(layers))
 
 
-def release(pot: Pot) -> Vector:
+def release(pot: Pot) -> Point:
     """Where an object that is to fall into this pot is let go, metres."""
     x, y, z = pot.opening
     return x, y, z + ABOVE

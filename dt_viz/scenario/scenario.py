@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from dt_viz.flows.integration import AUTO, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, Integration
 from dt_viz.obstacles.occupancy import Generator
-from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.shapes import Obstacle, Point
+from dt_viz.obstacles.union import Union
 from dt_viz.scenario.slices import SlicePose
 
 if TYPE_CHECKING:
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 Space = Literal["task", "cspace", "both"]
 """What avoids the obstacle: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""
 SPACES: tuple[Space, ...] = ("task", "cspace", "both")
-
-Vector = tuple[float, float, float]
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
 """What is shown as colour on the slice: det J of the stack, its Lyapunov value, or what the occupancy maps believe."""
@@ -62,7 +60,7 @@ class View:
     ghost_arm: bool = False
     """The arm where it would be without avoidance."""
     onion: bool = False
-    """Several arms along the motion, fading."""
+    """Union arms along the motion, fading."""
     body_points: bool = False
     """The spheres that cover the arm, and how far avoidance has moved each."""
     joint_plots: bool = False
@@ -135,7 +133,7 @@ class Scenario:
     """What else the end effector's motion is to do, from the inside out."""
     avoidance_level: int | None = None
     """How many of these layers the end effector's avoidance is stacked on; None is all of them."""
-    starts: tuple[Vector, ...] = ()
+    starts: tuple[Point, ...] = ()
     """Where motions begin besides the task's starts, metres."""
     arm_rollout: int = 0
     """Which rollout the arm follows: those from the task's starts come first, then those from `starts`."""
@@ -144,9 +142,9 @@ class Scenario:
     view: View = field(default_factory=View)
 
     @property
-    def obstacle(self) -> Several:
+    def obstacle(self) -> Union:
         """All obstacles as one."""
-        return Several(self.obstacles)
+        return Union(self.obstacles)
 
     @property
     def selected(self) -> int | None:

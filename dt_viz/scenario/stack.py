@@ -9,9 +9,10 @@ from typing import TypedDict
 import numpy as np
 
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.scenario.scenario import Layer, Scenario, Vector
+from dt_viz.obstacles.shapes import Point, as_point
+from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.bias import Biasing, BiasPoint, vector
+from dt_viz.transforms.bias import Biasing, BiasPoint
 
 MAX_BIAS_POINTS = 4
 BESIDE = 0.08
@@ -113,12 +114,12 @@ def levels(scenario: Scenario) -> tuple[str, ...]:
     return (IMITATION, *(name for name in visible_names(scenario) if name not in off))
 
 
-def plane_of(task: Task) -> tuple[Vector, Vector] | None:
+def plane_of(task: Task) -> tuple[Point, Point] | None:
     """The plane of a drawing, in which it is biased; None of a task in space."""
     if task.demonstrations[0].dimension != 2:
         return None
     u, v = task.slice.axes.T
-    return vector(u), vector(v)
+    return as_point(u), as_point(v)
 
 
 def place_beside(task: Task, scenario: Scenario) -> BiasPoint:
@@ -142,4 +143,4 @@ def place_beside(task: Task, scenario: Scenario) -> BiasPoint:
     # two whose regions overlap pull against each other: first where no other one is near, then as far as there is
     apart = [min((float(np.linalg.norm(place - other)) for other in taken), default=np.inf) for place in room]
     far = [place for place, distance in zip(room, apart, strict=True) if distance > APART]
-    return BiasPoint(vector(far[0] if far else room[int(np.argmax(apart))]), plane=plane)
+    return BiasPoint(as_point(far[0] if far else room[int(np.argmax(apart))]), plane=plane)

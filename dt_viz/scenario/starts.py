@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array
-from dt_viz.scenario.scenario import MAX_STARTS, Scenario, Vector
+from dt_viz.obstacles.shapes import Point, as_point
+from dt_viz.scenario.scenario import MAX_STARTS, Scenario
 from dt_viz.scenario.slices import Slice
-from dt_viz.transforms.bias import REACH, SHOULDER, vector
+from dt_viz.transforms.bias import REACH, SHOULDER
 
 GRID = (4, 4)
 """Starts of a grid along the slice's first and second axis."""
@@ -26,7 +27,7 @@ MIN_HEIGHT = 0.02
 class Grid:
     """A grid of starts, and what was left out of it."""
 
-    starts: tuple[Vector, ...]
+    starts: tuple[Point, ...]
     """All of the scenario's, the new ones last."""
     num_blocked: int = 0
     """Places at or inside an obstacle, or where the arm is that is to avoid it."""
@@ -50,17 +51,17 @@ def struck(area: Slice, origin: Array, direction: Array) -> Array | None:
     return place if along > 0 and (np.abs(area.across(place)) <= area.half_size).all() else None
 
 
-def with_start(scenario: Scenario, place: Array) -> tuple[Vector, ...]:
+def with_start(scenario: Scenario, place: Array) -> tuple[Point, ...]:
     """The scenario's starts with one more at `place` (3,), metres, if there is room for it."""
     taken = len(scenario.starts) >= MAX_STARTS or _is_taken(scenario.starts, place)
-    return scenario.starts if taken else (*scenario.starts, vector(place))
+    return scenario.starts if taken else (*scenario.starts, as_point(place))
 
 
-def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Vector, ...]:
+def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Point, ...]:
     """The scenario's starts with one of them at `place` (3,), metres; unchanged if it has gone."""
     starts = list(scenario.starts)
     if index < len(starts):
-        starts[index] = vector(place)
+        starts[index] = as_point(place)
     return tuple(starts)
 
 
@@ -85,7 +86,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
         elif place[2] < MIN_HEIGHT or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
             far += 1
         elif len(starts) < MAX_STARTS and not _is_taken(starts, place):
-            starts = (*starts, vector(place))
+            starts = (*starts, as_point(place))
     return Grid(starts, blocked, far)
 
 
@@ -94,5 +95,5 @@ def followed(scenario: Scenario, num_demonstrated: int) -> int:
     return scenario.arm_rollout % (num_demonstrated + len(scenario.starts))
 
 
-def _is_taken(starts: tuple[Vector, ...], place: Array) -> bool:
+def _is_taken(starts: tuple[Point, ...], place: Array) -> bool:
     return any(np.linalg.norm(place - np.array(start)) < APART for start in starts)

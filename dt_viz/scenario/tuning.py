@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dt_viz.flows.integration import Integration
+from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.scenario.scenario import MAX_MANUAL_DURATION, Scenario
 from dt_viz.scenario.stack import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, visible_names, with_changed_point
 from dt_viz.transforms.bias import MAX_DURATION as MAX_STRENGTH

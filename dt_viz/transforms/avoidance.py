@@ -9,10 +9,9 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow
 from dt_viz.flows.fields import Array, Mask, VectorField
 from dt_viz.flows.integrators import integrate_adaptive, rk4
-from dt_viz.motion.nominal import named_starts
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Several
-from dt_viz.transforms.base import Built, Motion
+from dt_viz.obstacles.union import Union
+from dt_viz.transforms.base import Built, Motion, named_starts
 
 MAX_DURATION = 2.5
 """Longest flow that is tried to clear an obstacle: a motion that still collides runs through the flow's centre."""
@@ -174,7 +173,7 @@ def _avoidable(motion: Motion) -> Mask:
 
 
 def clearing_duration(
-    field: VectorField, obstacle: Several | Obstacle, points: Array, margin: float, *, at_least: float = 0.0
+    field: VectorField, obstacle: Union | Obstacle, points: Array, margin: float, *, at_least: float = 0.0
 ) -> float | None:
     """The shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
 

@@ -7,9 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import Diffeomorphism
+from dt_viz.flows.diffeomorphisms import AUTO, Diffeomorphism, Integration
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.flows.integration import AUTO, Integration
 from dt_viz.scenario.scenario import Scenario
 
 
@@ -82,3 +81,13 @@ class Behaviour(Protocol):
     def satisfied(self, motion: Motion) -> bool:
         """Whether the samples of `motion`, taken after the transform, behave as wanted."""
         ...
+
+
+def named_starts(which: Indices, num_demonstrated: int, how: str) -> list[str]:
+    """What there is to say of starts, counted from 0, the task's first: they are all `how`; empty if it is of none."""
+    said = []
+    for numbers, kind in ((which[which < num_demonstrated], ""), (which[which >= num_demonstrated], "added ")):
+        counted = ", ".join(str(k + 1 - (num_demonstrated if kind else 0)) for k in numbers)
+        if len(numbers):
+            said.append(f"{kind}start {counted} is {how}" if len(numbers) == 1 else f"{kind}starts {counted} are {how}")
+    return said

@@ -10,11 +10,10 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.diffeomorphisms import AUTO, Flow, Integration
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
-from dt_viz.flows.integration import AUTO, Integration
 from dt_viz.flows.integrators import integrate, rk4
-from dt_viz.scenario.scenario import Vector
+from dt_viz.obstacles.shapes import Point
 from dt_viz.transforms.base import Built, Motion
 
 NUM_SAMPLES = 400
@@ -57,24 +56,18 @@ REACH = 0.95
 """Metres from the shoulder, beyond which the hand gets nowhere."""
 
 
-def vector(v: Array) -> Vector:
-    """An array (3,) as a value."""
-    x, y, z = (float(c) for c in v)
-    return x, y, z
-
-
 @dataclass(frozen=True)
 class BiasPoint:
     """A place that motions are pulled towards, and how."""
 
-    position: Vector
+    position: Point
     """The target, metres."""
     radius: float | None = None
     """Of the region S around it in which the field acts, metres; None is `auto`, by the distance of the motion."""
     strength: float | None = None
     """t of the flow, in which a point far from target and border moves by t radii; None is `auto`, the shortest after
     which every motion passes within a centimetre."""
-    plane: tuple[Vector, Vector] | None = None
+    plane: tuple[Point, Point] | None = None
     """Two orthonormal vectors: the field acts along these only, and alike at every depth. None is in space."""
     moves_goal: bool = False
     """Whether the goal is pulled along, or stays where it is."""
@@ -174,7 +167,7 @@ class Biasing:
     """
 
     point: BiasPoint
-    below: tuple[Vector, ...] = ()
+    below: tuple[Point, ...] = ()
     """Targets of the bias points below this one in the stack: what passes them is not to be pulled away again."""
 
     def build(self, motion: Motion, tolerance: float, at_least: float) -> Built:

@@ -18,7 +18,7 @@ from dt_viz.files import ply
 from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.files import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.controls import Control
@@ -294,7 +294,7 @@ def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obs
     mean = task.mean_path
     ends = np.concatenate([task.starts, mean[-1:]])
     room = np.linalg.norm(mean[:, None] - ends, axis=-1).min(axis=1)
-    room = np.minimum(room, Several(tuple(others)).signed_distance(mean))
+    room = np.minimum(room, Union(tuple(others)).signed_distance(mean))
     best = int(room.argmax())
     along = mean[min(best + 1, 100)] - mean[max(best - 1, 0)]
     aside = np.cross(along, np.cross(*task.slice.axes.T))

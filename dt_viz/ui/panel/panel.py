@@ -40,7 +40,7 @@ VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
     "ghost": "Undisturbed (dashed)",
     "demonstrations": "Demonstrations",
-    "field": "Vector field",
+    "field": "Point field",
     "streamlines": "Streamlines",
     "arm": "Arm",
     "ghost_arm": "Arm without avoidance",

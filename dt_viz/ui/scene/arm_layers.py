@@ -43,7 +43,7 @@ def arms_along(robot: Robot, motion: ArmMotion, num: int = NUM_ARMS) -> Array:
 
 
 class Onion(Picture):
-    """Several arms along the motion, from faint at its start to strong at its end. A drag sends their poses only."""
+    """Union arms along the motion, from faint at its start to strong at its end. A drag sends their poses only."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         super().__init__(scene.add_frame("/onion", show_axes=False, visible=False))

@@ -108,7 +108,7 @@ class Handles:
 
 
 class Dragged(Picture):
-    """Several things that are dragged themselves, parallel to the slice, and one of them also by handles."""
+    """Union things that are dragged themselves, parallel to the slice, and one of them also by handles."""
 
     def __init__(self, node: viser.SceneNodeHandle) -> None:
         super().__init__(node)

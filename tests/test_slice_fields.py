@@ -36,8 +36,8 @@ def shown(engine, scenario, wanted=Stage.FINE, **view):
 
 
 def solved(engine, scenario, precision=FINE):
-    ground = engine._ground(scenario, None)
-    return ground, solve(ground, scenario, precision)
+    nominal = engine._nominal(scenario, None)
+    return nominal, solve(nominal, scenario, precision)
 
 
 def with_bias(engine, scenario):
@@ -184,10 +184,10 @@ def test_det_j_of_the_identity_is_one_and_its_level_lines_are_circles(engine, sc
 def test_the_system_of_each_level_has_the_rollouts_of_that_level(engine, scenario):
     scenario = with_bias(engine, scenario)
     frame = shown(engine, scenario)
-    ground, solution = solved(engine, scenario)
+    nominal, solution = solved(engine, scenario)
     assert len(frame.levels) == len(levels(scenario)) == 3
     for level, paths in enumerate(frame.levels):
-        system = cut_off(ground, solution, level)
+        system = cut_off(nominal, solution, level)
         for rollout, path in enumerate(paths):
             times = frame.times[rollout][:-1]
             expected = system.transform.inverse(solution.rays.base.flow(solution.rays.z0[rollout], times))

@@ -1,13 +1,12 @@
-"""Several obstacles as one, and the fields that add up to theirs."""
+"""Union obstacles as one, and the fields that add up to theirs."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.obstacles.shapes import Box, Sphere
-from dt_viz.obstacles.union import ROUNDING, Several
-from dt_viz.transforms.bias import vector
+from dt_viz.obstacles.shapes import Box, Sphere, as_point
+from dt_viz.obstacles.union import ROUNDING, Union
 
 PARTS = (
     Sphere((0.0, 0.0, 0.0), 0.15),
@@ -23,14 +22,14 @@ def _points():
 
 def test_the_distance_is_that_of_the_nearest_part(points):
     apart = np.stack([part.signed_distance(points) for part in PARTS])
-    np.testing.assert_array_equal(Several(PARTS).signed_distance(points), apart.min(axis=0))
-    assert np.isinf(Several().signed_distance(points)).all()
+    np.testing.assert_array_equal(Union(PARTS).signed_distance(points), apart.min(axis=0))
+    assert np.isinf(Union().signed_distance(points)).all()
 
 
 def test_what_is_moved_out_is_outside_of_all(points):
-    free = Several(PARTS).nearest_free(points)
-    assert Several(PARTS).signed_distance(free).min() >= -ROUNDING
-    outside = Several(PARTS).signed_distance(points) > 0
+    free = Union(PARTS).nearest_free(points)
+    assert Union(PARTS).signed_distance(free).min() >= -ROUNDING
+    outside = Union(PARTS).signed_distance(points) > 0
     np.testing.assert_array_equal(free[outside], points[outside])
 
 
@@ -38,8 +37,8 @@ def test_what_is_moved_out_is_outside_of_all(points):
 def test_it_is_moved_hardly_farther_than_to_the_nearest_place(seed, num):
     """Also where two spheres hardly overlap, and where leaving one leads deeper into the next."""
     rng = np.random.default_rng(seed)
-    spheres = [Sphere(vector(rng.normal(0, 0.05, 3)), float(rng.uniform(0.08, 0.2))) for _ in range(num)]
-    together, directions = Several(tuple(spheres)), rng.normal(size=(3000, 3))
+    spheres = [Sphere(as_point(rng.normal(0, 0.05, 3)), float(rng.uniform(0.08, 0.2))) for _ in range(num)]
+    together, directions = Union(tuple(spheres)), rng.normal(size=(3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     surfaces = np.concatenate([sphere.position + sphere.radius * directions for sphere in spheres])
     surface = surfaces[together.signed_distance(surfaces) >= -ROUNDING]
@@ -54,7 +53,7 @@ def test_it_is_moved_hardly_farther_than_to_the_nearest_place(seed, num):
 
 @pytest.mark.parametrize("parts", [PARTS, PARTS[:2], PARTS[2:], PARTS[:1]])
 def test_the_fields_add_up(points, parts):
-    together = Several(parts).field("free-space", 6.0)
+    together = Union(parts).field("free-space", 6.0)
     apart = [part.field("free-space", 6.0) for part in parts]
     np.testing.assert_allclose(together(points), sum(field(points) for field in apart), rtol=0, atol=1e-12)
     value, derivative = together.with_jacobian(points)

@@ -8,11 +8,11 @@ import pytest
 from dt_viz.arm.collision import Nearest, load_collision_model
 from dt_viz.engine.engine import Stage
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_doubts
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import aware, plane_of
 from dt_viz.transforms.avoidance import BESIDE
-from dt_viz.transforms.bias import Biasing, BiasPoint, vector
+from dt_viz.transforms.bias import Biasing, BiasPoint
 
 
 def stage(engine, scenario, wanted=Stage.ROLLOUTS):
@@ -23,12 +23,12 @@ def stage(engine, scenario, wanted=Stage.ROLLOUTS):
 def near(goal, obstacle_position, clearance, diameter=0.15):
     """A sphere so near the goal, on the side of where the task's obstacle stands."""
     away = np.array(obstacle_position) - goal
-    return Sphere(vector(goal + (diameter / 2 + clearance) * away / np.linalg.norm(away)), diameter)
+    return Sphere(as_point(goal + (diameter / 2 + clearance) * away / np.linalg.norm(away)), diameter)
 
 
 @pytest.fixture(name="middle")
 def _middle(engine):
-    return vector(engine.task("draw_s").mean_path[50])
+    return as_point(engine.task("draw_s").mean_path[50])
 
 
 def far_below(engine, middle):
@@ -52,14 +52,14 @@ def test_a_motion_through_the_obstacle_is_said_whatever_else_is(engine, middle, 
 @pytest.mark.parametrize("task", ["draw_s", "lift_box"])
 def test_a_missed_goal_is_said_beside_a_covered_start_unless_it_is_covered_itself(engine, task):
     goal = stage(engine, Scenario(task, ())).goal
-    start = Sphere(vector(engine.task(task).starts[0]), 0.05)
+    start = Sphere(as_point(engine.task(task).starts[0]), 0.05)
     beside = near(goal, engine.task(task).obstacle_position, 0.0005)
     frame = stage(engine, Scenario(task, (beside, start)))
     missed = np.linalg.norm(frame.reached - frame.goal)
     assert missed > MAX_GOAL_MISS
     assert frame.health.says("inside the obstacle")
     assert frame.health.says(f"no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
-    covering = stage(engine, Scenario(task, (replace(beside, position=vector(goal)), start))).health
+    covering = stage(engine, Scenario(task, (replace(beside, position=as_point(goal)), start))).health
     assert covering.says("the goal is inside the obstacle: motions end beside it")
     assert not covering.says("no way to the goal")
 
@@ -79,8 +79,8 @@ def test_each_bias_point_speaks_by_its_name(engine, middle):
 def test_a_hopeless_bias_point_leaves_the_obstacle_avoided(engine, seed):
     rng, task = np.random.default_rng(seed), engine.task("draw_s")
     path = task.paths[seed % len(task.paths)]
-    sphere = Sphere(vector(path[int(rng.integers(60, 140))] + rng.normal(0, 0.015, 3)), float(rng.uniform(0.1, 0.2)))
-    target = BiasPoint(vector(path[path[:, 2].argmax()] + [0.0, 0.0, 0.10]), radius=0.05, plane=plane_of(task))
+    sphere = Sphere(as_point(path[int(rng.integers(60, 140))] + rng.normal(0, 0.015, 3)), float(rng.uniform(0.1, 0.2)))
+    target = BiasPoint(as_point(path[path[:, 2].argmax()] + [0.0, 0.0, 0.10]), radius=0.05, plane=plane_of(task))
     layer = Layer(Biasing(target), name="Bias 1")
     without, with_it = (
         stage(engine, Scenario("draw_s", (sphere,), layers=(replace(layer, on=on),))).health for on in (False, True)
@@ -91,7 +91,7 @@ def test_a_hopeless_bias_point_leaves_the_obstacle_avoided(engine, seed):
 
 @pytest.mark.parametrize(("temperature", "diameter"), [(1.0, 0.04), (1.0, 0.10), (2.0, 0.06)])
 def test_a_margin_out_of_reach_is_said_with_what_is_kept_and_what_helps(engine, middle, temperature, diameter):
-    sphere = Sphere(vector(np.add(middle, (0.01, 0.005, 0.0))), diameter)
+    sphere = Sphere(as_point(np.add(middle, (0.01, 0.005, 0.0))), diameter)
     scenario = Scenario("draw_s", (sphere,), temperature=temperature, margin=0.05)
     health = stage(engine, scenario).health
     assert 0 < health.clearance < 0.05
@@ -113,7 +113,7 @@ def test_a_motion_that_stays_inside_is_said_once(engine, middle):
 @pytest.mark.parametrize("wanted", [Stage.ROLLOUTS, Stage.FINE])
 def test_motions_to_a_goal_that_two_obstacles_cover_end_beside_both(engine, seed, wanted):
     goal, rng = stage(engine, Scenario("draw_s", ())).goal, np.random.default_rng(seed)
-    scenario = Scenario("draw_s", tuple(Sphere(vector(goal + rng.normal(0, 0.04, 3)), 0.15) for _ in range(2)))
+    scenario = Scenario("draw_s", tuple(Sphere(as_point(goal + rng.normal(0, 0.04, 3)), 0.15) for _ in range(2)))
     assert scenario.obstacle.signed_distance(goal) < 0
     frame = stage(engine, scenario, wanted)
     assert frame.health.clearance > -BESIDE
@@ -121,7 +121,7 @@ def test_motions_to_a_goal_that_two_obstacles_cover_end_beside_both(engine, seed
 
 
 def test_equal_layers_are_told_apart(engine, middle):
-    point = BiasPoint(vector(np.add(middle, (0.05, 0.0, 0.0))), plane=plane_of(engine.task("draw_s")))
+    point = BiasPoint(as_point(np.add(middle, (0.05, 0.0, 0.0))), plane=plane_of(engine.task("draw_s")))
     layers = tuple(Layer(Biasing(point), on=on, name=name) for name, on in (("A", False), ("B", True), ("C", True)))
     frame = stage(engine, Scenario("draw_s", (), layers=layers))
     durations, radii = frame.health.layer_durations, frame.layer_radii

@@ -8,7 +8,7 @@ import pytest
 from dt_viz.engine.engine import Stage
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
-from dt_viz.obstacles.union import Several
+from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import MAX_POINTS, NEAR, believed, occupancy_picture
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import Slice
@@ -68,4 +68,4 @@ def test_the_picture_is_worked_out_only_while_it_is_shown(engine, initial):
     frames = list(engine.frames(shown))
     assert [frame.pictures.occupancy is not None for frame in frames] == [frame.stage >= Stage.LIVE for frame in frames]
     outline = frames[-1].pictures.occupancy.outline
-    assert np.abs(Several(scenario.obstacles).signed_distance(outline)).max() < 1e-3
+    assert np.abs(Union(scenario.obstacles).signed_distance(outline)).max() < 1e-3
