@@ -17,7 +17,9 @@ Mask = NDArray[np.bool_]
 Selection = slice | Indices
 
 BLOCK = 4096
-"""Points that a sum over a grid is worked out for at once: of more, what is worked out on the way leaves the cache."""
+"""Number of points that a sum over a grid takes at once; with more of them the intermediate results leave the cache."""
+FEW = 16
+"""Number of points up to which the calls cost more than the arithmetic, so that fewer and larger products pay."""
 
 
 class VectorField(Protocol):
@@ -138,6 +140,8 @@ class GaussianGrid:
         if num > BLOCK:
             blocks = [self.contract(s[i : i + BLOCK], weights, orders) for i in range(0, num, BLOCK)]
             return np.concatenate(blocks, axis=1)
+        if num <= FEW:
+            return self._contract_few(s, weights, orders)
         highest, levels, order = _plan(orders)
         values = self._gaussians(s, highest)
         first, *others = self._flat_axes[2]
@@ -151,6 +155,18 @@ class GaussianGrid:
                 np.einsum("parn,an->prn", partial[source], values[derivative, part], out=longer[target])
             partial = longer
         return partial[order].swapaxes(1, 2)
+
+    def _contract_few(self, s: Array, weights: Array, orders: tuple[tuple[int, ...], ...]) -> Array:
+        """`contract` by one product for each axis, which gives all multi-indices with entries up to the highest."""
+        highest, chosen = _combinations(orders)
+        values = np.ascontiguousarray(self._gaussians(s, highest).transpose(2, 0, 1))  # (N, K + 1, Σn_j)
+        first, *others = self._flat_axes[2]
+        num, count = len(s), highest + 1
+        table = values[:, :, first].reshape(num * count, -1) @ weights.reshape(self.shape[0], -1)
+        for n, part in zip(self.shape[1:], others, strict=True):
+            table = values[:, None, :, part] @ table.reshape(num, count, n, -1)
+            count *= highest + 1
+        return table.reshape(num, count, -1).swapaxes(0, 1)[chosen]
 
     def features(self, s: Array) -> Array:
         """The dense matrix k(s, ŝ), (N, m): for fitting, not for evaluating."""
@@ -193,6 +209,14 @@ def _plan(orders: tuple[tuple[int, ...], ...]) -> _Plan:
         levels.append((tuple(pieces), len(now)))
         before = now
     return _Plan(max(map(max, orders)), tuple(levels), _selection([before.index(order) for order in orders]))
+
+
+@lru_cache(maxsize=256)
+def _combinations(orders: tuple[tuple[int, ...], ...]) -> tuple[int, Selection]:
+    """Highest derivative along an axis, and the places of multi-indices among all that reach up to it."""
+    highest = max(map(max, orders))
+    places = np.ravel_multi_index(tuple(np.transpose(orders)), (highest + 1,) * len(orders[0]))
+    return highest, _selection(places.tolist())
 
 
 def _selection(rows: list[int]) -> Selection:
