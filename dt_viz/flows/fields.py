@@ -232,6 +232,12 @@ def unit_orders(dim: int) -> tuple[tuple[int, ...], ...]:
 
 
 @lru_cache
+def jacobian_orders(dim: int) -> tuple[tuple[int, ...], ...]:
+    """Multi-indices of the value and of the `dim` first derivatives."""
+    return ((0,) * dim, *unit_orders(dim))
+
+
+@lru_cache
 def second_orders(dim: int) -> dict[tuple[int, int], tuple[int, ...]]:
     """Multi-index of each second derivative ∂²/∂s_i∂s_j, i ≤ j."""
     first = unit_orders(dim)
@@ -264,8 +270,8 @@ class GridRBF:
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
-        value, *columns = self.grid.contract(s, self.weights, ((0,) * self.dim, *unit_orders(self.dim)))
-        return value, np.stack(columns, axis=-1)
+        partials = self.grid.contract(s, self.weights, jacobian_orders(self.dim))
+        return partials[0], np.ascontiguousarray(partials[1:].transpose(1, 2, 0))
 
 
 @dataclass(frozen=True)
@@ -290,16 +296,24 @@ class PlacedField:
 
     def to_frame(self, s: Array) -> Array:
         """Where the world points `s` (N, d) lie in the frame of `inner`, Rᵀ(s − o)/c, (N, d)."""
-        return (s - self.origin) @ (self.axes / self.scale)
+        return (s - self.origin) @ self._to_local
 
     def __call__(self, s: Array) -> Array:
         """V at the world points `s` (N, d), as (N, d)."""
-        return self.inner(self.to_frame(s)) @ (self.scale * self.axes.T)
+        return self.inner(self.to_frame(s)) @ self._to_world
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the world points `s` (N, d)."""
         v, DV = self.inner.with_jacobian(self.to_frame(s))
-        return v @ (self.scale * self.axes.T), self.axes @ DV @ self.axes.T
+        return v @ self._to_world, self.axes @ DV @ self.axes.T
+
+    @cached_property
+    def _to_local(self) -> Array:
+        return self.axes / self.scale
+
+    @cached_property
+    def _to_world(self) -> Array:
+        return self.scale * self.axes.T
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,8 @@ def implicit_euler(
     identity = np.eye(field.dim)
     scale = 1.0 + np.abs(s).max(initial=0.0)
     y = best = s + h * field(s)
-    direction = np.zeros_like(s)
+    direction, length = np.zeros_like(s), np.ones((len(s), 1))
     smallest = np.full(len(s), np.inf)  # residual at `best`
-    length = np.ones((len(s), 1))
     for _ in range(max_iterations):
         v, DV = field.with_jacobian(y)
         residual = y - h * v - s
@@ -55,12 +54,16 @@ def implicit_euler(
             break
         update = np.linalg.solve(identity - h * DV, residual[..., None])[..., 0]
         worse = (size > smallest) & (size > 1e-13 * scale)
-        length = np.where(worse[:, None], 0.5 * length, 1.0)
-        best = np.where(worse[:, None], best, y)
-        direction = np.where(worse[:, None], direction, update)
-        smallest = np.where(worse, smallest, size)
-        y = best - length * direction
-        if not worse.any() and np.abs(update).max(initial=0.0) <= 1e-8 * scale:
+        if worse.any():
+            length = np.where(worse[:, None], 0.5 * length, 1.0)
+            best = np.where(worse[:, None], best, y)
+            direction = np.where(worse[:, None], direction, update)
+            smallest = np.where(worse, smallest, size)
+            y = best - length * direction
+            continue
+        length, best, direction, smallest = np.ones_like(length), y, update, size
+        y = y - update
+        if np.abs(update).max(initial=0.0) <= 1e-8 * scale:
             break  # quadratic convergence: the next correction would be far below rounding
     if U is None:
         return y, None

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
-from dt_viz.flows.fields import Array, GaussianGrid, Mask, VectorField, second_orders, unit_orders
+from dt_viz.flows.fields import Array, GaussianGrid, Indices, Mask, VectorField, jacobian_orders, second_orders
 from dt_viz.properties import cached_property
 
 Generator = Literal["free-space", "probability"]
@@ -40,20 +41,25 @@ class OccupancyMap:
 
     def logit_gradient(self, s: Array) -> tuple[Array, Array]:
         """The logit (N,) and its gradient (N, d) at the points `s` (N, d)."""
-        d = self.grid.dim
-        partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d)))[..., 0]
+        partials = self.grid.contract(s, self.weights[:, None], jacobian_orders(self.grid.dim))[..., 0]
         return partials[0] + self.bias, partials[1:].T
 
     def logit_hessian(self, s: Array) -> tuple[Array, Array, Array]:
         """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
         d = self.grid.dim
-        second = second_orders(d)
-        orders = ((0,) * d, *unit_orders(d), *second.values())
+        orders, entries = _hessian_orders(d)
         partials = self.grid.contract(s, self.weights[:, None], orders)[..., 0]
-        hessian = np.empty((len(s), d, d))
-        for (i, j), column in zip(second, partials[1 + d :], strict=True):
-            hessian[:, i, j] = hessian[:, j, i] = column
+        hessian = partials[entries].T.reshape(-1, d, d)
         return partials[0] + self.bias, partials[1 : 1 + d].T, hessian
+
+
+@lru_cache
+def _hessian_orders(dim: int) -> tuple[tuple[tuple[int, ...], ...], Indices]:
+    """Multi-indices up to the second derivatives, and the place of each entry of the Hessian among them, row by row."""
+    orders, second = jacobian_orders(dim), second_orders(dim)
+    places = {pair: len(orders) + k for k, pair in enumerate(second)}
+    entries = [places[min(i, j), max(i, j)] for i in range(dim) for j in range(dim)]
+    return (*orders, *second.values()), np.array(entries)
 
 
 def fit_occupancy(
@@ -158,10 +164,9 @@ class AvoidanceField:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d). DV is symmetric: V is a gradient."""
         logit, gradient, hessian = self.occupancy.logit_hessian(s)
         weight, slope = self._weight(logit)
-        outer = gradient[:, :, None] * gradient[:, None, :]
-        return (self._gain * weight)[:, None] * gradient, self._gain * (
-            weight[:, None, None] * hessian + slope[:, None, None] * outer
-        )
+        weight, bend = self._gain * weight[:, None], self._gain * slope[:, None] * gradient
+        DV = weight[:, None] * hessian + bend[:, :, None] * gradient[:, None]
+        return weight * gradient, DV
 
     def _weight(self, logit: Array) -> tuple[Array, Array]:
         """dU/dlogit and its derivative."""
