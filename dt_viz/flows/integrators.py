@@ -44,30 +44,34 @@ def implicit_euler(
     identity = np.eye(field.dim)
     scale = 1.0 + np.abs(s).max(initial=0.0)
     y = best = s + h * field(s)
-    direction, length = np.zeros_like(s), np.ones((len(s), 1))
-    smallest = np.full(len(s), np.inf)  # residual at `best`
+    direction, length, smallest = s, 1.0, np.inf  # Newton's step at `best`, the part of it taken, the residual there
+    jump = np.inf
     for _ in range(max_iterations):
         v, DV = field.with_jacobian(y)
-        residual = y - h * v - s
-        size = np.abs(residual).max(axis=1)
+        matrix, residual = identity - h * DV, y - h * v - s
+        size = np.abs(residual).max(axis=1, keepdims=True)
         if size.max(initial=0.0) <= 1e-15 * scale:
+            jump = 0.0
             break
-        update = np.linalg.solve(identity - h * DV, residual[..., None])[..., 0]
+        update = np.linalg.solve(matrix, residual[..., None])[..., 0]
         worse = (size > smallest) & (size > 1e-13 * scale)
         if worse.any():
-            length = np.where(worse[:, None], 0.5 * length, 1.0)
-            best = np.where(worse[:, None], best, y)
-            direction = np.where(worse[:, None], direction, update)
-            smallest = np.where(worse, smallest, size)
+            length = np.where(worse, 0.5 * length, 1.0)
+            best, direction, smallest = (
+                np.where(worse, old, new) for old, new in ((best, y), (direction, update), (smallest, size))
+            )
             y = best - length * direction
             continue
-        length, best, direction, smallest = np.ones_like(length), y, update, size
+        length, best, direction, smallest = 1.0, y, update, size
         y = y - update
-        if np.abs(update).max(initial=0.0) <= 1e-8 * scale:
+        jump = np.abs(update).max(initial=0.0)
+        if jump <= 1e-8 * scale:
             break  # quadratic convergence: the next correction would be far below rounding
     if U is None:
         return y, None
-    return y, np.linalg.solve(identity - h * field.with_jacobian(y)[1], U)
+    if jump > 1e-12 * scale:
+        matrix = identity - h * field.with_jacobian(y)[1]
+    return y, np.linalg.solve(matrix, U)
 
 
 def integrate(

@@ -81,9 +81,9 @@ class DiffeomorphicSystem:
     base: Attractor
 
     def velocity(self, y: Array) -> Array:
-        """ẏ, (*B, d), m/s: the derivative of ψ⁻¹ at ψ(y) along ż. No Jacobian is formed or inverted."""
-        z = self.transform.forward(y)
-        return self.transform.inverse_tangents(z, self.base.velocity(z)[..., None])[1][..., 0]
+        """ẏ, (*B, d), m/s, from one pass through ψ that carries its Jacobian along."""
+        z, J = self.transform.jacobian(y)
+        return np.linalg.solve(J, self.base.velocity(z)[..., None])[..., 0]
 
     def lyapunov(self, y: Array) -> Array:
         """Φ(ψ(y)), (*B,): strictly falling along every motion until the goal."""
@@ -104,11 +104,7 @@ class DiffeomorphicSystem:
         Returns:
             (*B, T, d) positions.
         """
-        return stepped(self._velocity_by_solve, y0, times, substeps)
-
-    def _velocity_by_solve(self, y: Array) -> Array:
-        z, J = self.transform.jacobian(y)
-        return np.linalg.solve(J, self.base.velocity(z)[..., None])[..., 0]
+        return stepped(self.velocity, y0, times, substeps)
 
 
 def stepped(velocity: Callable[[Array], Array], y0: Array, times: Array, substeps: int) -> Array:
