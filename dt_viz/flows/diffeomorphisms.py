@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -37,6 +38,13 @@ class Diffeomorphism(ABC):
 
         Of a flow that is γ(s·t, ·), so scaled(a)∘scaled(b) = scaled(a + b); of a chain, the chain of the scaled parts.
         """
+
+    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
+        """ψ with its integration errors at another tolerance, in the unit of the points, where it has a tolerance.
+
+        A controller that asks for the velocity at one point hardly needs the exactness of a rollout.
+        """
+        return self
 
     def forward(self, y: Array) -> Array:
         """ψ(y), (*B, d)."""
@@ -91,6 +99,8 @@ class Flow(Diffeomorphism):
     """Integrator for ψ⁻¹; None takes `step`. `implicit_euler` with `euler` gives an inverse exact to rounding."""
     sparse: bool = False
     """Whether the field vanishes on much of space: points where it does are not integrated, only found."""
+    tolerance: float | None = None
+    """Error that `steps` RK4 steps were chosen for, in the unit of the points; None where the steps define the map."""
 
     @property
     def dim(self) -> int:
@@ -100,6 +110,13 @@ class Flow(Diffeomorphism):
     def scaled(self, fraction: float) -> Flow:
         """See `Diffeomorphism`. The steps are as many, and shorter: what undoes them exactly still does."""
         return replace(self, duration=fraction * self.duration)
+
+    def at_tolerance(self, tolerance: float) -> Flow:
+        """See `Diffeomorphism`. The error of a step of length h is in proportion to h⁴."""
+        if self.tolerance is None:
+            return self
+        steps = math.ceil(self.steps * (self.tolerance / tolerance) ** 0.25)
+        return replace(self, steps=steps, tolerance=tolerance)
 
     def min_step_determinant(self, s: Array, *, inverse: bool) -> float:
         """Smallest det of the derivative of a step of ψ from points `s` (N, d), or of ψ⁻¹.
@@ -150,6 +167,10 @@ class AdaptiveFlow(Diffeomorphism):
         """See `Diffeomorphism`."""
         return replace(self, duration=fraction * self.duration)
 
+    def at_tolerance(self, tolerance: float) -> AdaptiveFlow:
+        """See `Diffeomorphism`."""
+        return replace(self, tolerance=tolerance)
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return integrate_adaptive(self.field, s, U, -self.duration if inverse else self.duration, self.tolerance)
 
@@ -175,6 +196,10 @@ class Chain(Diffeomorphism):
         """See `Diffeomorphism`."""
         return Chain([part.scaled(fraction) for part in self.parts])
 
+    def at_tolerance(self, tolerance: float) -> Chain:
+        """See `Diffeomorphism`."""
+        return Chain([part.at_tolerance(tolerance) for part in self.parts])
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         for part in self.parts if inverse else reversed(self.parts):
             s, U = part._map(s, U, inverse=inverse)
@@ -195,6 +220,10 @@ class Inverse(Diffeomorphism):
     def scaled(self, fraction: float) -> Inverse:
         """See `Diffeomorphism`."""
         return Inverse(self.of.scaled(fraction))
+
+    def at_tolerance(self, tolerance: float) -> Inverse:
+        """See `Diffeomorphism`."""
+        return Inverse(self.of.at_tolerance(tolerance))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return self.of._map(s, U, inverse=not inverse)
@@ -237,6 +266,10 @@ class Conjugated(Diffeomorphism):
         """See `Diffeomorphism`."""
         return replace(self, inner=self.inner.scaled(fraction))
 
+    def at_tolerance(self, tolerance: float) -> Conjugated:
+        """See `Diffeomorphism`."""
+        return Conjugated(self.inner.at_tolerance(tolerance), self.by.at_tolerance(tolerance))
+
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         s, U = self.by._map(s, U, inverse=False)
         s, U = self.inner._map(s, U, inverse=inverse)
@@ -275,6 +308,10 @@ class Placed(Diffeomorphism):
     def scaled(self, fraction: float) -> Placed:
         """See `Diffeomorphism`: in place and in size it stays as it is."""
         return replace(self, inner=self.inner.scaled(fraction))
+
+    def at_tolerance(self, tolerance: float) -> Placed:
+        """See `Diffeomorphism`."""
+        return replace(self, inner=self.inner.at_tolerance(tolerance / self.scale))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         k = self.inner.dim

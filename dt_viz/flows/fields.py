@@ -91,17 +91,18 @@ class GaussianGrid:
 
     @cached_property
     def _flat_axes(self) -> tuple[NDArray[np.intp], Array, tuple[slice, ...]]:
-        """The axes one after the other: to which coordinate each entry belongs, the entries, and each axis' part."""
+        """The axes one after the other: coordinate (Σn_j,) and value (Σn_j, 1) of each entry, and each axis' part."""
         ends = np.cumsum(self.shape)
         parts = tuple(slice(int(end) - n, int(end)) for n, end in zip(self.shape, ends, strict=True))
-        return np.repeat(np.arange(self.dim), self.shape), np.concatenate(self.axes), parts
+        return np.repeat(np.arange(self.dim), self.shape), np.concatenate(self.axes)[:, None], parts
 
     def _gaussians(self, s: Array, max_order: int) -> Array:
         """1-D Gaussians of all axes and their derivatives, (K + 1, Σn_j, N): the batch last, for long inner loops."""
         coordinate, entries, _ = self._flat_axes
-        offset = np.ascontiguousarray(s.T)[coordinate] - entries[:, None]
+        offset = s.T.take(coordinate, axis=0)
+        offset -= entries
         values = np.empty((max_order + 1, *offset.shape))
-        np.exp(-self.ell * (offset * offset), out=values[0])
+        np.exp(offset * offset * -self.ell, out=values[0])
         # Hermite recursion: g⁽ⁿ⁺¹⁾ = −2ℓ (offset · g⁽ⁿ⁾ + n · g⁽ⁿ⁻¹⁾)
         offset *= -2.0 * self.ell
         for n in range(max_order):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,6 +79,10 @@ class DiffeomorphicSystem:
     transform: Diffeomorphism
     """ψ, from the space of the motion to the space of the base attractor."""
     base: Attractor
+
+    def at_tolerance(self, tolerance: float) -> DiffeomorphicSystem:
+        """The system with the integration errors of ψ at another tolerance, metres; see `Diffeomorphism`."""
+        return replace(self, transform=self.transform.at_tolerance(tolerance))
 
     def velocity(self, y: Array) -> Array:
         """ẏ, (*B, d), m/s, from one pass through ψ that carries its Jacobian along."""

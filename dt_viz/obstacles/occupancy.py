@@ -158,25 +158,24 @@ class AvoidanceField:
     def __call__(self, s: Array) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
         logit, gradient = self.occupancy.logit_gradient(s)
-        return (self._gain * self._weight(logit)[0])[:, None] * gradient
+        return self._weight(logit)[0][:, None] * gradient
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d). DV is symmetric: V is a gradient."""
         logit, gradient, hessian = self.occupancy.logit_hessian(s)
         weight, slope = self._weight(logit)
-        weight, bend = self._gain * weight[:, None], self._gain * slope[:, None] * gradient
-        DV = weight[:, None] * hessian + bend[:, :, None] * gradient[:, None]
-        return weight * gradient, DV
+        weight, bend = weight[:, None], slope[:, None] * gradient
+        return weight * gradient, weight[:, None] * hessian + bend[:, :, None] * gradient[:, None]
 
     def _weight(self, logit: Array) -> tuple[Array, Array]:
-        """dU/dlogit and its derivative."""
+        """V's factor at the logit's gradient, which is dU/dlogit times the squared kernel width, and its derivative."""
         if self.generator == "probability":
             p = expit(logit)
-            weight = p * (1 - p)
+            weight = self._gain * p * (1 - p)
             return weight, weight * (1 - 2 * p)
         p = expit(logit / self.temperature)
         weight = np.maximum(p - self._far, 0)
-        return weight, (weight > 0) * p * (1 - p) / self.temperature
+        return self._gain * weight, (weight > 0) * p * (1 - p) * (self._gain / self.temperature)
 
 
 @dataclass(frozen=True)

@@ -207,7 +207,8 @@ class Biasing:
         elif point.strength is None and at_least > LONG and at_end.any() and not point.moves_goal:
             hopeless = True  # its ends stay where they are, and no other place of it will be nearer
             doubts.append("a motion has its start or goal nearer to the point than its way: it is not led there")
-        flow = Flow(field, duration, max(1, math.ceil(duration / (STEP * tolerance**0.25))), sparse=True)
+        steps = max(1, math.ceil(duration / (STEP * tolerance**0.25)))
+        flow = Flow(field, duration, steps, sparse=True, tolerance=tolerance)
         flow = point.integration.of(flow)
         goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
         return Built(flow, duration, goal, hopeless, tuple(doubts), point.integration)
