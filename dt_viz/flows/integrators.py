@@ -1,28 +1,55 @@
-"""One step of an integrator, for a state and, where asked for, for tangents carried along with it.
+"""Integrators, for points and, where asked for, for tangents carried along with them.
 
-A step takes (field, s, U, h): points `s` (N, d), tangents `U` (N, d, k) or None, step length h of either sign. It
-returns the new points and tangents. Tangents obey the variational equation U̇ = DV·U, integrated by the same method,
-so they are the exact derivative of the numerical step.
+A method takes (field, s, U, h, steps): points `s` (N, d), tangents `U` (N, d, k) or None, step length h of either sign,
+number of steps. It returns the new points and tangents. Tangents obey the variational equation U̇ = DV·U, integrated by
+the same method, so they are the exact derivative of the numerical step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
+from typing import Protocol
 
 import numpy as np
 
 from dt_viz.flows.fields import Array, Mask, VectorField
 from dt_viz.interruption import checkpoint
 
-Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
+
+class Step(Protocol):
+    """A method: several steps of one length."""
+
+    def __call__(
+        self, field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1
+    ) -> tuple[Array, Array | None]:
+        """The points (N, d) and tangents (N, d, k) after `steps` steps."""
+        ...
 
 
+def _one_by_one(step: Callable[[VectorField, Array, Array | None, float], tuple[Array, Array | None]]) -> Step:
+    """The method that takes one `step` after the other."""
+
+    @wraps(step)
+    def method(
+        field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1
+    ) -> tuple[Array, Array | None]:
+        for _ in range(steps):
+            checkpoint()
+            s, U = step(field, s, U, h)
+        return s, U
+
+    return method
+
+
+@_one_by_one
 def euler(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
     """Explicit Euler, the paper's: s + h·V(s). First order."""
     state, rate = _augment(field, s, U)
     return _split(state + h * rate(state), s, U)
 
 
+@_one_by_one
 def rk4(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
     """The classical Runge–Kutta step. Fourth order."""
     state, rate = _augment(field, s, U)
@@ -34,55 +61,69 @@ def rk4(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array,
 
 
 def implicit_euler(
-    field: VectorField, s: Array, U: Array | None, h: float, *, max_iterations: int = 200
+    field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1, *, max_iterations: int = 200
 ) -> tuple[Array, Array | None]:
-    """Implicit Euler: the y with y − h·V(y) = s. First order, and the exact inverse of `euler` with −h.
+    """Implicit Euler: the y_k with y_k − h·V(y_k) = y_{k−1}, y_0 = s. First order; `euler` with −h undoes it exactly.
 
-    Newton's method, point by point going back half the way where the residual has grown. While I − h·DV is regular
-    everywhere, which is also when the step is invertible, that leads to the one solution from everywhere.
+    Newton's method finds the points of all steps at once, for evaluating the field at many points costs little more
+    than at one. Where the residual of a point's steps has grown, it goes back half the way. While I − h·DV is regular
+    everywhere, which is also when a step is invertible, that leads to the one solution from everywhere.
     """
-    identity = np.eye(field.dim)
     scale = 1.0 + np.abs(s).max(initial=0.0)
-    y = best = s + h * field(s)
-    direction, length, smallest = s, 1.0, np.inf  # Newton's step at `best`, the part of it taken, the residual there
-    jump = np.inf
+    path, end = np.empty((steps, *s.shape)), s
+    for k in range(steps):
+        path[k] = end = end + h * field(end)
+    # Newton's step at `best`, the part of it that was taken, the residual there, and the last change of the path
+    best, direction, length, smallest, change = path, path, 1.0, np.inf, np.inf
     for _ in range(max_iterations):
-        v, DV = field.with_jacobian(y)
-        matrix, residual = identity - h * DV, y - h * v - s
-        size = np.abs(residual).max(axis=1, keepdims=True)
+        checkpoint()
+        matrices, residual = _implicit_residual(field, s, path, h)
+        size = np.abs(residual).max(axis=(0, 2))[:, None]
         if size.max(initial=0.0) <= 1e-15 * scale:
-            jump = 0.0
+            change = 0.0
             break
-        update = np.linalg.solve(matrix, residual[..., None])[..., 0]
+        update = residual.copy()
+        for k, inverse in enumerate(np.linalg.inv(matrices)):  # block by block, for the system is block bidiagonal
+            if k:
+                update[k] += update[k - 1]
+            update[k] = (inverse @ update[k, ..., None])[..., 0]
         worse = (size > smallest) & (size > 1e-13 * scale)
         if worse.any():
             length = np.where(worse, 0.5 * length, 1.0)
             best, direction, smallest = (
-                np.where(worse, old, new) for old, new in ((best, y), (direction, update), (smallest, size))
+                np.where(worse, old, new) for old, new in ((best, path), (direction, update), (smallest, size))
             )
-            y = best - length * direction
+            path = best - length * direction
             continue
-        length, best, direction, smallest = 1.0, y, update, size
-        y = y - update
-        jump = np.abs(update).max(initial=0.0)
-        if jump <= 1e-8 * scale:
+        best, direction, length, smallest = path, update, 1.0, size
+        path = path - update
+        change = np.abs(update).max(initial=0.0)
+        if change <= 1e-8 * scale:
             break  # quadratic convergence: the next correction would be far below rounding
     if U is None:
-        return y, None
-    if jump > 1e-12 * scale:
-        matrix = identity - h * field.with_jacobian(y)[1]
-    return y, np.linalg.solve(matrix, U)
+        return path[-1], None
+    if change > 1e-12 * scale:
+        matrices, _ = _implicit_residual(field, s, path, h)
+    for inverse in np.linalg.inv(matrices):
+        U = inverse @ U
+    return path[-1], U
+
+
+def _implicit_residual(field: VectorField, s: Array, path: Array, h: float) -> tuple[Array, Array]:
+    """Matrices I − h·DV(y_k) (K, N, d, d) and residuals y_k − h·V(y_k) − y_{k−1} (K, N, d) of a `path` (K, N, d)."""
+    d = path.shape[-1]
+    v, DV = field.with_jacobian(path.reshape(-1, d))
+    residual = path - h * v.reshape(path.shape)
+    residual[0] -= s
+    residual[1:] -= path[:-1]
+    return np.eye(d) - h * DV.reshape(*path.shape, d), residual
 
 
 def integrate(
     step: Step, field: VectorField, s: Array, U: Array | None, duration: float, steps: int
 ) -> tuple[Array, Array | None]:
     """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` for `duration` in equal `steps`."""
-    h = duration / steps
-    for _ in range(steps):
-        checkpoint()
-        s, U = step(field, s, U, h)
-    return s, U
+    return step(field, s, U, duration / steps, steps)
 
 
 def integrate_adaptive(

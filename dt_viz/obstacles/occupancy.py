@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
-from dt_viz.flows.fields import Array, GaussianGrid, Indices, Mask, VectorField, jacobian_orders, second_orders
+from dt_viz.flows.fields import Array, GaussianGrid, Mask, VectorField, jacobian_orders, second_orders
 from dt_viz.properties import cached_property
 
 Generator = Literal["free-space", "probability"]
@@ -47,19 +47,15 @@ class OccupancyMap:
     def logit_hessian(self, s: Array) -> tuple[Array, Array, Array]:
         """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
         d = self.grid.dim
-        orders, entries = _hessian_orders(d)
-        partials = self.grid.contract(s, self.weights[:, None], orders)[..., 0]
-        hessian = partials[entries].T.reshape(-1, d, d)
-        return partials[0] + self.bias, partials[1 : 1 + d].T, hessian
+        partials = self.grid.contract(s, self.weights[:, None], _hessian_orders(d))[..., 0]
+        return partials[0] + self.bias, partials[1 : 1 + d].T, partials[1 + d :].T.reshape(-1, d, d)
 
 
 @lru_cache
-def _hessian_orders(dim: int) -> tuple[tuple[tuple[int, ...], ...], Indices]:
-    """Multi-indices up to the second derivatives, and the place of each entry of the Hessian among them, row by row."""
-    orders, second = jacobian_orders(dim), second_orders(dim)
-    places = {pair: len(orders) + k for k, pair in enumerate(second)}
-    entries = [places[min(i, j), max(i, j)] for i in range(dim) for j in range(dim)]
-    return (*orders, *second.values()), np.array(entries)
+def _hessian_orders(dim: int) -> tuple[tuple[int, ...], ...]:
+    """Multi-indices of the value, of the first derivatives, and of all entries of the Hessian, row by row."""
+    second = second_orders(dim)
+    return (*jacobian_orders(dim), *(second[min(i, j), max(i, j)] for i in range(dim) for j in range(dim)))
 
 
 def fit_occupancy(
