@@ -17,6 +17,10 @@ from dt_viz.flows.fields import Array, Mask, VectorField
 from dt_viz.interruption import checkpoint
 
 
+TOGETHER = 128
+"""Number of points, counted once for each step, up to which implicit Euler finds the points of several steps at once."""
+
+
 class Step(Protocol):
     """A method: several steps of one length."""
 
@@ -65,34 +69,55 @@ def implicit_euler(
 ) -> tuple[Array, Array | None]:
     """Implicit Euler: the y_k with y_k − h·V(y_k) = y_{k−1}, y_0 = s. First order; `euler` with −h undoes it exactly.
 
-    Newton's method finds the points of all steps at once, for evaluating the field at many points costs little more
-    than at one. Where the residual of a point's steps has grown, it goes back half the way. While I − h·DV is regular
-    everywhere, which is also when a step is invertible, that leads to the one solution from everywhere.
+    For few points Newton's method finds the y_k of several steps at once, because a field costs little more at many
+    points than at one. Where the residual of a point has grown, the method goes back half the way. While I − h·DV is
+    regular everywhere, which is also when a step is invertible, that leads to the one solution from everywhere.
     """
+    at_once = max(1, TOGETHER // max(1, len(s)))
+    while steps > 0:
+        s, U = _implicit_steps(field, s, U, h, min(at_once, steps), max_iterations)
+        steps -= at_once
+    return s, U
+
+
+def _implicit_steps(
+    field: VectorField, s: Array, U: Array | None, h: float, steps: int, max_iterations: int
+) -> tuple[Array, Array | None]:
+    """`implicit_euler` with all K = `steps` steps at once; the unknowns are the path y_1, …, y_K of each point."""
+    num, d = s.shape
     scale = 1.0 + np.abs(s).max(initial=0.0)
-    path, end = np.empty((steps, *s.shape)), s
+    path, end = np.empty((num, steps, d)), s
     for k in range(steps):
-        path[k] = end = end + h * field(end)
+        path[:, k] = end = end + h * field(end)
+    linear = np.eye(steps * d) - np.eye(steps * d, k=-d)  # of the system: y_k − y_{k−1}
+    diagonal = np.arange(steps)
+
+    def system(path: Array) -> tuple[Array, Array]:
+        """Residual (N, K·d) of a path (N, K, d), and its derivative (N, K·d, K·d)."""
+        v, DV = field.with_jacobian(path.reshape(-1, d))
+        residual = path - h * v.reshape(path.shape)
+        residual[:, 0] -= s
+        residual[:, 1:] -= path[:, :-1]
+        matrix = np.empty((num, steps, d, steps, d))
+        matrix[...] = linear.reshape(matrix.shape[1:])
+        matrix[:, diagonal, :, diagonal] -= h * DV.reshape(num, steps, d, d).swapaxes(0, 1)
+        return residual.reshape(num, steps * d), matrix.reshape(num, steps * d, steps * d)
+
     # Newton's step at `best`, the part of it that was taken, the residual there, and the last change of the path
     best, direction, length, smallest, change = path, path, 1.0, np.inf, np.inf
     for _ in range(max_iterations):
         checkpoint()
-        matrices, residual = _implicit_residual(field, s, path, h)
-        size = np.abs(residual).max(axis=(0, 2))[:, None]
+        residual, matrix = system(path)
+        size = np.abs(residual).max(axis=1)[:, None, None]
         if size.max(initial=0.0) <= 1e-15 * scale:
             change = 0.0
             break
-        update = residual.copy()
-        for k, inverse in enumerate(np.linalg.inv(matrices)):  # block by block, for the system is block bidiagonal
-            if k:
-                update[k] += update[k - 1]
-            update[k] = (inverse @ update[k, ..., None])[..., 0]
+        update = np.linalg.solve(matrix, residual[..., None]).reshape(path.shape)
         worse = (size > smallest) & (size > 1e-13 * scale)
         if worse.any():
             length = np.where(worse, 0.5 * length, 1.0)
-            best, direction, smallest = (
-                np.where(worse, old, new) for old, new in ((best, path), (direction, update), (smallest, size))
-            )
+            best, direction = np.where(worse, best, path), np.where(worse, direction, update)
+            smallest = np.where(worse, smallest, size)
             path = best - length * direction
             continue
         best, direction, length, smallest = path, update, 1.0, size
@@ -101,22 +126,12 @@ def implicit_euler(
         if change <= 1e-8 * scale:
             break  # quadratic convergence: the next correction would be far below rounding
     if U is None:
-        return path[-1], None
+        return path[:, -1], None
     if change > 1e-12 * scale:
-        matrices, _ = _implicit_residual(field, s, path, h)
-    for inverse in np.linalg.inv(matrices):
-        U = inverse @ U
-    return path[-1], U
-
-
-def _implicit_residual(field: VectorField, s: Array, path: Array, h: float) -> tuple[Array, Array]:
-    """Matrices I − h·DV(y_k) (K, N, d, d) and residuals y_k − h·V(y_k) − y_{k−1} (K, N, d) of a `path` (K, N, d)."""
-    d = path.shape[-1]
-    v, DV = field.with_jacobian(path.reshape(-1, d))
-    residual = path - h * v.reshape(path.shape)
-    residual[0] -= s
-    residual[1:] -= path[:-1]
-    return np.eye(d) - h * DV.reshape(*path.shape, d), residual
+        _, matrix = system(path)
+    tangents = np.zeros((num, steps * d, U.shape[2]))
+    tangents[:, :d] = U
+    return path[:, -1], np.linalg.solve(matrix, tangents)[:, -d:]
 
 
 def integrate(
