@@ -17,7 +17,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     from dt_viz.errors import DataError  # noqa: PLC0415
-    from dt_viz.evaluate import avoidance, imitation, latency, load, places, rollouts, starts  # noqa: PLC0415
+    from dt_viz.evaluate import (  # noqa: PLC0415
+        avoidance,
+        imitation,
+        latency,
+        load,
+        places,
+        rollouts,
+        starts,
+        velocity,
+    )
     from dt_viz.evaluate.options import InputError, with_negative_values  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
 
@@ -31,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "places": places,
         "rollouts": rollouts,
         "starts": starts,
+        "velocity": velocity,
     }.items():
         summary = (module.__doc__ or "").splitlines()[0]
         subcommand = subcommands.add_parser(name, help=summary, description=summary)

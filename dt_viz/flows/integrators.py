@@ -16,9 +16,8 @@ import numpy as np
 from dt_viz.flows.fields import Array, Mask, VectorField
 from dt_viz.interruption import checkpoint
 
-
 TOGETHER = 128
-"""Number of points, counted once for each step, up to which implicit Euler finds the points of several steps at once."""
+"""Number of unknown points, one for each point and step, up to which implicit Euler solves for several steps at once."""
 
 
 class Step(Protocol):
@@ -35,9 +34,7 @@ def _one_by_one(step: Callable[[VectorField, Array, Array | None, float], tuple[
     """The method that takes one `step` after the other."""
 
     @wraps(step)
-    def method(
-        field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1
-    ) -> tuple[Array, Array | None]:
+    def method(field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1) -> tuple[Array, Array | None]:
         for _ in range(steps):
             checkpoint()
             s, U = step(field, s, U, h)
