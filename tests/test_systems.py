@@ -7,8 +7,11 @@ from hypothesis import strategies as st
 
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow, Identity, Placed
 from dt_viz.flows.fields import GaussianGrid, GridRBF
-from dt_viz.flows.integrators import euler, implicit_euler
+from dt_viz.flows.integrators import euler, implicit_euler, rk4
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Union
+from dt_viz.transforms.bias import BiasPoint
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -156,6 +159,60 @@ def test_the_velocity_is_the_derivative_of_the_rollout(system):
     y0, t, h = np.random.default_rng(5).uniform(-0.7, 0.7, (6, 2)), 0.8, 1e-4
     before, at, after = np.moveaxis(system.rollout(y0, np.array([t - h, t, t + h])), -2, 0)
     np.testing.assert_allclose(system.velocity(at), (after - before) / (2 * h), rtol=0, atol=1e-6)
+
+
+def around_a_sphere(tolerance=2e-9):
+    """Imitation-like flow with a sphere's avoidance and a bias point's pull on top, and places all around them."""
+    rng = np.random.default_rng(9)
+    grid = GaussianGrid(tuple(np.linspace(-0.3, 0.3, 5) for _ in range(3)), 0.5 / 0.1**2)
+    bent = GridRBF(grid, 0.03 * rng.normal(size=(grid.num_points, 3)))
+    sphere = Sphere((0.02, 0.03, -0.01), 0.15)
+    pulled = BiasPoint((-0.1, 0.05, 0.02)).field(0.12)
+    chain = Chain(
+        [
+            Flow(bent, 1.0, 4, implicit_euler, euler),
+            AdaptiveFlow(Union((sphere,)).field("free-space", 3.0), 0.4, tolerance),
+            Flow(pulled, 0.8, 32, rk4, sparse=True, tolerance=tolerance),
+        ]
+    )
+    y = rng.uniform(-0.2, 0.2, (40, 3))
+    return DiffeomorphicSystem(chain, Attractor(np.array([0.25, 0.1, 0.0]))), y[sphere.signed_distance(y) > 0.01]
+
+
+def test_the_velocity_beside_obstacles_and_bias_points_is_the_derivative_of_exact_rollouts():
+    system, y = around_a_sphere()
+    h = 2e-4
+    z = system.transform.forward(y)
+    f = system.base.velocity(z)[:, None]
+    far, near = (
+        np.diff(system.transform.inverse(z[:, None] + np.array([[-step], [step]]) * f), axis=1)[:, 0] / (2 * step)
+        for step in (2 * h, h)
+    )
+    velocity = system.velocity(y)
+    speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+    assert np.abs((velocity - (4 * near - far) / 3) / speed).max() < 1e-4
+
+
+def test_the_velocity_is_the_image_of_the_base_velocity_under_the_derivative_of_the_inverse():
+    system, y = around_a_sphere()
+    z = system.transform.forward(y)
+    _, image = system.transform.inverse_tangents(z, system.base.velocity(z)[..., None])
+    speed = np.linalg.norm(image[..., 0], axis=1, keepdims=True)
+    assert np.abs((system.velocity(y) - image[..., 0]) / speed).max() < 1e-6
+
+
+def test_the_velocity_at_one_point_is_that_in_a_batch():
+    system, y = around_a_sphere()
+    alone = np.stack([system.velocity(point) for point in y])
+    np.testing.assert_allclose(alone, system.velocity(y), rtol=0, atol=1e-9)
+
+
+def test_the_velocity_approaches_the_exact_one_with_the_tolerance():
+    system, y = around_a_sphere(1e-10)
+    exact = system.velocity(y)
+    speed = np.linalg.norm(exact, axis=1, keepdims=True)
+    errors = [np.abs((system.at_tolerance(h).velocity(y) - exact) / speed).max() for h in (1e-4, 1e-6, 1e-8)]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
 
 
 def test_the_lyapunov_value_falls_strictly_and_the_goal_is_reached(system):

@@ -17,7 +17,7 @@ from dt_viz.flows.fields import Array, Mask, VectorField
 from dt_viz.interruption import checkpoint
 
 TOGETHER = 128
-"""Number of unknown points, one for each point and step, up to which implicit Euler solves for several steps at once."""
+"""Number of points times steps up to which implicit Euler finds the points of several steps at once."""
 
 
 class Step(Protocol):

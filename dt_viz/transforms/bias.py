@@ -112,7 +112,7 @@ class RegionField:
         """V at the points `s` (N, d), as (N, d)."""
         value, (inside, u, r) = np.zeros_like(s), self._inside(s)
         if len(u):
-            value[inside, : u.shape[1]] = _window(r)[:, None] * self.directions(u)
+            value[inside, : u.shape[1]] = _window(_ramp(r))[:, None] * self.directions(u)
         return value
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
@@ -120,9 +120,10 @@ class RegionField:
         value, DV = np.zeros_like(s), np.zeros((*s.shape, s.shape[1]))
         inside, u, r = self._inside(s)
         if len(u):
-            k, window = u.shape[1], _window(r)[:, None]
+            k, x = u.shape[1], _ramp(r)
+            bump, window = x * (1 - x), _window(x)[:, None]
             fit, D_fit = self.directions.with_jacobian(u)
-            gradient = (_window_slope(r) / np.maximum(r, PLATEAU))[:, None] * u
+            gradient = (_STEEPNESS * bump * bump * bump / np.maximum(r, PLATEAU))[:, None] * u
             value[inside, :k] = window * fit
             DV[inside, :k, :k] = window[:, None] * D_fit + fit[:, :, None] * gradient[:, None]
         return value, DV
@@ -138,18 +139,19 @@ class RegionField:
         return inside, u[inside], np.sqrt(squared[inside])
 
 
-def _window(radius: Array) -> Array:
-    """Values w at the radii (N,) below 1."""
-    x = np.maximum(radius * (1 / (1 - PLATEAU)) - PLATEAU / (1 - PLATEAU), 0)
+_STEEPNESS = -140 / (1 - PLATEAU)
+"""Factor of w′ = factor·(x·(1 − x))³."""
+
+
+def _ramp(radius: Array) -> Array:
+    """Part x of the way from the plateau to the border, at the radii (N,) below 1."""
+    return np.maximum((radius - PLATEAU) / (1 - PLATEAU), 0)
+
+
+def _window(x: Array) -> Array:
+    """Values w (N,) at the parts `x` (N,) of the way from the plateau to the border."""
     squared = x * x
     return 1 - squared * squared * (35 + x * (-84 + x * (70 - 20 * x)))
-
-
-def _window_slope(radius: Array) -> Array:
-    """Derivative of w at the radii (N,) below 1."""
-    x = np.maximum(radius * (1 / (1 - PLATEAU)) - PLATEAU / (1 - PLATEAU), 0)
-    bump = x * (1 - x)
-    return (-140 / (1 - PLATEAU)) * bump * bump * bump
 
 
 @lru_cache(maxsize=2)
