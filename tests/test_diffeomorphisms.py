@@ -123,6 +123,21 @@ def test_scaled_it_goes_from_the_identity_to_itself_through_diffeomorphisms(case
     assert moved == sorted(moved) and (moved[1] > 0 or isinstance(transform, Identity))
 
 
+def test_at_another_tolerance_it_is_the_same_map_nearly(case):
+    transform, _ = case
+    y = points(transform, 20)
+    exact, coarse = (transform.at_tolerance(tolerance).forward(y) for tolerance in (1e-11, 1e-7))
+    np.testing.assert_allclose(coarse, exact, rtol=0, atol=1e-5)
+
+
+def test_a_flow_takes_as_many_steps_as_its_tolerance_asks_for_unless_they_define_it():
+    chosen = Flow(field(2), 1.0, 40, tolerance=1e-8)
+    assert chosen.at_tolerance(1e-8) == chosen
+    assert chosen.at_tolerance(16e-8).steps == 20
+    assert chosen.at_tolerance(1e3).steps == 1
+    assert Flow(field(2), 1.0, 40).at_tolerance(1e-4).steps == 40
+
+
 def test_tangents_are_jacobian_products(case):
     transform, _ = case
     y = points(transform, 9)

@@ -219,6 +219,23 @@ def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessi
     assert number_after(capsys.readouterr().out, "rollouts  ") == pytest.approx(figures["median_ms"], abs=0.06)
 
 
+# --- velocity ---
+
+
+def test_velocity_measures_every_stack_and_the_error_of_a_controllers_tolerance(lasa, tmp_path, capsys):
+    out = tmp_path / "velocity.json"
+    assert main(["velocity", "--task", "Hook", "--lasa", str(lasa), "--points", "9", "--out", str(out)]) == 0
+    figures, printed = json.loads(out.read_text()), capsys.readouterr().out
+    assert figures["settings"]["points"] == 9
+    for name, stack in figures["stacks"].items():
+        assert number_after(printed, f"\n{name}  ") == pytest.approx(stack["rollouts"]["median_ms"], abs=0.006)
+        for measured in stack.values():
+            assert 0 < measured["median_ms"] <= measured["p95_ms"]
+        assert stack["controller"]["error"] < 1e-2
+    assert figures["stacks"]["imitation"]["controller"]["error"] == 0  # its steps define it
+    assert figures["stacks"]["one sphere"]["controller"]["error"] > 0
+
+
 # --- avoidance ---
 
 
@@ -433,6 +450,7 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
         (["imitation", "Hook.mat", "Hook.csv", "--out", "out"], "SHAPE: found 'Hook.mat' and 'Hook.csv'"),
         (["imitation", "Hook.mat", "--out", "file/below"], "--out: found 'file/below', which cannot be made"),
         (["latency", "--task", "none", "--seconds", "1", "--out", "a.json"], "--task: found 'none'; accepted: draw_s,"),
+        (["velocity", *TASK, "--out", "a.txt"], "--out: found 'a.txt'; accepted: a file that ends in .json"),
         (["latency", *TASK, "--seconds", "1", "--out", "a.txt"], "--out: found 'a.txt'; accepted: a file that ends in"),
         (["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"], "no: folder: found nothing that can"),
         (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),

@@ -5,7 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.flows.fields import BLOCK, FEW, GaussianGrid, GridRBF, PlacedField, Repeated, Sum, second_orders, unit_orders
+from dt_viz.flows.fields import (
+    BLOCK,
+    FEW,
+    GaussianGrid,
+    GridRBF,
+    PlacedField,
+    Repeated,
+    Sum,
+    second_orders,
+    unit_orders,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 dims = st.sampled_from([2, 3])

@@ -16,8 +16,8 @@ import numpy as np
 from dt_viz.flows.fields import Array, Mask, VectorField
 from dt_viz.interruption import checkpoint
 
-TOGETHER = 128
-"""Number of points times steps up to which implicit Euler finds the points of several steps at once."""
+TOGETHER, MOST_STEPS = 128, 8
+"""Number of points times steps, and number of steps, up to which implicit Euler finds several steps at once."""
 
 
 class Step(Protocol):
@@ -70,7 +70,7 @@ def implicit_euler(
     points than at one. Where the residual of a point has grown, the method goes back half the way. While I − h·DV is
     regular everywhere, which is also when a step is invertible, that leads to the one solution from everywhere.
     """
-    at_once = max(1, TOGETHER // max(1, len(s)))
+    at_once = min(MOST_STEPS, max(1, TOGETHER // max(1, len(s))))
     while steps > 0:
         s, U = _implicit_steps(field, s, U, h, min(at_once, steps), max_iterations)
         steps -= at_once
