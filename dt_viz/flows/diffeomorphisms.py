@@ -34,15 +34,16 @@ class Diffeomorphism(ABC):
 
     @abstractmethod
     def scaled(self, fraction: float) -> Diffeomorphism:
-        """ψ on its way from the identity (0) to itself (1): every flow runs for this fraction of its duration.
+        """The transform between the identity (fraction 0) and ψ (1): each flow runs for a fraction of its duration.
 
-        Of a flow that is γ(s·t, ·), so scaled(a)∘scaled(b) = scaled(a + b); of a chain, the chain of the scaled parts.
+        A flow becomes γ(fraction·t, ·), so scaled(a)∘scaled(b) = scaled(a + b). A chain becomes the chain of its scaled
+        parts.
         """
 
     def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        """ψ with its integration errors at another tolerance, in the unit of the points, where it has a tolerance.
+        """ψ integrated to another tolerance (in the unit of the points); maps that have none stay as they are.
 
-        A controller that asks for the velocity at one point hardly needs the exactness of a rollout.
+        For a controller, which needs velocities quickly and less exactly than a rollout.
         """
         return self
 
@@ -98,7 +99,7 @@ class Flow(Diffeomorphism):
     inverse_step: Step | None = None
     """Integrator for ψ⁻¹; None takes `step`. `implicit_euler` with `euler` gives an inverse exact to rounding."""
     sparse: bool = False
-    """Whether the field vanishes on much of space: points where it does are not integrated, only found."""
+    """Whether the field vanishes on much of space; points where it does are left out of the integration."""
     tolerance: float | None = None
     """Error that `steps` RK4 steps were chosen for, in the unit of the points; None where the steps define the map."""
 
@@ -108,7 +109,7 @@ class Flow(Diffeomorphism):
         return self.field.dim
 
     def scaled(self, fraction: float) -> Flow:
-        """See `Diffeomorphism`. The steps are as many, and shorter: what undoes them exactly still does."""
+        """See `Diffeomorphism`. The number of steps stays, so an exact inverse stays exact."""
         return replace(self, duration=fraction * self.duration)
 
     def at_tolerance(self, tolerance: float) -> Flow:
@@ -121,7 +122,7 @@ class Flow(Diffeomorphism):
     def min_step_determinant(self, s: Array, *, inverse: bool) -> float:
         """Smallest det of the derivative of a step of ψ from points `s` (N, d), or of ψ⁻¹.
 
-        Where it is not positive, the step folds space: the method is no diffeomorphism, though the flow is one.
+        Where it is not positive, the step folds space: the numerical map is no diffeomorphism, though the flow is one.
         """
         step = (self.inverse_step or self.step) if inverse else self.step
         h = (-self.duration if inverse else self.duration) / self.steps
@@ -155,8 +156,8 @@ class AdaptiveFlow(Diffeomorphism):
     field: VectorField
     duration: float
     tolerance: float = 1e-8
-    """Largest estimated error of a step of the points, in their unit. Tangents obey `TANGENT_TOLERANCE`, whatever this
-    is: where space is squeezed strongly, det J may be off by some per cent."""
+    """Largest estimated error of a step of the points, in their unit. Tangents obey `TANGENT_TOLERANCE` instead: where
+    space is squeezed strongly, det J may be off by some per cent."""
 
     @property
     def dim(self) -> int:
@@ -306,7 +307,7 @@ class Placed(Diffeomorphism):
         return (y - self.origin) @ self.axes / self.scale
 
     def scaled(self, fraction: float) -> Placed:
-        """See `Diffeomorphism`: in place and in size it stays as it is."""
+        """See `Diffeomorphism`. Frame and scale stay."""
         return replace(self, inner=self.inner.scaled(fraction))
 
     def at_tolerance(self, tolerance: float) -> Placed:
@@ -329,6 +330,7 @@ Method = Literal["auto", "rk4", "euler"]
 METHODS: tuple[Method, ...] = ("auto", "rk4", "euler")
 STEPS: Mapping[Method, Step] = {"rk4": rk4, "euler": euler}
 MAX_STEPS = 50
+"""Largest number of steps that a user may choose."""
 
 
 @dataclass(frozen=True)
@@ -340,7 +342,7 @@ class Integration:
 
     @property
     def by_hand(self) -> bool:
-        """Whether the user chose the steps, so that nobody vouches for them."""
+        """Whether the user chose the steps, so that no tolerance is guaranteed."""
         return self.method != "auto"
 
     @overload
@@ -350,13 +352,13 @@ class Integration:
     def of(self, flow: AdaptiveFlow) -> Flow | AdaptiveFlow: ...
 
     def of(self, flow: Flow | AdaptiveFlow) -> Flow | AdaptiveFlow:
-        """The flow integrated this way; `flow` is how it is with `auto`."""
+        """The flow integrated by this method; `auto` leaves `flow` as it is."""
         if self.method == "auto":
             return flow
         return Flow(flow.field, flow.duration, self.steps, STEPS[self.method])
 
     def __str__(self) -> str:
-        """As the page calls it, "Euler in 3 steps"."""
+        """Name on the page, such as "Euler in 3 steps"."""
         steps = "1 step" if self.steps == 1 else f"{self.steps} steps"
         return {"auto": "auto", "rk4": f"RK4 in {steps}", "euler": f"Euler in {steps}"}[self.method]
 

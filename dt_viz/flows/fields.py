@@ -133,7 +133,7 @@ class GaussianGrid:
             orders: multi-indices; (0, 1) asks for ∂/∂s_2 in the plane.
 
         Returns:
-            (len(orders), N, k). Multi-indices that begin alike share the work of their beginning.
+            (len(orders), N, k). Multi-indices with a common prefix share its computation.
         """
         num, k = len(s), weights.shape[1]
         if not num:  # an obstacle that covers the whole slice leaves no arrows to evaluate
@@ -182,23 +182,23 @@ class GaussianGrid:
 
 
 _Piece = tuple[int, Selection, slice]
-"""Which derivative along an axis makes which beginnings of multi-indices into which longer ones."""
+"""A derivative along an axis, the prefixes of multi-indices that it extends, and the rows of the longer prefixes."""
 
 
 class _Plan(NamedTuple):
-    """In which order a contraction works out multi-indices, axis after axis."""
+    """Order in which a contraction computes partial derivatives, axis by axis."""
 
     highest: int
-    """Derivative along an axis."""
+    """Highest derivative along any axis."""
     levels: tuple[tuple[tuple[_Piece, ...], int], ...]
-    """For each axis its pieces, and how many beginnings of multi-indices there are with it."""
+    """For each axis its pieces, and the number of prefixes of multi-indices that end with it."""
     order: Selection
-    """Of the multi-indices at the end."""
+    """Rows of the requested multi-indices after the last axis."""
 
 
 @lru_cache(maxsize=256)
 def _plan(orders: tuple[tuple[int, ...], ...]) -> _Plan:
-    """Put together what takes the same derivative along an axis: it is one call."""
+    """Group the multi-indices by their derivative along each axis; each group is one call."""
     levels: list[tuple[tuple[_Piece, ...], int]] = []
     before: list[tuple[int, ...]] = [()]
     for length in range(1, len(orders[0]) + 1):
@@ -221,9 +221,9 @@ def _combinations(orders: tuple[tuple[int, ...], ...]) -> tuple[int, Selection]:
 
 
 def _selection(rows: list[int]) -> Selection:
-    """Rows of an array, without a copy where they are one after the other."""
-    one_after_the_other = rows == list(range(rows[0], rows[-1] + 1))
-    return slice(rows[0], rows[-1] + 1) if one_after_the_other else np.array(rows)
+    """Selection of rows of an array: a slice, which copies nothing, where they are consecutive."""
+    consecutive = rows == list(range(rows[0], rows[-1] + 1))
+    return slice(rows[0], rows[-1] + 1) if consecutive else np.array(rows)
 
 
 @lru_cache
@@ -350,11 +350,11 @@ class Sum:
 class Repeated:
     """The sum of one field at several places; at least one.
 
-    It is evaluated for all of them at once: a point is a row of its coordinates in each of their frames.
+    The inner field is evaluated once, for the coordinates of all points in the frames of all places.
     """
 
     places: tuple[PlacedField, ...]
-    """All with the same inner field."""
+    """Places of one and the same inner field."""
 
     @property
     def dim(self) -> int:
@@ -373,7 +373,7 @@ class Repeated:
         return V, DV.reshape(len(s), self.dim, self.dim)
 
     def _local(self, s: Array) -> Array:
-        """The points (N·P, d) in the frames of the P places, of the first point first."""
+        """Coordinates (N·P, d) of the points in the frames of the P places, all of the first point first."""
         return (s @ self._to_local - self._origins).reshape(-1, self.dim)
 
     @cached_property

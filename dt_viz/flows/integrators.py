@@ -143,10 +143,11 @@ def integrate_adaptive(
 ) -> tuple[Array, Array | None]:
     """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` with the Dormand–Prince 5(4) pair.
 
-    Every point has its own step length, chosen so that the estimated error of each step is below `tolerance` (in the
-    unit of `s`), in proportion less for motions shorter than `SHORT`, and for tangents below `TANGENT_TOLERANCE` of
-    them: points that the field hardly moves take one step, only those in its stiff core take many. The first step is
-    short where the field changes quickly along it: the estimated error of a step far too long may be small by chance.
+    Every point has its own step length: points that the field hardly moves take one step, only those in its stiff core
+    take many. The estimated error of a step is at most `tolerance` (in the unit of `s`) for the points, less in
+    proportion where the motion is shorter than `SHORT`, and at most `TANGENT_TOLERANCE` for the tangents. The first
+    step is short where the field changes quickly along it, because the estimated error of a step that is far too long
+    may be small by chance.
 
     Raises:
         ArithmeticError: if some point needs more than `max_rounds` steps.
@@ -161,7 +162,7 @@ def integrate_adaptive(
     turning = _turning(field, state, first, duration, tolerance)
     still = _still(state, first, turning, d, total, tolerance)
     state[still] += duration * first[still]
-    # of those that are still on their way: row, state, rate, time left, length of the next step
+    # for each point that has not arrived: its row, state, rate, time left, and length of the next step
     active = np.flatnonzero(~still)
     start, first, left = state[active], first[active], np.full(len(active), total)
     h = _first_step(first[:, :d], turning[active], total, tolerance)
@@ -177,7 +178,7 @@ def integrate_adaptive(
             end = start + step * _combined(row[:i], stages[:i])
             stages[i] = rate(end)
         defect = step * _combined(_DP_ERROR, stages)
-        # beside a rest point a small error is a large part of the motion, which grows with the motion
+        # beside a rest point a small error is large relative to the motion, and grows with it
         allowed = _allowed(np.abs(end - start)[:, :d].max(axis=1), tolerance)
         error = np.abs(defect[:, :d]).max(axis=1) / allowed
         if U is not None:
@@ -210,29 +211,29 @@ _DP_ERROR = np.array((71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22
 
 
 SHORT = 1 / 15
-"""Motion of a step, in the unit of the points, that is allowed the whole tolerance. What is squeezed into the core of
-an obstacle comes back magnified ten thousand times, and so does its error: the relative error counts there."""
+"""Motion of a step, in the unit of the points, from which on its error may be the whole tolerance. In the core of an
+obstacle space is squeezed ten thousand times; the inverse magnifies errors as much, so the relative error counts."""
 TANGENT_TOLERANCE = 3e-4
-"""Of a tangent, in a step."""
+"""Largest estimated error of a step's tangents, relative to their largest entry."""
 ROUNDING = 1e-15
-"""Below which differences of coordinates mean nothing, in their unit."""
+"""Difference of coordinates, in their unit, below which rounding hides it."""
 STRAIGHT = 0.1
-"""Part of a velocity that may change along a motion that counts as straight."""
+"""Largest relative change of the velocity along a motion that counts as straight."""
 LONGEST_TURN, TURN_ERROR = 0.8, 3e-4
-"""First step, in the time in which a velocity changes by as much as it is, and the part of the motion by which it is
-wrong, about."""
+"""Length of a first step, in units of the time in which the velocity changes by its own size, and the error of such a
+step relative to its motion, about."""
 
 
 def _combined(coefficients: Array, stages: Array) -> Array:
-    """Weighted sum of stages (S, N, ·), (N, ·), as one product."""
+    """Weighted sum (N, ·) of stages (S, N, ·), as one product."""
     return (coefficients @ stages.reshape(len(stages), -1)).reshape(stages.shape[1:])
 
 
 def _turning(field: VectorField, state: Array, rate: Array, duration: float, tolerance: float) -> Array:
-    """By how much a velocity changes for each unit of time, (N,), relative to it, of states (N, ·) with that `rate`.
+    """Relative change per unit of time (N,) of the velocities of states (N, ·) that change at `rate` (N, ·).
 
-    It is looked at where an Euler step of the whole duration leads, or at `tolerance` in that direction if that is
-    nearer.
+    The second velocity is that at the end of an Euler step over the whole duration, or at the distance `tolerance` in
+    the same direction if that is nearer.
     """
     d = field.dim
     turning = np.zeros(len(state))
@@ -248,10 +249,10 @@ def _turning(field: VectorField, state: Array, rate: Array, duration: float, tol
 
 
 def _still(state: Array, rate: Array, turning: Array, d: int, total: float, tolerance: float) -> Mask:
-    """Which states (N, ·) with that `rate` one Euler step carries well enough: those that hardly move or turn.
+    """Mask (N,) of the states (N, ·) that one Euler step carries accurately enough: those that hardly move or turn.
 
-    That the field is weak is not enough: it is so, too, beside a rest point, where motions grow from nothing and
-    tangents are stretched most.
+    A weak field is not enough. It is weak beside a rest point, too, where motions grow from nothing and tangents are
+    stretched most.
     """
     still = np.abs(rate[:, :d]).max(axis=1, initial=0.0) * total <= tolerance
     if rate.shape[1] == d:
@@ -271,12 +272,12 @@ def _first_step(velocity: Array, turning: Array, total: float, tolerance: float)
 
 
 def _allowed(motion: Array, tolerance: float) -> Array:
-    """Error (N,) that a step of this `motion` (N,) may have."""
+    """Largest error (N,) allowed for a step of this `motion` (N,)."""
     return np.clip(tolerance / SHORT * motion, ROUNDING, tolerance)
 
 
 def _augment(field: VectorField, s: Array, U: Array | None) -> tuple[Array, Callable[[Array], Array]]:
-    """The state (s, U) as one array (N, d·(1+k)) and its rate of change."""
+    """Join points and tangents to one state (N, d·(1+k)); also returns the function that gives its rate of change."""
     if U is None:
         return s, field
     _, d, k = U.shape

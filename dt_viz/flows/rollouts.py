@@ -11,17 +11,17 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import Attractor
 
 ARRIVED = 1e-4
-"""Metres in base space from the goal at which a motion counts as arrived."""
+"""Distance (m) from the goal in base space at which a motion counts as arrived."""
 ARRIVING = 0.5
-"""The same, at most, as a part of what is left at the last sample before: a stack may stretch it to a visible way."""
+"""Upper bound of that distance, relative to that of the sample before: a stack may stretch it to a visible length."""
 UNEVEN = 1.5
-"""How much wider than one of its neighbours a gap is that is stretched unevenly itself."""
+"""Ratio to its narrower neighbour from which on a gap counts as unevenly stretched inside."""
 OVERSAMPLING = 2
-"""Times as many samples are put into such a gap as it lacks: another round costs more."""
+"""Factor on the number of samples that such a gap lacks; too many cost less than another round."""
 MAX_INSERTED = 40
-"""Samples put between two neighbours in one round of refinement."""
+"""Largest number of samples inserted between two neighbours in one round of refinement."""
 MAX_SAMPLES = 60_000
-"""Samples of a bundle at which refinement ends: a stack may stretch a motion without limit."""
+"""Number of samples of a bundle at which refinement ends; a stack may stretch a motion without limit."""
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,16 @@ class Rays:
         return self.base.goal + (1 - fraction)[:, None] * (self.z0[index] - self.base.goal)
 
     def times(self, index: Indices, fraction: Array) -> Array:
-        """Seconds (N,) at which the motions are there, `index` not decreasing.
+        """Times (N,), seconds, at which the motions are at the points that `at` gives; `index` must not decrease.
 
-        The goal counts as reached within `ARRIVED`, or nearer where other samples are nearer: no two share a time.
+        The goal counts as reached at the distance `ARRIVED`, or at a smaller one where other samples are nearer: no two
+        samples share a time.
         """
         radius = np.linalg.norm(self.z0 - self.base.goal, axis=1)
         left = (1 - fraction) * radius[index]
         least = np.full(len(radius), ARRIVED)
         np.minimum.at(least, index[left > 0], ARRIVING * left[left > 0])
-        # one row for each ray, filled up with starts: what holds for a whole ray is worked out once
+        # one row for each ray, padded with its start, so that what all its samples share is computed once
         column = np.arange(len(index)) - np.searchsorted(index, index)
         remaining = np.repeat(radius[:, None], int(column.max()) + 1, axis=1)
         remaining[index, column] = np.maximum(left, least[index])
@@ -59,7 +60,7 @@ class Bundle:
     index: Indices
     """(N,) which rollout a sample belongs to, not decreasing."""
     fraction: Array
-    """(N,) where on its base ray it is, increasing within a rollout."""
+    """(N,) fraction of the base ray that lies behind it, increasing within a rollout."""
     levels: Array
     """(N, L, 3) positions on the manifold of each level of the stack, from the imitation up, metres."""
 
@@ -86,9 +87,9 @@ def evenly_sampled(evaluate: Evaluate, num_rollouts: int, num_samples: int) -> B
     """Sample rollouts at even distances along their paths, start and goal included.
 
     Args:
-        evaluate: where samples are.
-        num_rollouts: R.
-        num_samples: for each rollout.
+        evaluate: gives the levels of samples.
+        num_rollouts: number of rollouts R.
+        num_samples: number of samples of each rollout.
     """
     trial = np.linspace(0, 1, 2 * num_samples)
     index = np.repeat(np.arange(num_rollouts), len(trial))
@@ -108,17 +109,17 @@ def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: i
 
     Args:
         bundle: rollouts to refine.
-        evaluate: where samples are.
-        spacing: metres.
-        max_rounds: of insertion.
+        evaluate: gives the levels of samples.
+        spacing: largest distance of neighbours, metres.
+        max_rounds: largest number of rounds of insertion.
 
     Returns:
-        The refined bundle. One of `MAX_SAMPLES` samples has gaps left that are wider.
+        The refined bundle. Wider gaps remain after `max_rounds`, and where it has `MAX_SAMPLES` samples.
     """
     for round_ in range(max_rounds + 1):
         same = np.diff(bundle.index) == 0
         gap = np.linalg.norm(np.diff(bundle.positions, axis=0), axis=1) * same
-        # a gap that rounding cannot divide any more stays: two neighbouring floats on either side of the centre
+        # a gap between neighbouring floats on either side of an obstacle's centre cannot be divided
         divisible = np.diff(bundle.fraction) > 1e-13
         wide = np.flatnonzero((gap > spacing) & divisible)
         room = MAX_SAMPLES - len(bundle.index)

@@ -57,7 +57,7 @@ class Attractor:
     def times_at(self, z0: Array, distances: Array) -> Array:
         """Seconds, (*B, T), at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of the goal.
 
-        Zero for distances that the start is within already.
+        Zero where the start is already within the distance.
         """
         r0 = np.linalg.norm(z0 - self.goal, axis=-1, keepdims=True)
         farther = np.maximum(r0, distances)
@@ -81,7 +81,7 @@ class DiffeomorphicSystem:
     base: Attractor
 
     def at_tolerance(self, tolerance: float) -> DiffeomorphicSystem:
-        """The system with the integration errors of ψ at another tolerance, metres; see `Diffeomorphism`."""
+        """The system with ψ integrated to another tolerance, metres; see `Diffeomorphism.at_tolerance`."""
         return replace(self, transform=self.transform.at_tolerance(tolerance))
 
     def velocity(self, y: Array) -> Array:
@@ -118,7 +118,7 @@ def stepped(velocity: Callable[[Array], Array], y0: Array, times: Array, substep
         velocity: takes states (*B, d).
         y0: (*B, d) starts.
         times: (T,) increasing, seconds; the first is the start's.
-        substeps: between neighbouring times.
+        substeps: number of RK4 steps between neighbouring times.
 
     Returns:
         (*B, T, d) states.
