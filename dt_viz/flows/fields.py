@@ -216,7 +216,7 @@ def _plan(orders: tuple[tuple[int, ...], ...]) -> _Plan:
 def _combinations(orders: tuple[tuple[int, ...], ...]) -> tuple[int, Selection]:
     """Highest derivative along an axis, and the places of multi-indices among all that reach up to it."""
     highest = max(map(max, orders))
-    places = np.ravel_multi_index(tuple(np.transpose(orders)), (highest + 1,) * len(orders[0]))
+    places = np.array(orders) @ (highest + 1) ** np.arange(len(orders[0]))[::-1]
     return highest, _selection(places.tolist())
 
 

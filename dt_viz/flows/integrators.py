@@ -102,9 +102,9 @@ def _implicit_steps(
 
     # Newton's step at `best`, the part of it that was taken, the residual there, and the last change of the path
     best, direction, length, smallest, change = path, path, 1.0, np.inf, np.inf
+    residual, matrix = system(path)
     for _ in range(max_iterations):
         checkpoint()
-        residual, matrix = system(path)
         size = np.abs(residual).max(axis=1)[:, None, None]
         if size.max(initial=0.0) <= 1e-15 * scale:
             change = 0.0
@@ -116,12 +116,13 @@ def _implicit_steps(
             best, direction = np.where(worse, best, path), np.where(worse, direction, update)
             smallest = np.where(worse, smallest, size)
             path = best - length * direction
-            continue
-        best, direction, length, smallest = path, update, 1.0, size
-        path = path - update
-        change = np.abs(update).max(initial=0.0)
-        if change <= 1e-8 * scale:
-            break  # quadratic convergence: the next correction would be far below rounding
+        else:
+            best, direction, length, smallest = path, update, 1.0, size
+            path = path - update
+            change = np.abs(update).max(initial=0.0)
+            if change <= 1e-8 * scale:
+                break  # quadratic convergence: the next correction would be far below rounding
+        residual, matrix = system(path)
     if U is None:
         return path[:, -1], None
     if change > 1e-12 * scale:
