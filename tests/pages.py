@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from dt_viz.engine.engine import Frame, Stage
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.motion.health import Health
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS

@@ -7,7 +7,8 @@ import pytest
 
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.retiming import within_velocity_limits
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler

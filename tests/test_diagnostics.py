@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dt_viz.arm.collision import Nearest, load_collision_model
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_doubts
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario

@@ -10,7 +10,7 @@ import pytest
 import dt_viz.engine.engine as engine_module
 import dt_viz.engine.turns as turns_module
 from dt_viz.arm.retiming import used_fraction
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.engine.turns import Turns
 from dt_viz.flows import rollouts
 from dt_viz.interruption import interruptible

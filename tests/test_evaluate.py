@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 from PIL import Image
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.evaluate import latency, rollouts
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow

@@ -7,7 +7,8 @@ import pytest
 
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
-from dt_viz.engine.engine import Engine, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
 from dt_viz.motion.solve import LIVE, solve
 from dt_viz.obstacles.shapes import Sphere

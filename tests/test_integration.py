@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_stacks import random_scenario
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import AUTO, METHODS, AdaptiveFlow, Conjugated, Flow, Integration
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, rk4

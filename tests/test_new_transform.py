@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Layer

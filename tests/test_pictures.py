@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.solve import FINE, LIVE, solve
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.pictures.sketchbook import FINE_SPACING, LINE_SPACING

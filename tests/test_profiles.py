@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dt_viz.arm.body_points import load_body_points
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.metrics import (
     discrete_frechet,
     distance_from_path,

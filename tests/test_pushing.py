@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dt_viz.arm.retiming import used_fraction
-from dt_viz.engine.engine import ArmMotion, Stage
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.pushing import DISTANCES, MAX_TRACKING_ERROR, PUSH_SECONDS
 from dt_viz.motion.solve import FINE, solve
 from dt_viz.ui import playback as playback_module

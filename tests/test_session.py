@@ -13,7 +13,8 @@ import pytest
 from dt_viz import interruption
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine import session as session_module
-from dt_viz.engine.engine import Engine, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Stage
 from dt_viz.engine.session import GESTURE_PAUSE, MAX_UNDO, Session
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.learning.imitation import ImitationError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.solve import FINE, LIVE, cut_off, solve
 from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
 from dt_viz.scenario.scenario import SLICE_COLOURS, View

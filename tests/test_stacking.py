@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dt_viz.arm.whole_arm import MOVED
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import PlacedField
 from dt_viz.motion.nominal import Nominal

@@ -15,7 +15,8 @@ from viser import transforms  # noqa: TID251
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import CollisionReport, Nearest
 from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import ArmMotion, Stage
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.frame import Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.motion.health import Health

@@ -10,7 +10,7 @@ import pytest
 from pages import frame_of
 from PIL import Image
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.shapes import Sphere, rotation
 from dt_viz.pictures.sketchbook import Pictures
 from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture

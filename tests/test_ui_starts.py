@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.motion.following import room_at_rest
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import MAX_STARTS

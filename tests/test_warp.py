@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dt_viz.engine.engine
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.paper_scenes import SCENES

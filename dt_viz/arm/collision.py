@@ -28,6 +28,7 @@ from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.properties import cached_property
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -87,21 +88,20 @@ class CollisionReport:
         return max(0.0, -self.obstacle.distance)
 
     @property
-    def problems(self) -> tuple[str, ...]:
-        """What is wrong, in words for the page; empty when nothing is."""
-        entered = f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm" if self.depth > 0 else ""
-        return ((entered,) if entered else ()) + self.problems_of_its_own
-
-    @property
-    def problems_of_its_own(self) -> tuple[str, ...]:
-        """Those that have nothing to do with the obstacle."""
+    def warnings(self) -> tuple[MotionWarning, ...]:
+        """What is wrong."""
         found = []
+        if self.depth > 0:
+            text = f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm"
+            found.append(MotionWarning(Kind.ARM_ENTERS, text, ARM))
         if self.itself and self.itself.distance < SELF_MARGIN:
             inner, outer = self.itself.links
             gap = self.itself.distance
-            found.append(f"{outer} comes within {1e3 * gap:.0f} mm of {inner}" if gap > 0 else f"{outer} hits {inner}")
+            text = f"{outer} comes within {1e3 * gap:.0f} mm of {inner}" if gap > 0 else f"{outer} hits {inner}"
+            found.append(MotionWarning(Kind.ARM_HITS_ITSELF, text, ARM))
         if self.table.distance < 0:
-            found.append(f"{self.table.links[0]} is {-1e3 * self.table.distance:.0f} mm below the table")
+            text = f"{self.table.links[0]} is {-1e3 * self.table.distance:.0f} mm below the table"
+            found.append(MotionWarning(Kind.ARM_BELOW_TABLE, text, ARM))
         return tuple(found)
 
 

@@ -30,7 +30,8 @@ import numpy as np
 
 from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.evaluate.options import (
     InputError,

@@ -38,7 +38,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
     chosen_task,

@@ -9,7 +9,8 @@ from functools import partial
 import viser
 
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.motion.pushing import Pushed

@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import (

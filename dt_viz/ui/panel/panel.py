@@ -12,7 +12,7 @@ import viser
 
 from dt_viz.arm.collision import SELF_REACH, CollisionReport
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Frame, Stage
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.engine.worker import LatestWorker
 from dt_viz.errors import DataError

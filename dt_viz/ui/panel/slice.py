@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario
 from dt_viz.ui.controls import on_press

@@ -9,7 +9,7 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, METHODS, Method
 from dt_viz.learning.imitation import OBJECTIVES
 from dt_viz.obstacles.occupancy import GENERATORS

@@ -11,7 +11,8 @@ from viser import transforms
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import ArmMotion, Frame
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import View
 from dt_viz.ui.scene import palette

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 import viser.transforms
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import MAX_BIAS_POINTS, bias_points

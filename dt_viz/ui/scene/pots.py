@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.scenario.tasks import Pot, Task
 from dt_viz.ui.scene import palette

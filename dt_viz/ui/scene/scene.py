@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import bias_points

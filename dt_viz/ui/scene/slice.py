@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.ui.scene import palette

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from viser import transforms
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.slices import Slice

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
