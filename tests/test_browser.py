@@ -37,9 +37,9 @@ pytestmark = [pytest.mark.browser, needs_chromium]
 
 UNHURRIED = """
     const draw = window.requestAnimationFrame.bind(window);
-    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 80);
+    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 200);
 """
-"""Ten pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
+"""Five pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
 
 
 @pytest.fixture(scope="module")
