@@ -136,6 +136,12 @@ def test_every_module_and_file_is_found_in_the_environment(environment, tmp_path
     assert Path(where.strip()).is_relative_to(environment)
 
 
+def test_the_package_is_a_command_too(environment, tmp_path):
+    usage = run(environment / "bin" / "python", "-m", "dt_viz", "--help", cwd=tmp_path)
+    assert usage == run(environment / "bin" / "dt-viz", "--help", cwd=tmp_path)
+    assert "dt-viz evaluate --help" in usage
+
+
 @needs_chromium
 def test_the_page_of_the_installed_command_shows_the_motion(environment, tmp_path, browser):
     with started(environment, tmp_path) as (address, _):
