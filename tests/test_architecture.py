@@ -3,6 +3,7 @@
 import ast
 import graphlib
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,7 @@ def named(path: Path) -> str:
 MODULES = {named(path).removesuffix(".__init__"): path for path in SOURCES}
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Full names of the modules that a file imports, anywhere in it; relative names resolved."""
     names = set()
