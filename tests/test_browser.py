@@ -2,16 +2,14 @@
 
 import io
 import itertools
-import os
-import shutil
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
+from chromium import needs_chromium
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
 import dt_viz.learning.store
 from dt_viz.arm.robot import load_jaco
@@ -26,7 +24,6 @@ from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 
-CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 WIDTH, HEIGHT = 900, 560
 PATIENCE = 600.0
 """Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
@@ -35,29 +32,14 @@ TRIES = 8
 LIGHT = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
 """What is drawn by software thirty times a second; with the arm it takes most of a second."""
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(
-        CHROMIUM is None and "DT_VIZ_REQUIRE_BROWSER" not in os.environ,
-        reason="no Chromium on this machine (Debian: apt-get install chromium)",
-    ),
-]
+pytestmark = [pytest.mark.browser, needs_chromium]
 
 
 UNHURRIED = """
     const draw = window.requestAnimationFrame.bind(window);
-    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 80);
+    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 200);
 """
-"""Ten pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with sync_playwright() as playwright:
-        args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=args)
-        yield browser
-        browser.close()
+"""Five pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
 
 
 @pytest.fixture(scope="module")

@@ -98,6 +98,20 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
     assert "found 'nothing'" in capsys.readouterr().err
 
 
+def test_measurements_are_a_subcommand(capsys):
+    assert main(["evaluate", "starts", "--task", "nothing"]) == 2
+    assert capsys.readouterr().err.startswith("dt-viz evaluate starts: --task: found 'nothing'")
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    assert "dt-viz evaluate --help" in capsys.readouterr().out
+
+
+def test_numpy_is_not_imported_before_its_threads_are_limited():
+    program = "import sys, dt_viz.cli; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
 def test_what_is_no_origin_is_refused(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["--allow-origin", "demo.example.org"])

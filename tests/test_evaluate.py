@@ -326,7 +326,8 @@ def test_values_may_begin_with_a_minus():
 
 def test_starts_are_spread_over_the_grown_box_and_arrive(lasa, tmp_path, capsys):
     out = tmp_path / "starts.npz"
-    assert main(["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "600", "--out", str(out)]) == 0
+    counts = ["--count", "600", "--stepped", "30"]
+    assert main(["starts", "--task", "Hook", "--lasa", str(lasa), *counts, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     with np.load(out) as arrays:
         starts, ends, goal = arrays["starts"], arrays["ends"], arrays["goal"]
@@ -344,7 +345,8 @@ def test_the_same_seed_gives_the_same_starts(lasa, tmp_path):
     starts = []
     for seed in ("3", "3", "4"):
         out = tmp_path / "starts.npz"
-        main(["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "5", "--seed", seed, "--out", str(out)])
+        few = ["--count", "5", "--stepped", "0", "--seed", seed]
+        main(["starts", "--task", "Hook", "--lasa", str(lasa), *few, "--out", str(out)])
         with np.load(out) as arrays:
             starts.append(arrays["starts"])
     assert (starts[0] == starts[1]).all() and (starts[0] != starts[2]).any()
@@ -353,9 +355,9 @@ def test_the_same_seed_gives_the_same_starts(lasa, tmp_path):
 @pytest.mark.parametrize("wrong", ["velocity", "flow"])
 def test_starts_fail_where_stepping_leads_elsewhere_than_the_closed_form(lasa, monkeypatch, capsys, wrong):
     """Either side may be the wrong one: f of the base system, or its closed form; arrival alone would not tell."""
-    arguments = ["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "20", "--stepped", "20"]
+    arguments = ["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "5", "--stepped", "5"]
     assert main(arguments) == 0
-    assert "20 of 20" in capsys.readouterr().out.split("stepped by eq. (1)")[1]
+    assert "5 of 5" in capsys.readouterr().out.split("stepped by eq. (1)")[1]
     real = getattr(TimedAttractor, wrong)
     slower = {"velocity": lambda self, z: 0.97 * real(self, z), "flow": lambda self, z, t: real(self, z, 0.97 * t)}
     monkeypatch.setattr(TimedAttractor, wrong, slower[wrong])

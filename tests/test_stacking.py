@@ -26,6 +26,8 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.avoidance import ObstacleAvoidance
 from dt_viz.transforms.bias import Biasing, BiasPoint
 
+SIMILAR = ("draw_j", "draw_c", "draw_g", "draw_z")
+"""Tasks that behave much as "draw_s" and "draw_w" do."""
 PLACES = ((0.1, -0.5, 0.4), (0.2, -0.5, 0.4), (0.3, -0.5, 0.4))
 
 
@@ -142,7 +144,7 @@ def test_new_bias_points_lie_beside_the_motion_apart_from_each_other_and_in_the_
         scenario = edited(scenario, layers=with_bias_point(scenario.layers, point))
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [pytest.param(t, marks=[pytest.mark.slow] * (t in SIMILAR)) for t in TASKS])
 def test_two_new_bias_points_do_not_pull_against_each_other(task, engine, initial):
     scenario = initial(task)
     for _ in range(2):

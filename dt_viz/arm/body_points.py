@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 from dt_viz.arm.robot import NUM_JOINTS, KinematicChain, Robot
 from dt_viz.flows.fields import Array
 from dt_viz.properties import cached_property
-
-FILE = Path(__file__).resolve().parents[2] / "assets" / "body_points.npz"
+from dt_viz.shipped import ASSETS
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,5 +70,5 @@ class BodyPoints:
 @lru_cache(maxsize=1)
 def load_body_points() -> BodyPoints:
     """The JACO's body points, made by ``python -m assets.make_body_points``."""
-    with np.load(FILE, allow_pickle=False) as data:
+    with np.load(ASSETS / "body_points.npz", allow_pickle=False) as data:
         return BodyPoints(data["joint"], data["offset"], data["radius"])
