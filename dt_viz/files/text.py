@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 from dt_viz.errors import FormatError
 from dt_viz.interruption import checkpoint
@@ -96,3 +96,11 @@ def _of_width(rows: Iterator[tuple[int, list[str]]], width: int) -> Iterator[tup
         if len(cells) != width:
             raise FormatError(f"line {number}", f"{len(cells)} columns", f"{width}, as in the header")
         yield number, cells
+
+
+def decimal_numbers(cells: Sequence[str], line: int) -> list[float]:
+    """Return the numbers in the cells of a line. Raises FormatError if one of them is none."""
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError as error:
+        raise FormatError(f"line {line}", repr(",".join(cells)[:60]), "decimal numbers") from error
