@@ -46,6 +46,11 @@ def check_at_most(field: str, num: int, limit: int, unit: str = "") -> None:
         raise FormatError(field, f"{num} {unit}".rstrip(), f"at most {limit} {unit}".rstrip())
 
 
+def too_many(field: str, limit: int, unit: str = "") -> FormatError:
+    """Return the error about a count that has passed its limit before all was counted."""
+    return FormatError(field, f"more than {limit} {unit}".rstrip(), f"at most {limit} {unit}".rstrip())
+
+
 def real_numbers(values: ArrayLike, field: str, kinds: str = "iuf") -> Array:
     """Return an array as float64; values that overflow become infinite.
 

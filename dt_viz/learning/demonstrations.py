@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
-from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers
+from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers, too_many
 from dt_viz.files.npz import NpzFile
 from dt_viz.files.text import decimal_numbers, read_table
 from dt_viz.learning.matfile import Value, read_variable
@@ -263,7 +263,8 @@ def _read_csv(content: bytes, stem: str) -> Read:
     for line, row in rows:
         label = stem if len(row) == len(columns) else row[0]
         if label not in samples:
-            check_at_most("demonstrations", len(samples) + 1, MAX_DEMONSTRATIONS)
+            if len(samples) == MAX_DEMONSTRATIONS:
+                raise too_many("demonstrations", MAX_DEMONSTRATIONS)
             samples[label], lines[label] = array("d"), array("q")
         samples[label].extend(decimal_numbers(row[-len(columns) :], line))
         lines[label].append(line)
