@@ -101,64 +101,80 @@ def check_demonstrations(
             not move, has values so large that its unit must be another one, or a name that cannot be shown.
     """
     with naming(DemonstrationError, source):
-        if not demonstrations:
-            raise FormatError("demonstrations", "none", "at least one")
         check_at_most("demonstrations", len(demonstrations), MAX_DEMONSTRATIONS)
         checked = []
-        for i, demonstration in enumerate(demonstrations):
-            where = (
-                (lambda row: f"at sample {row + 1}") if lines is None else (lambda row, n=lines[i]: f"at line {n[row]}")
-            )
-            checked.append(_checked(demonstration, where))
-            first, this = checked[0], checked[-1]
-            if this.dimension != first.dimension:
-                found = f"{first.dimension} in {first.name!r} but {this.dimension} in {this.name!r}"
-                raise FormatError("dimension", found, "one dimension for all")
+        for demonstration, (times, positions) in zip(demonstrations, samples_of(demonstrations, lines), strict=True):
+            name = demonstration.name
+            if len(name) > MAX_NAME or re.search("[\ud800-\udfff]", name):  # a page cannot be sent half a character
+                raise FormatError("name", repr(name[:40]), f"text of at most {MAX_NAME} characters")
+            where = _places(lines, len(checked))
+            farthest = np.abs(positions).max(axis=1)
+            if farthest.max() > MAX_COORDINATE:
+                found = f"{farthest.max():.6g} m {where(int(farthest.argmax()))}; is the file in millimetres?"
+                accepted = f"metres, at most {MAX_COORDINATE:g} from the origin"
+                raise FormatError(f"positions of {name!r}", found, accepted)
+            if times[-1] > MAX_DURATION:
+                found = f"a duration of {times[-1]:.6g} s; is the file in milliseconds?"
+                accepted = f"seconds, at most {MAX_DURATION:g} from first to last"
+                raise FormatError(f"times of {name!r}", found, accepted)
+            if np.ptp(positions, axis=0).max() < MIN_EXTENT:
+                raise FormatError(f"positions of {name!r}", "a motion that stays at one point", "a motion")
+            times.setflags(write=False)
+            positions.setflags(write=False)
+            checked.append(Demonstration(times, positions, name))
     return tuple(checked)
 
 
-def _checked(demonstration: Demonstration, where: Callable[[int], str]) -> Demonstration:
-    name = demonstration.name
-    if len(name) > MAX_NAME or re.search("[\ud800-\udfff]", name):  # halves of characters cannot be sent to a page
-        raise FormatError("name", repr(name[:40]), f"text of at most {MAX_NAME} characters")
-    times_field, positions_field = f"times of {name!r}", f"positions of {name!r}"
-    times = real_numbers(demonstration.times, times_field)
-    positions = real_numbers(demonstration.positions, positions_field)
-    if times.ndim != 1:
-        raise FormatError(times_field, f"an array of shape {times.shape}", "shape (T,)")
-    if positions.ndim != 2 or positions.shape[1] not in DIMENSIONS:
-        raise FormatError(positions_field, f"an array of shape {positions.shape}", "(T, 2) or (T, 3)")
-    if len(times) != len(positions):
-        found = f"{len(positions)} positions for {len(times)} times"
-        raise FormatError(positions_field, found, "as many positions as times")
-    if len(times) < 2:
-        raise FormatError(positions_field, f"{len(times)} sample(s)", "at least 2 samples")
-    check_finite(times[:, None], times_field, where)
-    check_finite(positions, positions_field, where)
-    _check_times(times, times_field, where)
-    farthest = np.abs(positions).max(axis=1)
-    if farthest.max() > MAX_COORDINATE:
-        found = f"{farthest.max():.6g} m {where(int(farthest.argmax()))}; is the file in millimetres?"
-        raise FormatError(positions_field, found, f"metres, at most {MAX_COORDINATE:g} from the origin")
-    if np.ptp(positions, axis=0).max() < MIN_EXTENT:
-        raise FormatError(positions_field, "a motion that stays at one point", "a motion")
-    times = times - times[0]
-    times.setflags(write=False)
-    positions.setflags(write=False)
-    return Demonstration(times, positions, name)
+def samples_of(
+    demonstrations: Sequence[Demonstration], lines: Sequence[Sequence[int]] | None = None
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the times (T,) from 0 and the positions (T, d) of demonstrations as new float64 arrays.
+
+    Args:
+        demonstrations: recorded motions.
+        lines: as in :func:`check_demonstrations`.
+
+    Raises:
+        FormatError: there are none, they differ in dimension, or one of them has not the shapes, the number of samples,
+            the finite values or the increasing times that :class:`Demonstration` promises.
+    """
+    if not demonstrations:
+        raise FormatError("demonstrations", "none", "at least one")
+    samples = []
+    for i, demonstration in enumerate(demonstrations):
+        name, where = demonstration.name, _places(lines, i)
+        times_field, positions_field = f"times of {name!r}", f"positions of {name!r}"
+        times = real_numbers(demonstration.times, times_field)
+        positions = real_numbers(demonstration.positions, positions_field)
+        if times.ndim != 1:
+            raise FormatError(times_field, f"an array of shape {times.shape}", "shape (T,)")
+        if positions.ndim != 2 or positions.shape[1] not in DIMENSIONS:
+            raise FormatError(positions_field, f"an array of shape {positions.shape}", "(T, 2) or (T, 3)")
+        if len(times) != len(positions):
+            found = f"{len(positions)} positions for {len(times)} times"
+            raise FormatError(positions_field, found, "as many positions as times")
+        if len(times) < 2:
+            raise FormatError(positions_field, f"{len(times)} sample(s)", "at least 2 samples")
+        check_finite(times[:, None], times_field, where)
+        check_finite(positions, positions_field, where)
+        with np.errstate(over="ignore"):
+            elapsed = times - times[0]  # what will be stored: rounding may make close times equal
+        still = np.flatnonzero(elapsed[1:] <= elapsed[:-1])
+        if len(still):
+            row = int(still[0]) + 1
+            found = f"{times[row]:.9g} s {where(row)}, after {times[row - 1]:.9g} s"
+            raise FormatError(times_field, found, "times that increase from each sample to the next")
+        samples.append((elapsed, positions))
+        first, this = samples[0][1].shape[1], positions.shape[1]
+        if this != first:
+            found = f"{first} in {demonstrations[0].name!r} but {this} in {name!r}"
+            raise FormatError("dimension", found, "one dimension for all")
+    return samples
 
 
-def _check_times(times: np.ndarray, field: str, where: Callable[[int], str]) -> None:
-    with np.errstate(over="ignore"):
-        elapsed = times - times[0]  # what will be stored: rounding may make close times equal
-    still = np.flatnonzero(elapsed[1:] <= elapsed[:-1])
-    if len(still):
-        row = int(still[0]) + 1
-        found = f"{times[row]:.9g} s {where(row)}, after {times[row - 1]:.9g} s"
-        raise FormatError(field, found, "times that increase from each sample to the next")
-    if elapsed[-1] > MAX_DURATION:
-        found = f"a duration of {elapsed[-1]:.6g} s; is the file in milliseconds?"
-        raise FormatError(field, found, f"seconds, at most {MAX_DURATION:g} from first to last")
+def _places(lines: Sequence[Sequence[int]] | None, index: int) -> Callable[[int], str]:
+    """Return what describes the place of a sample of the demonstration with this index."""
+    return lambda row: f"at sample {row + 1}" if lines is None else f"at line {lines[index][row]}"
 
 
 def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:

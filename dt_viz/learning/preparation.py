@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
-from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.metrics import arc_length, resample_by_arc_length
 
 # All in units of the spread, the RMS distance of the demonstrations' points from their mean.
@@ -50,12 +51,15 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     Raises:
         ImitationError: there are none, they are damaged, or they do not end at one place.
     """
-    _check(demonstrations)
+    try:
+        samples = samples_of(demonstrations)
+    except FormatError as error:
+        raise ImitationError(str(error)) from error
     warnings: list[str] = []
     usable = []
-    for demonstration in demonstrations:
-        if arc_length(demonstration.positions)[-1] > 0:
-            usable.append(demonstration)
+    for demonstration, (times, positions) in zip(demonstrations, samples, strict=True):
+        if arc_length(positions)[-1] > 0:
+            usable.append(Demonstration(times, positions, demonstration.name))
         else:
             warnings.append(f"'{demonstration.name}' never moves; it is left out")
     if not usable:
@@ -65,7 +69,7 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
 
     names, times, positions = [], [], []
     for demonstration in usable:
-        t, path = demonstration.times - demonstration.times[0], _end_moved(demonstration.positions, goal)
+        t, path = demonstration.times, _end_moved(demonstration.positions, goal)
         away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
         if len(away) == 0:
             warnings.append(f"'{demonstration.name}' stays at the goal; it is left out")
@@ -84,28 +88,6 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     if not positions:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
     return Motions(tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
-
-
-def _check(demonstrations: Sequence[Demonstration]) -> None:
-    if not demonstrations:
-        raise ImitationError("there are no demonstrations; at least one is needed")
-    d = demonstrations[0].positions.shape[-1]
-    if d not in (2, 3):
-        raise ImitationError(
-            f"'{demonstrations[0].name}' has {d} coordinates; motions in the plane or in space can be fitted"
-        )
-    for demonstration in demonstrations:
-        name, t, path = demonstration.name, demonstration.times, demonstration.positions
-        if path.shape != (len(t), d):
-            raise ImitationError(f"'{name}': positions have shape {path.shape}; ({len(t)}, {d}) was expected")
-        if len(t) < 2:
-            raise ImitationError(f"'{name}' has {len(t)} sample; at least 2 are needed")
-        if not (np.isfinite(t).all() and np.isfinite(path).all()):
-            bad = int(np.flatnonzero(~(np.isfinite(t) & np.isfinite(path).all(axis=1)))[0])
-            raise ImitationError(f"'{name}': sample {bad} is not a finite number")
-        if (np.diff(t) <= 0).any():
-            bad = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
-            raise ImitationError(f"'{name}': the time of sample {bad} is not later than the one before")
 
 
 def _spread(demonstrations: Sequence[Demonstration]) -> float:
