@@ -1,4 +1,4 @@
-"""Demonstrations made ready for a fit: a common goal, clean motions, and a word on everything that had to be done."""
+"""Preparation of demonstrations for a fit: a common goal, clean motions, and a warning about every change."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.metrics import arc_length, resample_by_arc_length
+from dt_viz.properties import cached_property
 
-# All in units of the spread, the RMS distance of the demonstrations' points from their mean.
-SAME_GOAL = 1e-3  # ends closer than this to each other are the same place
-MAX_MOVED_END = 0.3  # ends up to this far off are moved to the common goal
-AT_GOAL = 0.05  # a motion that starts closer to the goal than this has nowhere to go
-STANDING_STEP = 1e-3  # covering less than this in 1 % of the duration is standing still
-LONG_STAND = 0.1  # part of the duration from which standing still is worth a word
+# Lengths are in units of the spread, the RMS distance of the demonstrations' points from their mean.
+SAME_GOAL = 1e-3  # distance from the goal up to which an end is at the goal
+MAX_MOVED_END = 0.3  # distance from the goal up to which an end is moved there
+AT_GOAL = 0.05  # distance from the goal up to which a start is at the goal
+STANDING_STEP = 1e-3  # length of a step, lasting 1 % of the motion, below which the motion stands still
+LONG_STAND = 0.1  # part of the duration from which standing still is reported
 
 
 class ImitationError(ValueError):
@@ -26,22 +27,27 @@ class ImitationError(ValueError):
 
 @dataclass(frozen=True)
 class Motions:
-    """What a fit works on."""
+    """Prepared motions, the input of a fit."""
 
     names: tuple[str, ...]
     times: tuple[Array, ...]
-    """For each motion (T_i,) seconds, increasing from 0."""
+    """(T_i,) times of each motion, seconds, increasing from 0."""
     positions: tuple[Array, ...]
-    """For each motion (T_i, d), the last row the goal."""
+    """(T_i, d) positions of each motion, the last row the goal."""
     goal: Array
-    """(d,) where all end."""
+    """(d,) common end."""
     spread: float
     """RMS distance of all points from their mean."""
     warnings: tuple[str, ...]
-    """What was done to which demonstration."""
+    """Descriptions of the changes to the demonstrations."""
+
+    @cached_property
+    def length(self) -> float:
+        """Mean length of the motions, in units of the spread."""
+        return float(np.mean([arc_length(path)[-1] for path in self.positions])) / self.spread
 
     def resampled(self, num: int) -> Array:
-        """All motions at `num` points equally spaced along each, (R, num, d)."""
+        """Resample all motions at `num` points equally spaced along each, (R, num, d)."""
         return np.stack([resample_by_arc_length(path, num) for path in self.positions])
 
 
@@ -49,7 +55,7 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     """Check demonstrations and give them a common goal.
 
     Raises:
-        ImitationError: there are none, they are damaged, or they do not end at one place.
+        ImitationError: there are none, they are damaged, or most do not end at one place.
     """
     try:
         samples = samples_of(demonstrations)
@@ -81,7 +87,7 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
                 f"its first {t[first]:.2g} s are left out"
             )
             t, path = t[first:] - t[first], path[first:]
-        _remark_on(demonstration.name, t, path, spread, warnings)
+        _warn_about(demonstration.name, t, path, spread, warnings)
         names.append(demonstration.name)
         times.append(t)
         positions.append(path)
@@ -98,7 +104,7 @@ def _spread(demonstrations: Sequence[Demonstration]) -> float:
 def _with_common_goal(
     demonstrations: list[Demonstration], spread: float, warnings: list[str]
 ) -> tuple[list[Demonstration], Array]:
-    """The demonstrations that end at the place where most of them do, and that place."""
+    """Return the demonstrations that end where most of them do, and that goal."""
     ends = np.array([demonstration.positions[-1] for demonstration in demonstrations])
     near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= MAX_MOVED_END * spread
     if 2 * near.sum() <= len(ends):
@@ -118,14 +124,14 @@ def _with_common_goal(
 
 
 def _end_moved(path: Array, goal: Array) -> Array:
-    """The path with its end moved to the goal, and the rest the less the farther it is from the end."""
+    """Move the end of a path to the goal, and its other points less the farther they are from the end."""
     length = arc_length(path)
     moved = path + (length / length[-1])[:, None] ** 2 * (goal - path[-1])
     moved[-1] = goal
     return moved
 
 
-def _remark_on(name: str, t: Array, path: Array, spread: float, warnings: list[str]) -> None:
+def _warn_about(name: str, t: Array, path: Array, spread: float, warnings: list[str]) -> None:
     even = np.linspace(t[0], t[-1], 101)
     steps = np.linalg.norm(np.diff([np.interp(even, t, x) for x in path.T], axis=1), axis=0)
     standing = float((steps[1:-1] < STANDING_STEP * spread).mean())

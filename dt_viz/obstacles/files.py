@@ -1,4 +1,4 @@
-"""Shapes of obstacles from files: closed meshes and point clouds, checked.
+"""Readers of obstacles' shapes from files: closed meshes and point clouds.
 
 Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB. They must be closed; small holes and seams are mended
 (see `dt_viz.obstacles.mending`).
@@ -9,7 +9,7 @@ Point clouds, in metres (or scaled to them):
     CSV (``.csv``), UTF-8: a header line ``x,y,z`` or ``x,y,z,occupied`` and one line per point.
     Labels are 1 (occupied) or 0 (free); without them every point is occupied.
 
-A shape's origin is put into the middle of its bounding box.
+The origin of a shape is moved to the middle of its bounding box.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> LoadedMesh:
     """Read a closed mesh from a file.
 
     Args:
-        path: of an STL, OBJ, PLY or GLB file.
+        path: an STL, OBJ, PLY or GLB file.
         scale: metres for one unit of the file.
 
     Raises:
@@ -154,7 +154,7 @@ def load_cloud(path: str | Path, *, scale: float = 1.0) -> LoadedCloud:
     """Read a point cloud from a file.
 
     Args:
-        path: of a PLY, npz or CSV file, see the module's docstring.
+        path: a PLY, npz or CSV file; see the module's docstring.
         scale: metres for one unit of the file.
 
     Raises:
@@ -222,7 +222,7 @@ def _check_enough(field: str, num: int, what: str) -> None:
 
 
 def _checked_size(points: Array, shape: Array, source: Path, scale: float) -> Array:
-    """Points in metres, the middle of the shape's bounding box at 0."""
+    """Return the points in metres, with the middle of the shape's bounding box at 0."""
     with np.errstate(over="ignore"):
         lower, upper = shape.min(axis=0), shape.max(axis=0)
         sizes = upper - lower
@@ -256,7 +256,7 @@ def _check_labels(labels: Array) -> None:
 
 
 def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
-    """Vertices (V, 3) and faces (F, 3) of all parts of a file."""
+    """Read vertices (V, 3) and faces (F, 3) of all parts of a file."""
     if suffix == ".stl":
         return read_stl(content, max_triangles=MAX_FACES)
     if suffix == ".obj":
