@@ -13,7 +13,6 @@ from dt_viz.engine.engine import Stage
 from dt_viz.evaluate import latency, rollouts
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
-from dt_viz.evaluate.imitation import grown_grid
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
@@ -21,7 +20,7 @@ from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
-from dt_viz.learning.imitation import ImitationSettings, fit
+from dt_viz.learning.imitation import ImitationSettings, fit, grown_grid
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
 

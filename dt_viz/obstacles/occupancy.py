@@ -39,13 +39,13 @@ class OccupancyMap:
         return expit(self.logit(s))
 
     def logit_gradient(self, s: Array) -> tuple[Array, Array]:
-        """Compute the logit (N,) and its gradient (N, d) at the points `s` (N, d)."""
+        """The logit (N,) and its gradient (N, d) at the points `s` (N, d)."""
         d = self.grid.dim
         partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d)))[..., 0]
         return partials[0] + self.bias, partials[1:].T
 
     def logit_hessian(self, s: Array) -> tuple[Array, Array, Array]:
-        """Compute the logit (N,), its gradient (N, d) and Hessian (N, d, d) at the points `s` (N, d)."""
+        """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
         d = self.grid.dim
         second = second_orders(d)
         orders = ((0,) * d, *unit_orders(d), *second.values())
@@ -159,7 +159,7 @@ class AvoidanceField:
         )
 
     def _weight(self, logit: Array) -> tuple[Array, Array]:
-        """Compute dU/dlogit and its derivative."""
+        """dU/dlogit and its derivative."""
         if self.generator == "probability":
             p = expit(logit)
             weight = p * (1 - p)
