@@ -41,7 +41,7 @@ def server(fits):
 @pytest.fixture
 def url(server):
     """Of the WebSocket; nobody is left over from another test."""
-    wait_until(lambda: not server._server.get_clients() and not server.num_sessions)
+    wait_until(lambda: not server._server.get_clients() and not server.visitors)
     return f"ws://127.0.0.1:{server.port}"
 
 
@@ -168,7 +168,7 @@ async def test_who_waits_is_told_that_all_places_are_taken(url, server):
     async with AsyncExitStack() as stack:
         for _ in range(NUM_PLACES):
             await (await stack.enter_async_context(ProtocolClient(url))).look()
-        await come_true(lambda: server.num_sessions == NUM_PLACES)
+        await come_true(lambda: len(server.visitors) == NUM_PLACES)
         async with ProtocolClient(url) as client:
             await client.look()
             assert await client.wait_for(

@@ -316,7 +316,7 @@ class TestPaths:
     def test_a_file_beyond_the_limit_is_not_read(self, tmp_path):
         with (tmp_path / "a.csv").open("wb") as file:
             file.truncate(MAX_BYTES + 1)
-        with pytest.raises(DemonstrationError, match="bytes"):
+        with pytest.raises(DemonstrationError, match="MB"):
             load_demonstrations(tmp_path / "a.csv")
 
     @pytest.mark.parametrize("path", ["\0.csv", "x" * 5000 + ".csv"])

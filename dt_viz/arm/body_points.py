@@ -72,6 +72,6 @@ class BodyPoints:
 
 @lru_cache(maxsize=1)
 def load_body_points() -> BodyPoints:
-    """Load the JACO's body points, made by ``python -m assets.make_body_points``."""
+    """The JACO's body points, made by ``python -m assets.make_body_points``."""
     with np.load(FILE, allow_pickle=False) as data:
         return BodyPoints(data["joint"], data["offset"], data["radius"])

@@ -39,7 +39,7 @@ def escape_directions(
     Returns:
         Unit vectors (3,), one for each distinct escape.
     """
-    directions = golden_spiral(NUM_DIRECTIONS, 0.5) * [1, -1, -1]
+    directions = golden_spiral(NUM_DIRECTIONS, 0.5)
     centres, radii = obstacle.cover()
     offset = points - centres[:, None, :, None]  # (B, P, 3, M)
     squared, sum_of_radii = (offset**2).sum(axis=2), (radii[:, None] + margin + radius)[:, :, None]

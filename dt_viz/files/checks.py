@@ -21,7 +21,7 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
     """
     if not path.is_file():
         raise FormatError("path", "no such file", "a readable file")
-    check_at_most("file", path.stat().st_size, max_bytes, "bytes")
+    check_size(path.stat().st_size, max_bytes)
     return path.read_bytes()
 
 
@@ -34,10 +34,16 @@ def checked_suffix(content: bytes, source: Path, accepted: Collection[str], max_
     suffix = source.suffix.lower()
     if suffix not in accepted:
         raise FormatError("suffix", repr(source.suffix) if suffix else "no suffix", ", ".join(accepted))
-    check_at_most("file", len(content), max_bytes, "bytes")
+    check_size(len(content), max_bytes)
     if not content:
         raise FormatError("file", "an empty file", f"a {suffix} file with content")
     return suffix
+
+
+def check_size(num_bytes: int, max_bytes: int) -> None:
+    """Raise FormatError if a file is larger than `max_bytes`."""
+    if num_bytes > max_bytes:
+        raise FormatError("file", f"{num_bytes / 1e6:.1f} MB", f"at most {max_bytes / 1e6:.0f} MB")
 
 
 def check_at_most(field: str, num: int, limit: int, unit: str = "") -> None:

@@ -532,7 +532,7 @@ def lathe(profile: Sequence[tuple[float, float]], num: int = 48) -> tuple[Array,
 def golden_spiral(num: int, offset: float = 0.0) -> Array:
     """Return evenly spread unit vectors (num, 3): a spiral in golden angles, turned by `offset` of them."""
     k = np.arange(num)
-    z, turn = (2 * k + 1) / num - 1, (k + offset) * np.pi * (3 - np.sqrt(5))
+    z, turn = 1 - (2 * k + 1) / num, np.pi * (1 + np.sqrt(5)) * (k + offset)
     r = np.sqrt(1 - z * z)
     vectors = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
     vectors.flags.writeable = False

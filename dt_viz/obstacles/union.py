@@ -48,7 +48,7 @@ class Union:
         free = deepest.nearest_free(s)
         if self.signed_distance(free) >= -ROUNDING:  # no free place is nearer
             return free
-        directions, length = golden_spiral(NUM_DIRECTIONS), np.zeros(NUM_DIRECTIONS)
+        directions, length = golden_spiral(NUM_DIRECTIONS) * [1, -1, -1], np.zeros(NUM_DIRECTIONS)
         for _ in range(NUM_STEPS):
             depth = -self.signed_distance(s + length[:, None] * directions)
             if depth[length.argmin()] <= 0:
