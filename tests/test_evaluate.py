@@ -140,7 +140,7 @@ def test_imitation_takes_other_files_in_metres_and_in_space(tmp_path):
 
 
 def test_the_grid_of_the_certificates_covers_the_box_and_half_its_size_on_every_side():
-    grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]))
+    grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]), 3)
     np.testing.assert_allclose([grid.min(axis=0), grid.max(axis=0)], [[-1, -2], [3, 6]])
 
 

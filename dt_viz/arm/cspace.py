@@ -58,7 +58,41 @@ NEAREST_TO_LIMIT = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class WholeArmField:
+class ArmField:
+    """Base of the generators V_q on R⁶ of an arm and an obstacle."""
+
+    robot: Robot
+    body: BodyPoints
+    """Body points that can be moved away."""
+    obstacle: Obstacle
+
+    @property
+    def dim(self) -> int:
+        """Dimension of configuration space."""
+        return NUM_JOINTS
+
+    @cached_property
+    def _core(self) -> Array:
+        return -CORE * (self.obstacle.depth + self.body.radius)[:, None]
+
+    def __call__(self, q: Array) -> Array:
+        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        raise NotImplementedError
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        num, d = q.shape
+        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
+        values = self(shifted).reshape(d, num, d)
+        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
+
+    def _distances(self, points: Array) -> Array:
+        """Return the distances (P, N) of the body points' spheres, at `points` (P, 3, N), from the obstacle."""
+        return self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class WholeArmField(ArmField):
     """Generator V_q whose reverse flow takes the arm out of an obstacle along an escape direction.
 
     A body point x_b with sphere radius r_b has the occupancy w_b = S(d(x_b) − r_b), d the distance from the obstacle's
@@ -75,10 +109,6 @@ class WholeArmField:
     the path with the first joint and turns sharply, see README "Departures".
     """
 
-    robot: Robot
-    body: BodyPoints
-    """Body points that can be moved away."""
-    obstacle: Obstacle
     direction: Array
     """n, (3,) unit vector in which the arm escapes."""
     pins: Array
@@ -86,20 +116,11 @@ class WholeArmField:
     reach: float = 6 * REACH_PER_TEMPERATURE
     """Distance from the obstacle's surface at which the field ends, metres."""
 
-    @property
-    def dim(self) -> int:
-        """Dimension of configuration space."""
-        return NUM_JOINTS
-
     @cached_property
     def _source(self) -> Array:
         end = self.obstacle.radius + self.reach + self.body.radius.max()
         behind = max(FAN * self.obstacle.radius, BEHIND * end)
         return (np.asarray(self.obstacle.position) - behind * self.direction)[:, None]
-
-    @cached_property
-    def _core(self) -> Array:
-        return -CORE * (self.obstacle.depth + self.body.radius)[:, None]
 
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
@@ -108,7 +129,7 @@ class WholeArmField:
         checkpoint()
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
-        distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        distance = self._distances(points)
         close = (distance.real < self.reach).any(axis=1)  # points away from the obstacle have no weight
         velocity = np.zeros_like(q)
         if not close.any():
@@ -140,41 +161,27 @@ class WholeArmField:
         velocity[near] = -(mobile @ pull)[..., 0] * self._freedom(q[near])[:, None]
         return velocity
 
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        return by_complex_steps(self, q)
-
     def _freedom(self, q: Array) -> Array:
         """Compute χ, (N,): 0 at the pins, 1 away from them."""
         return np.prod(1 - np.exp(-squared_lengths(q, self.pins) / (2 * PIN**2)), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
-class GradientField:
+class GradientField(ArmField):
     """The paper's generator V_q = ∇_q Σ_b U(x_b), U the occupancy w_b of `WholeArmField` times the depth it grows over.
 
     It moves start and goal, too, and ignores the motion of the hand.
     """
 
-    robot: Robot
-    body: BodyPoints
-    """Body points that can be moved away."""
-    obstacle: Obstacle
     reach: float = 6 * REACH_PER_TEMPERATURE
     """Distance from the obstacle's surface at which the field ends, metres."""
-
-    @property
-    def dim(self) -> int:
-        """Dimension of configuration space."""
-        return NUM_JOINTS
 
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
-        core = -CORE * (self.obstacle.depth + self.body.radius)[:, None]
-        distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        u = _unit_interval((self.reach - distance) / (self.reach - core))
+        distance = self._distances(points)
+        u = _unit_interval((self.reach - distance) / (self.reach - self._core))
         force: Array = -30 * (u * u * (1 - u) * (1 - u))[:, None] * self._outward(points)  # the slope of `_fading`
         moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
         return (chain.axes[:, 2] * moment).sum(axis=1).T
@@ -192,10 +199,6 @@ class GradientField:
 
     def _change(self, s: Array, shifts: Array) -> Array:
         return self.obstacle.signed_distance(s + shifts) - self.obstacle.signed_distance(s - shifts)
-
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        return by_complex_steps(self, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,14 +243,6 @@ class JointLimits(Diffeomorphism):
         stretch = 1 / np.sqrt(1 + squared)
         mapped = np.where(excess == 0, s, free + excess * stretch)
         return mapped, None if U is None else (stretch**3)[..., None] * U
-
-
-def by_complex_steps(field: WholeArmField | GradientField, q: Array) -> tuple[Array, Array]:
-    """Compute a field (N, 6) and its derivative (N, 6, 6) at configurations `q` (N, 6)."""
-    num, d = q.shape
-    shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # the field takes complex angles, too
-    values = field(shifted).reshape(d, num, d)
-    return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
 
 
 def squared_lengths(q: Array, pins: Array) -> Array:

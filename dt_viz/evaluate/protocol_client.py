@@ -8,12 +8,11 @@ msgpack map.
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -29,9 +28,10 @@ STATUS, CHECKED = "Smallest det J", "every check holds"
 """Texts in the status line of every frame, and of a frame whose certificates all hold."""
 MAX_MESSAGE = 64 * 2**20
 """Largest size of a message from the server, bytes."""
-PART = 512 * 1024
-"""Size of a part of an upload, bytes, as in viser's own page."""
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+T = TypeVar("T", bound="ProtocolClient")
 
 
 class LostError(ConnectionError):
@@ -64,7 +64,7 @@ class ProtocolClient:
         self._news = asyncio.Event()
         self._ended: Exception | None = None
 
-    async def __aenter__(self) -> ProtocolClient:
+    async def __aenter__(self: T) -> T:
         self._socket: ClientConnection = await connect(
             self._url,
             origin=websockets.Origin(self._origin) if self._origin is not None else None,
@@ -125,11 +125,6 @@ class ProtocolClient:
                 return bool(condition())
         return True
 
-    async def wait_until_lost(self, seconds: float) -> bool:
-        """Wait until the server has closed the connection; return False if it does not in time."""
-        done, _ = await asyncio.wait([self._receiving], timeout=seconds)
-        return bool(done)
-
     @property
     def rollouts(self) -> NDArray[np.float32] | None:
         """Segments (K, 2, 3) of the rollouts on the page, metres; None before there are any."""
@@ -149,17 +144,6 @@ class ProtocolClient:
         """Whether rollouts and status line are on the page."""
         return self.rollouts is not None and bool(self.status)
 
-    def find(self, label: str) -> str:
-        """Return the identifier of the control with this label. Raises KeyError."""
-        for uuid, control in self.controls.items():
-            if control.get("label") == label:
-                return uuid
-        raise KeyError(label)
-
-    async def set(self, label: str, value: bool | float | str) -> None:
-        """Set the value of a control."""
-        await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
-
     async def grab(self, name: str = OBSTACLE) -> None:
         """Begin to drag a gizmo."""
         await self.send("TransformControlsDragStartMessage", name=name, owner=self.nodes[name]["owner"])
@@ -177,32 +161,6 @@ class ProtocolClient:
     async def release(self, name: str = OBSTACLE) -> None:
         """End the drag of a gizmo."""
         await self.send("TransformControlsDragEndMessage", name=name, owner=self.nodes[name]["owner"])
-
-    async def upload(
-        self, label: str, name: str, content: bytes, *, announced: int | None = None, transfer: str = "transfer"
-    ) -> None:
-        """Send a file with an upload button.
-
-        Args:
-            label: label of the button.
-            name: name of the file.
-            content: all its bytes.
-            announced: announced number of bytes; the true one if None.
-            transfer: identifier of the transfer.
-        """
-        size = len(content) if announced is None else announced
-        common = {"source_component_uuid": self.find(label), "transfer_uuid": transfer}
-        parts = [content[k : k + PART] for k in range(0, len(content), PART)]
-        await self.send(
-            "FileTransferStartUpload",
-            **common,
-            filename=name,
-            mime_type="",
-            part_count=math.ceil(size / PART),
-            size_bytes=size,
-        )
-        for index, part in enumerate(parts):
-            await self.send("FileTransferPart", **common, part_index=index, content=part)
 
     async def _receive(self) -> None:
         try:
