@@ -144,7 +144,7 @@ def _warn_about(name: str, t: Array, path: Array, spread: float, warnings: list[
 
 
 def _crosses_itself(path: Array) -> bool:
-    """Whether two segments of a polyline (T, 2) that are not neighbours cross."""
+    """Return whether two segments of a polyline (T, 2) that are not neighbours cross."""
     a, b = path[:-1], path[1:]
 
     def side(p: Array, q: Array, r: Array) -> Array:

@@ -131,7 +131,7 @@ def _sides(faces: Indices, num_vertices: int) -> Indices:
 
 
 def _joins_pairs(sides: Indices) -> bool:
-    """Whether each edge is one of exactly two triangles, given their sides in order."""
+    """Return whether each edge has exactly two triangles, given their sides in order."""
     edges = sides // 2
     return bool(len(edges) % 2 == 0 and (edges[::2] == edges[1::2]).all() and (edges[1:-1:2] != edges[2::2]).all())
 

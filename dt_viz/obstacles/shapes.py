@@ -9,7 +9,6 @@ from functools import lru_cache
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array, Indices, Mask, PlacedField
 from dt_viz.obstacles.clouds import Cloud
@@ -428,8 +427,14 @@ class CloudObstacle(_Triangles):
 @lru_cache(maxsize=256)
 def rotation(wxyz: Quaternion) -> Array:
     """Return the matrix (3, 3) of a quaternion of any length; its columns are the turned axes."""
-    w, x, y, z = wxyz
-    matrix = Rotation.from_quat([x, y, z, w]).as_matrix()
+    w, x, y, z = np.asarray(wxyz, dtype=float) / np.linalg.norm(wxyz)
+    matrix = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
     matrix.flags.writeable = False
     return matrix
 
