@@ -433,7 +433,10 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
         (["imitation", "Hook.mat", "--out", "file/below"], "--out: found 'file/below', which cannot be made"),
         (["latency", "--task", "none", "--seconds", "1", "--out", "a.json"], "--task: found 'none'; accepted: draw_s,"),
         (["latency", *TASK, "--seconds", "1", "--out", "a.txt"], "--out: found 'a.txt'; accepted: a file that ends in"),
-        (["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"], "no: folder: found nothing that can"),
+        (
+            ["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"],
+            "no: folder: found something that cannot",
+        ),
         (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),
         (["starts", *TASK, "--out", "folder.npz"], "--out: found 'folder.npz', which cannot be written"),
         (["imitation", "Hook.mat", "--folds", "2", "--out", "out"], "--folds: found 2; accepted: it together with"),
@@ -460,7 +463,7 @@ def test_what_cannot_be_used_is_named(lasa, tmp_path, monkeypatch, capsys, argum
         (["avoidance", *TASK, "--obstacle", "0,0,0", "--diameter", "-1"], "argument --diameter: found '-1'; accepted"),
         (
             ["avoidance", *TASK, *SPHERE, "--space", "joint"],
-            "argument --space: found 'joint'; accepted: task, cspace, both",
+            "argument --space: invalid choice: 'joint'",
         ),
         (["starts", *TASK, "--count", "many"], "argument --count: found 'many'; accepted: a whole number, 1 or more"),
         (["imitation", "Hook.mat"], "the following arguments are required: --out"),

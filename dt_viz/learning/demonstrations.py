@@ -191,6 +191,8 @@ def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:
     with parsing(DemonstrationError, path, "path", "a readable file or folder"):
         if path.is_dir():
             return _load_csv_folder(path)
+        if not path.exists():
+            raise FormatError("path", "no such file or folder", "a readable file or folder")
         content = read_bytes(path, MAX_BYTES)
     return read_demonstrations(content, path)
 
