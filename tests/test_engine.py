@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import used_fraction
 
 import dt_viz.engine.engine as engine_module
 import dt_viz.engine.turns as turns_module
-from dt_viz.arm.retiming import used_fraction
 from dt_viz.engine.frame import Stage
 from dt_viz.engine.turns import Turns
 from dt_viz.flows import rollouts

@@ -13,7 +13,6 @@ from dt_viz.engine.frame import Stage
 from dt_viz.evaluate import latency, rollouts
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
-from dt_viz.evaluate.imitation import grown_grid
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
@@ -21,7 +20,7 @@ from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
-from dt_viz.learning.imitation import ImitationSettings, fit
+from dt_viz.learning.imitation import ImitationSettings, fit, grown_grid
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
 
@@ -141,7 +140,7 @@ def test_imitation_takes_other_files_in_metres_and_in_space(tmp_path):
 
 
 def test_the_grid_of_the_certificates_covers_the_box_and_half_its_size_on_every_side():
-    grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]))
+    grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]), 3)
     np.testing.assert_allclose([grid.min(axis=0), grid.max(axis=0)], [[-1, -2], [3, 6]])
 
 
@@ -436,7 +435,10 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
         (["imitation", "Hook.mat", "--out", "file/below"], "--out: found 'file/below', which cannot be made"),
         (["latency", "--task", "none", "--seconds", "1", "--out", "a.json"], "--task: found 'none'; accepted: draw_s,"),
         (["latency", *TASK, "--seconds", "1", "--out", "a.txt"], "--out: found 'a.txt'; accepted: a file that ends in"),
-        (["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"], "no: folder: found nothing that can"),
+        (
+            ["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"],
+            "no: folder: found something that cannot",
+        ),
         (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),
         (["starts", *TASK, "--out", "folder.npz"], "--out: found 'folder.npz', which cannot be written"),
         (["imitation", "Hook.mat", "--folds", "2", "--out", "out"], "--folds: found 2; accepted: it together with"),
@@ -463,7 +465,7 @@ def test_what_cannot_be_used_is_named(lasa, tmp_path, monkeypatch, capsys, argum
         (["avoidance", *TASK, "--obstacle", "0,0,0", "--diameter", "-1"], "argument --diameter: found '-1'; accepted"),
         (
             ["avoidance", *TASK, *SPHERE, "--space", "joint"],
-            "argument --space: found 'joint'; accepted: task, cspace, both",
+            "argument --space: invalid choice: 'joint'",
         ),
         (["starts", *TASK, "--count", "many"], "argument --count: found 'many'; accepted: a whole number, 1 or more"),
         (["imitation", "Hook.mat"], "the following arguments are required: --out"),

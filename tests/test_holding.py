@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import used_fraction
 
 from dt_viz.arm.arm_system import Section
-from dt_viz.arm.retiming import used_fraction
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR
 from dt_viz.motion.solve import LIVE, solve

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import used_fraction
 
-from dt_viz.arm.retiming import used_fraction
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.pushing import DISTANCES, MAX_TRACKING_ERROR, PUSH_SECONDS

@@ -51,7 +51,7 @@ class View:
     ghost_arm: bool = False
     """The arm where it would be without avoidance."""
     onion: bool = False
-    """Union arms along the motion, fading."""
+    """Several arms along the motion, fading."""
     body_points: bool = False
     """The spheres that cover the arm, and how far avoidance has moved each."""
     joint_plots: bool = False
