@@ -11,12 +11,12 @@ import viser  # noqa: TID251 - a page for tests of pictures and controls
 from chromium import ARGUMENTS, CHROMIUM
 from hypothesis import HealthCheck, settings
 from playwright.sync_api import sync_playwright
+from scenes import avoiding
 
 from dt_viz.arm.robot import Robot, load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 
 # Nothing here is timed, and a failure must come back on the next run.
@@ -75,7 +75,7 @@ def engine(new_engine) -> Engine:
 @pytest.fixture(scope="session")
 def initial(engine):
     """The scenario that a task begins with."""
-    return lambda task: Scenario(task, (Sphere(engine.task(task).obstacle_position),))
+    return lambda task: avoiding(task, Sphere(engine.task(task).obstacle_position))
 
 
 @pytest.fixture(scope="module")
