@@ -125,6 +125,17 @@ def anchored(scenario: Scenario) -> dict[str, Transform]:
     return {layer.name: layer.transform for layer in scenario.stack if layer.transform.anchor is not None}
 
 
+def added(scenario: Scenario) -> dict[str, Transform]:
+    """The transforms of which there may be several, also those that are off, by the name of their layer."""
+    return {layer.name: layer.transform for layer in scenario.stack if layer.transform.most > 1}
+
+
+def selected(scenario: Scenario) -> str | None:
+    """Name of the added transform that has the handles: the chosen one, or else the newest."""
+    names = added(scenario)
+    return scenario.view.bias if scenario.view.bias in names else next(reversed(names), None)
+
+
 def plane_of(task: Task) -> tuple[Point, Point] | None:
     """The plane of a drawing, in which it is biased; None of a task in space."""
     if task.demonstrations[0].dimension != 2:

@@ -107,6 +107,7 @@ class Avoidance(Transform):
             0.01,
             0.5,
             automatic=True,
+            of_flow=True,
             hint="the shortest flow that does what the transform is for",
         ),
         FlowIntegration(),

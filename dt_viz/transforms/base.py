@@ -102,6 +102,8 @@ class Number:
     """Units of the slider for one of the field's."""
     automatic: bool = False
     """Whether a switch beside the slider sets the field to None, which leaves the choice to the transform."""
+    of_flow: bool = False
+    """Whether it is t of the transform's flow."""
     hint: str = ""
 
 
@@ -114,7 +116,7 @@ class Switch:
     hint: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Choice:
     """A setting that is one of a few values."""
 
@@ -161,6 +163,14 @@ class ArmAvoidance:
     duration: float | None = None
     """t of the flow; None is the shortest that clears the obstacle by the margin."""
     integration: Integration = AUTO
+
+
+def axes_of(plane: tuple[Point, Point] | None) -> Array:
+    """Orthonormal columns (3, 3), those of a plane first, if there is one."""
+    if plane is None:
+        return np.eye(3)
+    u, v = np.asarray(plane)
+    return np.stack([u, v, np.cross(u, v)], axis=1)
 
 
 _Transform = TypeVar("_Transform", bound="Transform")
@@ -210,6 +220,16 @@ class Transform(ABC):
     @property
     def anchor(self) -> Point | None:
         """The place that it leads motions to and by which it is dragged, metres."""
+        return None
+
+    @property
+    def anchor_plane(self) -> tuple[Point, Point] | None:
+        """Two orthonormal vectors of the plane that it is dragged in; None of space."""
+        return None
+
+    @property
+    def region(self) -> float | None:
+        """Radius of the region around its anchor in which it acts, metres; None where that is chosen automatically."""
         return None
 
     def anchored(self: _Transform, place: Point) -> _Transform:

@@ -24,6 +24,7 @@ from dt_viz.transforms.base import (
     Surroundings,
     Switch,
     Transform,
+    axes_of,
 )
 from dt_viz.warning import Kind, MotionWarning
 
@@ -114,7 +115,7 @@ class BiasPoint(Transform):
             hint="of the region that it acts in; auto: by how far the motion is away",
         ),
         Switch("moves_goal", "Moves the goal", "motions end here instead of at the goal"),
-        Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True),
+        Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True, of_flow=True),
         FlowIntegration(),
     )
 
@@ -122,6 +123,16 @@ class BiasPoint(Transform):
     def anchor(self) -> Point:
         """See `Transform`."""
         return self.position
+
+    @property
+    def anchor_plane(self) -> tuple[Point, Point] | None:
+        """See `Transform`."""
+        return self.plane
+
+    @property
+    def region(self) -> float | None:
+        """See `Transform`."""
+        return self.radius
 
     @property
     def ends_motions(self) -> bool:
@@ -134,10 +145,7 @@ class BiasPoint(Transform):
 
     def axes(self) -> Array:
         """(3, 3) orthonormal columns, those of the plane first."""
-        if self.plane is None:
-            return np.eye(3)
-        u, v = np.asarray(self.plane)
-        return np.stack([u, v, np.cross(u, v)], axis=1)
+        return axes_of(self.plane)
 
     def field(self, radius: float) -> PlacedField:
         """The generator whose reverse flow leads to the target, from a regression done once for all targets."""

@@ -20,6 +20,7 @@ from dt_viz.obstacles.files import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeEr
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
+from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.controls import Control
 from dt_viz.ui.reading import Reader
@@ -103,8 +104,8 @@ class ObstaclePanel:
             )
             bind(
                 gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
-                lambda s: round(100 * s.margin, 3),
-                lambda _s, value: {"margin": value / 100},
+                lambda s: round(100 * s.avoidance.margin, 3),
+                lambda s, value: {"stack": with_avoidance(s, margin=value / 100)},
             )
             with gui.add_folder("From a file", expand_by_default=False):
                 self._unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
@@ -224,7 +225,7 @@ class ObstaclePanel:
         session = self._session
         if session is not None:
             view = replace(session.scenario.view, selected=selected)
-            session.edit("obstacles", obstacles=tuple(obstacles), view=view)
+            session.edit("obstacles", stack=with_avoidance(session.scenario, obstacles=tuple(obstacles)), view=view)
             session.end_gesture()
 
     def _size(
@@ -245,7 +246,8 @@ class ObstaclePanel:
             if not isinstance(chosen, shape):
                 return {}
             index, before = scenario.selected or 0, scenario.obstacles
-            return {"obstacles": (*before[:index], change(chosen, value / 100), *before[index + 1 :])}
+            changed = (*before[:index], change(chosen, value / 100), *before[index + 1 :])
+            return {"stack": with_avoidance(scenario, obstacles=changed)}
 
         handle.visible = False
         control = self._bind(handle, shown, changed)

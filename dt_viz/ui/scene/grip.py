@@ -77,10 +77,10 @@ class Grip:
         self._slice = frame.slice
         self.ball.visible = frame.arm is not None and not frame.blocked
 
-    def say(self, doubt: str) -> None:
+    def say(self, warning: str) -> None:
         """Show a warning beside the hand; none if it is empty."""
-        self._note.text = doubt or self._note.text
-        self._note.visible = bool(doubt)
+        self._note.text = warning or self._note.text
+        self._note.visible = bool(warning)
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
