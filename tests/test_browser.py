@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from chromium import needs_chromium
 from PIL import Image
+from scenes import beside, changing
 
 import dt_viz.learning.store
 from dt_viz.arm.robot import load_jaco
@@ -18,7 +19,7 @@ from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.scenario import View
-from dt_viz.scenario.stack import bias_points
+from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.server import Server
@@ -186,7 +187,7 @@ def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
     )
     obstacle = after.scenario.obstacle
     assert max(maximum_collision_distance(path, obstacle.signed_distance) for path in after.rollouts) == 0
-    assert after.health.clearance > 0.005
+    assert after.certificates.clearance > 0.005
 
 
 def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_pose_is_shown(visit):
@@ -232,7 +233,7 @@ def click_button(page, name):
 def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit):
     page, visitor = visit
     session, pictures = visitor.session, visitor.pictures.obstacles
-    session.edit("test", avoidance=False)
+    session.edit("test", **changing(session.scenario, avoids=False))
     (sphere,) = session.scenario.obstacles
     click_button(page, "Box")
     wait_until(lambda: [item.has_handles for item in pictures.items] == [False, True], "the box and its handles")
@@ -247,7 +248,13 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
         x, y = project(visitor, before - (0.05, 0.05, 0.015))  # away from the handles
         return (x, y), (x - 50, y + 30)
 
-    drag_until(page, visitor, dragged, lambda: session.edit("test", obstacles=boxed), along_its_face)
+    drag_until(
+        page,
+        visitor,
+        dragged,
+        lambda: session.edit("test", **changing(session.scenario, obstacles=boxed)),
+        along_its_face,
+    )
     assert session.scenario.obstacles[0] == sphere
     np.testing.assert_allclose(pictures.items[1].gizmo.position, session.scenario.obstacles[1].position, atol=1e-9)
 
@@ -266,7 +273,7 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
 def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     page, visitor = visit
     session = visitor.session
-    session.edit("test", obstacles=(), avoidance=False)
+    session.edit("test", **changing(session.scenario, obstacles=(), avoids=False))
     crate = trimesh.creation.box((150, 100, 50)).export(file_type="stl")
     page.get_by_text("From a file", exact=True).click()
     upload = page.locator("input[type=file]").first
@@ -293,7 +300,13 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
         turns = [np.array([np.cos(angle), 0.0, np.sin(angle)]) for angle in (grabbed, grabbed - 0.7)]
         return [project(visitor, mesh.position + arc * turn) for turn in turns]
 
-    drag_until(page, visitor, turned, lambda: session.edit("test", obstacles=(mesh,)), along_the_arc)
+    drag_until(
+        page,
+        visitor,
+        turned,
+        lambda: session.edit("test", **changing(session.scenario, obstacles=(mesh,))),
+        along_the_arc,
+    )
     assert session.wait_idle(PATIENCE)
     (after,) = session.scenario.obstacles
     axis = np.abs(after.wxyz[1:]) / np.linalg.norm(after.wxyz[1:])
@@ -315,15 +328,15 @@ def test_a_file_that_is_too_large_is_refused_with_a_reason_and_the_next_can_be_c
 
 def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_the_stack(visit):
     page, visitor = visit
-    session, pictures = visitor.session, visitor.pictures.biases
-    session.edit("test", obstacles=())
+    session, pictures = visitor.session, visitor.pictures.anchors
+    session.edit("test", **changing(session.scenario, obstacles=()))
     click_button(page, "Add")
-    wait_until(lambda: session.scenario.layers and session.wait_idle(0.3), "the bias point")
+    wait_until(lambda: beside(session.scenario) and session.wait_idle(0.3), "the bias point")
 
     def place():
-        return np.array(bias_points(session.scenario.layers)["Bias 1"].position)
+        return np.array(anchored(session.scenario)["Bias 1"].anchor)
 
-    before, layers = place(), session.scenario.layers
+    before, layers = place(), beside(session.scenario)
 
     def beside_its_middle():
         x, y = project(visitor, before)
@@ -332,7 +345,13 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     def moved():
         return 0.03 < np.linalg.norm(place() - before) < 0.15
 
-    drag_until(page, visitor, moved, lambda: session.edit("test", layers=layers), beside_its_middle)
+    drag_until(
+        page,
+        visitor,
+        moved,
+        lambda: session.edit("test", **changing(session.scenario, layers=layers)),
+        beside_its_middle,
+    )
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
     assert abs(place()[1] - before[1]) < 1e-6  # the drawing plane is y = const
     np.testing.assert_allclose(pictures.items[0].gizmo.position, place(), atol=1e-9)
@@ -340,7 +359,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
 
     open_tab(page, "Stack")
     page.get_by_role("button", name="● on", exact=True).first.evaluate("button => button.click()")  # of the outermost
-    wait_until(lambda: not session.scenario.layers[0].on and session.wait_idle(0.3), "the switch")
+    wait_until(lambda: not beside(session.scenario)[0].on and session.wait_idle(0.3), "the switch")
     for path, undisturbed in zip(visitor.shown.rollouts, visitor.shown.ghost, strict=True):
         assert max(np.linalg.norm(undisturbed - point, axis=1).min() for point in path) < 0.02
 
@@ -380,7 +399,7 @@ def test_reset_brings_back_the_scene_and_the_camera(visit):
     page, visitor = visit
     begun = replace(visitor.session.scenario, view=View())
     drag(page, (100, HEIGHT - 60), (260, HEIGHT - 120))
-    visitor.session.edit("test", temperature=2.0, view=View(grid=True))
+    visitor.session.edit("test", **changing(visitor.session.scenario, temperature=2.0), view=View(grid=True))
     wait_until(lambda: not camera_rests(visitor), "the camera to be turned")
     page.wait_for_timeout(1000)
     click_button(page, "Reset")
@@ -394,9 +413,9 @@ def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, serv
     third = browser.new_page()
     third.set_default_timeout(1000 * PATIENCE)
     try:
-        second.session.edit("test", avoidance=False)
+        second.session.edit("test", **changing(second.session.scenario, avoids=False))
         assert second.session.wait_idle(PATIENCE)
-        assert first.session.scenario.avoidance
+        assert first.session.scenario.avoids
         third.goto(f"http://127.0.0.1:{server.port}")
         third.get_by_text("All 2 places are taken").wait_for()
     finally:
@@ -531,7 +550,11 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
 def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_go(visit):
     page, visitor = visit
     session = visitor.session
-    session.edit("test", obstacles=(), view=View(playing=False, field=False, table=False, demonstrations=False))
+    session.edit(
+        "test",
+        **changing(session.scenario, obstacles=()),
+        view=View(playing=False, field=False, table=False, demonstrations=False),
+    )
     wait_until(
         lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion without obstacle"
     )
@@ -579,7 +602,7 @@ def test_the_slice_is_moved_by_its_handles_and_the_field_with_it(visit):
         return np.linalg.norm(visitor.shown.slice.centre - home.centre) > 0.03
 
     moving = replace(LIGHT, streamlines=True, move_slice=True)
-    session.edit("test", obstacles=(), view=moving)
+    session.edit("test", **changing(session.scenario, obstacles=()), view=moving)
     wait_until(lambda: session.wait_idle(0.3), "the handles")
     drag_until(page, visitor, moved, lambda: session.edit("test", view=moving), along_its_first_arrow)
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its picture")
@@ -594,7 +617,7 @@ def test_the_slice_is_moved_by_its_handles_and_the_field_with_it(visit):
 def test_a_click_on_the_slice_starts_a_rollout_and_a_drag_of_the_camera_does_not(visit):
     page, visitor = visit
     session, area = visitor.session, visitor.shown.slice
-    session.edit("test", obstacles=(), view=replace(LIGHT, click_to_start=True))
+    session.edit("test", **changing(session.scenario, obstacles=()), view=replace(LIGHT, click_to_start=True))
     wait_until(lambda: session.wait_idle(0.3), "the mode")
     place = area.at(np.array([-0.6, 0.6]) * area.half_size)
     for _ in range(TRIES):

@@ -99,7 +99,7 @@ def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
 
 
 class Engine:
-    """Computes frames for one visitor. Not thread-safe: one worker thread calls it.
+    """Computes frames for one visitor. Not thread-safe: one worker thread calls it, but for `task`.
 
     The same scenario always gives the same frame, with two exceptions. Where there is no motion for it the last one
     that there was for the task is shown, marked by `Frame.blocked`. And up to stage LIVE joints are looked for from
@@ -126,10 +126,13 @@ class Engine:
         self._sketchbook = lru_cache(maxsize=2)(_sketchbook)
 
     def task(self, name: str) -> Task:
-        """The task of that name, loaded on first use. Raises DemonstrationError if its file cannot be used."""
-        if name not in self._tasks:
-            self._tasks[name] = self._loaders[name]()
-        return self._tasks[name]
+        """The task of that name, loaded on first use; may be called by any thread.
+
+        Raises:
+            DemonstrationError: its file cannot be used.
+        """
+        known = self._tasks.get(name)
+        return self._tasks.setdefault(name, self._loaders[name]()) if known is None else known
 
     def frames(
         self, scenario: Scenario, progress: Progress | None = None, checkpoint: Checkpoint = lambda: None

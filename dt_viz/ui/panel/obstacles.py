@@ -22,6 +22,7 @@ from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import Task
+from dt_viz.ui.chores import Later
 from dt_viz.ui.controls import Control
 from dt_viz.ui.reading import Reader
 
@@ -49,13 +50,14 @@ Shape = type[Obstacle] | UnionType
 class ObstaclePanel:
     """The folder "Obstacles" of one visitor's panel."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str, bool], None]) -> None:
+    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str, bool], None], later: Later) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
         Args:
             gui: of the visitor.
             bind: ties a control to the scenario.
             say: shows a text for a while, and whether it is about an error.
+            later: does work beside the server's event loop.
         """
         self._bind, self._say = bind, say
         self._session: Session | None = None
@@ -119,8 +121,8 @@ class ObstaclePanel:
             self._begin(partial(self.load, file.content, file.name, UNITS[self._unit.value]))
 
         Control(self._again, lambda _clicked: self._begin(self.load_again))
-        Control(self._add, lambda name: self.add(SHAPES[name]))
-        Control(self._change, lambda name: {"Duplicate": self.duplicate, "Delete": self.delete}[name]())
+        Control(self._add, lambda name: later(partial(self.add, SHAPES[name])))
+        Control(self._change, lambda name: later({"Duplicate": self.duplicate, "Delete": self.delete}[name]))
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""

@@ -20,6 +20,7 @@ from dt_viz.learning.imitation import ImitationError
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
+from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
@@ -121,12 +122,14 @@ class Panel:
         on_press(self._cancel, self._cancel_learning)
         self._build_task()
         tabs = gui.add_tab_group()
+        self._chores = Chores(self.fail)
+        later = self._chores.later
         with tabs.add_tab("World"):
             self._obstacles = ObstaclePanel(
-                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
+                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER)), later
             )
-            self._transforms = TransformsPanel(gui, self._bind)
-            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER))
+            self._transforms = TransformsPanel(gui, self._bind, later)
+            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER), later)
         with tabs.add_tab("Stack"):
             self._stack = StackPanel(gui, self._bind)
         with tabs.add_tab("Show"):
@@ -153,6 +156,7 @@ class Panel:
         self._stack.close()
         self._saver.close()
         self._beginnings.close()
+        self._chores.close()
 
     @property
     def legend(self) -> Legend | None:

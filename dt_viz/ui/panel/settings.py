@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import viser
 
@@ -98,8 +98,10 @@ class _Tie:
             transform = None if name is None else transform_of(scenario, name)
             if before is _ABSENT or name is None or transform is None:
                 return {}
-            changed: Any = transform
-            return {"stack": with_transform(scenario, name, replace(changed, **{self._field: meant(before, value)}))}
+            after, dataclass = meant(before, value), cast(Any, transform)
+            if after == before:
+                return {}
+            return {"stack": with_transform(scenario, name, replace(dataclass, **{self._field: after}))}
 
         return self._bind(handle, read, change)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import viser
 
@@ -12,6 +13,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import added, selected, surroundings, with_added, without
 from dt_viz.transforms.base import Setting, Transform
 from dt_viz.transforms.registry import KINDS
+from dt_viz.ui.chores import Later
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.settings import Bind, Settings
 from dt_viz.ui.panel.transform_settings import chosen_values, own
@@ -25,8 +27,8 @@ DELETE = "Delete"
 class TransformsPanel:
     """Adds and deletes transforms, and changes the selected one."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Bind) -> None:
-        """Build the controls; they act once `connect` has given them a session."""
+    def __init__(self, gui: viser.GuiApi, bind: Bind, later: Later) -> None:
+        """Build the controls, which do their work `later`; they act once `connect` has given them a session."""
         self._session: Session | None = None
         with gui.add_folder("Transforms"):
             hints = "; ".join(f"{title}: {kind.hint}" for title, kind in ADDABLE.items())
@@ -38,8 +40,8 @@ class TransformsPanel:
                 lambda s, value: {"view": replace(s.view, bias=value)},
             ).handle
             self._settings = Settings(gui, bind, _own_settings, selected)
-        Control(self._add, lambda title: self.add(ADDABLE[title]))
-        Control(self._delete, lambda _delete: self.delete())
+        Control(self._add, lambda title: later(partial(self.add, ADDABLE[title])))
+        Control(self._delete, lambda _delete: later(self.delete))
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
