@@ -271,9 +271,9 @@ def test_without_avoidance_the_same_command_shows_the_collision(lasa, tmp_path, 
 
 def test_avoidance_says_what_is_not_to_be_trusted(lasa, tmp_path, capsys):
     start = run_avoidance(lasa, tmp_path / "a.npz", [0.5, -0.5, 0.9])["demo_0"][0]
-    assert "doubt" not in capsys.readouterr().out
+    assert "warning" not in capsys.readouterr().out
     run_avoidance(lasa, tmp_path / "a.npz", start)
-    assert "doubt: start 1 is inside the obstacle" in capsys.readouterr().out
+    assert "warning: start 1 is inside the obstacle" in capsys.readouterr().out
 
 
 def test_the_whole_arm_avoids_what_the_hand_alone_does_not(lasa, tmp_path, middle, robot, capsys):
