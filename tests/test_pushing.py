@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from oracles import used_fraction
+from scenes import changed
 
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.engine.frame import Stage
@@ -55,7 +56,7 @@ def test_the_hand_is_pushed_aside_and_still_reaches_the_goal(engine, initial, ro
 
 def test_after_the_push_it_is_a_motion_of_the_system(engine, initial, task):
     scenario = initial(task)
-    system = solve(engine._nominal(scenario, None), scenario, FINE).system
+    system = solve(engine._nominal(scenario, None), scenario.active, FINE).system
     for _, _, pushed in pushes(engine, scenario):
         after = pushed.path[pushed.begins :]
         assert (np.diff(system.lyapunov(after)) < 0).all()
@@ -67,7 +68,7 @@ def test_after_the_push_it_is_a_motion_of_the_system(engine, initial, task):
 
 @pytest.mark.parametrize("space", ["task", "cspace", "both"])
 def test_the_arm_keeps_its_limits_and_keeps_clear(engine, initial, robot, task, space):
-    for frame, q, pushed in pushes(engine, replace(initial(task), space=space)):
+    for frame, q, pushed in pushes(engine, changed(initial(task), space=space)):
         motion = pushed.motion
         assert (motion.q >= robot.lower).all() and (motion.q <= robot.upper).all()
         assert used_fraction(motion.times, motion.q, robot.velocity_limits) < 1 + 1e-6

@@ -72,7 +72,7 @@ def held(
         doubt = "out of the arm's reach" if far else "the arm gives way to the obstacle here"
     elif place[2] < 0:
         doubt = "below the table"
-    elif scenario.avoidance and scenario.warp == 1 and room.obstacle < 0:
+    elif scenario.avoids and scenario.warp == 1 and room.obstacle < 0:
         doubt = "the motion from here touches the obstacle"
     elif room.tracking < 0:
         doubt = "the arm cannot follow the motion from here"

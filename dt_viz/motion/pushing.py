@@ -169,6 +169,6 @@ def onwards(
     if arm is not None:
         clearance = float(follower.whole_arm.clearance(joints, scenario.obstacle).min())
     else:
-        clearance = float(scenario.obstacle.signed_distance(path if scenario.avoidance else aside).min())
+        clearance = float(scenario.obstacle.signed_distance(path if scenario.avoids else aside).min())
     room = Room(float(path[:, 2].min()) - lowest, MAX_TRACKING_ERROR - float(tracked.error.max()), clearance)
     return Pushed(scenario, motion, path, len(aside) - 1), room
