@@ -79,6 +79,16 @@ def test_the_arm_keeps_its_limits_and_keeps_clear(engine, initial, robot, task, 
         assert pushed.path[:, 2].min() > 0
 
 
+def test_an_obstacle_that_is_not_avoided_hinders_no_push_that_is_clear_of_it_itself(engine, initial):
+    off, paths = changed(initial("draw_s"), avoids=False), []
+    for scenario in (off, changed(off, obstacles=())):
+        arm, rng = shown(engine, scenario).arm, np.random.default_rng(0)
+        paths.append([engine.pushed(scenario, arm.q[len(arm.q) // 10], rng).path for _ in range(4)])
+    for pushed, free in zip(*paths, strict=True):
+        assert off.obstacle.signed_distance(free).min() < 0  # on the way to the goal
+        np.testing.assert_allclose(pushed, free, rtol=0, atol=1e-9)
+
+
 def test_directions_differ_and_come_from_the_generator(engine, initial):
     first, again = (list(pushes(engine, initial("draw_s"))) for _ in range(2))
     for (_, _, a), (_, _, b) in zip(first, again, strict=True):
