@@ -143,6 +143,21 @@ def test_no_number_is_no_certificate():
     assert kinds(known.warnings) == {BEFORE.kind, *failed}
 
 
+def test_what_follows_from_a_cause_that_is_said_is_not_told_beside_it_but_known():
+    cause = MotionWarning(Kind.FOLDS, "a step folds", "Bias 1")
+    follows = MotionWarning(Kind.NOT_FALLING, "it rises")
+    known = CLEAR.warning(follows, cause, cause)
+    assert known.found == (BEFORE, follows, cause, cause)
+    assert known.warnings == (BEFORE, cause)
+    assert CLEAR.warning(follows).warnings == (BEFORE, follows)
+
+
+def test_a_cause_in_one_transform_leaves_what_fails_in_another_told():
+    cause = MotionWarning(Kind.STAYS_INSIDE, "it does not leave", "Avoidance")
+    its_own, other = (MotionWarning(Kind.ENTERS, "it enters", name) for name in ("Avoidance", "Avoidance 2"))
+    assert CLEAR.warning(cause, its_own, other).warnings == (BEFORE, cause, other)
+
+
 # --- motions other than those that were computed ---
 
 
