@@ -53,6 +53,11 @@ def beside(scenario):
     return tuple(layer for layer in scenario.stack if layer is not avoidance_layer(scenario))
 
 
+def kinds(warnings):
+    """The kinds of warnings, each once."""
+    return {warning.kind for warning in warnings}
+
+
 def biases(*points):
     """Layers of bias points, named as on the page."""
     return tuple(Layer(point, name=f"Bias {k}") for k, point in enumerate(points, 1))

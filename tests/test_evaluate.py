@@ -202,13 +202,16 @@ def test_what_is_held_out_is_not_learned_from():
 # --- latency ---
 
 
-@pytest.mark.parametrize("sessions", [1, 2])
-def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessions, capsys, monkeypatch):
+BIAS = ["--drag", "bias", "--obstacles", "0"]
+
+
+@pytest.mark.parametrize(("sessions", "dragged"), [(1, []), (2, []), (1, BIAS)])
+def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessions, dragged, capsys, monkeypatch):
     recorders, out = [Recorder() for _ in range(sessions)], tmp_path / "latency.json"
     monkeypatch.setattr(latency, "Recorder", iter(recorders).__next__)
     monkeypatch.setattr(latency, "WARM_UP_SECONDS", 0.1)
     task = ["--task", "Hook", "--lasa", str(lasa)]
-    assert main(["latency", *task, "--sessions", str(sessions), "--seconds", "0.3", "--out", str(out)]) == 0
+    assert main(["latency", *task, *dragged, "--sessions", str(sessions), "--seconds", "0.3", "--out", str(out)]) == 0
     figures = json.loads(out.read_text())
     assert figures["settings"]["edits"] == 18 * sessions == figures["frames"] + figures["skipped"]
     assert 0 < figures["rebuild_median_ms"] <= figures["median_ms"] <= figures["p95_ms"]
@@ -271,9 +274,9 @@ def test_without_avoidance_the_same_command_shows_the_collision(lasa, tmp_path, 
 
 def test_avoidance_says_what_is_not_to_be_trusted(lasa, tmp_path, capsys):
     start = run_avoidance(lasa, tmp_path / "a.npz", [0.5, -0.5, 0.9])["demo_0"][0]
-    assert "doubt" not in capsys.readouterr().out
+    assert "warning" not in capsys.readouterr().out
     run_avoidance(lasa, tmp_path / "a.npz", start)
-    assert "doubt: start 1 is inside the obstacle" in capsys.readouterr().out
+    assert "warning: start 1 is inside the obstacle" in capsys.readouterr().out
 
 
 def test_the_whole_arm_avoids_what_the_hand_alone_does_not(lasa, tmp_path, middle, robot, capsys):

@@ -131,8 +131,8 @@ def run(options: argparse.Namespace) -> int:
         arrays |= {f"q_{i}": motion.q, f"x_{i}": measured[-1].x, f"times_{i}": motion.times, f"demo_{i}": demonstration}
     write_npz(out, **arrays)
     _print(options, task.name, measured, motions)
-    for doubt in dict.fromkeys(frame.health.doubts):
-        print(f"doubt: {doubt}")
+    for warning in frame.certificates.warnings:
+        print(f"warning: {warning}")
     return 0
 
 

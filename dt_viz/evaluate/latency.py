@@ -36,6 +36,7 @@ from dt_viz.evaluate.options import (
     InputError,
     add_space,
     add_task,
+    avoiding,
     chosen_task,
     positive_number,
     print_table,
@@ -46,10 +47,11 @@ from dt_viz.evaluate.options import (
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.motion.nominal import NUM_SAMPLES
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.stack import plane_of
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.bias import Biasing, BiasPoint
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.bias import BiasPoint
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
@@ -192,20 +194,19 @@ def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
     if options.drag == "obstacle" and options.obstacles == 0:
         raise InputError("--obstacles", "0", "1 or more, or --drag bias")
     obstacles = tuple(Sphere(as_point(place), diameter) for place in task.mean_path[places])
+    scenario = avoiding(task, Avoidance(obstacles, space=options.space))
+    if options.drag == "obstacle":
+        return scenario
     bias = BiasPoint(task.obstacle_position, plane=plane_of(task))
-    layers = (Layer(Biasing(bias), name="Bias 1"),) if options.drag == "bias" else ()
-    return Scenario(task.name, obstacles, layers=layers, space=options.space)
+    return replace(scenario, stack=with_added(scenario, bias)[0])
 
 
 def _moved(scenario: Scenario, place: tuple[float, float, float]) -> dict[str, Any]:
     """Return the changed fields of the scenario after the drag to a place."""
-    if not scenario.layers:
-        first, *others = scenario.obstacles
-        return {"obstacles": (first.moved(place), *others)}
-    (layer,) = scenario.layers
-    assert isinstance(layer.behaviour, Biasing)
-    point = replace(layer.behaviour.point, position=place)
-    return {"layers": (replace(layer, behaviour=Biasing(point)),)}
+    for name, point in anchored(scenario).items():
+        return {"stack": with_transform(scenario, name, point.anchored(place))}
+    first, *others = scenario.avoidance.obstacles
+    return {"stack": with_avoidance(scenario, obstacles=(first.moved(place), *others))}
 
 
 def _drag(

@@ -40,6 +40,7 @@ from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
+    avoiding,
     chosen_task,
     positive_number,
     print_table,
@@ -50,8 +51,8 @@ from dt_viz.evaluate.options import (
 from dt_viz.evaluate.protocol_client import ROLLOUTS, LostError, ProtocolClient
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.obstacles.shapes import Point, Sphere, as_point
-from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.avoidance import Avoidance
 
 EDITS_PER_SECOND = 20
 """Rate of a drag's edits; no page sends more."""
@@ -95,7 +96,7 @@ class Poses:
         return False
 
     def _frames(self, index: int) -> Iterator[Frame]:
-        return self._engine.frames(Scenario(self._task.name, (Sphere(self.positions[index]),)))
+        return self._engine.frames(avoiding(self._task, Avoidance(Sphere(self.positions[index]))))
 
     def _segments(self, frame: Frame) -> Segments:
         paths = frame.rollouts[: len(self._task.demonstrations)]

@@ -13,8 +13,9 @@ import numpy as np
 
 from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.scenario.scenario import SPACES, Scenario
+from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, lasa_tasks
+from dt_viz.transforms.avoidance import SPACE_NAMES, Avoidance
 
 
 class InputError(ValueError):
@@ -33,7 +34,7 @@ def add_task(parser: argparse.ArgumentParser) -> None:
 def add_space(parser: argparse.ArgumentParser, default: str = "task") -> None:
     """Add `--space`."""
     what = "what avoids: the end effector (task), the whole arm (cspace), or both (default: %(default)s)"
-    parser.add_argument("--space", choices=SPACES, default=default, help=what)
+    parser.add_argument("--space", choices=tuple(SPACE_NAMES), default=default, help=what)
 
 
 def add_avoidance(parser: argparse.ArgumentParser, space: str) -> None:
@@ -46,8 +47,13 @@ def add_avoidance(parser: argparse.ArgumentParser, space: str) -> None:
 
 def scenario_around(obstacle: Obstacle, task: Task, options: argparse.Namespace) -> Scenario:
     """Return the scenario of an obstacle with the options of `add_avoidance`."""
-    avoidance = not options.no_avoidance
-    return Scenario(task.name, (obstacle,), avoidance=avoidance, space=options.space, generator=options.generator)
+    avoidance = Avoidance(obstacle, space=options.space, generator=options.generator)
+    return avoiding(task, avoidance, on=not options.no_avoidance)
+
+
+def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
+    """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
+    return Scenario(task.name, (Layer(avoidance, on, avoidance.title),))
 
 
 def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], Task]:

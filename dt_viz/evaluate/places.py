@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
         frame, motions = engine.arm_motions(scenario)
         pairs = zip(motions, task.paths, strict=False)
         found.append([measure(motion, path, frame.goal, obstacle, robot) for motion, path in pairs])
-        rows.append((str(k), *_row(found[-1], scenario), *(frame.blocked or frame.health.doubts)[:1]))
+        rows.append((str(k), *_row(found[-1], scenario), *map(str, (frame.blocked or frame.certificates.warnings)[:1])))
     names = ("frechet", "depth_without", "turn", "turn_without", "num_outside", "goal_miss")
     arrays = {name: _table(found, len(task.paths), lambda m, name=name: getattr(m, name)) for name in names}
     arrays["arm_depth"] = _table(found, len(task.paths), lambda m: m.arm.depth)
@@ -102,7 +102,7 @@ def _row(measured: list[Measured], scenario: Scenario) -> tuple[str, ...]:
         f"{1e3 * max(m.arm.depth for m in measured):.1f}",
         f"{1e3 * min(m.arm.obstacle.distance for m in measured):.1f}",
         f"{1e3 * max(m.frechet for m in measured):.0f}",
-        f"{max(m.frechet / (m.depth_without + scenario.margin) for m in measured):.2f}",
+        f"{max(m.frechet / (m.depth_without + scenario.avoidance.margin) for m in measured):.2f}",
         f"{worst.turn:.0f}° ({worst.turn_without:.0f}°)",
         f"{1e3 * max(m.goal_miss for m in measured):.3f}",
         f"{sum(m.num_outside for m in measured)}",

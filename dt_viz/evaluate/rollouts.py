@@ -32,6 +32,7 @@ from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.options import (
     add_task,
+    avoiding,
     chosen_task,
     point,
     positive_number,
@@ -45,7 +46,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.transforms.avoidance import Avoidance
 
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 ARRIVED = 1e-4
@@ -98,10 +99,10 @@ def run(options: argparse.Namespace) -> int:
     clock = learned.base
     # the learned pace has kinks, which a stepping of high order would have to find: that would flatter the exact side
     learned = replace(learned, base=Attractor(clock.goal, clock.speed, clock.smoothing))
-    scenario = Scenario(task.name, (Sphere(options.obstacle or task.obstacle_position, options.diameter),))
-    frame = next(iter(Engine(tasks, fits, load_jaco()).frames(scenario)))
-    field = scenario.obstacle.field(scenario.generator, scenario.temperature)
-    duration = frame.health.duration or 0.0
+    avoidance = Avoidance(Sphere(options.obstacle or task.obstacle_position, options.diameter))
+    frame = next(iter(Engine(tasks, fits, load_jaco()).frames(avoiding(task, avoidance))))
+    field = avoidance.avoided.field(avoidance.generator, avoidance.temperature)
+    duration = frame.durations[0] or 0.0
 
     def with_obstacle(tolerance: float) -> DiffeomorphicSystem:
         avoiding = AdaptiveFlow(field, duration, tolerance)
@@ -123,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
         rows += [(f"{scene}, exact, {how}", f"{1e3 * seconds:.1f}", "", "") for how, seconds in apart.items()]
     if out is not None:
         settings = {"task": task.name, "accuracy": options.accuracy, "repeats": options.repeats}
-        settings |= {"obstacle": scenario.obstacles[0].position, "diameter": options.diameter, "duration": duration}
+        settings |= {"obstacle": avoidance.obstacles[0].position, "diameter": options.diameter, "duration": duration}
         write_json(out, {**results, "settings": settings})
     print(
         f"{task.name}, {NUM_ROLLOUTS} rollouts × {NUM_POINTS} points, both within {options.accuracy:g} m of the truth"
