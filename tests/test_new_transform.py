@@ -1,4 +1,4 @@
-"""A new kind of transform, as the README shows it: one file with a subclass of `Transform`, one line in the registry."""
+"""A new kind of transform, as the README shows it: one file with a subclass like this one, one line in the registry."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
