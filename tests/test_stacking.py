@@ -181,6 +181,7 @@ def test_new_bias_points_lie_beside_the_motion_apart_from_each_other_and_in_the_
             0.02 < min(np.linalg.norm(path - point.position, axis=1).min() for path in task.paths) < 2 * PLACED_BESIDE
         )
         for other in anchored(scenario).values():
+            assert isinstance(other, BiasPoint)
             assert np.linalg.norm(np.subtract(point.position, other.position)) > 0.5 * PLACED_BESIDE
         if (plane := plane_of(task)) is not None:
             assert abs(np.cross(*plane) @ (np.asarray(point.position) - task.slice.centre)) < 1e-9
@@ -197,6 +198,7 @@ def test_two_new_bias_points_do_not_pull_against_each_other(task, engine, initia
     frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.FINE)
     assert frame.certificates.warnings == ()
     for point in anchored(scenario).values():
+        assert isinstance(point, BiasPoint)
         for path in frame.rollouts:
             assert np.linalg.norm(path - point.position, axis=1).min() <= 0.0105  # between samples, too
 
@@ -224,13 +226,16 @@ def test_the_chosen_transform_is_tuned_or_the_outermost_if_it_is_gone():
 @pytest.mark.parametrize("name", tunable(TUNED)[:-1])
 def test_what_is_set_is_what_is_read_and_the_others_stay(name):
     before = {other: transform_of(TUNED, other) for other in tunable(TUNED)}
-    after = replace(before[name], integration=EULER)
+    own = before[name]
+    assert isinstance(own, Avoidance | BiasPoint)
+    after = replace(own, integration=EULER)
     edited = replace(TUNED, stack=with_transform(TUNED, name, after))
     for other, transform in before.items():
         shared = {name, other} <= {WHOLE_ARM, AVOIDANCE}
         assert transform_of(edited, other) == (after if other == name or shared else transform)
     assert replace(edited, stack=TUNED.stack) == TUNED
     assert listed(edited) == listed(TUNED)
+    assert edited.arm_avoidance is not None
     assert (edited.arm_avoidance.integration == EULER) == (name in {WHOLE_ARM, AVOIDANCE})
 
 

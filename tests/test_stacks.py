@@ -55,7 +55,7 @@ def check(engine, seed):
         np.testing.assert_allclose(path[-1], frame.reached, atol=1e-3)
         np.testing.assert_allclose(path[0], start, atol=1e-3)
     moved = np.linalg.norm(frame.reached - frame.goal)
-    may_move = scenario.obstacles or any(point.moves_goal for point in points)
+    may_move = scenario.obstacles or any(point.ends_motions for point in points)
     assert moved < 1e-3 or may_move
     assert certificates.min_det_jacobian > 0
     assert certificates.round_trip_error < 1e-6
@@ -68,7 +68,7 @@ def assert_said(scenario, frame):
     if scenario.obstacles and frame.certificates.clearance < -BETWEEN_SAMPLES:
         assert kinds & {Kind.START_COVERED, Kind.GOAL_COVERED, Kind.STAYS_INSIDE, Kind.ENTERS}
     missed = np.linalg.norm(frame.reached - frame.goal)
-    if missed > MAX_GOAL_MISS and not any(layer.transform.moves_goal for layer in layers):
+    if missed > MAX_GOAL_MISS and not any(layer.transform.ends_motions for layer in layers):
         assert Kind.GOAL_COVERED in kinds or says(frame, f"motions end {1e3 * missed:.0f} mm beside")
     sources = {warning.source for warning in frame.certificates.warnings}
     for layer in layers:
