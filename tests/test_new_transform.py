@@ -1,15 +1,18 @@
-"""A new kind of transform, as the README shows it: one file with a value like this one, one line in the layers."""
+"""A new kind of transform, as the README shows it: one file with a subclass like this one, one line in the registry."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from scenes import changed
 
 from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array
-from dt_viz.scenario.scenario import Layer
-from dt_viz.transforms.base import Built, Motion
+from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
+from dt_viz.transforms import registry
+from dt_viz.transforms.base import Built, MotionBelow, Number, Setting, Transform
 
 
 @dataclass(frozen=True)
@@ -33,47 +36,57 @@ class Whirl:
 
 
 @dataclass(frozen=True)
-class Twirl:
-    """Motions are turned around a place by an angle, radians."""
+class Twirl(Transform):
+    """Motions are turned around a place by an angle."""
 
-    centre: tuple[float, float, float]
-    angle: float
+    centre: tuple[float, float, float] = (0.2, -0.35, 0.3)
+    angle: float = 0.8
+    """Radians."""
 
-    def build(self, motion: Motion, tolerance: float, at_least: float) -> Built:
+    title: ClassVar[str] = "Twirl"
+    settings: ClassVar[tuple[Setting, ...]] = (Number("angle", "Angle", "[rad]", -1.0, 1.0, 0.1, 0.8),)
+
+    def build(self, motion: MotionBelow) -> Built:
         flow = Flow(Whirl(np.array(self.centre), 0.12), -self.angle, steps=16)
         return Built(flow, self.angle, motion.goal)
 
-    def satisfied(self, motion: Motion) -> bool:
-        return True
 
-
-@pytest.fixture(params=["below avoidance", "above avoidance"])
-def scenario(request, initial):
+@pytest.fixture(params=[("Twirl 1", "Avoidance"), ("Avoidance", "Twirl 1")], ids=" below ".join)
+def scenario(request, engine, initial, monkeypatch):
+    """The kind is looked up and added as the page does."""
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, Twirl))  # the one line
     plain = initial("lift_box")
-    twirl = Layer(Twirl((0.2, -0.35, 0.3), 0.8), name="Twirl")  # the one line
-    return replace(plain, layers=(twirl,), avoidance_level=0 if request.param == "above avoidance" else None)
+    twirl = registry.by_title()["Twirl"].beside(surroundings(engine.task("lift_box"), plain))
+    stack, name = with_added(plain, twirl)
+    scenario = replace(plain, stack=stack)
+    if request.param[1] == name:
+        scenario = replace(scenario, stack=shifted(scenario, name, 1))
+    assert listed(scenario) == request.param
+    return scenario
 
 
-def test_a_new_transform_needs_a_value_and_a_line(engine, scenario):
+def test_a_new_transform_needs_a_file_and_a_line(engine, scenario):
+    assert set(listed(scenario)) < set(tunable(scenario))
+    assert not anchored(scenario)  # it has no handles
     *_, frame = engine.frames(scenario)
     assert frame.stage is Stage.CERTIFIED
     for path, before in zip(frame.rollouts, frame.ghost, strict=True):
         assert np.isfinite(path).all()
         np.testing.assert_allclose(path[0], before[0], atol=1e-6)
         np.testing.assert_allclose(path[-1], frame.goal, atol=1e-3)
-    assert frame.health.layer_durations == (0.8,)
-    assert frame.health.min_det_jacobian > 0
-    assert frame.health.round_trip_error < 1e-6
-    assert frame.health.lyapunov_falls
+    assert dict(zip([layer.name for layer in scenario.stack], frame.durations, strict=True))["Twirl 1"] == 0.8
+    assert frame.certificates.min_det_jacobian > 0
+    assert frame.certificates.round_trip_error < 1e-6
+    assert frame.certificates.lyapunov_falls
 
 
 def test_it_turns_motions_as_it_says_and_not_when_it_is_off(engine, scenario):
-    alone = replace(scenario, avoidance=False)
+    alone = changed(scenario, avoids=False)
     *_, frame = engine.frames(alone)
     below, turned = frame.levels
     moved = max(np.linalg.norm(a - b, axis=1).max() for a, b in zip(below, turned, strict=True))
     assert 0.02 < moved < 0.2
-    off = replace(alone, layers=(replace(alone.layers[0], on=False),))
+    off = replace(alone, stack=switched(alone, "Twirl 1"))
     *_, frame = engine.frames(off)
     for path, before in zip(frame.rollouts, frame.ghost, strict=True):
         assert max(np.linalg.norm(before - point, axis=1).min() for point in path) < 1e-3
