@@ -26,7 +26,7 @@ from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 
 WIDTH, HEIGHT = 900, 560
-PATIENCE = 600.0
+PATIENCE = 240.0
 """Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
 TRIES = 8
 """Drags or clicks until the page, which may still be on its way to what was asked of it, has taken one."""
@@ -330,7 +330,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     page, visitor = visit
     session, pictures = visitor.session, visitor.pictures.anchors
     session.edit("test", **changing(session.scenario, obstacles=()))
-    click_button(page, "Add")
+    click_button(page, "Bias")
     wait_until(lambda: beside(session.scenario) and session.wait_idle(0.3), "the bias point")
 
     def place():

@@ -52,7 +52,7 @@ def test_the_hand_is_where_it_is_held_and_goes_on_to_the_goal(engine, initial, r
         assert used_fraction(motion.times, motion.q, robot.velocity_limits) < 1 + 1e-6
         np.testing.assert_allclose(there, found.path, atol=MAX_TRACKING_ERROR)
         np.testing.assert_allclose(there[-1], frame.goal, atol=1e-3)
-        if not found.doubt:
+        if not found.warning:
             num_right += 1
             np.testing.assert_allclose(there[0], place, atol=1e-3)
             assert frame.scenario.obstacle.signed_distance(there).min() > 0
@@ -93,7 +93,7 @@ def test_where_the_arm_cannot_reach_it_stretches_towards_the_pointer_and_says_so
         found = engine.held(scenario, q, place)
         q = found.motion.q[0]
         distances.append(np.linalg.norm(robot.end_effector(q) - place))
-        assert (distances[-1] > MAX_TRACKING_ERROR) == (found.doubt == "out of the arm's reach")
+        assert (distances[-1] > MAX_TRACKING_ERROR) == (found.warning == "out of the arm's reach")
         np.testing.assert_allclose(robot.end_effector(found.motion.q[-1]), frame.goal, atol=1e-3)
     shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
     least = np.linalg.norm(place - shoulder) - robot.reach
@@ -106,7 +106,7 @@ def test_a_hand_that_is_held_in_the_obstacle_is_said_to_be(engine, initial, robo
     inside = np.array(scenario.obstacles[0].position) + np.array([0.0, 0.0, 0.03])
     near = min(frame.arm.q, key=lambda q: np.linalg.norm(robot.end_effector(q) - inside))
     found = engine.held(scenario, near, inside)
-    assert found.doubt == "inside the obstacle"
+    assert found.warning == "inside the obstacle"
     np.testing.assert_allclose(robot.end_effector(found.motion.q[-1]), frame.goal, atol=1e-3)
 
 
@@ -119,8 +119,8 @@ def test_a_pointer_out_of_reach_is_said_to_be_and_no_other(engine, initial, robo
     q = frame.arm.q[len(frame.arm.q) // 2]
     for distance in (4.0, 1.2 * robot.reach, 0.6 * robot.reach):
         place = shoulder + distance * np.array(direction) / np.linalg.norm(direction)
-        doubt = engine.held(scenario, q, place).doubt
-        assert (doubt == "out of the arm's reach") == (distance > robot.reach)
+        warning = engine.held(scenario, q, place).warning
+        assert (warning == "out of the arm's reach") == (distance > robot.reach)
 
 
 @pytest.mark.parametrize("change", [{"warp": 0.0}, {"warp": 0.4}, {"avoids": False}])
@@ -130,7 +130,7 @@ def test_nothing_is_said_of_an_obstacle_that_is_not_avoided_or_not_yet(engine, i
     for q in shown(engine, scenario).arm.q[::50]:
         place = robot.end_effector(q)
         if scenario.obstacle.signed_distance(place) > 0:
-            assert engine.held(scenario, q, place).doubt == ""
+            assert engine.held(scenario, q, place).warning == ""
 
 
 def test_nothing_is_held_that_is_not_shown(new_engine, initial, robot):

@@ -57,7 +57,7 @@ def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_th
     scenario = changed(initial("draw_s"), obstacles=(Sphere((float(x), float(y), float(z))),))
     grid = with_grid(scenario, area, no_arm)
     assert len(grid.starts) + grid.num_blocked + grid.num_far == 16 and grid.num_blocked > 0
-    assert (scenario.obstacle.signed_distance(np.array(grid.starts)) >= scenario.margin).all()
+    assert (scenario.obstacle.signed_distance(np.array(grid.starts)) >= scenario.avoidance.margin).all()
     np.testing.assert_allclose((np.array(grid.starts) - area.centre) @ area.normal, 0, atol=1e-9)
     again = with_grid(replace(scenario, starts=grid.starts), area, no_arm)
     assert again.starts == grid.starts
