@@ -10,9 +10,9 @@ from dt_viz.arm.collision import Nearest, load_collision_model
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_warnings
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.scenario.scenario import Layer
+from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import plane_of
-from dt_viz.transforms.avoidance import BESIDE
+from dt_viz.transforms.avoidance import BESIDE, Avoidance
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.warning import ARM, Kind, MotionWarning, told
 
@@ -175,3 +175,18 @@ def test_the_last_frame_says_what_margin_the_meshes_keep(engine, initial, margin
     said = f"keeps {1e3 * min(clearance):.2g} mm from the obstacle; 10 mm were asked for"
     of_margin = [warning for warning in frame.certificates.warnings if warning.kind is Kind.ARM_TOO_NEAR]
     assert [(said in warning.text, warning.source) for warning in of_margin] == ([] if kept else [(True, ARM)])
+
+
+def test_the_arm_s_clearance_is_that_from_what_the_arm_avoids(engine):
+    """Not from an obstacle that only the end effector avoids, where the fingers may be."""
+    task = engine.task("draw_s")
+    of_hand = Avoidance(Sphere(task.obstacle_position))
+    of_arm = Avoidance(Sphere(as_point(task.mean_path[60]), 0.08), space="cspace")
+    scenario = Scenario("draw_s", (Layer(of_hand, name="Hand"), Layer(of_arm, name="Arm")))
+    frame = stage(engine, scenario, Stage.CERTIFIED)
+    assert Kind.ARM_ENTERS in kinds(frame)
+    assert not kinds(frame) & {Kind.OTHER_CLEARANCE, Kind.ROLLOUT_ENTERS}
+    p = engine._shown.arm.p
+    clearance = engine._follower.whole_arm.clearance
+    assert clearance(p, of_hand.avoided).min() < 0 < frame.certificates.clearance
+    assert frame.certificates.clearance == pytest.approx(clearance(p, of_arm.avoided).min())

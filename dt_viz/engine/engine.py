@@ -280,8 +280,9 @@ class Engine:
         if frame.arm is not None:
             p[arm.index == frame.chosen] = frame.arm.q
         path, times = np.concatenate(frame.rollouts), np.concatenate(frame.times)
-        assert scenario.arm_avoidance is not None
-        integration = scenario.arm_avoidance.integration
+        avoidance = scenario.arm_avoidance
+        assert avoidance is not None
+        integration = avoidance.integration
         known = known.warning(
             *hand_warnings(robot, p, path, tolerance=MAX_OFF),
             *fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed),
@@ -290,7 +291,7 @@ class Engine:
         shown = Shown(arm.index, arm.fraction, times, robot.end_effector(q))
         known = certified(known, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
         hosts = arm.index < len(frame.rollouts) - fine.nominal.num_added
-        kept = float(whole_arm.clearance(p[hosts], scenario.obstacle).min())
+        kept = float(whole_arm.clearance(p[hosts], avoidance.obstacle).min())
         return known.warning(*clearance_warnings(known.clearance, kept))
 
     def _stages_without_motion(
@@ -473,15 +474,15 @@ class Engine:
 def _with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates:
     """What is known with what the meshes of the arm come near to: of the one that is shown, and of all that avoid."""
     assert frame.arm is not None
-    model, scenario = load_collision_model(), frame.scenario
+    model, scenario, avoidance = load_collision_model(), frame.scenario, frame.scenario.arm_avoidance
     report = model.report(frame.arm.q, scenario.obstacle)
     # what gives way only in part may still be in the obstacle
     apart = {Kind.ARM_ENTERS} if scenario.warp < 1 else set()
     known = replace(known, collision=report).warning(*(w for w in report.warnings if w.kind not in apart))
-    if fine.arm is None:
+    if fine.arm is None or avoidance is None:
         return known
     hosts = range(len(frame.rollouts) - fine.nominal.num_added)
-    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], scenario.obstacle) for host in hosts]
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], avoidance.obstacle) for host in hosts]
     return known.warning(*margin_warnings(scenario, nearest))
 
 
