@@ -213,9 +213,9 @@ def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
     drag(page, (x - 18, y + 14), (x + 30, y - 20))
     wait_until(lambda: visitor.session.scenario != first and visitor.session.wait_idle(0.5), "the drag")
     second = visitor.session.scenario
-    page.get_by_text("Undo", exact=True).click()
+    press(page.get_by_text("Undo", exact=True))
     wait_until(lambda: visitor.session.scenario.obstacle == first.obstacle, "undo")
-    page.get_by_text("Redo", exact=True).click()
+    press(page.get_by_text("Redo", exact=True))
     wait_until(lambda: visitor.session.scenario.obstacle == second.obstacle, "redo")
     assert visitor.session.wait_idle(PATIENCE)
     assert_shows_the_obstacle_where_it_is(visitor)
@@ -223,11 +223,16 @@ def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
 
 def open_tab(page, name):
     """A tab of the panel."""
-    page.get_by_role("tab", name=name, exact=True).click()
+    press(page.get_by_role("tab", name=name, exact=True))
+
+
+def press(locator):
+    """Click wherever it is scrolled to, without waiting for pictures of the page."""
+    locator.evaluate("element => element.click()")
 
 
 def click_button(page, name):
-    page.get_by_role("button", name=name, exact=True).evaluate("button => button.click()")  # wherever it is scrolled to
+    press(page.get_by_role("button", name=name, exact=True))
 
 
 def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit):
@@ -261,8 +266,8 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     x, y = project(visitor, sphere.position)
     page.mouse.click(x - 18, y + 14)
     wait_until(lambda: [item.has_handles for item in pictures.items] == [True, False], "the sphere to be selected")
-    page.locator("input[value='1: sphere']").first.click()
-    page.get_by_role("option", name="2: box").click()
+    press(page.locator("input[value='1: sphere']").first)
+    press(page.get_by_role("option", name="2: box"))
     wait_until(lambda: session.scenario.selected == 1, "the box to be selected")
     click_button(page, "Delete")
     wait_until(lambda: session.scenario.obstacles == (sphere,) and len(pictures.items) == 1, "the box to go")
@@ -275,7 +280,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     session = visitor.session
     session.edit("test", **changing(session.scenario, obstacles=(), avoids=False))
     crate = trimesh.creation.box((150, 100, 50)).export(file_type="stl")
-    page.get_by_text("From a file", exact=True).click()
+    press(page.get_by_text("From a file", exact=True))
     upload = page.locator("input[type=file]").first
     upload.set_input_files({"name": "crate.stl", "mimeType": "model/stl", "buffer": crate})
     page.get_by_text("seems to be in millimetres: 150 × 100 × 50 units").first.wait_for()
@@ -316,7 +321,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
 
 def test_a_file_that_is_too_large_is_refused_with_a_reason_and_the_next_can_be_chosen(visit):
     page, visitor = visit
-    page.get_by_text("From a file", exact=True).click()
+    press(page.get_by_text("From a file", exact=True))
     upload = page.locator("input[type=file]").first
     upload.set_input_files({"name": "city.stl", "mimeType": "model/stl", "buffer": bytes(MAX_BYTES + 1)})
     page.get_by_text("city.stl: file: found 20.0 MB; accepted: at most 20 MB").wait_for(timeout=1000 * PATIENCE)
@@ -358,7 +363,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     assert all(np.linalg.norm(path - place(), axis=1).min() < 0.015 for path in visitor.shown.rollouts)
 
     open_tab(page, "Stack")
-    page.get_by_role("button", name="● on", exact=True).first.evaluate("button => button.click()")  # of the outermost
+    press(page.get_by_role("button", name="● on", exact=True).first)  # of the outermost
     wait_until(lambda: not beside(session.scenario)[0].on and session.wait_idle(0.3), "the switch")
     for path, undisturbed in zip(visitor.shown.rollouts, visitor.shown.ghost, strict=True):
         assert max(np.linalg.norm(undisturbed - point, axis=1).min() for point in path) < 0.02
@@ -370,7 +375,7 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     assert visitor.session.wait_idle(PATIENCE)
     open_tab(page, "Picture")
     with page.expect_download() as download:
-        page.get_by_text("Save PNG").click()
+        press(page.get_by_text("Save PNG"))
     image = Image.open(io.BytesIO(download.value.path().read_bytes()))
     assert image.size == (1280, 720)
     assert image.mode == "RGB"
@@ -390,7 +395,7 @@ def test_what_was_learned_of_a_sphere_without_points_is_shown(visit):
     page, visitor = visit
     visitor.session.edit("test", view=View(colour="occupancy"))
     assert visitor.session.wait_idle(PATIENCE)
-    page.get_by_text("Show", exact=True).click()
+    press(page.get_by_text("Show", exact=True))
     page.get_by_text("Learned occupancy: how likely something is there").wait_for(timeout=1000 * PATIENCE)
     page.wait_for_timeout(1000)
 
@@ -427,8 +432,8 @@ def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, serv
 
 def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
     page, visitor = visit
-    page.get_by_role("textbox", name="Task").or_(page.locator("input[value='Draw S']")).first.click()
-    page.get_by_role("option", name="Lift box").click()
+    press(page.get_by_role("textbox", name="Task").or_(page.locator("input[value='Draw S']")).first)
+    press(page.get_by_role("option", name="Lift box"))
     wait_until(lambda: visitor.shown is not None and visitor.shown.task.name == "lift_box", "the other task")
     assert len(visitor.shown.rollouts) == 8
 
@@ -447,7 +452,7 @@ def test_each_layer_of_the_transform_is_drawn_once_it_is_switched_on(visit):
         picture = visitor.pictures.layer(name)
         assert not picture.visible
 
-        page.get_by_label(label).first.evaluate("box => box.click()")  # wherever the panel is scrolled to
+        press(page.get_by_label(label).first)  # wherever the panel is scrolled to
         wait_until(lambda name=name: getattr(visitor.session.scenario.view, name), f"the checkbox of {name}")
         assert visitor.session.wait_idle(PATIENCE)
         assert picture.visible
@@ -497,14 +502,14 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
     before = pixels(page)
     for label, (name, coloured) in ARM_LAYERS.items():
         box = page.get_by_label(label, exact=True).first
-        box.evaluate("box => box.click()")
+        press(box)
         wait_until(lambda name=name: getattr(session.scenario.view, name), f"the checkbox of {name}")
         wait_until(
             lambda coloured=coloured: coloured(pixels(page)).sum() > coloured(before).sum() + 1000, f"{name} to be seen"
         )
         session.edit("test", view=plain)
 
-    page.get_by_label("Joint plots").first.evaluate("box => box.click()")
+    press(page.get_by_label("Joint plots").first)
     drawn = """() => [...document.querySelectorAll('.uplot canvas')].filter(canvas => canvas.width).map(canvas => {
         const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
         let coloured = 0;
@@ -518,8 +523,8 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
 def test_who_avoids_is_chosen_in_the_page(visit):
     page, visitor = visit
     open_tab(page, "Stack")
-    page.get_by_role("textbox", name="Avoid with").or_(page.locator("input[value='End effector']")).first.click()
-    page.get_by_role("option", name="Whole arm").click()
+    press(page.get_by_role("textbox", name="Avoid with").or_(page.locator("input[value='End effector']")).first)
+    press(page.get_by_role("option", name="Whole arm"))
     wait_until(lambda: visitor.session.scenario.space == "cspace", "the choice to arrive")
     wait_until(lambda: visitor.shown.scenario.space == "cspace", "its picture")
 
@@ -534,12 +539,12 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
 
     monkeypatch.setattr(dt_viz.learning.store, "fit", endless)
     open_tab(page, "Stack")
-    page.get_by_role("textbox", name="Settings of").or_(page.locator("input[value='Avoidance']")).first.click()
-    page.get_by_role("option", name="Imitation").click()
-    page.get_by_role("textbox", name="Learn").or_(page.locator("input[value='trajectory']")).first.click()
-    page.get_by_role("option", name="velocity").click()
+    press(page.get_by_role("textbox", name="Settings of").or_(page.locator("input[value='Avoidance']")).first)
+    press(page.get_by_role("option", name="Imitation"))
+    press(page.get_by_role("textbox", name="Learn").or_(page.locator("input[value='trajectory']")).first)
+    press(page.get_by_role("option", name="velocity"))
     page.get_by_text("Learning the motion: without end").wait_for()
-    page.get_by_role("button", name="Cancel").click()
+    press(page.get_by_role("button", name="Cancel"))
     page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for()
     assert visitor.session.wait_idle(PATIENCE)
     assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
@@ -581,7 +586,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
 def test_the_warp_is_played_in_the_page(visit):
     page, visitor = visit
     open_tab(page, "Stack")
-    page.get_by_text("0 → 1").click()
+    press(page.get_by_text("0 → 1"))
     wait_until(lambda: visitor.shown.scenario.warp < 1, "a picture on its way")
     wait_until(lambda: visitor.session.scenario.warp == visitor.shown.scenario.warp == 1, "the full stack")
     page.get_by_text("0 → 1").wait_for()

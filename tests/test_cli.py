@@ -14,7 +14,7 @@ import pytest
 
 import dt_viz
 from dt_viz.cli import main
-from dt_viz.evaluate.protocol_client import ProtocolClient
+from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 
 APP = Path(dt_viz.__file__).parent.parent / "app.py"
 PATIENCE = 120.0
@@ -69,7 +69,8 @@ async def visit_and_stop(process, url, number):
             await asyncio.sleep(0.02)
         process.send_signal(number)
         for client in clients:
-            assert await client.wait_until_lost(PATIENCE)
+            with pytest.raises(LostError):
+                await client.wait_for(lambda: False, PATIENCE)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])

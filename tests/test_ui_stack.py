@@ -160,7 +160,7 @@ def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(
     first, second, *others = picture.items
     assert [item.gizmo.visible for item in picture.items] == [True, True, *[False] * len(others)]
     for item, point in zip((first, second), anchored(SCENARIO).values(), strict=True):
-        np.testing.assert_allclose(item.gizmo.position, point.position)
+        np.testing.assert_allclose(item.gizmo.position, cast(Any, point).position)
     assert first.gizmo.active_axes == (True, True, False)  # in the drawing's plane
     assert second.gizmo.active_axes == (True, True, True)
     assert (first.gizmo.opacity, second.gizmo.opacity) == (0.0, 1.0)  # the newest

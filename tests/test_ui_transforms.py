@@ -97,7 +97,7 @@ def test_settings_change_the_transform_that_they_are_shown_for(controls):
     controls.set("Settings of", "Bias 1")
     controls.set("Integrator", "Euler (the paper's)")
     controls.set("Steps", 3)
-    assert anchored(controls.scenario)["Bias 1"].integration == Integration("euler", 3)
+    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).integration == Integration("euler", 3)
     assert controls.scenario.avoidance == SCENARIO.avoidance
     controls.set("Settings of", AVOIDANCE)
     assert (controls.value("Integrator"), controls.value("Steps")) == ("auto", 8)
@@ -116,9 +116,9 @@ def test_a_duration_by_hand_goes_on_from_what_auto_chose(controls):
         assert not slider.handle.disabled and slider.value == chosen
         controls.set(f"{label} t", 1.5)
     assert controls.scenario.avoidance.duration == 1.5
-    assert anchored(controls.scenario)["Bias 1"].strength == 1.5
+    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).strength == 1.5
     controls.set("Strength: auto", True)
-    assert anchored(controls.scenario)["Bias 1"].strength is None
+    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).strength is None
 
 
 def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choose(controls):

@@ -161,12 +161,13 @@ class Engine:
             UnreachableError: the arm cannot get to where the motions start.
         """
         nominal = self._nominal(scenario, None)
-        if scenario.arm_avoidance is not None:
-            blocked = self._follower.obstructions(nominal, scenario.obstacle)
+        avoidance = scenario.arm_avoidance
+        if avoidance is not None:
+            blocked = self._follower.obstructions(nominal, avoidance.obstacle)
             if blocked:
                 *_, frame = self._stages_without_motion(nominal, scenario, blocked)
                 return frame, ()
-            nominal = self._follower.admitted(nominal, scenario.obstacle)
+            nominal = self._follower.admitted(nominal, avoidance.obstacle)
         fine = self._solved(nominal, scenario, FINE)
         frame = self._frame(scenario, fine)
         arms, certificates = [], frame.certificates
@@ -211,10 +212,11 @@ class Engine:
     def _stages(self, nominal: Nominal, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
         kept = self._kept
         if kept is None or not kept.scenario.moves_like(scenario):
-            if scenario.arm_avoidance is not None:
+            avoidance = scenario.arm_avoidance
+            if avoidance is not None:
                 with _in_turn():
-                    blocked = self._follower.obstructions(nominal, scenario.obstacle)
-                    admitted = nominal if blocked else self._follower.admitted(nominal, scenario.obstacle)
+                    blocked = self._follower.obstructions(nominal, avoidance.obstacle)
+                    admitted = nominal if blocked else self._follower.admitted(nominal, avoidance.obstacle)
                 if blocked:
                     yield from self._stages_without_motion(nominal, scenario, blocked, checkpoint)
                     return
