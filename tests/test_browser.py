@@ -525,8 +525,8 @@ def test_who_avoids_is_chosen_in_the_page(visit):
     open_tab(page, "Stack")
     press(page.get_by_role("textbox", name="Avoid with").or_(page.locator("input[value='End effector']")).first)
     press(page.get_by_role("option", name="Whole arm"))
-    wait_until(lambda: visitor.session.scenario.space == "cspace", "the choice to arrive")
-    wait_until(lambda: visitor.shown.scenario.space == "cspace", "its picture")
+    wait_until(lambda: visitor.session.scenario.avoidance.space == "cspace", "the choice to arrive")
+    wait_until(lambda: visitor.shown.scenario.avoidance.space == "cspace", "its picture")
 
 
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):

@@ -95,7 +95,7 @@ class Shown:
 def certified(
     known: Certificates, stack: Solution, ends: Array, shown: Shown, *, tolerance: float = MAX_OFF
 ) -> Certificates:
-    """Add the certificates of a stack along the motions that are shown of it, and a doubt for each that fails.
+    """Add the certificates of a stack along the motions that are shown of it, and a warning for each that fails.
 
     Args:
         known: what is known already.

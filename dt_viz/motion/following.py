@@ -166,7 +166,8 @@ class Follower:
         if not (far | touches).any():
             return nominal
         numbers = np.array(nominal.numbers)
-        warnings = far_starts(numbers[far], num) + _touching_starts(numbers[touches], num)
+        # of the motions, not of the arm that is shown: these have none
+        warnings = far_starts(numbers[far], num, source="") + _touching_starts(numbers[touches], num)
         return nominal.only(np.flatnonzero(~(far | touches)), warnings)
 
     def _touching(self, pins: Array, obstacle: Obstacle) -> list[MotionWarning]:
@@ -232,14 +233,14 @@ def unreachable(error: UnreachableError) -> MotionWarning:
     return MotionWarning(Kind.OUT_OF_REACH, f"the arm cannot reach the starts: {error}", ARM)
 
 
-def far_starts(which: Indices, num_demonstrated: int) -> list[MotionWarning]:
+def far_starts(which: Indices, num_demonstrated: int, source: str = ARM) -> list[MotionWarning]:
     """Warnings about starts, counted from 0, that are out of the arm's reach."""
-    return start_warnings(which, num_demonstrated, Kind.OUT_OF_REACH, "out of the arm's reach", ARM)
+    return start_warnings(which, num_demonstrated, Kind.OUT_OF_REACH, "out of the arm's reach", source)
 
 
 def _touching_starts(which: Indices, num_demonstrated: int) -> list[MotionWarning]:
     how = "inside the obstacle: the arm there touches it"
-    return start_warnings(which, num_demonstrated, Kind.START_COVERED, how, ARM)
+    return start_warnings(which, num_demonstrated, Kind.START_COVERED, how)
 
 
 def arm_samples(num: int) -> Indices:
