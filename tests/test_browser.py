@@ -227,12 +227,17 @@ def open_tab(page, name):
 
 
 def press(locator):
-    """Click wherever it is scrolled to, without waiting for pictures of the page."""
+    """Click without waiting for two alike pictures of the page, which may be long in coming."""
+    locator.click(force=True)
+
+
+def press_unseen(locator):
+    """Click wherever the panel is scrolled to."""
     locator.evaluate("element => element.click()")
 
 
 def click_button(page, name):
-    press(page.get_by_role("button", name=name, exact=True))
+    press_unseen(page.get_by_role("button", name=name, exact=True))
 
 
 def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit):
@@ -363,7 +368,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
     assert all(np.linalg.norm(path - place(), axis=1).min() < 0.015 for path in visitor.shown.rollouts)
 
     open_tab(page, "Stack")
-    press(page.get_by_role("button", name="● on", exact=True).first)  # of the outermost
+    press_unseen(page.get_by_role("button", name="● on", exact=True).first)  # of the outermost
     wait_until(lambda: not beside(session.scenario)[0].on and session.wait_idle(0.3), "the switch")
     for path, undisturbed in zip(visitor.shown.rollouts, visitor.shown.ghost, strict=True):
         assert max(np.linalg.norm(undisturbed - point, axis=1).min() for point in path) < 0.02
@@ -452,7 +457,7 @@ def test_each_layer_of_the_transform_is_drawn_once_it_is_switched_on(visit):
         picture = visitor.pictures.layer(name)
         assert not picture.visible
 
-        press(page.get_by_label(label).first)  # wherever the panel is scrolled to
+        press_unseen(page.get_by_label(label).first)
         wait_until(lambda name=name: getattr(visitor.session.scenario.view, name), f"the checkbox of {name}")
         assert visitor.session.wait_idle(PATIENCE)
         assert picture.visible
@@ -502,14 +507,14 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
     before = pixels(page)
     for label, (name, coloured) in ARM_LAYERS.items():
         box = page.get_by_label(label, exact=True).first
-        press(box)
+        press_unseen(box)
         wait_until(lambda name=name: getattr(session.scenario.view, name), f"the checkbox of {name}")
         wait_until(
             lambda coloured=coloured: coloured(pixels(page)).sum() > coloured(before).sum() + 1000, f"{name} to be seen"
         )
         session.edit("test", view=plain)
 
-    press(page.get_by_label("Joint plots").first)
+    press_unseen(page.get_by_label("Joint plots").first)
     drawn = """() => [...document.querySelectorAll('.uplot canvas')].filter(canvas => canvas.width).map(canvas => {
         const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
         let coloured = 0;

@@ -361,7 +361,10 @@ async def test_forged_values_change_nothing_and_break_nothing(url, server):
         await client.send("GetRenderResponseMessage", payload=b"", render_uuid="nothing")
         assert await answers(client)
         after = visitor.session.scenario
-        assert (after.avoidance.margin, after.obstacles[0].position) == (before.avoidance.margin, before.obstacles[0].position)
+        assert (after.avoidance.margin, after.obstacles[0].position) == (
+            before.avoidance.margin,
+            before.obstacles[0].position,
+        )
         np.testing.assert_array_equal(visitor.client.camera.position, camera)
 
 

@@ -1,18 +1,24 @@
 """A new kind of transform, as the README shows it: one file with a subclass like this one, one line in the registry."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, cast  # noqa: F401 - of the README's example
 
 import numpy as np
 import pytest
-from scenes import changed
+from pages import Edited
+from scenes import avoiding, changed
 
+import dt_viz
 from dt_viz.engine.frame import Stage
-from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.engine.session import Session
+from dt_viz.flows.diffeomorphisms import Flow  # noqa: F401
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
 from dt_viz.transforms import registry
-from dt_viz.transforms.base import Built, MotionBelow, Number, Setting, Transform
+from dt_viz.transforms.base import Built, MotionBelow, Number, Setting, Transform  # noqa: F401
+from dt_viz.ui.controls import Control
+from dt_viz.ui.panel.transforms import TransformsPanel, addable
 
 
 @dataclass(frozen=True)
@@ -35,26 +41,19 @@ class Whirl:
         return V, weight[:, None, None] * turn - 2 / self.radius**2 * V[:, :, None] * offset[:, None, :]
 
 
-@dataclass(frozen=True)
-class Twirl(Transform):
-    """Motions are turned around a place by an angle."""
-
-    centre: tuple[float, float, float] = (0.2, -0.35, 0.3)
-    angle: float = 0.8
-    """Radians."""
-
-    title: ClassVar[str] = "Twirl"
-    settings: ClassVar[tuple[Setting, ...]] = (Number("angle", "Angle", "[rad]", -1.0, 1.0, 0.1, 0.8),)
-
-    def build(self, motion: MotionBelow) -> Built:
-        flow = Flow(Whirl(np.array(self.centre), 0.12), -self.angle, steps=16)
-        return Built(flow, self.angle, motion.goal)
+def shown_in_the_readme():
+    """The class that dt_viz/README.md shows, made from its text."""
+    text = (Path(dt_viz.__file__).parent / "README.md").read_text(encoding="utf-8")
+    code = text.split("## Adding a new transform")[1].split("```python")[1].split("```")[0]
+    names = dict(globals())
+    exec(compile("from __future__ import annotations\n" + code, "README.md", "exec"), names)
+    return names["Twirl"]
 
 
 @pytest.fixture(params=[("Twirl 1", "Avoidance"), ("Avoidance", "Twirl 1")], ids=" below ".join)
 def scenario(request, engine, initial, monkeypatch):
     """The kind is looked up and added as the page does."""
-    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, Twirl))  # the one line
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))  # the one line
     plain = initial("lift_box")
     twirl = registry.by_title()["Twirl"].beside(surroundings(engine.task("lift_box"), plain))
     stack, name = with_added(plain, twirl)
@@ -90,3 +89,24 @@ def test_it_turns_motions_as_it_says_and_not_when_it_is_off(engine, scenario):
     *_, frame = engine.frames(off)
     for path, before in zip(frame.rollouts, frame.ghost, strict=True):
         assert max(np.linalg.norm(before - point, axis=1).min() for point in path) < 1e-3
+
+
+def test_the_page_offers_it_and_has_its_controls(server, monkeypatch):
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))
+    session, bound = Edited(avoiding("lift_box")), {}
+
+    def bind(handle, read, change):
+        control = Control(handle)
+        bound[handle.label] = control, read, change
+        return control
+
+    panel = TransformsPanel(server.gui, bind, later=lambda work: work())
+    panel.connect(cast(Session, session))
+    panel.add(addable()["Twirl"])
+    panel.adopt(session.scenario)
+    assert panel._add.options == ("Bias", "Twirl")
+    control, read, change = bound["Angle [rad]"]
+    assert control.handle.visible and read(session.scenario) == 0.8
+    session.edit("Angle [rad]", **change(session.scenario, -0.5))
+    assert [layer.name for layer in session.scenario.stack] == ["Twirl 1", "Avoidance"]
+    assert cast(Any, session.scenario.stack[0].transform).angle == -0.5

@@ -86,7 +86,7 @@ class Section:
 class ArmSystem:
     """The pulled-back system ṗ = Dψ_q⁻¹(q)·q̇ = J_ψ(p)⁻¹·q̇ with q = ψ_q(p), q̇ = DQ(x)·ẋ and x = x(q).
 
-    Sec. 4.5 and eq. (4), in exact form: the printed one drops a transpose and flips a sign, see README "Departures".
+    Sec. 4.5 and eq. (4), in exact form: the printed one drops a transpose and flips a sign, see dt_viz/README.md.
     Its states are the postures p = ψ_q⁻¹(Q(x)) of the avoiding manifold. The chain p → q → x → z is a conjugacy to the
     base attractor, hence the system is as stable as that, and its motions are images of the base's.
     """

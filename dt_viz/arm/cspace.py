@@ -106,7 +106,7 @@ class WholeArmField(ArmField):
     (J) as possible. χ vanishes at pinned postures, so start and goal do not move.
 
     The plain gradient ∇_q ΣU(x_b) of the paper (`GradientField`) follows the joints' mobility instead: it sweeps along
-    the path with the first joint and turns sharply, see README "Departures".
+    the path with the first joint and turns sharply, see dt_viz/README.md.
     """
 
     direction: Array

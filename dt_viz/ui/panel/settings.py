@@ -12,8 +12,8 @@ import viser
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, Integration, Method
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import transform_of, with_transform
+from dt_viz.transforms import registry
 from dt_viz.transforms.base import Choice, FlowIntegration, Number, Setting, Switch, Transform
-from dt_viz.transforms.registry import KINDS
 from dt_viz.ui.controls import Control
 
 Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], Mapping[str, Any]]], Control]
@@ -46,7 +46,7 @@ class Settings:
         self._chosen, self._offered = chosen, offered
         self._adopted: Scenario | None = None
         self._controls: dict[Setting, _SettingControls] = {}
-        for setting in dict.fromkeys(setting for kind in KINDS for setting in offered(kind)):
+        for setting in dict.fromkeys(setting for kind in registry.KINDS for setting in offered(kind)):
             self._controls[setting] = _CONTROLS[type(setting)](gui, _Tie(bind, chosen, setting), setting, order)
 
     def adopt(self, scenario: Scenario) -> None:

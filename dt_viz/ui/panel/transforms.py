@@ -11,15 +11,13 @@ from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import added, selected, surroundings, with_added, without
+from dt_viz.transforms import registry
 from dt_viz.transforms.base import Setting, Transform
-from dt_viz.transforms.registry import KINDS
 from dt_viz.ui.chores import Later
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.settings import Bind, Settings
 from dt_viz.ui.panel.transform_settings import chosen_values, own
 
-ADDABLE = {kind.title: kind for kind in KINDS if kind.most > 1}
-"""Kinds of transforms that are added, by the name of their button."""
 NONE = "–"
 DELETE = "Delete"
 
@@ -30,9 +28,10 @@ class TransformsPanel:
     def __init__(self, gui: viser.GuiApi, bind: Bind, later: Later) -> None:
         """Build the controls, which do their work `later`; they act once `connect` has given them a session."""
         self._session: Session | None = None
+        kinds = addable()
         with gui.add_folder("Transforms"):
-            hints = "; ".join(f"{title}: {kind.hint}" for title, kind in ADDABLE.items())
-            self._add = gui.add_button_group("Add", tuple(ADDABLE), hint=hints)
+            hints = "; ".join(f"{title}: {kind.hint}" for title, kind in kinds.items() if kind.hint)
+            self._add = gui.add_button_group("Add", tuple(kinds), hint=hints)
             self._delete = gui.add_button_group("Change", (DELETE,), visible=False, hint="the selected one")
             self._which = bind(
                 gui.add_dropdown("Selected", (NONE,), visible=False),
@@ -40,7 +39,7 @@ class TransformsPanel:
                 lambda s, value: {"view": replace(s.view, bias=value)},
             ).handle
             self._settings = Settings(gui, bind, _own_settings, selected)
-        Control(self._add, lambda title: later(partial(self.add, ADDABLE[title])))
+        Control(self._add, lambda title: later(partial(self.add, kinds[title])))
         Control(self._delete, lambda _delete: later(self.delete))
 
     def connect(self, session: Session) -> None:
@@ -80,10 +79,15 @@ class TransformsPanel:
         self._settings.report(chosen_values(frame))
 
 
+def addable() -> dict[str, type[Transform]]:
+    """Kinds of transforms that are added, by the name of their button."""
+    return {kind.title: kind for kind in registry.KINDS if kind.most > 1}
+
+
 def _offered(scenario: Scenario) -> tuple[str, ...]:
     """Titles of the kinds of which there may be one more."""
     present = [type(transform).title for transform in added(scenario).values()]
-    return tuple(title for title, kind in ADDABLE.items() if present.count(title) < kind.most)
+    return tuple(title for title, kind in addable().items() if present.count(title) < kind.most)
 
 
 def _own_settings(kind: type[Transform]) -> tuple[Setting, ...]:
