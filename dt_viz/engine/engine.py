@@ -36,7 +36,7 @@ from dt_viz.motion.certificates import (
     delay_warnings,
     hand_warnings,
 )
-from dt_viz.motion.diagnostics import fold_warnings, margin_warnings, motion_warnings, target_warnings
+from dt_viz.motion.diagnostics import anchor_warnings, fold_warnings, margin_warnings, motion_warnings, target_warnings
 from dt_viz.motion.following import ArmMotion, Follower, arm_samples, far_starts, unreachable
 from dt_viz.motion.holding import held
 from dt_viz.motion.nominal import Learned, Nominal
@@ -365,6 +365,7 @@ class Engine:
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
         warnings = motion_warnings(solved, float(np.linalg.norm(reached - nominal.goal)))
+        warnings += anchor_warnings(stack)
         if scenario.avoids and scenario.warp == 1:
             warnings += target_warnings(solved, self._robot)
         made = [stack.at(place) for place in range(len(scenario.stack))]

@@ -39,7 +39,7 @@ def motion_warnings(solved: Solved, missed: float) -> tuple[MotionWarning, ...]:
     """
     nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
     warnings = [MotionWarning(Kind.IMITATION, text) for text in nominal.imitation.warnings]
-    warnings += [*stack.warnings, *_of_anchors(stack)]
+    warnings += stack.warnings
     if max(len(stack.bundle.index), len(arm.index) if arm else 0) >= MAX_SAMPLES:
         text = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"
         warnings.append(MotionWarning(Kind.UNSAMPLED, text))
@@ -82,8 +82,8 @@ def _of_arm(solved: Solved) -> list[MotionWarning]:
     return warnings + start_warnings(numbers[beside], num, Kind.START_COVERED, how, WHOLE_ARM)
 
 
-def _of_anchors(stack: Solution) -> list[MotionWarning]:
-    """Warnings about transforms that lead motions to where the hand cannot be."""
+def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
+    """Warnings about transforms that lead motions to where the arm's hand cannot be."""
     warnings = []
     for applied in stack.built:
         anchor = applied.transform.anchor
@@ -97,7 +97,7 @@ def _of_anchors(stack: Solution) -> list[MotionWarning]:
         if away > REACH:
             text = f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m"
             warnings.append(MotionWarning(Kind.MISPLACED, f"{applied.name}: {text}", applied.name))
-    return warnings
+    return tuple(warnings)
 
 
 def _top(solved: Solved, applied: Applied, index: Indices, positions: Array) -> MotionBelow:

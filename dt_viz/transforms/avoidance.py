@@ -9,10 +9,10 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Integration
-from dt_viz.flows.fields import Array, Mask, VectorField
+from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
 from dt_viz.flows.integrators import integrate_adaptive, rk4
 from dt_viz.obstacles.occupancy import Generator
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import (
     ArmAvoidance,
@@ -23,6 +23,7 @@ from dt_viz.transforms.base import (
     Number,
     Setting,
     Transform,
+    axes_of,
     start_warnings,
 )
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
@@ -57,6 +58,10 @@ ACCEPTED_MARGIN = 0.9
 BESIDE = 1e-3
 """Metres inside that still are beside the obstacle where its surface is only nearly known, and by which a motion may go
 deeper than its covered start before that counts."""
+NUM_DIRECTIONS, MAX_STEPS_OUT = 360, 200
+"""Number of directions of a plane in which a way out of obstacles is looked for, and of steps on it."""
+SHORTEST = 1e-4
+"""Length of the shortest of these steps, metres: by so much a way may lead farther than to the surface."""
 TAIL = 2.0
 """Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
 place: such a path arrives at up to 60° from the straight way out."""
@@ -79,6 +84,8 @@ class Avoidance(Transform):
     """t of the flow; None is the shortest that clears the obstacles by the margin."""
     integration: Integration
     """Integration of the flow."""
+    plane: tuple[Point, Point] | None
+    """Two orthonormal vectors: the flow acts along these only; None is in space."""
 
     title: ClassVar[str] = "Avoidance"
     hint: ClassVar[str] = "leads motions around the obstacles"
@@ -123,6 +130,7 @@ class Avoidance(Transform):
         margin: float = 0.01,
         duration: float | None = None,
         integration: Integration = AUTO,
+        plane: tuple[Point, Point] | None = None,
     ) -> None:
         values = {
             "obstacles": tuple(obstacles) if isinstance(obstacles, Iterable) else (obstacles,),
@@ -132,6 +140,7 @@ class Avoidance(Transform):
             "margin": margin,
             "duration": duration,
             "integration": integration,
+            "plane": plane,
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -154,6 +163,29 @@ class Avoidance(Transform):
         """See `Transform`."""
         return Union(self.obstacles)
 
+    def in_plane(self, plane: tuple[Point, Point]) -> Avoidance:
+        """See `Transform`."""
+        return replace(self, plane=plane)
+
+    def _field(self) -> VectorField:
+        field = self.avoided.field(self.generator, self.temperature)
+        return field if self.plane is None else InPlane(field, axes_of(self.plane)[:, :2])
+
+    def _nearest_free(self, goal: Array) -> Array:
+        """The place (3,) where motions end whose goal (3,) is covered, metres; in the plane, if the flow acts there."""
+        obstacle = self.avoided
+        if self.plane is None or obstacle.signed_distance(goal) >= 0:
+            return obstacle.nearest_free(goal)
+        turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
+        directions = np.column_stack([np.cos(turn), np.sin(turn)]) @ axes_of(self.plane)[:, :2].T
+        length = np.zeros(NUM_DIRECTIONS)
+        for _ in range(MAX_STEPS_OUT):
+            depth = -obstacle.signed_distance(goal + length[:, None] * directions)
+            if depth[length.argmin()] <= 0:
+                break
+            length += np.where(depth > 0, np.maximum(depth, SHORTEST), 0)
+        return goal + length.min() * directions[length.argmin()]
+
     def build(self, motion: MotionBelow) -> Built:
         """See `Transform`. The automatic flow time is the shortest that clears all that can be cleared.
 
@@ -161,7 +193,7 @@ class Avoidance(Transform):
         attempt to the next: where a start or goal is close to the obstacle it may end up longer than needed.
         """
         obstacle = self.avoided
-        field = obstacle.field(self.generator, self.temperature)
+        field = self._field()
         num_demonstrated = len(motion.demonstrated.starts)
         covered = np.flatnonzero(_blocked(obstacle, motion))
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
@@ -187,7 +219,7 @@ class Avoidance(Transform):
                     text = f"a motion does not leave the obstacle: {why}"
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
         flow = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
-        goal = obstacle.nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
+        goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
             end = "end beside it" if inside < BESIDE else f"end {1e3 * inside:.0f} mm deep in it"
@@ -233,7 +265,7 @@ class Avoidance(Transform):
         obstacle = self.avoided
         ends = motion.starts[~_blocked(obstacle, motion)]
         if motion.keeps_goal:
-            ends = np.concatenate([ends, obstacle.nearest_free(motion.goal)[None]])
+            ends = np.concatenate([ends, self._nearest_free(motion.goal)[None]])
         room = obstacle.signed_distance(ends).min(initial=self.margin)
         return max(0.0, float(room))
 
@@ -247,7 +279,7 @@ class Avoidance(Transform):
         distance = obstacle.signed_distance(motion.positions)
         free, clear = distance >= -ROUNDING, distance >= ACCEPTED_MARGIN * self._kept_margin(motion) - ROUNDING
         goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
-        instead = obstacle.nearest_free(motion.goal) if goal_covered else motion.goal
+        instead = self._nearest_free(motion.goal) if goal_covered else motion.goal
         avoidable = np.ones(len(free), dtype=bool)
         for rollout, blocked in enumerate(_blocked(obstacle, motion)):
             if not (blocked or goal_covered):

@@ -241,6 +241,10 @@ class Transform(ABC):
         """Whether motions are to end at its anchor."""
         return False
 
+    def in_plane(self: _Transform, plane: tuple[Point, Point]) -> _Transform:
+        """The same transform, acting along a plane only, given by two orthonormal vectors."""
+        return self
+
     def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
         """Warnings about what it wants and does not get.
 

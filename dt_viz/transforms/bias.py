@@ -129,6 +129,10 @@ class BiasPoint(Transform):
         """See `Transform`."""
         return self.plane
 
+    def in_plane(self, plane: tuple[Point, Point]) -> BiasPoint:
+        """See `Transform`."""
+        return replace(self, plane=plane)
+
     @property
     def region(self) -> float | None:
         """See `Transform`."""
