@@ -1,1 +1,70 @@
-"""DT-Viz: diffeomorphic transforms for generalised imitation learning, live in the browser."""
+"""DT-Viz: diffeomorphic transforms for generalised imitation learning, live in the browser, and as a library.
+
+    import dt_viz as dt
+
+    motion = dt.fit(dt.load_demonstrations("push_box.npz"))
+    around = motion.stack(dt.Avoidance(dt.Sphere((0.10, -0.53, 0.15), diameter=0.15)))
+    paths = around.rollouts()
+
+Names are loaded when they are first used: whoever starts the page sets the number of threads before that.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dt_viz.flows.diffeomorphisms import Integration
+    from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
+    from dt_viz.library import Arm, JointPath, Motion, Path, fit, load_jaco
+    from dt_viz.motion.certificates import Certificates
+    from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+    from dt_viz.transforms.avoidance import Avoidance
+    from dt_viz.transforms.base import Transform
+    from dt_viz.transforms.bias import BiasPoint
+    from dt_viz.warning import MotionWarning
+
+__all__ = [
+    "Arm",
+    "Avoidance",
+    "BiasPoint",
+    "Box",
+    "Certificates",
+    "Cylinder",
+    "Demonstration",
+    "Integration",
+    "JointPath",
+    "Motion",
+    "MotionWarning",
+    "Path",
+    "Sphere",
+    "Transform",
+    "fit",
+    "load_demonstrations",
+    "load_jaco",
+]
+
+_MODULES = {
+    "flows.diffeomorphisms": ("Integration",),
+    "learning.demonstrations": ("Demonstration", "load_demonstrations"),
+    "library": ("Arm", "JointPath", "Motion", "Path", "fit", "load_jaco"),
+    "motion.certificates": ("Certificates",),
+    "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
+    "transforms.avoidance": ("Avoidance",),
+    "transforms.base": ("Transform",),
+    "transforms.bias": ("BiasPoint",),
+    "warning": ("MotionWarning",),
+}
+"""Names by the module that defines them."""
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - classes and functions
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

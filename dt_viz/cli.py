@@ -1,4 +1,4 @@
-"""The command line of the demo."""
+"""The command line: the demo, and the measurements as its subcommand."""
 
 from __future__ import annotations
 
@@ -13,15 +13,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from dt_viz.evaluate.__main__ import main as evaluate
 from dt_viz.ui.logs import Terse
 from dt_viz.ui.origins import Origin, OriginError
 
 MAX_PORT = 65535
+PROG = "dt-viz"
+MEASURE = "evaluate"
+"""Subcommand of the measurements; without it the demo starts."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the server until Ctrl-C or SIGTERM; returns the process' exit status."""
-    options = _parser().parse_args(arguments)
+    """Run the server until Ctrl-C or SIGTERM, or a measurement (`evaluate …`); returns the process' exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given and given[0] == MEASURE:
+        return evaluate(given[1:], prog=f"{PROG} {MEASURE}")
+    options = _parser().parse_args(given)
     try:
         with _interruptible():
             return _serve(options)
@@ -48,7 +55,7 @@ def _serve(options: argparse.Namespace) -> int:
     try:
         tasks = {**TASKS, **(lasa_tasks(options.lasa) if options.lasa is not None else {})}
         if options.task not in tasks:
-            print(f"app.py: --task: found {options.task!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
+            print(f"{PROG}: --task: found {options.task!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2
         fits = FitStore(default_cache_folder())
         first = tasks[options.task]()
@@ -64,7 +71,7 @@ def _serve(options: argparse.Namespace) -> int:
             allowed=options.allow_origin,
         )
     except (DataError, ImitationError, AddressError, GateError) as error:
-        print(f"app.py: {error}", file=sys.stderr)
+        print(f"{PROG}: {error}", file=sys.stderr)
         return 2
     host = f"[{server.host}]" if ":" in server.host else server.host
     print(f"DT-Viz is at http://{host}:{server.port} (Ctrl-C stops it)", flush=True)
@@ -96,7 +103,11 @@ def _interruptible() -> Iterator[None]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="app.py", description="Diffeomorphic transforms, live in the browser.")
+    parser = argparse.ArgumentParser(
+        prog=PROG,
+        description="Diffeomorphic transforms, live in the browser.",
+        epilog=f"{PROG} {MEASURE} --help: the measurements of DT-Viz",
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=_port, default=8080, help="port to listen on (default: %(default)s)")
     parser.add_argument("--task", default="draw_s", help="task to begin with (default: %(default)s)")

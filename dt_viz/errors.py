@@ -1,4 +1,4 @@
-"""What is said of data that cannot be used."""
+"""Errors about data that cannot be used."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class DataError(ValueError):
 
 
 class FormatError(ValueError):
-    """Bytes that are not what a reader of a format expects; `parsing` adds whose bytes they are.
+    """Data that are not in the expected format; `naming` and `parsing` add their source.
 
     Attributes:
         field: the part of them that is wrong.
@@ -47,6 +47,15 @@ class FormatError(ValueError):
 
 
 @contextmanager
+def naming(kind: type[DataError], source: str | Path) -> Iterator[None]:
+    """Turn a FormatError into an error of one kind that names the source, too."""
+    try:
+        yield
+    except FormatError as error:
+        raise kind(source, error.field, error.found, error.accepted) from error
+
+
+@contextmanager
 def parsing(kind: type[DataError], source: str | Path, field: str, accepted: str) -> Iterator[None]:
     """Turn whatever a reader raises on hostile bytes into one kind of error.
 
@@ -60,12 +69,13 @@ def parsing(kind: type[DataError], source: str | Path, field: str, accepted: str
         DataError: of that kind. UnwantedError is let through: nothing is wrong with the data then.
     """
     try:
-        with np.errstate(all="ignore"):  # what overflows is refused as not finite, or as too large
+        with (
+            np.errstate(all="ignore"),
+            naming(kind, source),
+        ):  # what overflows is refused as not finite, or as too large
             yield
     except (DataError, UnwantedError):
         raise
-    except FormatError as error:
-        raise kind(source, error.field, error.found, error.accepted) from error
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise kind(source, field, f"something that cannot be read ({reason})", accepted) from error

@@ -1,19 +1,22 @@
 """What several test modules share: a robot, learned tasks in a temporary cache, scenarios."""
 
 import os
+import re
 
 # Tests run beside each other, each on one core: read when numpy is imported, by its BLAS.
 os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"} | os.environ)
 
 import pytest
 import viser  # noqa: TID251 - a page for tests of pictures and controls
+from chromium import ARGUMENTS, CHROMIUM
 from hypothesis import HealthCheck, settings
+from playwright.sync_api import sync_playwright
+from scenes import avoiding
 
 from dt_viz.arm.robot import Robot, load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 
 # Nothing here is timed, and a failure must come back on the next run.
@@ -28,12 +31,20 @@ settings.load_profile("dt-viz")
 
 
 def pytest_collection_modifyitems(config, items):
-    """What is marked slow runs when it is asked for by its marker; the browser begins, as it waits longest."""
+    """What is marked slow or package runs when asked for by its marker; the browser begins, as it waits longest."""
     items.sort(key=lambda item: item.get_closest_marker("browser") is None)
-    if "slow" not in config.getoption("-m"):
+    for name in {"slow", "package"} - set(re.findall(r"\w+", config.getoption("-m"))):
         for item in items:
-            if item.get_closest_marker("slow"):
-                item.add_marker(pytest.mark.skip(reason="slow: run with pytest -m slow"))
+            if item.get_closest_marker(name):
+                item.add_marker(pytest.mark.skip(reason=f"{name}: run with pytest -m {name}"))
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +75,7 @@ def engine(new_engine) -> Engine:
 @pytest.fixture(scope="session")
 def initial(engine):
     """The scenario that a task begins with."""
-    return lambda task: Scenario(task, (Sphere(engine.task(task).obstacle_position),))
+    return lambda task: avoiding(task, Sphere(engine.task(task).obstacle_position))
 
 
 @pytest.fixture(scope="module")

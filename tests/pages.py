@@ -3,8 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
-from dt_viz.engine.engine import Frame, Stage
-from dt_viz.motion.health import Health
+from dt_viz.engine.frame import Frame, Stage
+from dt_viz.motion.certificates import Certificates
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 
@@ -22,7 +22,7 @@ def frame_of(scenario: Scenario, **changes: Any) -> Frame:
         "goal": nothing,
         "reached": nothing,
         "blocked": (),
-        "health": Health(0.01),
+        "certificates": Certificates(0.01),
     }
     return Frame(scenario=scenario, **(given | changes))
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import changed
 
 from dt_viz.arm.arm_system import ArmSystem, Section
 from dt_viz.arm.tracking import track
@@ -24,7 +25,7 @@ class Case:
     def __init__(self, engine, robot, scenario):
         mean = np.mean([resample_by_arc_length(path, 101) for path in engine.task(scenario.task).paths], axis=0)
         x, y, z = (float(c) for c in mean[50])
-        scenario = replace(scenario, space="cspace", obstacles=(Sphere((x, y, z), 0.15),))
+        scenario = changed(scenario, space="cspace", obstacles=Sphere((x, y, z), 0.15))
         follower = Follower(robot)
         self.nominal = engine._nominal(scenario, None)
         self.lifted = follower.undisturbed(self.nominal)
@@ -32,7 +33,7 @@ class Case:
         # the learned pace is not smooth enough for RK4 to show its order: a plain attractor takes its place
         base = Attractor(self.nominal.system.base.goal, speed=0.2, smoothing=0.05)
         hand = DiffeomorphicSystem(self.nominal.system.transform, base)
-        solution = follower.whole_arm.avoiding(self.lifted, scenario, LIVE.spacing, coarse=True)
+        solution = follower.whole_arm.avoiding(self.lifted, scenario.arm_avoidance, LIVE.spacing, coarse=True)
         avoids = solution.transform
         assert isinstance(avoids, Conjugated) and isinstance(avoids.inner, Flow)
         self.field, self.duration = avoids.inner.field, avoids.inner.duration

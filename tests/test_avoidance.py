@@ -1,19 +1,23 @@
 """The duration that clears an obstacle: enough, no more than enough, and the obstacle's own wherever it stands."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import avoiding
 
 from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Scenario
-from dt_viz.transforms.avoidance import ACCEPTED_MARGIN, MAX_DURATION, ObstacleAvoidance, _crests, clearing_duration
-from dt_viz.transforms.base import Motion
+from dt_viz.transforms.avoidance import ACCEPTED_MARGIN, MAX_DURATION, Avoidance, _crests, clearing_duration
+from dt_viz.transforms.base import MotionBelow
+from dt_viz.warning import Kind, MotionWarning
 
 seeds = st.integers(0, 2**32 - 1)
 SPHERE = Sphere((0.1, -0.4, 0.3), 0.15)
 MARGIN = 0.01
+AVOIDANCE = Avoidance(SPHERE, margin=MARGIN)
 
 
 def passing_points(seed, num=40, sphere=SPHERE):
@@ -83,20 +87,18 @@ def test_a_moved_and_grown_obstacle_clears_its_points_in_the_same_time(seed, dia
     assert elsewhere == pytest.approx(here, rel=1e-3, abs=1e-4)
 
 
-def motion(paths, **changes):
+def motion(*paths, **changes):
     index = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
-    scenario = Scenario("any", (SPHERE,), margin=MARGIN, **changes)
-    starts = np.stack([path[0] for path in paths])
-    return Motion(scenario, starts, paths[0][-1], index, np.concatenate(paths))
+    starts, positions = np.stack([path[0] for path in paths]), np.concatenate(paths)
+    return MotionBelow(starts, paths[0][-1], index, positions, name="Avoidance", tolerance=1e-8, **changes)
 
 
 def test_the_built_transform_clears_the_motion_it_was_built_for():
-    before = motion([passing_points(1), passing_points(2)])
-    built = ObstacleAvoidance().build(before, 1e-8, 0.0)
-    assert built is not None and built.doubts == ()
-    after = Motion(before.scenario, before.starts, before.goal, before.index, built.transform.inverse(before.positions))
-    assert not ObstacleAvoidance().satisfied(before)
-    assert ObstacleAvoidance().satisfied(after)
+    before = motion(passing_points(1), passing_points(2))
+    built = AVOIDANCE.build(before)
+    assert built.warnings == ()
+    assert not AVOIDANCE.satisfied(before)
+    assert AVOIDANCE.satisfied(replace(before, positions=built.transform.inverse(before.positions)))
 
 
 @given(seeds, st.floats(0.0005, 0.02), st.floats(0, 1), st.floats(0.05, 0.5), st.floats(1, 6))
@@ -110,9 +112,7 @@ def test_the_duration_hardly_depends_on_where_a_path_is_sampled(seed, miss, phas
         return np.array(SPHERE.position) + 0.2 * u * along + (miss + bend * (0.2 * u) ** 2) * aside
 
     def duration(u):
-        built = ObstacleAvoidance().build(motion([path(u)]), 1e-8, 0.0)
-        assert built is not None
-        return built.duration
+        return AVOIDANCE.build(motion(path(u))).duration
 
     gaps = uneven ** rng.uniform(-0.5, 0.5, 80)  # refinement leaves neighbours of very different length
     coarse = 2 * np.cumsum(gaps) / gaps.sum() - 1 + phase / 40
@@ -127,35 +127,34 @@ def test_crests_lie_on_a_bent_path_however_unevenly_it_is_sampled(seed, uneven):
     gaps = uneven ** rng.uniform(-0.5, 0.5, 40)
     turn = 1.2 * (2 * np.cumsum(gaps) / gaps.sum() - 1)[:, None]
     centre = np.array(SPHERE.position) + (radius + 0.004) * aside
-    before = motion([centre + radius * (np.sin(turn) * along - np.cos(turn) * aside)])
-    found = _crests(before, SPHERE.signed_distance(before.positions), SPHERE.field("free-space", 6.0))
+    before = motion(centre + radius * (np.sin(turn) * along - np.cos(turn) * aside))
+    found = _crests(before, SPHERE.signed_distance(before.positions), SPHERE.field("free-space", 6.0), MARGIN)
     assert len(found) or np.abs(turn).min() < 0.01  # a sample is as good as on it
     np.testing.assert_allclose(np.linalg.norm(found - centre, axis=1), radius, rtol=0, atol=3e-6)
 
 
-def test_nothing_is_built_when_avoidance_is_off():
-    assert ObstacleAvoidance().build(motion([passing_points(1)], avoidance=False), 1e-8, 0.0) is None
+def test_what_is_off_or_has_nothing_to_lead_around_is_not_in_the_stack():
+    assert [layer.name for _, layer in avoiding("any", SPHERE).active] == ["Avoidance"]
+    for changes in ({"avoids": False}, {"obstacles": ()}, {"space": "cspace"}):
+        assert avoiding("any", **{"obstacles": SPHERE, **changes}).active == ()
 
 
 def test_a_chosen_duration_is_taken_as_it_is():
-    before = motion([passing_points(1)], duration=0.123)
-    built = ObstacleAvoidance().build(before, 1e-8, 0.7)
-    assert built is not None and built.duration == 0.123
-    assert ObstacleAvoidance().satisfied(before)  # nobody asked for more
+    before, chosen = motion(passing_points(1), at_least=0.7), replace(AVOIDANCE, duration=0.123)
+    assert chosen.build(before).duration == 0.123
+    assert chosen.satisfied(before)  # nobody asked for more
 
 
 def test_a_covered_start_is_named_and_does_not_keep_the_others_from_being_cleared():
     covered = passing_points(1)
     covered = covered[np.argmin(SPHERE.signed_distance(covered)) :]
-    built = ObstacleAvoidance().build(motion([passing_points(2), covered]), 1e-8, 0.0)
-    assert built is not None
-    assert built.doubts == ("start 2 is inside the obstacle",)
+    built = AVOIDANCE.build(motion(passing_points(2), covered))
+    assert built.warnings == (MotionWarning(Kind.START_COVERED, "start 2 is inside the obstacle", "Avoidance"),)
     assert SPHERE.signed_distance(built.transform.inverse(passing_points(2))).min() > ACCEPTED_MARGIN * MARGIN
 
 
 def test_a_covered_goal_is_said():
     path = passing_points(1)
     path = path[: np.argmin(SPHERE.signed_distance(path)) + 1]
-    built = ObstacleAvoidance().build(motion([path]), 1e-8, 0.0)
-    assert built is not None
-    assert any("goal is inside the obstacle" in doubt for doubt in built.doubts)
+    covered = [warning for warning in AVOIDANCE.build(motion(path)).warnings if warning.kind is Kind.GOAL_COVERED]
+    assert ["goal is inside the obstacle" in warning.text for warning in covered] == [True]

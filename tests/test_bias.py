@@ -6,27 +6,28 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import avoiding, biases
 
 from dt_viz.flows.diffeomorphisms import Flow, round_trip_error
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.solve import FINE, LIVE, Nominal, Solution, solve
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import DRAWING_AXES, POTS
 from dt_viz.transforms.avoidance import ACCEPTED_MARGIN
-from dt_viz.transforms.base import Motion
+from dt_viz.transforms.base import MotionBelow
 from dt_viz.transforms.bias import (
     ACCEPTED,
     AIM,
     MAX_DURATION,
-    Biasing,
     BiasPoint,
     Point,
     closest_distances,
     closest_points,
     unit_field,
 )
+from dt_viz.warning import Kind, MotionWarning
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -51,27 +52,27 @@ def nominal(fits, engine):
 
     def nominal(task) -> Nominal:
         if task not in made:
-            made[task] = engine._nominal(Scenario(task, ()), None)
+            made[task] = engine._nominal(Scenario(task), None)
         return made[task]
 
     return nominal
 
 
-def biased(nominal, *behaviours, precision=FINE, **changes) -> Solution:
-    changes = {"avoidance": False, **changes}
-    scenario = Scenario(
-        nominal.task.name, changes.pop("obstacles", ()), layers=tuple(map(Layer, behaviours)), **changes
-    )
-    return solve(nominal, scenario, precision)
+def biased(nominal, *points, precision=FINE, **changes) -> Solution:
+    scenario = avoiding(nominal.task.name, layers=biases(*points), **changes)
+    return solve(nominal, scenario.active, precision)
 
 
-def motion_of(nominal, solution) -> Motion:
-    scenario = Scenario(nominal.task.name, ())
-    return Motion(scenario, nominal.task.starts, nominal.goal, solution.bundle.index, solution.bundle.positions)
+def satisfied(solution) -> bool:
+    return all(applied.satisfied for applied in solution.built)
+
+
+def motion_of(nominal, bundle) -> MotionBelow:
+    return MotionBelow(nominal.task.starts, nominal.goal, bundle.index, bundle.positions)
 
 
 def missed(nominal, solution, point) -> float:
-    return float(closest_distances(point, motion_of(nominal, solution)).max())
+    return float(closest_distances(point, motion_of(nominal, solution.bundle)).max())
 
 
 def beside(nominal, rng, plane=None):
@@ -167,10 +168,10 @@ def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(nom
     g, rng, off, turns = nominal(task), np.random.default_rng(7), [], []
     for number in range(num):
         point = BiasPoint(beside(g, rng, plane_of(task)), plane=plane_of(task))
-        solution = biased(g, Biasing(point), precision=FINE if number % 3 == 0 else LIVE)
-        assert not solution.unsatisfied and solution.doubts == ()
+        solution = biased(g, point, precision=FINE if number % 3 == 0 else LIVE)
+        assert satisfied(solution) and solution.warnings == ()
         assert missed(g, solution, point) <= ACCEPTED
-        off.append(closest_distances(point, motion_of(g, solution=replace(solution, bundle=g.bundle))).max())
+        off.append(closest_distances(point, motion_of(g, g.bundle)).max())
         turns.append(max(sharpest_turn(path, 0.02) for path in solution.bundle.paths))
         if number % 3 == 0:
             assert_sound(g, solution)
@@ -181,28 +182,29 @@ def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(nom
 
 def test_a_drawing_stays_in_its_plane(nominal):
     g = nominal("draw_s")
-    solution = biased(g, Biasing(BiasPoint(beside(g, np.random.default_rng(1), PLANE), plane=PLANE)))
+    solution = biased(g, BiasPoint(beside(g, np.random.default_rng(1), PLANE), plane=PLANE))
     assert np.ptp(solution.bundle.positions[:, 1]) < 1e-12
 
 
 def test_a_biased_motion_is_still_the_motion_of_a_stable_system(nominal):
     g = nominal("lift_box")
-    solution = biased(g, Biasing(BiasPoint(beside(g, np.random.default_rng(2)))))
+    solution = biased(g, BiasPoint(beside(g, np.random.default_rng(2))))
     system: DiffeomorphicSystem = solution.system
     for path in solution.bundle.paths:
         assert (np.diff(system.lyapunov(path)) < 0).all()
 
 
-def straight(distance, num=401):
+def straight(distance, num=401, **changes):
     """A straight motion that passes the origin at this distance."""
     path = np.stack([np.linspace(-0.6, 0.6, num), np.full(num, distance), np.zeros(num)], axis=1)
-    return Motion(Scenario("any", ()), path[:1], path[-1], np.zeros(num, dtype=int), path)
+    changes = {"name": "Bias 1", "tolerance": 1e-8, **changes}
+    return MotionBelow(path[:1], path[-1], np.zeros(num, dtype=int), path, **changes)
 
 
 @given(st.floats(0.02, 0.15), st.sampled_from([None, 0.3]))
 def test_the_auto_duration_is_the_shortest(distance, radius):
     motion, point = straight(distance), BiasPoint((0.0, 0.0, 0.0), radius)
-    built = Biasing(point).build(motion, 1e-8, 0.0)
+    built = point.build(motion)
     assert isinstance(built.transform, Flow)
     field = built.transform.field
 
@@ -214,14 +216,14 @@ def test_the_auto_duration_is_the_shortest(distance, radius):
 
     assert after(built.duration) == pytest.approx(AIM, rel=0.03)
     assert after(0.97 * built.duration) > AIM
-    assert Biasing(point).satisfied(replace(motion, positions=built.transform.inverse(motion.positions)))
-    assert not Biasing(point).satisfied(motion)
+    assert point.satisfied(replace(motion, positions=built.transform.inverse(motion.positions)))
+    assert not point.satisfied(motion)
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.10, 0.15])
 def test_with_room_around_it_a_straight_motion_turns_gently(distance):
-    motion = straight(distance, 2001)
-    built = Biasing(BiasPoint((0.0, 0.0, 0.0))).build(motion, 1e-6, 0.0)
+    motion = straight(distance, 2001, tolerance=1e-6)
+    built = BiasPoint((0.0, 0.0, 0.0)).build(motion)
     assert sharpest_turn(built.transform.inverse(motion.positions), 0.02) < 40
 
 
@@ -231,7 +233,7 @@ def test_the_closest_point_is_that_of_the_polyline(seed):
     lengths = rng.integers(2, 30, 4)
     paths = [np.cumsum(rng.normal(0, 0.05, (n, 3)), axis=0) for n in lengths]
     index = np.repeat(np.arange(4), lengths)
-    motion = Motion(Scenario("any", ()), np.stack([p[0] for p in paths]), paths[0][-1], index, np.concatenate(paths))
+    motion = MotionBelow(np.stack([p[0] for p in paths]), paths[0][-1], index, np.concatenate(paths))
     point = BiasPoint((0.05, 0.0, 0.02))
     fine = [resample_by_arc_length(path, 20000) for path in paths]
     expected = [np.linalg.norm(path - point.position, axis=1).min() for path in fine]
@@ -242,10 +244,10 @@ def test_the_closest_point_is_that_of_the_polyline(seed):
 
 
 def test_a_chosen_strength_is_taken_as_it_is():
-    motion, point = straight(0.1), BiasPoint((0.0, 0.0, 0.0), 0.3, strength=0.2)
-    built = Biasing(point).build(motion, 1e-8, 0.7)
+    motion, point = straight(0.1, at_least=0.7), BiasPoint((0.0, 0.0, 0.0), 0.3, strength=0.2)
+    built = point.build(motion)
     assert built.duration == 0.2 and built.goal is motion.goal and not built.hopeless
-    assert Biasing(point).satisfied(motion)  # nobody asked for more
+    assert point.satisfied(motion)  # nobody asked for more
 
 
 # several
@@ -258,8 +260,8 @@ def test_two_bias_points_in_either_order(nominal, task, order):
     path = resample_by_arc_length(g.bundle.paths[0], 101)
     aside = 0.06 * np.array([1.0, 0.0, 0.0])
     points = [BiasPoint(as_point(path[k] + aside), plane=plane) for k in (35, 75)][::order]
-    solution = biased(g, Biasing(points[0]), Biasing(points[1], below=(points[0].position,)))
-    assert not solution.unsatisfied
+    solution = biased(g, *points)
+    assert satisfied(solution)
     for point in points:
         assert missed(g, solution, point) <= ACCEPTED
     assert_sound(g, solution)
@@ -271,7 +273,7 @@ def test_fig_4_a_letter_biased_to_two_points(nominal):
     first = as_point(path[30] + [-0.10, 0.0, 0.0])  # into the letter
     second = as_point(path[70] + [0.0, 0.0, -0.08])  # below its bow
     points = [BiasPoint(first, plane=PLANE), BiasPoint(second, plane=PLANE)]
-    solution = biased(g, Biasing(points[0]), Biasing(points[1], below=(first,)))
+    solution = biased(g, *points)
     assert [missed(g, solution, point) <= ACCEPTED for point in points] == [True, True]
     assert_sound(g, solution)
 
@@ -281,9 +283,9 @@ def test_fig_8_the_object_falls_into_the_chosen_pot(nominal, pot):
     g = nominal("drop_pots")
     assert POTS[1].catches(g.goal) and not pot.catches(g.goal)
     point = BiasPoint((pot.x, pot.y, float(g.goal[2])), moves_goal=True)
-    solution = biased(g, Biasing(point))
+    solution = biased(g, point)
     goal = solution.built[0].made.goal
-    assert not solution.unsatisfied and pot.catches(goal)
+    assert satisfied(solution) and pot.catches(goal)
     assert np.linalg.norm(goal - point.position) <= ACCEPTED
     assert_sound(g, solution, goal=goal)
     assert (solution.bundle.positions[:, 2] > pot.height + 0.10).all()  # carried above the rims
@@ -294,8 +296,8 @@ def test_bias_and_avoidance_in_either_order(nominal, level):
     g = nominal("draw_s")
     path = resample_by_arc_length(g.bundle.paths[0], 101)
     point, sphere = BiasPoint(as_point(path[75] + [0.0, 0.0, -0.06]), plane=PLANE), Sphere(as_point(path[35]), 0.10)
-    solution = biased(g, Biasing(point), obstacles=(sphere,), avoidance=True, avoidance_level=level)
-    assert not solution.unsatisfied
+    solution = biased(g, point, obstacles=sphere, level=level)
+    assert satisfied(solution)
     assert missed(g, solution, point) <= ACCEPTED
     assert sphere.signed_distance(solution.bundle.positions).min() > ACCEPTED_MARGIN * 0.01
     assert_sound(g, solution)
@@ -305,54 +307,76 @@ def test_bias_and_avoidance_in_either_order(nominal, level):
 
 
 def test_a_region_that_does_not_reach_the_motion_is_said_to_be_too_small():
-    built = Biasing(BiasPoint((0.0, 0.0, 0.0), radius=0.08)).build(straight(0.12), 1e-8, 0.0)
+    built = BiasPoint((0.0, 0.0, 0.0), radius=0.08).build(straight(0.12))
     assert built.hopeless and built.duration == MAX_DURATION
-    assert built.doubts == ("the region of 8 cm is too small: a motion is 12 cm from the target",)
+    text = "Bias 1: the region of 8 cm is too small: a motion is 12 cm from the target"
+    assert built.warnings == (MotionWarning(Kind.UNREACHED, text, "Bias 1"),)
 
 
 def test_a_region_that_hardly_reaches_the_motion_is_said_to_fade_out():
-    built = Biasing(BiasPoint((0.0, 0.0, 0.0), radius=0.123)).build(straight(0.12), 1e-8, 0.0)
-    assert built.hopeless and "fades out" in built.doubts[0]
+    built = BiasPoint((0.0, 0.0, 0.0), radius=0.123).build(straight(0.12))
+    assert built.hopeless and "fades out" in built.warnings[0].text
+
+
+def misplaced(warnings):
+    return [warning.text for warning in warnings if warning.kind is Kind.MISPLACED]
 
 
 @pytest.mark.parametrize(
-    ("place", "doubt"),
+    ("place", "words"), [((0.6, 0.1, 0.0), "the point is on the goal"), ((-0.6, 0.1, 0.0), "the point is on a start")]
+)
+def test_a_misplaced_bias_point_is_doubted(place, words):
+    built = BiasPoint(place, radius=0.2).build(straight(0.1, tolerance=1e-6))
+    (text,) = misplaced(built.warnings)
+    assert text.startswith(f"Bias 1: {words}")
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
     [
-        ((0.6, 0.1, 0.0), "on the goal"),
-        ((-0.6, 0.1, 0.0), "on a start"),
-        ((0.0, 0.1, -0.02), "below the table"),
-        ((0.0, 0.1, 1.30), "1.02 m from the arm's shoulder, which reaches 0.95 m"),
+        ((0.0, 0.1, -0.02), "the point is below the table"),
+        ((0.0, 0.1, 1.30), "the point is 1.02 m from the arm's shoulder, which reaches 0.95 m"),
+        ((0.0, -0.4, 0.3), None),
     ],
 )
-def test_a_misplaced_bias_point_is_doubted(place, doubt):
-    built = Biasing(BiasPoint(place, radius=0.2)).build(straight(0.1), 1e-6, 0.0)
-    assert any(doubt in said for said in built.doubts)
+def test_a_bias_point_where_the_hand_cannot_be_is_doubted(engine, place, words):
+    frame = next(engine.frames(avoiding("lift_box", layers=biases(BiasPoint(place, strength=0.0)))))
+    assert misplaced(frame.certificates.warnings) == ([] if words is None else [f"Bias 1: {words}"])
 
 
 def test_a_target_off_the_plane_of_a_drawing_is_doubted(nominal):
     g = nominal("draw_s")
     x, _, z = g.bundle.positions[100]
     point = BiasPoint((float(x), -0.45, float(z)), plane=PLANE)
-    solution = biased(g, Biasing(point), precision=LIVE)
-    assert any("5 cm before or behind the plane" in doubt for doubt in solution.doubts)
+    solution = biased(g, point, precision=LIVE)
+    (text,) = (warning.text for warning in solution.warnings if warning.kind is Kind.OFF_PLANE)
+    assert "5 cm before or behind the plane" in text
 
 
 def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(nominal):
     g = nominal("drop_pots")
     point = BiasPoint((0.0, -0.52, 0.14))
-    solution = biased(g, Biasing(point), precision=LIVE)
-    assert solution.unsatisfied
-    assert any("its start or goal nearer to the point" in doubt for doubt in solution.doubts)
+    solution = biased(g, point, precision=LIVE)
+    assert not satisfied(solution)
+    assert any("its start or goal nearer to the point" in warning.text for warning in solution.warnings)
     for path in solution.bundle.paths:
         np.testing.assert_allclose(path[-1], g.goal, atol=1e-3)
 
 
 def test_a_region_over_another_target_is_doubted():
-    point = BiasPoint((0.0, 0.0, 0.0), radius=0.3)
-    built = Biasing(point, below=((0.1, 0.1, 0.0),)).build(straight(0.1), 1e-6, 0.0)
-    assert any("covers a bias point below it" in doubt for doubt in built.doubts)
+    point, other = BiasPoint((0.0, 0.0, 0.0), radius=0.3), (0.1, 0.1, 0.0)
+    assert not misplaced(point.build(straight(0.1)).warnings)
+    (text,) = misplaced(point.build(straight(0.1, targets=(other,))).warnings)
+    assert "covers a bias point below it" in text
+
+
+def test_a_bias_point_is_told_the_targets_below_it(nominal):
+    path = resample_by_arc_length(nominal("lift_box").bundle.paths[0], 101)
+    points = [BiasPoint(as_point(path[50]), radius=0.3), BiasPoint(as_point(path[55]), radius=0.3)]
+    solution = biased(nominal("lift_box"), *points, precision=LIVE)
+    assert [bool(misplaced(applied.made.warnings)) for applied in solution.built] == [False, True]
 
 
 def test_equal_bias_points_are_equal_layers():
     point = BiasPoint((0.0, -0.4, 0.3), plane=PLANE)
-    assert Biasing(point) == Biasing(replace(point)) and hash(Biasing(point)) == hash(Biasing(replace(point)))
+    assert biases(point) == biases(replace(point)) and hash(biases(point)) == hash(biases(replace(point)))

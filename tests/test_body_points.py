@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from dt_viz.arm.body_points import FILE, BodyPoints, load_body_points
+from dt_viz.arm.body_points import BodyPoints, load_body_points
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.shipped import ASSETS
 
 SCRIPT = Path(__file__).parents[1] / "assets" / "make_body_points.py"
 OVERSHOOT = {-1: 0.0375, 0: 0.0295, 1: 0.0455, 2: 0.043, 3: 0.031, 4: 0.031, 5: 0.0255}
@@ -101,7 +102,7 @@ class TestCover:
     @pytest.mark.slow
     def test_the_script_makes_the_file_that_ships(self):
         made = script().body_points()
-        with np.load(FILE, allow_pickle=False) as shipped:
+        with np.load(ASSETS / "body_points.npz", allow_pickle=False) as shipped:
             assert set(made) == set(shipped.files)
             np.testing.assert_array_equal(made["joint"], shipped["joint"])
             # Another platform's mathematics may round the last digit differently.

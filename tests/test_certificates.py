@@ -4,23 +4,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scenes import changed, kinds
 
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.retiming import within_velocity_limits
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor
-from dt_viz.motion.certificates import MAX_OFF_POSTURE, OFF_MOTION, Shown, certified
-from dt_viz.motion.health import RISES, Health
+from dt_viz.motion.certificates import MAX_OFF_POSTURE, Certificates, Shown, certified
 from dt_viz.motion.solve import Solution, Solved
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.warning import Kind, MotionWarning
 
 BASE = Attractor(np.array([0.5, 0.2, 0.0]), 0.2, 0.05)
 RAYS = Rays(np.array([[-0.8, -0.3, 0.1], [-0.6, 0.7, -0.2]]), BASE)
-CLEAR = Health(clearance=0.05, duration=0.3, doubts=("said before",))
+BEFORE = MotionWarning(Kind.IMITATION, "said before")
+CLEAR = Certificates(clearance=0.05, found=(BEFORE,))
 
 
 def field(strength):
@@ -50,12 +53,12 @@ def both(*fractions):
 @pytest.mark.parametrize(
     "transform", [Identity(3), Flow(field(0.3), 0.5, 20), Flow(field(0.3), 0.5, 6, implicit_euler, euler)]
 )
-def test_a_healthy_stack_gets_its_certificates_and_no_doubt(transform):
-    health = certify(transform)
-    assert health.min_det_jacobian is not None and health.min_det_jacobian > 0
-    assert health.round_trip_error is not None and health.round_trip_error < 1e-6
-    assert health.lyapunov_falls is True
-    assert (health.clearance, health.duration, health.doubts) == (0.05, 0.3, ("said before",))
+def test_a_healthy_stack_gets_its_certificates_and_no_warning(transform):
+    known = certify(transform)
+    assert known.min_det_jacobian is not None and known.min_det_jacobian > 0
+    assert known.round_trip_error is not None and known.round_trip_error < 1e-6
+    assert known.lyapunov_falls is True
+    assert (known.clearance, known.warnings) == (0.05, (BEFORE,))
 
 
 def test_the_smallest_determinant_is_that_of_the_forward_map():
@@ -68,28 +71,29 @@ def test_the_smallest_determinant_is_that_of_the_forward_map():
 def test_a_folding_euler_map_is_recognised():
     folding = Flow(field(6.0), 1.0, 1, euler)
     bundle = bundle_of(Identity(3))  # straight through where it folds
-    health = certify(folding, bundle)
-    assert health.min_det_jacobian is not None and health.min_det_jacobian < 0
-    assert any("no diffeomorphism" in doubt for doubt in health.doubts)
+    known = certify(folding, bundle)
+    assert known.min_det_jacobian is not None and known.min_det_jacobian < 0
+    assert Kind.NO_DIFFEOMORPHISM in kinds(known.warnings)
 
 
 def test_a_bad_round_trip_is_recognised_and_measured():
     coarse = Flow(field(0.4), 1.0, 10, euler)  # Euler back is not the inverse of Euler there
     bundle = bundle_of(coarse)
-    health = certify(coarse, bundle)
+    known = certify(coarse, bundle)
     error = np.linalg.norm(coarse.inverse(coarse.forward(bundle.positions)) - bundle.positions, axis=1).max()
-    assert health.round_trip_error is not None
-    assert health.round_trip_error == pytest.approx(error, rel=0.05)
-    assert any(f"misses by {1e3 * health.round_trip_error:.3g} mm" in doubt for doubt in health.doubts)
-    assert health.doubts[0] == "said before"
+    assert known.round_trip_error is not None
+    assert known.round_trip_error == pytest.approx(error, rel=0.05)
+    assert known.warnings[0] == BEFORE
+    (warning,) = (warning for warning in known.warnings if warning.kind is Kind.ROUND_TRIP)
+    assert f"misses by {1e3 * known.round_trip_error:.3g} mm" in warning.text
 
 
 def test_a_motion_that_turns_back_is_recognised():
     there = np.linspace(0, 1, 100)
     bundle = both(there[:60], there[40:])
-    health = certify(Identity(3), bundle)
-    assert health.lyapunov_falls is False
-    assert health.doubts == (*CLEAR.doubts, RISES)
+    known = certify(Identity(3), bundle)
+    assert known.lyapunov_falls is False
+    assert [warning.kind for warning in known.warnings] == [BEFORE.kind, Kind.NOT_FALLING]
 
 
 @pytest.mark.parametrize(("rise", "falls"), [(1e-6, True), (1e-4, False)])
@@ -108,9 +112,8 @@ def test_a_motion_that_stands_still_does_not_fall_strictly():
 
 @pytest.mark.parametrize(("first", "last"), [(0.0, 0.9), (0.1, 1.0)])
 def test_a_motion_that_is_not_shown_as_a_whole_is_recognised(first, last):
-    assert certify(Identity(3), both(np.linspace(first, last, 50))).doubts[1:] == (
-        "a motion is not shown from its start to its goal",
-    )
+    warnings = certify(Identity(3), both(np.linspace(first, last, 50))).warnings[1:]
+    assert warnings == (MotionWarning(Kind.OTHER_ENDS, "a motion is not shown from its start to its goal"),)
 
 
 def test_the_rise_from_the_end_of_one_rollout_to_the_start_of_the_next_is_none():
@@ -134,9 +137,25 @@ class Broken(Diffeomorphism):
 
 def test_no_number_is_no_certificate():
     with np.errstate(invalid="ignore"):
-        health = certify(Broken(), both(np.linspace(0, 1, 5)))
-    assert health.lyapunov_falls is False
-    assert len(health.doubts) == 1 + 5
+        known = certify(Broken(), both(np.linspace(0, 1, 5)))
+    assert known.lyapunov_falls is False
+    failed = {Kind.NO_DIFFEOMORPHISM, Kind.ROUND_TRIP, Kind.NOT_FALLING, Kind.OFF_MOTION, Kind.OTHER_ENDS}
+    assert kinds(known.warnings) == {BEFORE.kind, *failed}
+
+
+def test_what_follows_from_a_cause_that_is_said_is_not_told_beside_it_but_known():
+    cause = MotionWarning(Kind.FOLDS, "a step folds", "Bias 1")
+    follows = MotionWarning(Kind.NOT_FALLING, "it rises")
+    known = CLEAR.warning(follows, cause, cause)
+    assert known.found == (BEFORE, follows, cause, cause)
+    assert known.warnings == (BEFORE, cause)
+    assert CLEAR.warning(follows).warnings == (BEFORE, follows)
+
+
+def test_a_cause_in_one_transform_leaves_what_fails_in_another_told():
+    cause = MotionWarning(Kind.STAYS_INSIDE, "it does not leave", "Avoidance")
+    its_own, other = (MotionWarning(Kind.ENTERS, "it enters", name) for name in ("Avoidance", "Avoidance 2"))
+    assert CLEAR.warning(cause, its_own, other).warnings == (BEFORE, cause, other)
 
 
 # --- motions other than those that were computed ---
@@ -150,10 +169,11 @@ class Certified:
     frame: Frame
     solved: Solved
 
-    def doubts(self, frame: Frame | None = None, solved: Solved | None = None) -> tuple[str, ...]:
-        """What the certificates add to what is said of a frame already."""
+    def failed(self, frame: Frame | None = None, solved: Solved | None = None) -> set[Kind]:
+        """The kinds of warnings that the certificates add to those of a frame."""
         frame = frame or self.frame
-        return self.engine._certified(frame, solved or self.solved).doubts[len(frame.health.doubts) :]
+        warnings = self.engine._certified(frame, solved or self.solved).warnings
+        return kinds(warning for warning in warnings if warning not in frame.certificates.warnings)
 
     def with_hand(self, change) -> tuple[Frame, Solved]:
         """The same with other rollouts, everywhere: `change` takes each (T, 3) and what it is without avoidance."""
@@ -193,7 +213,7 @@ def _hand(engine, initial):
 
 @pytest.fixture(scope="module", name="arm")
 def _arm(engine, initial):
-    return computed(engine, replace(initial("push_box"), space="cspace"))
+    return computed(engine, changed(initial("push_box"), space="cspace"))
 
 
 def noise(path, size):
@@ -236,18 +256,18 @@ ARM = {
 
 
 def test_the_computed_motions_pass(hand, arm):
-    assert hand.doubts() == arm.doubts() == ()
+    assert hand.failed() == arm.failed() == set()
 
 
 @pytest.mark.parametrize("corruption", HAND)
 def test_rollouts_of_another_motion_are_recognised(hand, corruption):
-    assert any(OFF_MOTION in doubt for doubt in hand.doubts(*hand.with_hand(HAND[corruption])))
+    assert Kind.OFF_MOTION in hand.failed(*hand.with_hand(HAND[corruption]))
 
 
 @pytest.mark.parametrize("corruption", ARM)
 def test_postures_of_another_motion_are_recognised(arm, robot, corruption):
     frame, solved = arm.with_postures(lambda p, q: ARM[corruption](p, q, robot))
-    assert any(OFF_MOTION in doubt for doubt in arm.doubts(frame, solved))
+    assert Kind.OFF_MOTION in arm.failed(frame, solved)
 
 
 def test_each_displaced_sample_is_recognised_where_the_stack_squeezes_space_most(hand):
@@ -260,7 +280,7 @@ def test_each_displaced_sample_is_recognised_where_the_stack_squeezes_space_most
         paths = list(hand.frame.rollouts)
         paths[rollout] = displaced(paths[rollout], row - before[rollout], sign * 5e-3 * Vt[row, -1])
         frame = replace(hand.frame, rollouts=tuple(paths), arm=None)
-        assert any(OFF_MOTION in doubt for doubt in hand.doubts(frame))
+        assert Kind.OFF_MOTION in hand.failed(frame)
 
 
 def test_postures_displaced_where_the_hand_stays_are_recognised(arm, robot):
@@ -271,7 +291,7 @@ def test_postures_displaced_where_the_hand_stays_are_recognised(arm, robot):
         null = np.linalg.svd(robot.chain(p[[middle]].T).position_jacobian()[..., 0].T)[2][-1]
         return displaced(p, middle, 5e-3 * null / np.linalg.norm(null * LEVERS))
 
-    assert any(OFF_MOTION in doubt for doubt in arm.doubts(*arm.with_postures(elbow)))
+    assert Kind.OFF_MOTION in arm.failed(*arm.with_postures(elbow))
 
 
 def test_the_tolerance_of_postures_is_far_from_what_the_computation_leaves_and_from_what_is_seen(arm):
@@ -287,9 +307,9 @@ def test_scaled_times_are_recognised(request, whose, factor):
     motion = request.getfixturevalue(whose)
     frame = motion.frame
     late = replace(frame, times=tuple(factor * times for times in frame.times))
-    assert any("the times are not those of the motion" in doubt for doubt in motion.doubts(late))
+    assert Kind.OTHER_TIMES in motion.failed(late)
     slow = replace(frame, arm=replace(frame.arm, times=factor * frame.arm.times))
-    assert any("does not keep the times of its rollout" in doubt for doubt in motion.doubts(slow))
+    assert Kind.OTHER_DELAY in motion.failed(slow)
 
 
 @pytest.mark.parametrize("whose", ["hand", "arm"])
@@ -298,7 +318,8 @@ def test_a_goal_other_than_the_one_of_the_base_system_is_recognised(request, who
     rays = motion.solved.stack.rays
     base = replace(rays.base, goal=rays.base.goal + 0.005 * np.eye(3)[0])
     shifted = replace(motion.solved, stack=replace(motion.solved.stack, rays=replace(rays, base=base)))
-    assert any("begin or end up to 5" in doubt for doubt in motion.doubts(solved=shifted))
+    warnings = motion.engine._certified(motion.frame, shifted).warnings
+    assert any(w.kind is Kind.OTHER_ENDS and "begin or end up to 5" in w.text for w in warnings)
 
 
 @pytest.mark.parametrize("whose", ["hand", "arm"])
@@ -306,12 +327,12 @@ def test_a_motion_around_another_obstacle_is_recognised(request, engine, whose):
     motion = request.getfixturevalue(whose)
     (obstacle,) = motion.frame.scenario.obstacles
     x, y, z = obstacle.position
-    scenario = replace(motion.frame.scenario, obstacles=(Sphere((x, y, z + 0.03), obstacle.diameter),))
+    scenario = changed(motion.frame.scenario, obstacles=Sphere((x, y, z + 0.03), obstacle.diameter))
     other = computed(engine, scenario)
-    assert other.doubts() == ()
+    assert other.failed() == set()
     posed = replace(other.frame, scenario=motion.frame.scenario)
     solved = replace(other.solved, scenario=motion.frame.scenario)
-    assert any("the motions shown keep" in doubt for doubt in other.doubts(posed, solved))
+    assert Kind.OTHER_CLEARANCE in other.failed(posed, solved)
 
 
 @pytest.mark.parametrize("whose", ["hand", "arm"])
@@ -320,4 +341,4 @@ def test_an_arm_beside_its_rollout_is_recognised(request, whose, robot):
     q = displaced(motion.frame.arm.q, 50, sideways(motion.frame.arm.q, robot))
     times = motion.frame.arm.times
     frame = replace(motion.frame, arm=replace(motion.frame.arm, q=q, times=times))
-    assert any("the hand of the arm is up to" in doubt for doubt in motion.doubts(frame))
+    assert Kind.HAND_BESIDE in motion.failed(frame)

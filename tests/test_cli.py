@@ -14,7 +14,7 @@ import pytest
 
 import dt_viz
 from dt_viz.cli import main
-from dt_viz.evaluate.protocol_client import ProtocolClient
+from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
 
 APP = Path(dt_viz.__file__).parent.parent / "app.py"
 PATIENCE = 120.0
@@ -69,7 +69,8 @@ async def visit_and_stop(process, url, number):
             await asyncio.sleep(0.02)
         process.send_signal(number)
         for client in clients:
-            assert await client.wait_until_lost(PATIENCE)
+            with pytest.raises(LostError):
+                await client.wait_for(lambda: False, PATIENCE)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
@@ -96,6 +97,20 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
     assert main(["--task", "nothing"]) == 2
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
     assert "found 'nothing'" in capsys.readouterr().err
+
+
+def test_measurements_are_a_subcommand(capsys):
+    assert main(["evaluate", "starts", "--task", "nothing"]) == 2
+    assert capsys.readouterr().err.startswith("dt-viz evaluate starts: --task: found 'nothing'")
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    assert "dt-viz evaluate --help" in capsys.readouterr().out
+
+
+def test_numpy_is_not_imported_before_its_threads_are_limited():
+    program = "import sys, dt_viz.cli; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
 def test_what_is_no_origin_is_refused(capsys):

@@ -27,6 +27,7 @@ from dt_viz.arm.robot import LinkMesh, collision_meshes, package_folder, urdf_pa
 from dt_viz.arm.tracking import inverse_kinematics, track
 from dt_viz.obstacles.shapes import Box, Cylinder, MeshObstacle, Quaternion, Sphere
 from dt_viz.obstacles.solids import Solid
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 HAND = 6
 FOLDED = np.array([0.0, np.pi, 0.5, 0.0, 5.7, 0.0])  # the hand in the upper arm
@@ -150,7 +151,7 @@ class TestObstacle:
         report = model.report(robot.home[None], Sphere((2.0, 0.0, 0.0)))
         assert report.depth == 0.0
         assert report.obstacle.distance > 1.0
-        assert report.problems == ()
+        assert report.warnings == ()
 
     def test_inside_of_the_links_is_told_from_outside(self, model):
         for link, solid in zip(model.links, solids(), strict=True):
@@ -322,7 +323,7 @@ class TestItself:
     def test_folded_into_itself(self, model):
         report = model.report(FOLDED[None], Sphere((2.0, 0.0, 0.0)))
         assert report.itself == Nearest(0.0, ("link 2", "link 6"), 0.0)
-        assert report.problems == ("link 6 hits link 2",)
+        assert [str(warning) for warning in report.warnings] == ["link 6 hits link 2"]
 
     def test_found_between_samples(self, model):
         folded = np.array([0.0, np.pi, 0.5, np.pi, 1.5, 0.0])
@@ -364,7 +365,9 @@ class TestTable:
         assert report.table.links[0].startswith("finger tip")
         assert report.table.at == 19.0
         assert report.table.distance < -0.04
-        assert report.problems == (f"{report.table.links[0]} is {-1e3 * report.table.distance:.0f} mm below the table",)
+        (warning,) = report.warnings
+        below = f"{-1e3 * report.table.distance:.0f} mm below the table"
+        assert warning == MotionWarning(Kind.ARM_BELOW_TABLE, f"{report.table.links[0]} is {below}", ARM)
 
     def test_what_stands_on_the_table_does_not_count(self, model, robot):
         assert model.nearest_to_table(robot.home[None]).distance > 0.2
@@ -382,10 +385,10 @@ def test_the_report_says_what_is_wrong():
         Nearest(-0.0124, ("link 3",), 1.0), Nearest(0.004, ("base", "link 5"), 0.0), Nearest(-0.03, ("link 6",), 2.5)
     )
     assert bad.depth == 0.0124
-    assert bad.problems == (
-        "link 3 enters the obstacle by 12 mm",
-        "link 5 comes within 4 mm of base",
-        "link 6 is 30 mm below the table",
+    assert bad.warnings == (
+        MotionWarning(Kind.ARM_ENTERS, "link 3 enters the obstacle by 12 mm", ARM),
+        MotionWarning(Kind.ARM_HITS_ITSELF, "link 5 comes within 4 mm of base", ARM),
+        MotionWarning(Kind.ARM_BELOW_TABLE, "link 6 is 30 mm below the table", ARM),
     )
     good = CollisionReport(Nearest(0.02, ("link 3",), 1.0), Nearest(0.03, ("base", "link 5"), 0.0), bad.obstacle)
     assert good.depth == 0.0

@@ -3,6 +3,7 @@
 import asyncio
 import functools
 import logging
+import math
 import socket
 import time
 import urllib.error
@@ -24,10 +25,60 @@ from dt_viz.ui import gate
 from dt_viz.ui.origins import Origin
 from dt_viz.ui.server import MAX_WAITING, Server
 
+PART = 512 * 1024
+"""Size of a part of an upload, bytes, as in viser's own page."""
 PATIENCE = 90.0
 """Seconds that anything may take: the machine may be busy."""
 UPLOAD = "Mesh or point cloud"
 NUM_PLACES = 2
+
+
+class Client(ProtocolClient):
+    """A visitor who also sets controls and sends files."""
+
+    def find(self, label: str) -> str:
+        """Return the identifier of the control with this label. Raises KeyError."""
+        for uuid, control in self.controls.items():
+            if control.get("label") == label:
+                return uuid
+        raise KeyError(label)
+
+    async def set(self, label: str, value: bool | float | str) -> None:
+        """Set the value of a control."""
+        await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
+
+    async def upload(
+        self, label: str, name: str, content: bytes, *, announced: int | None = None, transfer: str = "transfer"
+    ) -> None:
+        """Send a file with an upload button.
+
+        Args:
+            label: label of the button.
+            name: name of the file.
+            content: all its bytes.
+            announced: announced number of bytes; the true one if None.
+            transfer: identifier of the transfer.
+        """
+        size = len(content) if announced is None else announced
+        common = {"source_component_uuid": self.find(label), "transfer_uuid": transfer}
+        parts = [content[k : k + PART] for k in range(0, len(content), PART)]
+        await self.send(
+            "FileTransferStartUpload",
+            **common,
+            filename=name,
+            mime_type="",
+            part_count=math.ceil(size / PART),
+            size_bytes=size,
+        )
+        for index, part in enumerate(parts):
+            await self.send("FileTransferPart", **common, part_index=index, content=part)
+
+    async def wait_until_lost(self, seconds: float) -> bool:
+        """Wait until the server has closed the connection; False if it does not in time."""
+        try:
+            return await self.wait_for(lambda: False, seconds)
+        except LostError:
+            return True
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +92,7 @@ def server(fits):
 @pytest.fixture
 def url(server):
     """Of the WebSocket; nobody is left over from another test."""
-    wait_until(lambda: not server._server.get_clients() and not server.num_sessions)
+    wait_until(lambda: not server._server.get_clients() and not server.visitors)
     return f"ws://127.0.0.1:{server.port}"
 
 
@@ -157,7 +208,7 @@ async def test_a_page_of_another_version_is_told_so_as_viser_does(url, capfd):
 async def test_there_are_only_so_many_connections(url, server):
     async with AsyncExitStack() as stack:
         for _ in range(NUM_PLACES + MAX_WAITING):
-            await stack.enter_async_context(ProtocolClient(url))
+            await stack.enter_async_context(Client(url))
         assert await status_of(url) == 503
     await come_true(lambda: not server._server._websock_server._live_connections)
     assert await status_of(url) == 101
@@ -167,9 +218,9 @@ async def test_there_are_only_so_many_connections(url, server):
 async def test_who_waits_is_told_that_all_places_are_taken(url, server):
     async with AsyncExitStack() as stack:
         for _ in range(NUM_PLACES):
-            await (await stack.enter_async_context(ProtocolClient(url))).look()
-        await come_true(lambda: server.num_sessions == NUM_PLACES)
-        async with ProtocolClient(url) as client:
+            await (await stack.enter_async_context(Client(url))).look()
+        await come_true(lambda: len(server.visitors) == NUM_PLACES)
+        async with Client(url) as client:
             await client.look()
             assert await client.wait_for(
                 lambda: any("places are taken" in str(control) for control in client.controls.values()), PATIENCE
@@ -214,7 +265,7 @@ async def test_what_the_page_does_not_use_is_not_served(url, server, monkeypatch
     monkeypatch.setattr(server._server, "request_share_url", lambda: asked.append("share"))
     monkeypatch.setattr(server._server, "disconnect_share_url", lambda: asked.append("unshare"))
     kept = server._server._websock_server._broadcast_buffer.message_from_id
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         before = len(kept)
         await client.send("ShareUrlRequest")
@@ -261,7 +312,7 @@ MALFORMED = {
 @pytest.mark.parametrize("raw", MALFORMED.values(), ids=MALFORMED)
 @asynchronous
 async def test_a_message_that_no_page_sends_ends_its_connection(url, raw, caplog, capfd):
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await client.look()
         await client.send_raw(raw)
         assert await client.wait_until_lost(PATIENCE)
@@ -272,7 +323,7 @@ async def test_a_message_that_no_page_sends_ends_its_connection(url, raw, caplog
 
 @asynchronous
 async def test_it_ends_no_other_connection(url):
-    async with ProtocolClient(url) as client, ProtocolClient(url) as other:
+    async with Client(url) as client, Client(url) as other:
         await open_page(client)
         await other.look()
         await other.send_raw(b"\xc1")
@@ -282,7 +333,7 @@ async def test_it_ends_no_other_connection(url):
 
 @asynchronous
 async def test_forged_values_change_nothing_and_break_nothing(url, server):
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         (visitor,) = server.visitors
         before = visitor.session.scenario
@@ -310,13 +361,16 @@ async def test_forged_values_change_nothing_and_break_nothing(url, server):
         await client.send("GetRenderResponseMessage", payload=b"", render_uuid="nothing")
         assert await answers(client)
         after = visitor.session.scenario
-        assert (after.margin, after.obstacles[0].position) == (before.margin, before.obstacles[0].position)
+        assert (after.avoidance.margin, after.obstacles[0].position) == (
+            before.avoidance.margin,
+            before.obstacles[0].position,
+        )
         np.testing.assert_array_equal(visitor.client.camera.position, camera)
 
 
 @asynchronous
 async def test_a_flood_is_slowed_down(url):
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         began = time.monotonic()
         for _ in range(3 * gate.MAX_RATE):
@@ -327,7 +381,7 @@ async def test_a_flood_is_slowed_down(url):
 
 @asynchronous
 async def test_what_callbacks_raise_is_in_the_log_without_what_was_sent(url, caplog, capfd):
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         caplog.clear()
         await client.set("Margin [cm]", "secret")
@@ -342,7 +396,7 @@ async def test_what_callbacks_raise_is_in_the_log_without_what_was_sent(url, cap
 @asynchronous
 async def test_a_visitor_who_does_not_listen_costs_no_memory(url, server):
     """What is not sent yet is replaced by what is newer."""
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         client._receiving.cancel()
         await client.grab()
@@ -369,7 +423,7 @@ def parts_held(server):
 
 @asynchronous
 async def test_a_file_that_is_announced_too_large_is_refused_before_any_of_it_is_held(url, server):
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         await client.upload(UPLOAD, "large.stl", bytes(3 * 2**20), announced=MAX_BYTES + 1)
         assert await client.wait_for(lambda: client.notices, PATIENCE)
@@ -380,7 +434,7 @@ async def test_a_file_that_is_announced_too_large_is_refused_before_any_of_it_is
 
 @asynchronous
 async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         with pytest.raises(LostError):
             await client.upload(UPLOAD, "x.stl", bytes(3 * 2**20), announced=2**20 + 1)
@@ -390,7 +444,7 @@ async def test_a_file_that_is_larger_than_announced_ends_the_connection(url):
 
 @asynchronous
 async def test_files_that_were_given_up_are_not_held(url, server):
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         for k in range(10):
             await client.upload(UPLOAD, "x.stl", bytes(2**20), announced=2**21, transfer=f"{k}")
@@ -404,7 +458,7 @@ async def test_files_that_were_given_up_are_not_held(url, server):
 @asynchronous
 async def test_a_file_that_keeps_to_it_arrives(url, server):
     """The panel says what is wrong with it: it is no mesh."""
-    async with ProtocolClient(url) as client:
+    async with Client(url) as client:
         await open_page(client)
         await client.upload(UPLOAD, "x.stl", bytes(2**20))
         assert await client.wait_for(lambda: client.notices, PATIENCE)

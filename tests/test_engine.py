@@ -6,22 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import used_fraction
+from scenes import biases, changed, kinds, says
 
 import dt_viz.engine.engine as engine_module
 import dt_viz.engine.turns as turns_module
-from dt_viz.arm.retiming import used_fraction
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.engine.turns import Turns
 from dt_viz.flows import rollouts
 from dt_viz.interruption import interruptible
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.motion import diagnostics as doubts
-from dt_viz.motion.diagnostics import MAX_TARGET_MISS, UNSAMPLED
+from dt_viz.motion import diagnostics
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import plane_of, switched, with_bias_point
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.scenario.stack import plane_of, switched
+from dt_viz.transforms.bias import MAX_TARGET_MISS, BiasPoint
+from dt_viz.warning import Kind
 
 PATIENCE = 60
 """Seconds after which threads that should have ended are given up; nothing takes that long."""
@@ -41,7 +42,7 @@ def stage(engine, scenario, wanted):
 
 def placed(scenario, position, diameter=0.15, **changes):
     x, y, z = (float(c) for c in position)
-    return replace(scenario, obstacles=(Sphere((x, y, z), diameter),), **changes)
+    return changed(scenario, obstacles=(Sphere((x, y, z), diameter),), **changes)
 
 
 def mean_end(task):
@@ -64,7 +65,7 @@ def depth(frame):
 def assert_finite(frame):
     for path, times in zip(frame.rollouts, frame.times, strict=True):
         assert np.isfinite(path).all() and np.isfinite(times).all()
-    assert np.isfinite(frame.reached).all() and np.isfinite(frame.health.clearance)
+    assert np.isfinite(frame.reached).all() and np.isfinite(frame.certificates.clearance)
     field = frame.pictures.field
     if field is not None:
         assert np.isfinite(field.points).all() and np.isfinite(field.velocities).all()
@@ -82,24 +83,25 @@ def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(eng
         assert len(frame.rollouts) == len(frame.times) == len(frame.ghost) == len(frame.task.demonstrations)
         assert (frame.pictures.field is not None) == (frame.stage >= Stage.LIVE)
         assert (frame.arm is not None) == (frame.stage >= Stage.LIVE)
-        assert (frame.health.min_det_jacobian is not None) == (frame.stage >= Stage.CERTIFIED)
+        assert (frame.certificates.min_det_jacobian is not None) == (frame.stage >= Stage.CERTIFIED)
         assert_finite(frame)
         for path, times in zip(frame.rollouts, frame.times, strict=True):
             assert len(path) == len(times)
             assert (np.diff(times) > 0).all() and times[0] == pytest.approx(0, abs=1e-9)
 
 
-def test_the_first_picture_is_clear_healthy_and_undoubted(engine, scenario):
+def test_the_first_picture_is_clear_and_certified_without_warnings(engine, scenario):
     live = stage(engine, scenario, Stage.LIVE)
     assert depth(live) == 0
-    assert live.health.clearance > MARGIN_KEPT * scenario.margin
+    assert live.certificates.clearance > MARGIN_KEPT * scenario.avoidance.margin
     certified = stage(engine, scenario, Stage.CERTIFIED)
-    health = certified.health
+    certificates = certified.certificates
     assert depth(certified) == 0
-    assert health.min_det_jacobian is not None and health.min_det_jacobian > 0
-    assert health.round_trip_error is not None and health.round_trip_error < 1e-6
-    assert health.lyapunov_falls is True
-    assert health.doubts == ()
+    assert certificates.min_det_jacobian is not None and certificates.min_det_jacobian > 0
+    assert certificates.round_trip_error is not None and certificates.round_trip_error < 1e-6
+    assert certificates.lyapunov_falls is True
+    assert certificates.collision is not None
+    assert set(certificates.warnings) <= set(certificates.collision.warnings)  # only the hand gives way
 
 
 def poses_near(paths, num, seed):
@@ -121,7 +123,7 @@ def test_no_drawn_segment_crosses_the_obstacle_wherever_it_stands(engine, initia
             if frame.stage in (Stage.LIVE, Stage.FINE):
                 where = f"obstacle at {pose}, {frame.stage.name}"
                 assert depth(frame) == 0, where
-                assert frame.health.clearance > 0.8 * frame.scenario.margin, where
+                assert frame.certificates.clearance > 0.8 * frame.scenario.avoidance.margin, where
                 tolerance = 1e-5 if frame.stage is Stage.FINE else 5e-4
                 np.testing.assert_allclose(starts_of(frame), starts, rtol=0, atol=tolerance, err_msg=where)
                 goals = np.broadcast_to(frame.goal, ends_of(frame).shape)
@@ -150,7 +152,10 @@ def test_an_obstacle_that_nearly_touches_the_goal_is_cleared_and_a_missed_goal_i
     frame = stage(engine, beside_goal(engine, scenario, 0.15, clearance), Stage.FINE)
     assert depth(frame) < 1e-5
     missed = np.linalg.norm(frame.reached - frame.goal)
-    assert missed < 1e-4 or any("beside" in doubt for doubt in frame.health.doubts), (missed, frame.health.doubts)
+    assert missed < 1e-4 or Kind.GOAL_MISSED in kinds(frame.certificates.warnings), (
+        missed,
+        frame.certificates.warnings,
+    )
 
 
 @pytest.mark.parametrize("offset", [(0.02, 0.0, 0.03), (-0.03, 0.01, -0.02), (0.0, 0.0, 0.07), (0.001, 0.0, 0.0)])
@@ -161,13 +166,13 @@ def test_motions_to_a_covered_goal_stay_outside_and_end_beside_the_obstacle(engi
         frame = stage(engine, placed(scenario, centre, 0.15), wanted)
         assert depth(frame) < 1e-5
         assert np.linalg.norm(frame.reached - centre) < 0.075 + 0.03  # the margin, or the obstacle's own image of it
-        assert any("goal is inside" in doubt for doubt in frame.health.doubts)
+        assert Kind.GOAL_COVERED in kinds(frame.certificates.warnings)
 
 
 def test_without_avoidance_the_rollouts_are_the_ghost(engine, scenario):
-    without = replace(scenario, avoidance=False)
+    without = changed(scenario, avoids=False)
     for frame in engine.frames(without):
-        assert frame.health.duration is None
+        assert frame.durations == (None,)
         for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
             if frame.stage <= Stage.LIVE:
                 np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
@@ -177,13 +182,13 @@ def test_without_avoidance_the_rollouts_are_the_ghost(engine, scenario):
 
 def test_with_an_obstacle_far_away_nothing_changes(engine, scenario):
     frame = stage(engine, placed(scenario, (3.0, 3.0, 3.0)), Stage.LIVE)
-    assert frame.health.duration == 0
+    assert frame.durations == (0,)
     for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
         np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
 
 
 def test_without_imitation_motions_are_straight(engine, scenario):
-    frame = stage(engine, replace(scenario, imitation=False, avoidance=False), Stage.LIVE)
+    frame = stage(engine, changed(scenario, imitation=False, avoids=False), Stage.LIVE)
     for path, start in zip(frame.rollouts, frame.task.starts, strict=True):
         np.testing.assert_allclose(path[[0, -1]], [start, frame.goal], rtol=0, atol=1e-12)
         along = (frame.goal - start) / np.linalg.norm(frame.goal - start)
@@ -203,21 +208,21 @@ def test_the_field_is_drawn_outside_the_obstacle_and_is_the_velocity_of_the_moti
 
 
 AWKWARD = {
-    "on the goal": ("goal", 0.15, "goal is inside the obstacle"),
-    "on a start": ("start", 0.15, "inside the obstacle"),
-    "around everything": ("middle", 2.0, "inside the obstacle"),
+    "on the goal": ("goal", 0.15, Kind.GOAL_COVERED),
+    "on a start": ("start", 0.15, Kind.START_COVERED),
+    "around everything": ("middle", 2.0, Kind.START_COVERED),
 }
 
 
 @pytest.mark.parametrize("case", AWKWARD)
 @pytest.mark.parametrize("imitation", [True, False])
 def test_an_awkward_obstacle_is_said_in_words_and_everything_stays_finite(engine, scenario, case, imitation):
-    where, diameter, words = AWKWARD[case]
+    where, diameter, kind = AWKWARD[case]
     task = engine.task(scenario.task)
     position = {"goal": mean_end(task), "start": task.starts[0], "middle": scenario.obstacles[0].position}[where]
     for frame in engine.frames(placed(scenario, position, diameter, imitation=imitation)):
         assert_finite(frame)
-        assert any(words in doubt for doubt in frame.health.doubts), frame.health.doubts
+        assert kind in kinds(frame.certificates.warnings), frame.certificates.warnings
         if frame.stage is Stage.FINE:
             break
 
@@ -225,9 +230,9 @@ def test_an_awkward_obstacle_is_said_in_words_and_everything_stays_finite(engine
 @pytest.mark.parametrize("duration", [None, 0.0, 0.3])
 @pytest.mark.parametrize("generator", ["probability", "free-space"])
 def test_a_motion_either_clears_the_obstacle_or_that_is_said(engine, scenario, generator, duration):
-    frame = stage(engine, replace(scenario, generator=generator, duration=duration), Stage.LIVE)
+    frame = stage(engine, changed(scenario, generator=generator, duration=duration), Stage.LIVE)
     assert_finite(frame)
-    assert (depth(frame) == 0) != bool(frame.health.doubts)
+    assert (depth(frame) == 0) != bool(frame.certificates.warnings)
 
 
 def test_an_edit_of_the_view_gives_the_same_motion(engine, scenario):
@@ -244,7 +249,7 @@ def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
         hand = robot.end_effector(frame.arm.q)
         path = frame.rollouts[chosen]
         nearest = np.linalg.norm(hand[:, None] - path, axis=-1).min(axis=1)
-        said = any("arm misses" in doubt for doubt in frame.health.doubts)
+        said = Kind.PATH_MISSED in kinds(frame.certificates.warnings)
         assert said or nearest.max() < 1e-3
         assert frame.arm.times[0] == frame.times[chosen][0]
         assert frame.arm.times[-1] >= frame.times[chosen][-1]  # later where the joints cannot keep up
@@ -253,10 +258,10 @@ def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
 
 @pytest.mark.parametrize(("beyond", "radius"), [((0.0, 0.2, 0.15), 0.4), ((0.0, 0.05, 0.05), 0.2)])
 def test_times_increase_where_a_strong_bias_stretches_space_at_the_goal(engine, initial, robot, beyond, radius):
-    scenario = replace(initial("drop_pots"), obstacles=())
+    scenario = changed(initial("drop_pots"), obstacles=())
     target = mean_end(engine.task("drop_pots")) + np.array(beyond)
     point = BiasPoint(as_point(target), radius=radius, strength=4.0)
-    frames = engine.frames(replace(scenario, layers=with_bias_point((), point)))
+    frames = engine.frames(changed(scenario, layers=biases(point)))
     for frame in itertools.islice(frames, Stage.CERTIFIED):  # certificates change no times
         for times in frame.times:
             assert (np.diff(times) > 0).all()
@@ -276,7 +281,7 @@ def test_refining_ends_where_a_checkpoint_says_so(engine, scenario):
     assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     with pytest.raises(UnwantedError):
         next(frames)
-    assert stage(engine, scenario, Stage.CERTIFIED).health.lyapunov_falls  # nothing is left locked
+    assert stage(engine, scenario, Stage.CERTIFIED).certificates.lyapunov_falls  # nothing is left locked
 
 
 @pytest.mark.parametrize("space", ["task", "both"])
@@ -287,9 +292,9 @@ def test_what_follows_a_hand_ends_where_the_thread_is_interrupted(new_engine, in
     def refuse():
         raise ClosedError
 
-    engine, scenario, passed = new_engine(), replace(initial("draw_s"), space=space), []
+    engine, scenario, passed = new_engine(), changed(initial("draw_s"), space=space), []
     with interruptible(lambda: passed.append(None)):
-        frames = engine.frames(replace(scenario, margin=0.012))
+        frames = engine.frames(changed(scenario, margin=0.012))
         assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     assert len(passed) > 20
     with pytest.raises(ClosedError), interruptible(refuse):
@@ -300,13 +305,13 @@ def test_what_follows_a_hand_ends_where_the_thread_is_interrupted(new_engine, in
 def test_a_motion_that_would_take_too_many_samples_says_so(new_engine, initial, monkeypatch):
     scenario = initial("draw_s")
     frame = stage(new_engine(), scenario, Stage.FINE)
-    assert not frame.health.says(UNSAMPLED)
+    assert Kind.UNSAMPLED not in kinds(frame.certificates.warnings)
     most = sum(len(path) for path in frame.rollouts) - 5
-    for module in (rollouts, doubts):
+    for module in (rollouts, diagnostics):
         monkeypatch.setattr(module, "MAX_SAMPLES", most)
     frame = stage(new_engine(), scenario, Stage.FINE)
     assert sum(len(path) for path in frame.rollouts) == most
-    assert frame.health.says(UNSAMPLED)
+    assert Kind.UNSAMPLED in kinds(frame.certificates.warnings)
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
@@ -314,7 +319,7 @@ def test_wherever_refining_is_interrupted_it_leaves_nothing_half_done(new_engine
     class UnwantedError(Exception):
         pass
 
-    scenario, engine, passed = replace(initial("draw_s"), space=space), new_engine(), []
+    scenario, engine, passed = changed(initial("draw_s"), space=space), new_engine(), []
     expected = [*new_engine().frames(scenario, checkpoint=lambda: passed.append(None))][-1]
     assert len(passed) > 100  # all along, not between a few long parts
     for moment in (0.05, 0.5, 0.95):
@@ -327,12 +332,13 @@ def test_wherever_refining_is_interrupted_it_leaves_nothing_half_done(new_engine
         with pytest.raises(UnwantedError):
             list(new_engine().frames(scenario, checkpoint=refuse))
         with pytest.raises(UnwantedError):
-            list(engine.frames(replace(scenario, margin=0.01 * moment), checkpoint=refuse))
+            list(engine.frames(changed(scenario, margin=0.01 * moment), checkpoint=refuse))
     found = [*engine.frames(scenario)][-1]
     for path, times, same, at in zip(found.rollouts, found.times, expected.rollouts, expected.times, strict=True):
         np.testing.assert_allclose(path, same, rtol=0, atol=1e-9)
         np.testing.assert_allclose(times, at, rtol=0, atol=1e-9)
-    assert found.health == expected.health
+    assert (found.certificates, found.durations) == (expected.certificates, expected.durations)
+    assert found.arm_duration == expected.arm_duration
 
 
 def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
@@ -388,7 +394,7 @@ def test_engines_that_take_turns_at_every_checkpoint_all_get_their_first_frames(
     """Whatever one of them has half computed when it gives its turn away, the others can go on."""
     monkeypatch.setattr(turns_module, "SLICE", -1.0)
     monkeypatch.setattr(engine_module, "_turns", Turns())  # a deadlock is this test's own
-    scenario, barrier, done = replace(initial("draw_s"), space=space), threading.Barrier(4), []
+    scenario, barrier, done = changed(initial("draw_s"), space=space), threading.Barrier(4), []
 
     def open_page():
         engine = new_engine()
@@ -406,13 +412,13 @@ def test_engines_that_take_turns_at_every_checkpoint_all_get_their_first_frames(
 def random_edit(rng, scenario, initial):
     kind = rng.integers(0, 6)
     if kind == 0:
-        return replace(initial(str(rng.choice(TASK_NAMES))), temperature=scenario.temperature)
+        return changed(initial(str(rng.choice(TASK_NAMES))), temperature=scenario.avoidance.temperature)
     if kind == 1:
-        return replace(scenario, generator=str(rng.choice(["free-space", "probability"])), duration=0.4)
+        return changed(scenario, generator=str(rng.choice(["free-space", "probability"])), duration=0.4)
     if kind == 2:
-        return replace(scenario, imitation=bool(rng.integers(2)), avoidance=bool(rng.integers(2)))
+        return changed(scenario, imitation=bool(rng.integers(2)), avoids=bool(rng.integers(2)))
     if kind == 3:
-        return replace(scenario, arm_rollout=int(rng.integers(7)), temperature=float(rng.uniform(1, 12)))
+        return changed(scenario, arm_rollout=int(rng.integers(7)), temperature=float(rng.uniform(1, 12)))
     position = np.array(scenario.obstacles[0].position) + rng.normal(size=3) * 0.03
     return placed(scenario, position, float(rng.uniform(0.05, 0.2)))
 
@@ -430,7 +436,7 @@ def test_the_same_scenario_gives_the_same_frame_whatever_was_shown_before(new_en
             np.testing.assert_array_equal(left, right)
     assert a.pictures.field is not None and b.pictures.field is not None
     np.testing.assert_array_equal(a.pictures.field.velocities, b.pictures.field.velocities)
-    assert a.health == b.health
+    assert (a.certificates, a.durations, a.arm_duration) == (b.certificates, b.durations, b.arm_duration)
     assert (a.arm is None) == (b.arm is None)
 
 
@@ -471,15 +477,15 @@ def test_a_bias_point_that_motions_pass_giving_way_is_said_with_the_distance(eng
     scenario = initial("draw_s")
     target = np.add(scenario.obstacles[0].position, (0.10, 0.0, 0.0))
     point = BiasPoint(as_point(target), plane=plane_of(engine.task("draw_s")))
-    scenario = replace(scenario, space=space, layers=with_bias_point((), point))
+    scenario = changed(scenario, space=space, layers=biases(point))
     frame = stage(engine, scenario, Stage.ROLLOUTS)
     missed = max(np.linalg.norm(path - target, axis=1).min() for path in frame.rollouts)
-    told = [doubt for doubt in frame.health.doubts if "gives way to the obstacle and passes" in doubt]
+    told = [warning for warning in frame.certificates.warnings if warning.kind is Kind.TARGET_MISSED]
     assert len(told) == 1
     assert missed > MAX_TARGET_MISS
-    assert told[0].startswith("Bias 1: the arm" if space != "task" else "Bias 1: a motion")
-    said = float(told[0].split()[-4])
+    assert told[0].text.startswith("Bias 1: the arm" if space != "task" else "Bias 1: a motion")
+    said = float(told[0].text.split()[-4])
     assert said == pytest.approx(1e3 * missed, abs=2)  # the samples are that far beside the motion between them
-    off = replace(scenario, layers=switched(scenario.layers, "Bias 1"))
-    for quiet in (off, replace(scenario, warp=0.5), replace(scenario, avoidance=False)):
-        assert not any("Bias 1" in doubt for doubt in stage(engine, quiet, Stage.ROLLOUTS).health.doubts)
+    off = replace(scenario, stack=switched(scenario, "Bias 1"))
+    for quiet in (off, replace(scenario, warp=0.5), changed(scenario, avoids=False)):
+        assert not says(stage(engine, quiet, Stage.ROLLOUTS), "Bias 1")

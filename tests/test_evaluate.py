@@ -9,11 +9,10 @@ import pytest
 import scipy.io
 from PIL import Image
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.evaluate import latency, rollouts
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
-from dt_viz.evaluate.imitation import grown_grid
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
@@ -21,7 +20,7 @@ from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
-from dt_viz.learning.imitation import ImitationSettings, fit
+from dt_viz.learning.imitation import ImitationSettings, fit, grown_grid
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
 
@@ -141,7 +140,7 @@ def test_imitation_takes_other_files_in_metres_and_in_space(tmp_path):
 
 
 def test_the_grid_of_the_certificates_covers_the_box_and_half_its_size_on_every_side():
-    grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]))
+    grid = grown_grid(np.array([[0.0, 0.0], [2.0, 4.0]]), 3)
     np.testing.assert_allclose([grid.min(axis=0), grid.max(axis=0)], [[-1, -2], [3, 6]])
 
 
@@ -203,13 +202,16 @@ def test_what_is_held_out_is_not_learned_from():
 # --- latency ---
 
 
-@pytest.mark.parametrize("sessions", [1, 2])
-def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessions, capsys, monkeypatch):
+BIAS = ["--drag", "bias", "--obstacles", "0"]
+
+
+@pytest.mark.parametrize(("sessions", "dragged"), [(1, []), (2, []), (1, BIAS)])
+def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessions, dragged, capsys, monkeypatch):
     recorders, out = [Recorder() for _ in range(sessions)], tmp_path / "latency.json"
     monkeypatch.setattr(latency, "Recorder", iter(recorders).__next__)
     monkeypatch.setattr(latency, "WARM_UP_SECONDS", 0.1)
     task = ["--task", "Hook", "--lasa", str(lasa)]
-    assert main(["latency", *task, "--sessions", str(sessions), "--seconds", "0.3", "--out", str(out)]) == 0
+    assert main(["latency", *task, *dragged, "--sessions", str(sessions), "--seconds", "0.3", "--out", str(out)]) == 0
     figures = json.loads(out.read_text())
     assert figures["settings"]["edits"] == 18 * sessions == figures["frames"] + figures["skipped"]
     assert 0 < figures["rebuild_median_ms"] <= figures["median_ms"] <= figures["p95_ms"]
@@ -289,9 +291,9 @@ def test_without_avoidance_the_same_command_shows_the_collision(lasa, tmp_path, 
 
 def test_avoidance_says_what_is_not_to_be_trusted(lasa, tmp_path, capsys):
     start = run_avoidance(lasa, tmp_path / "a.npz", [0.5, -0.5, 0.9])["demo_0"][0]
-    assert "doubt" not in capsys.readouterr().out
+    assert "warning" not in capsys.readouterr().out
     run_avoidance(lasa, tmp_path / "a.npz", start)
-    assert "doubt: start 1 is inside the obstacle" in capsys.readouterr().out
+    assert "warning: start 1 is inside the obstacle" in capsys.readouterr().out
 
 
 def test_the_whole_arm_avoids_what_the_hand_alone_does_not(lasa, tmp_path, middle, robot, capsys):
@@ -343,7 +345,8 @@ def test_values_may_begin_with_a_minus():
 
 def test_starts_are_spread_over_the_grown_box_and_arrive(lasa, tmp_path, capsys):
     out = tmp_path / "starts.npz"
-    assert main(["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "600", "--out", str(out)]) == 0
+    counts = ["--count", "600", "--stepped", "30"]
+    assert main(["starts", "--task", "Hook", "--lasa", str(lasa), *counts, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     with np.load(out) as arrays:
         starts, ends, goal = arrays["starts"], arrays["ends"], arrays["goal"]
@@ -361,7 +364,8 @@ def test_the_same_seed_gives_the_same_starts(lasa, tmp_path):
     starts = []
     for seed in ("3", "3", "4"):
         out = tmp_path / "starts.npz"
-        main(["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "5", "--seed", seed, "--out", str(out)])
+        few = ["--count", "5", "--stepped", "0", "--seed", seed]
+        main(["starts", "--task", "Hook", "--lasa", str(lasa), *few, "--out", str(out)])
         with np.load(out) as arrays:
             starts.append(arrays["starts"])
     assert (starts[0] == starts[1]).all() and (starts[0] != starts[2]).any()
@@ -370,9 +374,9 @@ def test_the_same_seed_gives_the_same_starts(lasa, tmp_path):
 @pytest.mark.parametrize("wrong", ["velocity", "flow"])
 def test_starts_fail_where_stepping_leads_elsewhere_than_the_closed_form(lasa, monkeypatch, capsys, wrong):
     """Either side may be the wrong one: f of the base system, or its closed form; arrival alone would not tell."""
-    arguments = ["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "20", "--stepped", "20"]
+    arguments = ["starts", "--task", "Hook", "--lasa", str(lasa), "--count", "5", "--stepped", "5"]
     assert main(arguments) == 0
-    assert "20 of 20" in capsys.readouterr().out.split("stepped by eq. (1)")[1]
+    assert "5 of 5" in capsys.readouterr().out.split("stepped by eq. (1)")[1]
     real = getattr(TimedAttractor, wrong)
     slower = {"velocity": lambda self, z: 0.97 * real(self, z), "flow": lambda self, z, t: real(self, z, 0.97 * t)}
     monkeypatch.setattr(TimedAttractor, wrong, slower[wrong])
@@ -452,7 +456,10 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
         (["latency", "--task", "none", "--seconds", "1", "--out", "a.json"], "--task: found 'none'; accepted: draw_s,"),
         (["velocity", *TASK, "--out", "a.txt"], "--out: found 'a.txt'; accepted: a file that ends in .json"),
         (["latency", *TASK, "--seconds", "1", "--out", "a.txt"], "--out: found 'a.txt'; accepted: a file that ends in"),
-        (["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"], "no: folder: found nothing that can"),
+        (
+            ["latency", *TASK, "--lasa", "no", "--seconds", "1", "--out", "a.json"],
+            "no: folder: found something that cannot",
+        ),
         (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),
         (["starts", *TASK, "--out", "folder.npz"], "--out: found 'folder.npz', which cannot be written"),
         (["imitation", "Hook.mat", "--folds", "2", "--out", "out"], "--folds: found 2; accepted: it together with"),
@@ -479,7 +486,7 @@ def test_what_cannot_be_used_is_named(lasa, tmp_path, monkeypatch, capsys, argum
         (["avoidance", *TASK, "--obstacle", "0,0,0", "--diameter", "-1"], "argument --diameter: found '-1'; accepted"),
         (
             ["avoidance", *TASK, *SPHERE, "--space", "joint"],
-            "argument --space: found 'joint'; accepted: task, cspace, both",
+            "argument --space: invalid choice: 'joint'",
         ),
         (["starts", *TASK, "--count", "many"], "argument --count: found 'many'; accepted: a whole number, 1 or more"),
         (["imitation", "Hook.mat"], "the following arguments are required: --out"),

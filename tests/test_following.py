@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import changed, kinds
 
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
-from dt_viz.engine.engine import Engine, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
 from dt_viz.motion.solve import LIVE, solve
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.warning import Kind
 
 FAR = Sphere((3.0, 3.0, 3.0))
 
@@ -23,7 +26,7 @@ def around(point, diameter=0.15):
 
 
 def placed(scenario, *obstacles, **changes):
-    return replace(scenario, obstacles=obstacles, space="cspace", **changes)
+    return changed(scenario, obstacles=obstacles, space="cspace", **changes)
 
 
 @pytest.fixture(scope="module", name="nominal")
@@ -59,13 +62,12 @@ class TestObstructions:
     def test_a_covered_start_is_named(self, follower, nominal):
         away = np.linalg.norm(nominal.task.starts - nominal.task.starts[2], axis=1)
         (reason,) = self.reasons(follower, nominal, around(nominal.task.starts[2], 0.12))
-        assert reason.startswith("start") and "3" in reason and "inside the obstacle" in reason
-        assert (away[[k for k in range(7) if str(k + 1) in reason]] < 0.15).all()
+        assert reason.kind is Kind.START_COVERED and reason.text.startswith("start") and "3" in reason.text
+        assert (away[[k for k in range(7) if str(k + 1) in reason.text]] < 0.15).all()
 
     def test_a_covered_goal_is_named(self, follower, nominal):
-        assert self.reasons(follower, nominal, around(nominal.goal, 0.15)) == (
-            "the goal is inside the obstacle: the arm there touches it",
-        )
+        (reason,) = self.reasons(follower, nominal, around(nominal.goal, 0.15))
+        assert reason.kind is Kind.GOAL_COVERED and "the arm there touches it" in reason.text
 
     def test_what_fits_between_the_fingers_does_not_cover_the_goal(self, follower, nominal):
         assert self.reasons(follower, nominal, around(nominal.goal, 0.04)) == ()
@@ -73,7 +75,7 @@ class TestObstructions:
     @pytest.mark.parametrize(("height", "name"), [(0.05, "base"), (0.2, "link 1")])
     def test_what_touches_the_pedestal_is_said_to(self, follower, nominal, height, name):
         (reason,) = self.reasons(follower, nominal, around((0.0, 0.08, height), 0.1))
-        assert name in reason and "cannot move away" in reason
+        assert name in reason.text and "cannot move away" in reason.text
 
     def test_the_spheres_that_cover_the_arm_are_no_reason_while_its_meshes_are_free(self, follower, nominal):
         """An obstacle between the sphere and the mesh of a hand at rest."""
@@ -90,7 +92,8 @@ class TestObstructions:
         nominal = too_far._nominal(initial("push_box"), None)
         follower = Follower(robot)
         (reason,) = follower.obstructions(nominal, Union((FAR,)))
-        assert "cannot reach the starts" in reason and "no configuration reaches" in reason
+        assert reason.kind is Kind.OUT_OF_REACH
+        assert "cannot reach the starts" in reason.text and "no configuration reaches" in reason.text
         for _ in range(2):  # the second answer is the remembered one
             with pytest.raises(UnreachableError):
                 follower.undisturbed(nominal)
@@ -103,7 +106,7 @@ class TestFollowing:
 
     @pytest.mark.parametrize(("exact", "tolerance"), [(False, 1e-3), (True, 1e-8)])
     def test_behaviours_of_the_hand_are_followed(self, follower, nominal, initial, robot, exact, tolerance):
-        solution = solve(nominal, replace(initial("push_box"), space="both"), LIVE)
+        solution = solve(nominal, changed(initial("push_box"), space="both").active, LIVE)
         lifted = follower.behaving(nominal, solution, exact=exact)
         assert lifted.fractions.shape == (7, NUM_CONFIGURATIONS)
         assert (np.diff(lifted.fractions, axis=1) > 0).all()
@@ -116,21 +119,21 @@ class TestFollowing:
     def test_what_was_followed_before_changes_nothing_that_is_seen(
         self, follower, nominal, initial, robot, exact, tolerance
     ):
-        wanted = solve(nominal, replace(initial("push_box"), space="both"), LIVE)
+        wanted = solve(nominal, changed(initial("push_box"), space="both").active, LIVE)
         x, y, z = initial("push_box").obstacles[0].position
-        other = replace(initial("push_box"), space="both", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
-        follower.behaving(nominal, solve(nominal, other, LIVE), exact=False)
+        other = changed(initial("push_box"), space="both", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
+        follower.behaving(nominal, solve(nominal, other.active, LIVE), exact=False)
         again = follower.behaving(nominal, wanted, exact=exact).tracked.q
         fresh = Follower(robot).behaving(nominal, wanted, exact=exact).tracked.q
         np.testing.assert_allclose(again, fresh, rtol=0, atol=tolerance)
 
-    def test_doubts_say_what_misses_its_path(self, follower, nominal):
+    def test_warnings_say_what_misses_its_path(self, follower, nominal):
         path = np.linspace([0.0, -0.5, 0.2], [0.0, -1.2, 0.2], NUM_ARM_SAMPLES)
         joints = follower.along(nominal, 0, path, exact=False)
-        doubts = follower.doubts(joints, 4)
-        assert any("misses the path of rollout 5" in doubt for doubt in doubts)
-        assert any("stretched out" in doubt for doubt in doubts)
-        assert follower.doubts(follower.undisturbed(nominal).tracked, 0) == ()
+        missed, damped = follower.warnings(joints, 4)
+        assert missed.kind is Kind.PATH_MISSED and "misses the path of rollout 5" in missed.text
+        assert damped.kind is Kind.DAMPED
+        assert follower.warnings(follower.undisturbed(nominal).tracked, 0) == ()
 
 
 class TestBlocked:
@@ -146,10 +149,10 @@ class TestBlocked:
         assert [frame.stage for frame in frames] == list(Stage)
         for frame in frames:
             assert frame.scenario == covered
-            assert any("goal is inside" in reason for reason in frame.blocked)
+            assert Kind.GOAL_COVERED in kinds(frame.blocked)
             assert frame.arm is good.arm and frame.rollouts is good.rollouts
-            assert frame.health.clearance < 0  # of the motion that is shown, from the obstacle where it is now
-            assert frame.health.min_det_jacobian is None  # certificates of another scenario certify nothing
+            assert frame.certificates.clearance < 0  # of the motion that is shown, from the obstacle where it is now
+            assert frame.certificates.min_det_jacobian is None  # certificates of another scenario certify nothing
         recovered = self.last(engine, free)
         assert recovered.blocked == ()
         for a, b in zip(recovered.rollouts, good.rollouts, strict=True):
@@ -157,7 +160,7 @@ class TestBlocked:
 
     def test_without_a_motion_before_it_is_the_undisturbed_one(self, new_engine, initial):
         frame = self.last(new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3)))
-        assert any("cannot move away" in reason for reason in frame.blocked)
+        assert Kind.ARM_BLOCKED in kinds(frame.blocked)
         for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
             assert np.linalg.norm(path[:, None] - ghost, axis=-1).min(axis=0).max() < 1e-12
 
@@ -175,5 +178,5 @@ class TestBlocked:
 
     def test_demonstrations_out_of_reach_are_shown_without_an_arm(self, too_far, initial):
         for frame in too_far.frames(placed(initial("push_box"), *initial("push_box").obstacles)):
-            assert any("cannot reach the starts" in reason for reason in frame.blocked)
-            assert frame.arm is None and np.isfinite(frame.health.clearance)
+            assert kinds(frame.blocked) == {Kind.OUT_OF_REACH}
+            assert frame.arm is None and np.isfinite(frame.certificates.clearance)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
 from pages import frame_of
+from scenes import biases, changing
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
@@ -20,7 +21,6 @@ from dt_viz.engine.engine import Engine
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import with_bias_point
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui import controls, gestures
@@ -140,13 +140,11 @@ class Page:
         """A scenario in which most controls are shown, and most things stand in the scene."""
         task = TASKS["draw_s"]()
         obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
+        avoidance = {"space": "both", "duration": 0.5, "integration": Integration("rk4", 8)}
+        layers = biases(BiasPoint(MIDDLE, radius=0.1, strength=0.5))
         self.session.edit(
             "test",
-            obstacles=obstacles,
-            space="both",
-            duration=0.5,
-            integration=Integration("rk4", 8),
-            layers=with_bias_point((), BiasPoint(MIDDLE, radius=0.1, strength=0.5)),
+            **changing(self.session.scenario, obstacles=obstacles, layers=layers, **avoidance),
             starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
             view=View(generator=True, click_to_start=True, **view),
         )
@@ -229,10 +227,10 @@ def test_a_forged_value_is_refused_or_moved_to_the_limits(page, claim, selected)
     [
         ("Diameter [cm]", 1e6, lambda s: s.obstacles[0].diameter, 0.30),
         ("Height [cm]", -1.0, lambda s: s.obstacles[0].height, 0.03),
-        ("Steps", 10**6, lambda s: s.integration.steps, 50),
+        ("Steps", 10**6, lambda s: s.avoidance.integration.steps, 50),
         ("Warp", 50.0, lambda s: s.warp, 1.0),
         ("Of flow", -9, lambda s: s.view.generator_layer, 0),
-        ("Reach T", 1e9, lambda s: s.temperature, 20.0),
+        ("Reach T", 1e9, lambda s: s.avoidance.temperature, 20.0),
         ("Warp", math.nan, lambda s: s.warp, 1.0),
         ("Learn", "nonsense", lambda s: s.objective, "trajectory"),
         ("Task", "nonsense", lambda s: s.task, "draw_s"),
@@ -319,7 +317,7 @@ def test_what_is_dragged_in_the_scene_moves_and_what_is_far_away_stays(page):
     page.drag("/starts/1", MIDDLE, (0.2, -0.4, 0.3), "start")
     after = page.session.scenario
     assert after.obstacles[0] != before.obstacles[0] and after.obstacles[1:] == before.obstacles[1:]
-    assert after.layers != before.layers and after.starts != before.starts
+    assert after.stack != before.stack and after.starts != before.starts
     for name in ("/obstacles/0/surface", "/bias/0/ball", "/starts/1"):
         page.drag(name, MIDDLE, (900.0, -0.5, 0.4))
     assert page.session.scenario == after

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import used_fraction
+from scenes import changed
 
 from dt_viz.arm.arm_system import Section
-from dt_viz.arm.retiming import used_fraction
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR
 from dt_viz.motion.solve import LIVE, solve
 
@@ -44,14 +45,14 @@ def drags(engine, scenario, robot, num=4):
 
 def test_the_hand_is_where_it_is_held_and_goes_on_to_the_goal(engine, initial, robot, task, space):
     num_right = 0
-    for frame, q, place, found in drags(engine, replace(initial(task), space=space), robot):
+    for frame, q, place, found in drags(engine, changed(initial(task), space=space), robot):
         motion, there = found.motion, robot.end_effector(found.motion.q)
         assert (motion.q >= robot.lower).all() and (motion.q <= robot.upper).all()
         assert np.abs(motion.q[0] - q).max() < 0.25 and np.abs(np.diff(motion.q, axis=0)).max() < 0.15
         assert used_fraction(motion.times, motion.q, robot.velocity_limits) < 1 + 1e-6
         np.testing.assert_allclose(there, found.path, atol=MAX_TRACKING_ERROR)
         np.testing.assert_allclose(there[-1], frame.goal, atol=1e-3)
-        if not found.doubt:
+        if not found.warning:
             num_right += 1
             np.testing.assert_allclose(there[0], place, atol=1e-3)
             assert frame.scenario.obstacle.signed_distance(there).min() > 0
@@ -60,7 +61,7 @@ def test_the_hand_is_where_it_is_held_and_goes_on_to_the_goal(engine, initial, r
 
 def test_the_motion_from_there_is_one_of_the_system(engine, initial, robot, task):
     scenario = initial(task)
-    system = solve(engine._nominal(scenario, None), scenario, LIVE).system
+    system = solve(engine._nominal(scenario, None), scenario.active, LIVE).system
     for _, _, place, found in drags(engine, scenario, robot):
         np.testing.assert_allclose(found.path[0], place, atol=1e-3)
         z = system.transform.forward(found.path)
@@ -72,7 +73,7 @@ def test_the_motion_from_there_is_one_of_the_system(engine, initial, robot, task
 
 def test_the_arm_gives_way_by_its_transform_while_it_is_held(engine, initial, robot):
     """Its postures are those of eq. (4): ψ_q leads each to the section that the undisturbed motion is lifted by."""
-    scenario = replace(initial("push_box"), space="cspace")
+    scenario = changed(initial("push_box"), space="cspace")
     for _, _, _, found in drags(engine, scenario, robot):
         solved = engine._live
         section = Section(robot, engine._follower.reference(solved.nominal))
@@ -81,7 +82,7 @@ def test_the_arm_gives_way_by_its_transform_while_it_is_held(engine, initial, ro
 
 
 def test_where_the_arm_cannot_reach_it_stretches_towards_the_pointer_and_says_so(engine, initial, robot):
-    scenario = replace(initial("push_box"), obstacles=())
+    scenario = changed(initial("push_box"), obstacles=())
     frame = shown(engine, scenario)
     q = frame.arm.q[40]
     hand = robot.end_effector(q)
@@ -92,7 +93,7 @@ def test_where_the_arm_cannot_reach_it_stretches_towards_the_pointer_and_says_so
         found = engine.held(scenario, q, place)
         q = found.motion.q[0]
         distances.append(np.linalg.norm(robot.end_effector(q) - place))
-        assert (distances[-1] > MAX_TRACKING_ERROR) == (found.doubt == "out of the arm's reach")
+        assert (distances[-1] > MAX_TRACKING_ERROR) == (found.warning == "out of the arm's reach")
         np.testing.assert_allclose(robot.end_effector(found.motion.q[-1]), frame.goal, atol=1e-3)
     shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
     least = np.linalg.norm(place - shoulder) - robot.reach
@@ -100,36 +101,36 @@ def test_where_the_arm_cannot_reach_it_stretches_towards_the_pointer_and_says_so
 
 
 def test_a_hand_that_is_held_in_the_obstacle_is_said_to_be(engine, initial, robot, space):
-    scenario = replace(initial("push_box"), space=space)
+    scenario = changed(initial("push_box"), space=space)
     frame = shown(engine, scenario)
     inside = np.array(scenario.obstacles[0].position) + np.array([0.0, 0.0, 0.03])
     near = min(frame.arm.q, key=lambda q: np.linalg.norm(robot.end_effector(q) - inside))
     found = engine.held(scenario, near, inside)
-    assert found.doubt == "inside the obstacle"
+    assert found.warning == "inside the obstacle"
     np.testing.assert_allclose(robot.end_effector(found.motion.q[-1]), frame.goal, atol=1e-3)
 
 
 @pytest.mark.parametrize("direction", [(0.5, -0.6, 0.6), (0.0, -1.0, 0.0), (-0.7, -0.1, 0.7)])
 def test_a_pointer_out_of_reach_is_said_to_be_and_no_other(engine, initial, robot, space, direction):
     """Wherever the search for the place of the motion below gives up."""
-    scenario = replace(initial("draw_s"), space=space)
+    scenario = changed(initial("draw_s"), space=space)
     frame = shown(engine, scenario)
     shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
     q = frame.arm.q[len(frame.arm.q) // 2]
     for distance in (4.0, 1.2 * robot.reach, 0.6 * robot.reach):
         place = shoulder + distance * np.array(direction) / np.linalg.norm(direction)
-        doubt = engine.held(scenario, q, place).doubt
-        assert (doubt == "out of the arm's reach") == (distance > robot.reach)
+        warning = engine.held(scenario, q, place).warning
+        assert (warning == "out of the arm's reach") == (distance > robot.reach)
 
 
-@pytest.mark.parametrize("warp", [0.0, 0.4])
-def test_under_a_warp_nothing_is_said_of_an_obstacle_that_is_not_avoided_yet(engine, initial, robot, space, warp):
+@pytest.mark.parametrize("change", [{"warp": 0.0}, {"warp": 0.4}, {"avoids": False}])
+def test_nothing_is_said_of_an_obstacle_that_is_not_avoided_or_not_yet(engine, initial, robot, space, change):
     """As of the motion itself."""
-    scenario = replace(initial("draw_s"), space=space, warp=warp)
+    scenario = changed(initial("draw_s"), space=space, **change)
     for q in shown(engine, scenario).arm.q[::50]:
         place = robot.end_effector(q)
         if scenario.obstacle.signed_distance(place) > 0:
-            assert engine.held(scenario, q, place).doubt == ""
+            assert engine.held(scenario, q, place).warning == ""
 
 
 def test_nothing_is_held_that_is_not_shown(new_engine, initial, robot):

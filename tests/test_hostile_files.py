@@ -160,7 +160,7 @@ def instances() -> bytes:
 ATTACKS = {
     "a member that bzip2 packs": ("cloud", "a.npz", bzip2_member, "stored or deflated members", 20),
     "a directory that lies": ("cloud", "a.npz", lying_header, "found", 20),
-    "a mesh in very many places": ("mesh", "a.glb", instances, "faces: found more than 500000, all instances", 20),
+    "a mesh in very many places": ("mesh", "a.glb", instances, "faces: found more than 500000 of all instances", 20),
     "short lines": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"1\n" * 9_999_990, "line 2: found 1 columns", 60),
     "short lines of demonstrations": (
         "demonstrations",

@@ -11,7 +11,7 @@ from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.flow_chain import Layer, Stack, equally_spaced_grid, min_step_determinant
-from dt_viz.learning.imitation import Imitation, ImitationSettings, fit, paper_preset
+from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.learning.unbending import unbending
 from dt_viz.learning.velocity import VelocityFit
@@ -255,7 +255,7 @@ def test_velocity_objective_gives_a_stable_invertible_system_too(dim):
 
 @pytest.mark.parametrize("objective", ["trajectory", "velocity"])
 def test_the_papers_preset_runs(objective):
-    preset = paper_preset(objective)
+    preset = ImitationSettings(objective, ell=0.005e6, num_inducing=720)  # ℓ = 0.005 for LASA in millimetres
     demonstrations = hooks(2, num=2, scale=0.3)
     imitation = fit(demonstrations, replace(preset, max_iterations=3))
     flow = imitation.transform.parts[0]
@@ -365,19 +365,19 @@ def test_demonstrations_that_never_move_are_refused_or_left_out(path):
 def test_numbers_that_are_not_finite_are_refused_by_name(value):
     path = hooks(2)[1].positions.copy()
     path[7, 1] = value
-    with pytest.raises(ImitationError, match="'hook 1': sample 7"):
+    with pytest.raises(ImitationError, match=r"'hook 1': found .* at sample 8"):
         fit(changed(1, path))
 
 
 def test_times_that_do_not_increase_are_refused_by_name():
     times = hooks(2)[3].times.copy()
     times[5] = times[4]
-    with pytest.raises(ImitationError, match="'hook 3': the time of sample 5"):
+    with pytest.raises(ImitationError, match=r"'hook 3': found .* at sample 6"):
         fit(changed(3, times=times))
 
 
 def test_no_demonstrations_are_refused():
-    with pytest.raises(ImitationError, match="no demonstrations"):
+    with pytest.raises(ImitationError, match="demonstrations: found none"):
         fit([])
 
 

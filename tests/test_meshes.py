@@ -86,7 +86,10 @@ class TestGlb:
     @pytest.mark.parametrize(
         ("changes", "words"),
         [
-            ({"nodes": [{"mesh": 0}] * 26, "scenes": [{"nodes": list(range(26))}]}, "faces: found more than 100, all"),
+            (
+                {"nodes": [{"mesh": 0}] * 26, "scenes": [{"nodes": list(range(26))}]},
+                "faces: found more than 100 of all instances",
+            ),
             ({"nodes": [{"children": [1]}, {"children": [0]}]}, "node 0 in two places, or inside itself"),
             ({"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "node 1 in two places"),
             ({"nodes": [{"mesh": -1}]}, r"no meshes\[-1\]"),

@@ -1,15 +1,24 @@
-"""A new kind of transform, as the README shows it: one file with a value like this one, one line in the layers."""
+"""A new kind of transform, as the README shows it: one file with a subclass like this one, one line in the registry."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, cast  # noqa: F401 - of the README's example
 
 import numpy as np
 import pytest
+from pages import Edited
+from scenes import avoiding, changed
 
-from dt_viz.engine.engine import Stage
-from dt_viz.flows.diffeomorphisms import Flow
+import dt_viz
+from dt_viz.engine.frame import Stage
+from dt_viz.engine.session import Session
+from dt_viz.flows.diffeomorphisms import Flow  # noqa: F401
 from dt_viz.flows.fields import Array
-from dt_viz.scenario.scenario import Layer
-from dt_viz.transforms.base import Built, Motion
+from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
+from dt_viz.transforms import registry
+from dt_viz.transforms.base import Built, MotionBelow, Number, Setting, Transform  # noqa: F401
+from dt_viz.ui.controls import Control
+from dt_viz.ui.panel.transforms import TransformsPanel, addable
 
 
 @dataclass(frozen=True)
@@ -32,48 +41,72 @@ class Whirl:
         return V, weight[:, None, None] * turn - 2 / self.radius**2 * V[:, :, None] * offset[:, None, :]
 
 
-@dataclass(frozen=True)
-class Twirl:
-    """Motions are turned around a place by an angle, radians."""
-
-    centre: tuple[float, float, float]
-    angle: float
-
-    def build(self, motion: Motion, tolerance: float, at_least: float) -> Built:
-        flow = Flow(Whirl(np.array(self.centre), 0.12), -self.angle, steps=16)
-        return Built(flow, self.angle, motion.goal)
-
-    def satisfied(self, motion: Motion) -> bool:
-        return True
+def shown_in_the_readme():
+    """The class that dt_viz/README.md shows, made from its text."""
+    text = (Path(dt_viz.__file__).parent / "README.md").read_text(encoding="utf-8")
+    code = text.split("## Adding a new transform")[1].split("```python")[1].split("```")[0]
+    names = dict(globals())
+    exec(compile("from __future__ import annotations\n" + code, "README.md", "exec"), names)
+    return names["Twirl"]
 
 
-@pytest.fixture(params=["below avoidance", "above avoidance"])
-def scenario(request, initial):
+@pytest.fixture(params=[("Twirl 1", "Avoidance"), ("Avoidance", "Twirl 1")], ids=" below ".join)
+def scenario(request, engine, initial, monkeypatch):
+    """The kind is looked up and added as the page does."""
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))  # the one line
     plain = initial("lift_box")
-    twirl = Layer(Twirl((0.2, -0.35, 0.3), 0.8), name="Twirl")  # the one line
-    return replace(plain, layers=(twirl,), avoidance_level=0 if request.param == "above avoidance" else None)
+    twirl = registry.by_title()["Twirl"].beside(surroundings(engine.task("lift_box"), plain))
+    stack, name = with_added(plain, twirl)
+    scenario = replace(plain, stack=stack)
+    if request.param[1] == name:
+        scenario = replace(scenario, stack=shifted(scenario, name, 1))
+    assert listed(scenario) == request.param
+    return scenario
 
 
-def test_a_new_transform_needs_a_value_and_a_line(engine, scenario):
+def test_a_new_transform_needs_a_file_and_a_line(engine, scenario):
+    assert set(listed(scenario)) < set(tunable(scenario))
+    assert not anchored(scenario)  # it has no handles
     *_, frame = engine.frames(scenario)
     assert frame.stage is Stage.CERTIFIED
     for path, before in zip(frame.rollouts, frame.ghost, strict=True):
         assert np.isfinite(path).all()
         np.testing.assert_allclose(path[0], before[0], atol=1e-6)
         np.testing.assert_allclose(path[-1], frame.goal, atol=1e-3)
-    assert frame.health.layer_durations == (0.8,)
-    assert frame.health.min_det_jacobian > 0
-    assert frame.health.round_trip_error < 1e-6
-    assert frame.health.lyapunov_falls
+    assert dict(zip([layer.name for layer in scenario.stack], frame.durations, strict=True))["Twirl 1"] == 0.8
+    assert frame.certificates.min_det_jacobian > 0
+    assert frame.certificates.round_trip_error < 1e-6
+    assert frame.certificates.lyapunov_falls
 
 
 def test_it_turns_motions_as_it_says_and_not_when_it_is_off(engine, scenario):
-    alone = replace(scenario, avoidance=False)
+    alone = changed(scenario, avoids=False)
     *_, frame = engine.frames(alone)
     below, turned = frame.levels
     moved = max(np.linalg.norm(a - b, axis=1).max() for a, b in zip(below, turned, strict=True))
     assert 0.02 < moved < 0.2
-    off = replace(alone, layers=(replace(alone.layers[0], on=False),))
+    off = replace(alone, stack=switched(alone, "Twirl 1"))
     *_, frame = engine.frames(off)
     for path, before in zip(frame.rollouts, frame.ghost, strict=True):
         assert max(np.linalg.norm(before - point, axis=1).min() for point in path) < 1e-3
+
+
+def test_the_page_offers_it_and_has_its_controls(server, monkeypatch):
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))
+    session, bound = Edited(avoiding("lift_box")), {}
+
+    def bind(handle, read, change):
+        control = Control(handle)
+        bound[handle.label] = control, read, change
+        return control
+
+    panel = TransformsPanel(server.gui, bind, later=lambda work: work())
+    panel.connect(cast(Session, session))
+    panel.add(addable()["Twirl"])
+    panel.adopt(session.scenario)
+    assert panel._add.options == ("Bias", "Twirl")
+    control, read, change = bound["Angle [rad]"]
+    assert control.handle.visible and read(session.scenario) == 0.8
+    session.edit("Angle [rad]", **change(session.scenario, -0.5))
+    assert [layer.name for layer in session.scenario.stack] == ["Twirl 1", "Avoidance"]
+    assert cast(Any, session.scenario.stack[0].transform).angle == -0.5

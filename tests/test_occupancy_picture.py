@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.pictures.occupancy import MAX_POINTS, NEAR, believed, occupancy_picture
+from dt_viz.pictures.occupancy import MAX_POINTS, NEAR, learned_occupancy, occupancy_picture
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import Slice
 
@@ -23,17 +23,17 @@ SHAPES = [
 
 @pytest.mark.parametrize("shape", SHAPES, ids=["sphere", "box", "cylinder"])
 @pytest.mark.parametrize("coarse", [True, False])
-def test_the_picture_shows_the_true_outline_and_what_is_believed(shape, coarse):
+def test_the_picture_shows_the_true_outline_and_what_is_learned_occupancy(shape, coarse):
     picture = occupancy_picture(AREA, (shape,), coarse=coarse)
     spacing = 0.010 if coarse else 0.004
     assert np.abs(shape.signed_distance(picture.outline)).max() < 0.3 * spacing
-    assert np.abs(believed(shape, picture.level.reshape(-1, 3)) - 0.5).max() < (0.2 if coarse else 0.05)
+    assert np.abs(learned_occupancy(shape, picture.level.reshape(-1, 3)) - 0.5).max() < (0.2 if coarse else 0.05)
     assert np.abs(shape.signed_distance(picture.level)).max() < 0.25 * shape.radius  # it has learned the shape
     normal = np.cross(*AREA.axes.T)
     for segments in (picture.level, picture.outline):
         np.testing.assert_allclose((segments - AREA.centre) @ normal, 0, atol=1e-12)
     corner = AREA.centre - AREA.axes @ AREA.half_size
-    assert picture.probability[0, 0] == pytest.approx(float(believed(shape, corner[None])[0]), abs=1e-9)
+    assert picture.probability[0, 0] == pytest.approx(float(learned_occupancy(shape, corner[None])[0]), abs=1e-9)
 
 
 def test_what_any_obstacle_is_believed_to_occupy_is_occupied():

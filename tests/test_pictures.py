@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import changed
 from scipy.spatial.transform import Rotation
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.solve import FINE, LIVE, solve
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.pictures.sketchbook import FINE_SPACING, LINE_SPACING
@@ -48,7 +49,7 @@ def test_pictures_are_worked_out_only_while_they_are_shown_and_never_before_the_
 
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
 def test_the_warped_grid_of_the_identity_is_the_grid(engine, scenario, wanted):
-    frame, pictures = picture_at(engine, replace(scenario, imitation=False, avoidance=False), wanted)
+    frame, pictures = picture_at(engine, changed(scenario, imitation=False, avoids=False), wanted)
     lines = [on_slice(frame.task, line) for line in pictures.grid.lines]
     assert straightness(lines) < 1e-9
     for axis in range(2):
@@ -63,9 +64,9 @@ def test_the_warped_grid_of_the_identity_is_the_grid(engine, scenario, wanted):
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
 def test_the_warped_grid_is_made_of_images_of_points_of_planes(engine, scenario, wanted, avoidance):
     """ψ by another way, the forward side of the whole stack, makes the lines straight again, seen along the normal."""
-    scenario = replace(scenario, avoidance=avoidance)
+    scenario = changed(scenario, avoids=avoidance)
     frame, pictures = picture_at(engine, scenario, wanted)
-    stack = solve(engine._nominal(scenario, None), scenario, LIVE if wanted is Stage.LIVE else FINE)
+    stack = solve(engine._nominal(scenario, None), scenario.active, LIVE if wanted is Stage.LIVE else FINE)
     middle, obstacle = [], scenario.obstacle
     for line in pictures.grid.lines:
         outside = line[obstacle.signed_distance(line) > 0.005]  # nearer, ψ magnifies what the picture rounds
@@ -88,7 +89,7 @@ def test_the_live_grid_is_the_same_before_and_after_the_fine_one(new_engine, ini
 
 
 def test_the_grid_lies_over_the_slice_and_is_smooth(engine, scenario):
-    frame, pictures = picture_at(engine, replace(scenario, avoidance=False))
+    frame, pictures = picture_at(engine, changed(scenario, avoids=False))
     points = on_slice(frame.task, np.concatenate(pictures.grid.lines))
     assert (np.abs(points[:, :2]) <= np.array(frame.task.slice.half_size) + 1e-4).all()
     assert np.abs(points[:, 2]).max() < 3e-3  # between samples
@@ -101,7 +102,7 @@ def test_the_grid_lies_over_the_slice_and_is_smooth(engine, scenario):
 
 def test_the_grid_covers_the_slice_also_where_it_is_tilted(engine, initial):
     for name in TASK_NAMES:
-        scenario = replace(initial(name), avoidance=False)
+        scenario = changed(initial(name), avoids=False)
         home = engine.task(name).slice
         turn = Rotation.from_rotvec([0.0, 0.1, 0.5]) * Rotation.from_quat(np.roll(home.pose.wxyz, -1))
         x, y, z = (float(c) for c in home.centre + 0.03)
@@ -120,14 +121,14 @@ def test_the_grid_keeps_out_of_the_obstacle_as_the_motions_do(engine, scenario):
     points = np.concatenate(pictures.grid.lines)
     inside = scenario.obstacle.signed_distance(points) < -0.01
     assert inside.mean() < 0.01
-    bare = np.concatenate(picture_at(engine, replace(scenario, avoidance=False))[1].grid.lines)
+    bare = np.concatenate(picture_at(engine, changed(scenario, avoids=False))[1].grid.lines)
     assert (scenario.obstacle.signed_distance(bare) < -0.01).mean() > 0.03
 
 
 def test_far_from_the_obstacle_the_grid_does_not_move(engine, scenario):
-    away = replace(scenario, obstacles=(Sphere((0.0, 3.0, 3.0)),))
+    away = changed(scenario, obstacles=(Sphere((0.0, 3.0, 3.0)),))
     moved = picture_at(engine, away)[1].grid.lines
-    still = picture_at(engine, replace(away, avoidance=False))[1].grid.lines
+    still = picture_at(engine, changed(away, avoids=False))[1].grid.lines
     for a, b in zip(moved, still, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
 
@@ -191,6 +192,6 @@ def test_the_inset_shows_straight_rays_to_one_goal_beside_the_slice(engine, scen
 def test_pictures_are_remembered_where_the_obstacle_does_not_matter(engine, scenario):
     first = picture_at(engine, scenario, Stage.LIVE)[1]
     x, y, z = scenario.obstacles[0].position
-    moved = picture_at(engine, replace(scenario, obstacles=(Sphere((x, y, z + 0.02)),)), Stage.LIVE)[1]
+    moved = picture_at(engine, changed(scenario, obstacles=(Sphere((x, y, z + 0.02)),)), Stage.LIVE)[1]
     assert moved.generator is first.generator
     assert moved.base.grid is first.base.grid

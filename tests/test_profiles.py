@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import changed
 
 from dt_viz.arm.body_points import load_body_points
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.metrics import (
     discrete_frechet,
     distance_from_path,
@@ -31,7 +32,7 @@ def profiled(engine, scenario):
 
 @pytest.fixture(scope="module", params=["task", "cspace", "both"])
 def shown(request, engine, initial):
-    return profiled(engine, replace(initial("draw_s"), space=request.param, arm_rollout=1))
+    return profiled(engine, changed(initial("draw_s"), space=request.param, arm_rollout=1))
 
 
 # --- Distance from a polyline ---
@@ -80,9 +81,9 @@ def test_distances_agree_with_the_metrics(shown):
 def test_clearance_agrees_with_the_signed_distance(shown, robot):
     frame, profiles = shown
     obstacle = frame.scenario.obstacle
-    assert profiles.of_body == (frame.scenario.space != "task")
-    assert profiles.shown.clearance.min() >= frame.health.clearance - 1e-9
-    assert profiles.shown.clearance.min() == pytest.approx(frame.health.clearance, abs=0.03)
+    assert profiles.of_body == (frame.scenario.avoidance.space != "task")
+    assert profiles.shown.clearance.min() >= frame.certificates.clearance - 1e-9
+    assert profiles.shown.clearance.min() == pytest.approx(frame.certificates.clearance, abs=0.03)
     assert profiles.undisturbed.depth > 0.03 and profiles.shown.depth < 1e-3
     if profiles.of_body:
         points, q = load_body_points().on_moving_links, frame.arm.q[[0]]
@@ -97,7 +98,7 @@ def test_clearance_agrees_with_the_signed_distance(shown, robot):
 
 
 def test_without_obstacles_the_clearance_is_infinite_and_nothing_is_entered(engine, initial):
-    _, profiles = profiled(engine, replace(initial("draw_s"), obstacles=()))
+    _, profiles = profiled(engine, changed(initial("draw_s"), obstacles=()))
     for profile in (profiles.shown, profiles.undisturbed):
         assert np.isinf(profile.clearance).all() and profile.depth == 0
     np.testing.assert_allclose(profiles.shown.distance, profiles.undisturbed.distance, atol=2e-4)

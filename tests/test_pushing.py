@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import used_fraction
+from scenes import changed
 
-from dt_viz.arm.retiming import used_fraction
-from dt_viz.engine.engine import ArmMotion, Stage
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.pushing import DISTANCES, MAX_TRACKING_ERROR, PUSH_SECONDS
 from dt_viz.motion.solve import FINE, solve
 from dt_viz.ui import playback as playback_module
@@ -54,7 +56,7 @@ def test_the_hand_is_pushed_aside_and_still_reaches_the_goal(engine, initial, ro
 
 def test_after_the_push_it_is_a_motion_of_the_system(engine, initial, task):
     scenario = initial(task)
-    system = solve(engine._nominal(scenario, None), scenario, FINE).system
+    system = solve(engine._nominal(scenario, None), scenario.active, FINE).system
     for _, _, pushed in pushes(engine, scenario):
         after = pushed.path[pushed.begins :]
         assert (np.diff(system.lyapunov(after)) < 0).all()
@@ -66,7 +68,7 @@ def test_after_the_push_it_is_a_motion_of_the_system(engine, initial, task):
 
 @pytest.mark.parametrize("space", ["task", "cspace", "both"])
 def test_the_arm_keeps_its_limits_and_keeps_clear(engine, initial, robot, task, space):
-    for frame, q, pushed in pushes(engine, replace(initial(task), space=space)):
+    for frame, q, pushed in pushes(engine, changed(initial(task), space=space)):
         motion = pushed.motion
         assert (motion.q >= robot.lower).all() and (motion.q <= robot.upper).all()
         assert used_fraction(motion.times, motion.q, robot.velocity_limits) < 1 + 1e-6
@@ -75,6 +77,16 @@ def test_the_arm_keeps_its_limits_and_keeps_clear(engine, initial, robot, task, 
         assert np.linalg.norm(robot.end_effector(motion.q[-1]) - frame.goal) < 1e-3
         assert frame.scenario.obstacle.signed_distance(pushed.path).min() > 0
         assert pushed.path[:, 2].min() > 0
+
+
+def test_an_obstacle_that_is_not_avoided_hinders_no_push_that_is_clear_of_it_itself(engine, initial):
+    off, paths = changed(initial("draw_s"), avoids=False), []
+    for scenario in (off, changed(off, obstacles=())):
+        arm, rng = shown(engine, scenario).arm, np.random.default_rng(0)
+        paths.append([engine.pushed(scenario, arm.q[len(arm.q) // 10], rng).path for _ in range(4)])
+    for pushed, free in zip(*paths, strict=True):
+        assert off.obstacle.signed_distance(free).min() < 0  # on the way to the goal
+        np.testing.assert_allclose(pushed, free, rtol=0, atol=1e-9)
 
 
 def test_directions_differ_and_come_from_the_generator(engine, initial):

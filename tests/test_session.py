@@ -9,20 +9,23 @@ from typing import cast
 
 import numpy as np
 import pytest
+from scenes import avoiding, biases, changed, changing
 
 from dt_viz import interruption
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine import session as session_module
-from dt_viz.engine.engine import Engine, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Stage
 from dt_viz.engine.session import GESTURE_PAUSE, MAX_UNDO, Session
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.learning.imitation import ImitationError
 from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.scenario import Layer, Scenario, View
+from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.slices import SlicePose
-from dt_viz.scenario.stack import AVOIDANCE, IMITATION, with_bias_point, without
+from dt_viz.scenario.stack import IMITATION, with_added, without
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
 
 PATIENCE = 30.0
@@ -59,7 +62,7 @@ class FakeEngine:
             time.sleep(0.005)
         if scenario.task == "hopeless":
             raise ImitationError("they contradict each other")
-        if scenario.temperature == 13.0:
+        if scenario.avoidance.temperature == 13.0:
             raise DemonstrationError("unlucky.csv", "file", "13", "another")
         for stage in Stage:
             while stage is self.endless:
@@ -109,7 +112,7 @@ class Page:
 def fresh(task):
     if task == "broken":
         raise DemonstrationError("broken.csv", "lines", "none", "two or more")
-    return Scenario(task, (Sphere((0.1, 0.2, 0.3 if task == "draw_s" else 0.6)),))
+    return avoiding(task, Sphere((0.1, 0.2, 0.3 if task == "draw_s" else 0.6)))
 
 
 @dataclass
@@ -118,6 +121,9 @@ class Opened:
     engine: FakeEngine
     page: Page
     clock: list
+
+    def edit(self, gesture, **changes):
+        self.session.edit(gesture, **changing(self.session.scenario, **changes))
 
     def settle(self):
         assert self.session.wait_idle(PATIENCE)
@@ -153,7 +159,7 @@ def test_a_session_begins_with_its_task(opened):
 
 
 def test_an_edit_is_adopted_computed_and_shown(opened):
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     assert opened.session.scenario.obstacles[0] == at(1.0)
     assert opened.page.adopted[-1] == opened.shown == opened.session.scenario
@@ -162,7 +168,7 @@ def test_an_edit_is_adopted_computed_and_shown(opened):
 
 def test_an_edit_that_changes_nothing_does_nothing(opened):
     before = (len(opened.engine.asked), len(opened.page.adopted))
-    opened.session.edit("obstacle", obstacles=opened.session.scenario.obstacles)
+    opened.edit("obstacle", obstacles=opened.session.scenario.obstacles)
     opened.settle()
     assert (len(opened.engine.asked), len(opened.page.adopted)) == before
     opened.session.undo()
@@ -171,15 +177,15 @@ def test_an_edit_that_changes_nothing_does_nothing(opened):
 
 def test_a_view_is_adopted_and_nothing_is_computed(opened):
     asked, hidden = len(opened.engine.asked), View(ghost=False)
-    opened.session.edit("ghost", view=hidden)
+    opened.edit("ghost", view=hidden)
     opened.settle()
     assert opened.page.adopted[-1].view == opened.session.scenario.view == hidden
     assert len(opened.engine.asked) == asked
 
 
 def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
-    opened.session.edit("ghost", view=View(ghost=False))
+    opened.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("ghost", view=View(ghost=False))
     opened.session.undo()
     assert opened.session.scenario == replace(fresh("draw_s"), view=View(ghost=False))
 
@@ -187,7 +193,7 @@ def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
 def test_one_gesture_is_one_step_of_undo(opened):
     for x in np.linspace(0, 1, 20):
         opened.clock[0] += 0.05
-        opened.session.edit("obstacle", obstacles=(at(x),))
+        opened.edit("obstacle", obstacles=(at(x),))
     opened.session.undo()
     assert opened.session.scenario == fresh("draw_s")
     opened.session.redo()
@@ -196,15 +202,15 @@ def test_one_gesture_is_one_step_of_undo(opened):
 
 @pytest.mark.parametrize("ending", ["let go", "pause", "another control"])
 def test_the_next_gesture_is_a_step_of_its_own(opened, ending):
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     if ending == "let go":
         opened.session.end_gesture()
     if ending == "pause":
         opened.clock[0] += 1.1
     if ending == "another control":
-        opened.session.edit("temperature", temperature=2.0)
+        opened.edit("temperature", temperature=2.0)
     middle = opened.session.scenario
-    opened.session.edit("obstacle", obstacles=(at(2.0),))
+    opened.edit("obstacle", obstacles=(at(2.0),))
     opened.session.undo()
     assert opened.session.scenario == middle
 
@@ -212,7 +218,7 @@ def test_the_next_gesture_is_a_step_of_its_own(opened, ending):
 def test_undo_and_redo_are_inverse_and_shown(opened):
     states = [opened.session.scenario]
     for step in range(5):
-        opened.session.edit(f"control {step}", temperature=2.0 + step)
+        opened.edit(f"control {step}", temperature=2.0 + step)
         states.append(opened.session.scenario)
     for state in reversed(states[:-1]):
         opened.session.undo()
@@ -229,26 +235,26 @@ def test_undo_and_redo_are_inverse_and_shown(opened):
 
 
 def test_a_new_edit_ends_what_could_be_redone(opened):
-    opened.session.edit("a", temperature=2.0)
+    opened.edit("a", temperature=2.0)
     opened.session.undo()
-    opened.session.edit("b", temperature=3.0)
+    opened.edit("b", temperature=3.0)
     opened.session.redo()
-    assert opened.session.scenario.temperature == 3.0
+    assert opened.session.scenario.avoidance.temperature == 3.0
     opened.session.undo()
     assert opened.session.scenario == fresh("draw_s")
 
 
 def test_history_does_not_grow_without_end(opened):
     for step in range(MAX_UNDO + 50):
-        opened.session.edit(f"control {step}", temperature=20.0 + step)
+        opened.edit(f"control {step}", temperature=20.0 + step)
     for _ in range(MAX_UNDO + 50):
         opened.session.undo()
-    assert opened.session.scenario.temperature == 20.0 + 49
+    assert opened.session.scenario.avoidance.temperature == 20.0 + 49
 
 
 def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_the_motion_can_be_undone(opened):
-    opened.session.edit("ghost", view=View(ghost=False, playing=False, health_plots=True))
-    opened.session.edit("a", temperature=2.0, obstacles=(at(1.0),), generator="probability")
+    opened.edit("ghost", view=View(ghost=False, playing=False, health_plots=True))
+    opened.edit("a", temperature=2.0, obstacles=(at(1.0),), generator="probability")
     changed = opened.session.scenario
     opened.session.reset()
     opened.settle()
@@ -258,11 +264,11 @@ def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_the_motion_can
 
 
 def test_another_task_brings_its_place_and_keeps_other_choices(opened):
-    opened.session.edit("size", obstacles=(Sphere((0.0, 0.0, 0.0), 0.22),), temperature=3.0)
+    opened.edit("size", obstacles=(Sphere((0.0, 0.0, 0.0), 0.22),), temperature=3.0)
     opened.session.choose_task("lift_box")
     opened.settle()
     scenario = opened.session.scenario
-    assert (scenario.task, scenario.temperature) == ("lift_box", 3.0)
+    assert (scenario.task, scenario.avoidance.temperature) == ("lift_box", 3.0)
     assert scenario.obstacles == (Sphere(fresh("lift_box").obstacles[0].position, 0.22),)
     assert opened.shown == scenario
     opened.session.undo()
@@ -285,18 +291,18 @@ def test_another_task_has_its_own_slice_and_undo_brings_the_moved_one_back(opene
 def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first(opened):
     box = Box((0.0, 0.0, 0.0), (0.1, 0.2, 0.1), (0.6, 0.8, 0.0, 0.0))
     for obstacles in ((box,), (box, at(1.0), at(2.0))):
-        opened.session.edit("shapes", obstacles=obstacles)
+        opened.edit("shapes", obstacles=obstacles)
         opened.session.choose_task("lift_box")
         assert opened.session.scenario.obstacles == (replace(box, position=fresh("lift_box").obstacles[0].position),)
         opened.session.undo()
         assert opened.session.scenario.obstacles == obstacles
-    opened.session.edit("shapes", obstacles=())
+    opened.edit("shapes", obstacles=())
     opened.session.choose_task("lift_box")
     assert opened.session.scenario.obstacles == ()
 
 
 def test_choosing_the_same_task_changes_nothing(opened):
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     opened.session.choose_task("draw_s")
     assert opened.session.scenario.obstacles[0] == at(1.0)
 
@@ -305,7 +311,7 @@ def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
     with pytest.raises(DemonstrationError, match=r"broken\.csv"):
         opened.session.choose_task("broken")
     assert opened.session.scenario == fresh("draw_s")
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     assert opened.shown.obstacles[0] == at(1.0)
 
@@ -313,10 +319,10 @@ def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
 def test_a_drag_is_one_step_for_undo_however_slow(opened):
     opened.session.begin_gesture()
     for x in range(1, 5):
-        opened.session.edit("obstacle", obstacles=(at(float(x)),))
+        opened.edit("obstacle", obstacles=(at(float(x)),))
         opened.clock[0] += 10 * GESTURE_PAUSE
     opened.session.end_gesture()
-    opened.session.edit("obstacle", obstacles=(at(9.0),))
+    opened.edit("obstacle", obstacles=(at(9.0),))
     opened.session.undo()
     assert opened.session.scenario.obstacles[0] == at(4.0)
     opened.session.undo()
@@ -325,31 +331,31 @@ def test_a_drag_is_one_step_for_undo_however_slow(opened):
 
 def test_a_drag_whose_end_is_lost_ends_with_the_next_control(opened):
     opened.session.begin_gesture()
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     for margin in (0.02, 0.03):
         opened.clock[0] += 2 * GESTURE_PAUSE
-        opened.session.edit("margin", margin=margin)
+        opened.edit("margin", margin=margin)
     opened.session.undo()
-    assert opened.session.scenario.margin == 0.02
+    assert opened.session.scenario.avoidance.margin == 0.02
     opened.session.undo()
-    assert opened.session.scenario == replace(fresh("draw_s"), obstacles=(at(1.0),))
+    assert opened.session.scenario == changed(fresh("draw_s"), obstacles=(at(1.0),))
 
 
 def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
     with caplog.at_level(logging.CRITICAL):
-        opened.session.edit("temperature", temperature=13.0)
+        opened.edit("temperature", temperature=13.0)
         opened.settle()
     assert [str(error) for error in opened.page.errors] == ["unlucky.csv: file: found 13; accepted: another"]
-    opened.session.edit("temperature", temperature=5.0)
+    opened.edit("temperature", temperature=5.0)
     opened.settle()
-    assert opened.shown.temperature == 5.0
+    assert opened.shown.avoidance.temperature == 5.0
     assert len(opened.page.errors) == 1
 
 
 def test_a_view_that_cannot_be_drawn_is_left_by_reset(opened, caplog):
     bad = View(generator=True, generator_layer=-9, health_plots=True)
     with caplog.at_level(logging.CRITICAL):
-        opened.session.edit("view", view=bad)
+        opened.edit("view", view=bad)
         opened.settle()
     assert [str(error) for error in opened.page.errors] == ["no such flow"]
     opened.session.reset()
@@ -362,10 +368,10 @@ def test_a_view_that_cannot_be_drawn_is_left_by_reset(opened, caplog):
 def test_after_a_picture_that_failed_any_choice_that_can_be_drawn_is(opened, caplog):
     """Also one that needs nothing but what was asked for before, and did not come."""
     with caplog.at_level(logging.CRITICAL):
-        opened.session.edit("view", view=View(generator=True, generator_layer=-9))
+        opened.edit("view", view=View(generator=True, generator_layer=-9))
         opened.settle()
     opened.page.frames.clear()
-    opened.session.edit("view", view=View())
+    opened.edit("view", view=View())
     opened.settle()
     assert opened.page.frames[-1] == Sketch(opened.session.scenario, Stage.CERTIFIED)
 
@@ -374,10 +380,10 @@ def test_a_view_that_is_left_while_it_fails_is_drawn_without_another_edit(opened
     gate = opened.engine.gate = threading.Event()
     opened.engine.begun.clear()
     with caplog.at_level(logging.CRITICAL):
-        opened.session.edit("view", view=View(generator=True, generator_layer=-9))
+        opened.edit("view", view=View(generator=True, generator_layer=-9))
         assert opened.engine.begun.wait(PATIENCE)
         opened.page.frames.clear()
-        opened.session.edit("view", view=View())
+        opened.edit("view", view=View())
         gate.set()
         opened.settle()
     assert opened.page.frames[-1] == Sketch(opened.session.scenario, Stage.CERTIFIED)
@@ -386,9 +392,9 @@ def test_a_view_that_is_left_while_it_fails_is_drawn_without_another_edit(opened
 @pytest.mark.parametrize("stage", [Stage.ROLLOUTS, Stage.LIVE])
 def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
     opened.engine.endless = stage
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     assert opened.engine.busy.wait(PATIENCE)
-    opened.session.edit("obstacle", obstacles=(at(2.0),))
+    opened.edit("obstacle", obstacles=(at(2.0),))
     assert not opened.session.wait_idle(0.2)  # a newer edit ends nothing that follows a hand
     opened.session.close()
     opened.session._worker._thread.join(5.0)
@@ -415,10 +421,10 @@ def test_a_session_that_closes_ends_what_its_arm_is_asked_for(opened):
 def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
     opened.engine.begun.clear()
     opened.engine.gate = threading.Event()
-    opened.session.edit("obstacle", obstacles=(at(0.0),))
+    opened.edit("obstacle", obstacles=(at(0.0),))
     assert opened.engine.begun.wait(PATIENCE)
     for x in range(1, 8):
-        opened.session.edit("obstacle", obstacles=(at(float(x)),))
+        opened.edit("obstacle", obstacles=(at(float(x)),))
     opened.engine.gate.set()
     opened.settle()
     assert [scenario.obstacles[0].position[0] for scenario in opened.engine.asked[1:]] == [0.0, 7.0]
@@ -444,9 +450,9 @@ def test_after_a_storm_from_several_threads_the_last_picture_is_that_of_the_last
         for _ in range(150):
             what = rng.integers(0, 7)
             if what <= 2:
-                opened.session.edit("obstacle", obstacles=(at(float(rng.normal())),))
+                opened.edit("obstacle", obstacles=(at(float(rng.normal())),))
             elif what == 3:
-                opened.session.edit("temperature", temperature=float(rng.uniform(1, 12)))
+                opened.edit("temperature", temperature=float(rng.uniform(1, 12)))
             elif what == 4:
                 opened.session.undo()
             elif what == 5:
@@ -480,10 +486,10 @@ def test_what_the_controls_show_last_is_the_last_scenario_also_from_several_thre
         original(scenario)
 
     opened.page.adopt = slow_first
-    thread = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacles": (at(1.0),)})
+    thread = threading.Thread(target=opened.edit, args=("obstacle",), kwargs={"obstacles": (at(1.0),)})
     thread.start()
     assert inside.wait(PATIENCE)
-    second = threading.Thread(target=opened.session.edit, args=("obstacle",), kwargs={"obstacles": (at(2.0),)})
+    second = threading.Thread(target=opened.edit, args=("obstacle",), kwargs={"obstacles": (at(2.0),)})
     second.start()
     second.join(0.2)
     release.set()
@@ -495,7 +501,7 @@ def test_what_the_controls_show_last_is_the_last_scenario_also_from_several_thre
 def test_a_closed_session_computes_nothing_more(opened):
     opened.session.close()
     asked = len(opened.engine.asked)
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     assert opened.session.wait_idle(1.0)
     assert len(opened.engine.asked) == asked
 
@@ -507,7 +513,7 @@ def begin_learning(opened, task="lift_box"):
 
 
 def test_cancelling_goes_back_to_the_task_that_was_shown_and_says_so(opened):
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     before = opened.session.scenario
     begin_learning(opened)
@@ -522,8 +528,8 @@ def test_cancelling_goes_back_to_the_task_that_was_shown_and_says_so(opened):
 
 def test_cancelling_keeps_the_view_and_forgets_what_was_edited_meanwhile(opened):
     begin_learning(opened)
-    opened.session.edit("ghost", view=View(ghost=False))
-    opened.session.edit("obstacle", obstacles=(at(2.0),))
+    opened.edit("ghost", view=View(ghost=False))
+    opened.edit("obstacle", obstacles=(at(2.0),))
     opened.session.cancel()
     opened.settle()
     assert opened.session.scenario == opened.shown == replace(fresh("draw_s"), view=View(ghost=False))
@@ -557,7 +563,7 @@ def test_another_choice_supersedes_learning(opened, how):
 def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
     begin_learning(opened)
     for x in range(5):
-        opened.session.edit("obstacle", obstacles=(at(float(x)),))
+        opened.edit("obstacle", obstacles=(at(float(x)),))
     opened.engine.learning.clear()
     assert opened.engine.learning.wait(PATIENCE)
     assert [scenario.task for scenario in opened.engine.asked].count("lift_box") == 1
@@ -567,7 +573,7 @@ def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
 
 
 def test_there_is_nothing_to_cancel_when_nothing_is_learned(opened):
-    opened.session.edit("obstacle", obstacles=(at(1.0),))
+    opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     opened.session.cancel()
     opened.settle()
@@ -585,7 +591,7 @@ def test_the_first_task_can_be_cancelled_too_and_any_edit_begins_again():
         assert session.wait_idle(PATIENCE)
         assert page.cancellations == ["draw_s"] and page.frames == []
         engine.unlearned = set()
-        session.edit("obstacle", obstacles=(at(1.0),))
+        session.edit("obstacle", **changing(session.scenario, obstacles=(at(1.0),)))
         assert session.wait_idle(PATIENCE)
         assert page.frames[-1].scenario.obstacles[0] == at(1.0)
     finally:
@@ -609,11 +615,11 @@ def test_a_task_that_cannot_be_learned_leaves_the_picture_and_the_choice_before_
 
 def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(opened):
     asked = len(opened.engine.asked)
-    opened.session.edit("grid", view=View(grid=True))
+    opened.edit("grid", view=View(grid=True))
     opened.settle()
     assert opened.shown.view.grid and len(opened.engine.asked) == asked + 1
-    opened.session.edit("grid", view=View())
-    opened.session.edit("flow", view=View(generator_layer=2))
+    opened.edit("grid", view=View())
+    opened.edit("flow", view=View(generator_layer=2))
     opened.settle()
     assert len(opened.engine.asked) == asked + 1
     opened.session.undo()
@@ -623,19 +629,19 @@ def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(open
 @pytest.mark.parametrize("layer", ["ghost_arm", "onion", "body_points", "joint_plots"])
 def test_what_is_drawn_from_the_motion_itself_needs_no_new_frame(opened, layer):
     asked = len(opened.engine.asked)
-    opened.session.edit(layer, view=replace(View(), **{layer: True}))
+    opened.edit(layer, view=replace(View(), **{layer: True}))
     opened.settle()
     assert len(opened.engine.asked) == asked
     assert getattr(opened.page.adopted[-1].view, layer)
 
 
 def test_who_avoids_can_be_undone(opened):
-    opened.session.edit("Avoid with", space="both")
+    opened.edit("Avoid with", space="both")
     opened.settle()
-    assert opened.shown.space == "both"
+    assert opened.shown.avoidance.space == "both"
     opened.session.undo()
     opened.settle()
-    assert opened.shown.space == "task"
+    assert opened.shown.avoidance.space == "task"
 
 
 def test_a_scene_is_seen_as_it_wants_to_be_and_undo_brings_back_what_was_seen_before(opened):
@@ -675,7 +681,7 @@ def test_reset_in_a_scene_brings_the_scene_back_as_it_was(opened):
     opened.engine.task = lambda name: task
     session.load("draw_s", SCENES["cloud"].scenario)
     loaded = session.scenario
-    session.edit("size", obstacles=(at(1.0),), temperature=2.0)
+    opened.edit("size", obstacles=(at(1.0),), temperature=2.0)
     session.edit("view", view=View(grid=True))
     changed = session.scenario
     session.reset()
@@ -686,7 +692,7 @@ def test_reset_in_a_scene_brings_the_scene_back_as_it_was(opened):
 
 def test_moving_the_slice_is_a_step_for_undo(opened):
     session, poses = opened.session, [SlicePose((0.1 * k, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0)) for k in range(3)]
-    session.edit("temperature", temperature=2.0)
+    opened.edit("temperature", temperature=2.0)
     for first, second in ((poses[0], poses[1]), (poses[1], poses[2])):
         session.begin_gesture()
         for pose in (first, second):
@@ -696,9 +702,9 @@ def test_moving_the_slice_is_a_step_for_undo(opened):
     for expected in (poses[1], None):
         session.undo()
         assert session.scenario.view.slice == expected and session.scenario.view.grid
-        assert session.scenario.temperature == 2.0
+        assert session.scenario.avoidance.temperature == 2.0
     session.undo()
-    assert session.scenario.temperature != 2.0
+    assert session.scenario.avoidance.temperature != 2.0
     for _ in range(3):
         session.redo()
     assert session.scenario.view.slice == poses[2]
@@ -708,10 +714,10 @@ def test_moving_the_slice_is_a_step_for_undo(opened):
 
 def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_with_its_own_obstacle(opened):
     session = opened.session
-    session.edit("scene", layers=(cast(Layer, "a layer"),), avoidance_level=0, temperature=8.0)
+    opened.edit("scene", layers=biases(BiasPoint((0.2, -0.5, 0.4))), level=0, temperature=8.0)
     session.choose_task("lift_box")
-    assert session.scenario == replace(fresh("lift_box"), temperature=8.0)
-    session.edit("scene", obstacles=(), space="cspace", scene="somewhere")
+    assert session.scenario == changed(fresh("lift_box"), temperature=8.0)
+    opened.edit("scene", obstacles=(), space="cspace", scene="somewhere")
     session.choose_task("draw_s")
     assert session.scenario == fresh("draw_s")
 
@@ -721,21 +727,22 @@ def test_another_task_begins_without_the_layers_of_this_one_and_after_a_scene_wi
 
 @pytest.mark.parametrize("back", ["delete", "undo"])
 def test_a_level_that_is_gone_is_not_looked_at_when_another_gets_its_name(opened, back):
-    session, layers = opened.session, with_bias_point((), BiasPoint((0.2, -0.5, 0.4)))
-    session.edit("add", layers=layers)
+    session = opened.session
+    stack, _ = with_added(session.scenario, BiasPoint((0.2, -0.5, 0.4)))
+    session.edit("add", stack=stack)
     session.end_gesture()
-    for level in (IMITATION, AVOIDANCE, "Bias 1"):
+    for level in (IMITATION, Avoidance.title, "Bias 1"):
         session.edit("see", view=View(level=level))
         assert session.scenario.view.level == level
     if back == "undo":
         session.undo()
     else:
-        session.edit("delete", **without(session.scenario, "Bias 1"))
+        session.edit("delete", stack=without(session.scenario, "Bias 1"))
         session.end_gesture()
     assert session.scenario.view.level == ""
-    session.edit("add", layers=layers)
+    session.edit("add", stack=stack)
     opened.settle()
-    assert opened.shown.layers == layers and opened.shown.view.level == ""
+    assert opened.shown.stack == stack and opened.shown.view.level == ""
 
 
 # --- Pushing the hand ---
@@ -768,7 +775,7 @@ def test_a_push_goes_through_the_worker_and_computes_no_frames(opened):
 def busy_with(opened, gesture, **changes):
     """Have the worker in the middle of an edit, until the gate is set."""
     opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.session.edit(gesture, **changes)
+    opened.edit(gesture, **changes)
     assert opened.engine.begun.wait(PATIENCE)
 
 
@@ -783,7 +790,7 @@ def test_a_push_interrupts_frames_and_they_are_completed_after_it(opened):
 
 def test_nothing_is_pushed_while_another_motion_is_computed_and_no_edit_is_lost(opened):
     busy_with(opened, "obstacle", obstacles=(at(1.0),))
-    opened.session.edit("obstacle", obstacles=(at(2.0),))
+    opened.edit("obstacle", obstacles=(at(2.0),))
     shown = push(opened)
     opened.engine.gate.set()
     opened.settle()
@@ -858,7 +865,7 @@ def test_a_view_that_is_edited_while_the_hand_is_held_is_shown_and_loses_no_rele
     busy_with(opened, "grid", view=View(grid=True))
     shown = []
     hold(opened, 1.0, shown, last=True)
-    opened.session.edit("grid", view=View(grid=True, base=True))  # overtakes it in the worker's slot
+    opened.edit("grid", view=View(grid=True, base=True))  # overtakes it in the worker's slot
     opened.engine.gate.set()
     opened.settle()
     assert shown == [("held", (1.0, 0.0, 0.0))]
@@ -904,7 +911,7 @@ def test_nothing_is_held_while_another_motion_is_computed(opened):
 def test_starts_are_added_and_removed_step_by_step_for_undo_and_another_task_has_none(opened):
     a, b = (0.1, -0.5, 0.4), (0.2, -0.5, 0.4)
     for starts in ((a,), (a, b), (b,)):
-        opened.session.edit("starts", starts=starts)
+        opened.edit("starts", starts=starts)
         opened.session.end_gesture()
     for expected in ((a, b), (a,), ()):
         opened.session.undo()

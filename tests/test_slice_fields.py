@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import biases, changed
 from scipy.spatial.transform import Rotation
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.motion.solve import FINE, LIVE, cut_off, solve
 from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
 from dt_viz.scenario.scenario import SLICE_COLOURS, View
 from dt_viz.scenario.slices import SlicePose
-from dt_viz.scenario.stack import levels, place_beside, with_bias_point
+from dt_viz.scenario.stack import levels, surroundings
+from dt_viz.transforms.bias import BiasPoint
 
 TASK_NAMES = ["draw_s", "lift_box"]
 
@@ -37,11 +39,11 @@ def shown(engine, scenario, wanted=Stage.FINE, **view):
 
 def solved(engine, scenario, precision=FINE):
     nominal = engine._nominal(scenario, None)
-    return nominal, solve(nominal, scenario, precision)
+    return nominal, solve(nominal, scenario.active, precision)
 
 
 def with_bias(engine, scenario):
-    return replace(scenario, layers=with_bias_point((), place_beside(engine.task(scenario.task), scenario)))
+    return changed(scenario, layers=biases(BiasPoint.beside(surroundings(engine.task(scenario.task), scenario))))
 
 
 # --- The slice ---
@@ -73,12 +75,12 @@ def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, s
     moved = replace(scenario, view=View(slice=tilted(engine.task(scenario.task)), level="Imitation"))
     for old, new in zip(before, engine.frames(moved), strict=True):
         assert new.scenario == moved and new.stage is old.stage and new.level == 0
-        assert new.health == old.health
+        assert (new.certificates, new.durations) == (old.certificates, old.durations)
         for a, b in zip(old.rollouts, new.rollouts, strict=True):
             np.testing.assert_array_equal(a, b)
     x, y, z = scenario.obstacles[0].position
     with pytest.raises(BaseException, match="solved again"):
-        next(engine.frames(replace(moved, obstacles=(scenario.obstacles[0].moved((x, y, z + 0.01)),))))
+        next(engine.frames(changed(moved, obstacles=(scenario.obstacles[0].moved((x, y, z + 0.01)),))))
 
 
 def test_frames_of_a_changed_view_are_those_of_a_fresh_start(engine, new_engine, scenario):
@@ -170,7 +172,7 @@ def test_colours_are_the_functions_that_they_say(engine, scenario, wanted):
 
 
 def test_det_j_of_the_identity_is_one_and_its_level_lines_are_circles(engine, scenario):
-    plain = replace(scenario, imitation=False, avoidance=False)
+    plain = changed(scenario, imitation=False, avoids=False)
     np.testing.assert_allclose(shown(engine, plain, colour="det").pictures.colour.values, 1, atol=1e-12)
     frame = shown(engine, plain, colour="lyapunov")
     radii = np.linalg.norm(frame.pictures.colour.lines - frame.goal, axis=-1)
@@ -214,7 +216,7 @@ def test_the_pictures_are_those_of_the_selected_level(engine, scenario):
 
 def test_the_grid_of_the_imitation_is_that_of_the_stack_without_the_obstacle(engine, scenario):
     below = shown(engine, scenario, grid=True, level="Imitation").pictures.grid.lines
-    without = shown(engine, replace(scenario, avoidance=False), grid=True).pictures.grid.lines
+    without = shown(engine, changed(scenario, avoids=False), grid=True).pictures.grid.lines
     assert len(below) == len(without)
     for a, b in zip(below, without, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -222,13 +224,13 @@ def test_the_grid_of_the_imitation_is_that_of_the_stack_without_the_obstacle(eng
 
 def test_a_level_that_is_not_in_the_stack_is_no_level(engine, scenario):
     assert shown(engine, scenario, Stage.ROLLOUTS, level="Bias 7").level is None
-    assert shown(engine, replace(scenario, avoidance=False), Stage.ROLLOUTS, level="Avoidance").level is None
+    assert shown(engine, changed(scenario, avoids=False), Stage.ROLLOUTS, level="Avoidance").level is None
 
 
 def test_the_slice_can_be_moved_while_there_is_no_motion(new_engine, initial):
-    engine, scenario = new_engine(), replace(initial("draw_s"), space="cspace")
+    engine, scenario = new_engine(), changed(initial("draw_s"), space="cspace")
     list(engine.frames(scenario))
-    base = replace(scenario, obstacles=(scenario.obstacles[0].moved((0.0, 0.0, 0.1)),))
+    base = changed(scenario, obstacles=(scenario.obstacles[0].moved((0.0, 0.0, 0.1)),))
     blocked = next(engine.frames(base))
     assert blocked.blocked
     moved = shown(engine, base, slice=tilted(engine.task("draw_s")))

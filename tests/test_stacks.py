@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
+from scenes import avoiding, beside, biases, says
 
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.motion.diagnostics import MAX_GOAL_MISS, MAX_TARGET_MISS
+from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
-from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.transforms.avoidance import GOAL_INSIDE, STAYS_INSIDE
-from dt_viz.transforms.bias import Biasing, BiasPoint
+from dt_viz.transforms.bias import MAX_TARGET_MISS, BiasPoint
+from dt_viz.warning import Kind
 
 TASK_NAMES = ("draw_s", "lift_box", "push_box")
-INSIDE = "inside the obstacle"
 BETWEEN_SAMPLES = 1e-4
 """Metres by which a motion may be elsewhere between its samples."""
 
@@ -35,15 +34,12 @@ def random_scenario(engine, seed):
             return Sphere(place(), a)
         return Box(place(), (a, b, c), (w, x, y, z)) if kind == 1 else Cylinder(place(), a, b, (w, x, y, z))
 
-    layers = tuple(
-        Layer(Biasing(BiasPoint(place(), moves_goal=bool(rng.integers(4) == 0))), name=f"Bias {k + 1}")
-        for k in range(rng.integers(3))
-    )
-    return Scenario(
+    layers = biases(*(BiasPoint(place(), moves_goal=bool(rng.integers(4) == 0)) for _ in range(rng.integers(3))))
+    return avoiding(
         task.name,
         tuple(obstacle() for _ in range(rng.integers(4))),
         layers=layers,
-        avoidance_level=int(rng.integers(len(layers) + 1)),
+        level=int(rng.integers(len(layers) + 1)),
         temperature=float(rng.uniform(2, 12)),
     )
 
@@ -51,34 +47,35 @@ def random_scenario(engine, seed):
 def check(engine, seed):
     scenario = random_scenario(engine, seed)
     *_, frame = engine.frames(scenario)
-    task, health = engine.task(scenario.task), frame.health
-    assert len(frame.levels) == 1 + len(scenario.layers) + bool(scenario.obstacles)
+    task, certificates = engine.task(scenario.task), frame.certificates
+    points = [layer.transform for layer in beside(scenario)]
+    assert len(frame.levels) == 1 + len(points) + bool(scenario.obstacles)
     assert all(np.isfinite(path).all() for path in frame.rollouts)
     for path, start in zip(frame.rollouts, task.starts, strict=True):
         np.testing.assert_allclose(path[-1], frame.reached, atol=1e-3)
         np.testing.assert_allclose(path[0], start, atol=1e-3)
     moved = np.linalg.norm(frame.reached - frame.goal)
-    points = [layer.behaviour.point for layer in scenario.layers if isinstance(layer.behaviour, Biasing)]
-    may_move = scenario.obstacles or any(point.moves_goal for point in points)
+    may_move = scenario.obstacles or any(point.ends_motions for point in points)
     assert moved < 1e-3 or may_move
-    assert health.min_det_jacobian > 0
-    assert health.round_trip_error < 1e-6
+    assert certificates.min_det_jacobian > 0
+    assert certificates.round_trip_error < 1e-6
     assert_said(scenario, frame)
 
 
 def assert_said(scenario, frame):
     """Whatever else is said: what goes through the obstacle, ends beside the goal or misses a bias point is."""
-    health, layers = frame.health, scenario.layers
-    if scenario.obstacles and health.clearance < -BETWEEN_SAMPLES:
-        assert any(health.says(words) for words in (INSIDE, STAYS_INSIDE, "a motion enters the obstacle"))
+    layers, kinds = beside(scenario), {warning.kind for warning in frame.certificates.warnings}
+    if scenario.obstacles and frame.certificates.clearance < -BETWEEN_SAMPLES:
+        assert kinds & {Kind.START_COVERED, Kind.GOAL_COVERED, Kind.STAYS_INSIDE, Kind.ENTERS}
     missed = np.linalg.norm(frame.reached - frame.goal)
-    if missed > MAX_GOAL_MISS and not any(layer.behaviour.point.moves_goal for layer in layers):
-        assert health.says(GOAL_INSIDE) or health.says(f"motions end {1e3 * missed:.0f} mm beside")
+    if missed > MAX_GOAL_MISS and not any(layer.transform.ends_motions for layer in layers):
+        assert Kind.GOAL_COVERED in kinds or says(frame, f"motions end {1e3 * missed:.0f} mm beside")
+    sources = {warning.source for warning in frame.certificates.warnings}
     for layer in layers:
-        point = layer.behaviour.point
+        point = layer.transform
         paths = [path[-1:] if point.moves_goal else resample_by_arc_length(path, 2000) for path in frame.rollouts]
         passed = max(np.linalg.norm(path - point.position, axis=1).min() for path in paths)
-        assert passed < MAX_TARGET_MISS + BETWEEN_SAMPLES or health.says(f"{layer.name}: "), layer
+        assert passed < MAX_TARGET_MISS + BETWEEN_SAMPLES or layer.name in sources, layer
 
 
 @pytest.mark.parametrize("seed", [1, 1122])  # the last one is squeezed most

@@ -1,17 +1,17 @@
 """Tasks: demonstrations and their place in the robot's world."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from scenes import changed
 from scipy.io import savemat
 
 from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.tracking import inverse_kinematics, track
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.scenario.scenario import SPACES
 from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
+from dt_viz.transforms.avoidance import SPACE_NAMES
+from dt_viz.warning import Kind
 
 
 def write_shape(path, dim):
@@ -44,7 +44,7 @@ def test_a_file_in_space_is_refused_and_named(tmp_path):
 def test_the_obstacle_first_stands_in_the_way_of_the_motion(name, initial):
     scenario = initial(name)
     clearance = scenario.obstacle.signed_distance(np.concatenate(TASKS[name]().paths)).min()
-    assert clearance < scenario.margin
+    assert clearance < scenario.avoidance.margin
 
 
 OTHER_LETTERS = [name for name in TASKS if name.startswith("draw_") and name != "draw_s"]
@@ -56,17 +56,18 @@ OTHER_LETTERS = [name for name in TASKS if name.startswith("draw_") and name != 
     [
         pytest.param(name, space, marks=[pytest.mark.slow] * (space != "task" and name in OTHER_LETTERS))
         for name in TASKS
-        for space in SPACES
+        for space in SPACE_NAMES
     ],
 )
 def test_the_obstacle_first_stands_where_hand_and_arm_find_a_way_to_the_goal(name, space, engine, initial):
-    *_, frame = engine.frames(replace(initial(name), space=space))
+    *_, frame = engine.frames(changed(initial(name), space=space))
     assert frame.blocked == ()
     # the margin is kept by the spheres that cover the arm, less what they stick out: the meshes may keep less of it
-    assert [doubt for doubt in frame.health.doubts if "were asked for" not in doubt] == []
+    meshes = frame.certificates.collision.warnings
+    assert all(w.kind is Kind.ARM_TOO_NEAR or w in meshes for w in frame.certificates.warnings)
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
     if space != "task":
-        assert frame.health.collision.problems == () and frame.health.arm_duration > 0.05  # it is in the arm's way, too
+        assert meshes == () and frame.arm_duration > 0.05  # it is in the arm's way, too
 
 
 @pytest.mark.parametrize("name", TASKS)

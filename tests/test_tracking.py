@@ -177,7 +177,6 @@ class TestTracking:
         result = self.follow(robot, stretched)
         assert result.damped[-1]
         assert not result.damped[0]
-        assert result.min_manipulability == result.manipulability.min()
 
     def test_several_paths_at_once_equal_one_by_one(self, robot):
         paths = np.stack([smooth_path(seed) for seed in range(4)])

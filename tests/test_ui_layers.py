@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 import trimesh
 from pages import frame_of
+from scenes import avoiding, beside, biases, changed
 from viser import transforms  # noqa: TID251
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import CollisionReport, Nearest
 from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import ArmMotion, Stage
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.frame import Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.learning.demonstrations import DemonstrationError
-from dt_viz.motion.health import Health
+from dt_viz.motion.certificates import Certificates
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import with_bias_point
+from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.panel import CHANGED, COMPUTING, PLOTS, VIEW_LABELS, Panel, hint, status_html
@@ -36,6 +37,7 @@ from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
 from dt_viz.ui.scene.picture import Arrows, Lines
 from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, Rollouts, ScenePictures
 from dt_viz.ui.scene.starts import Starts
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 ROBOT = load_jaco()
 REACHING = np.array([0.9, 3.6, 1.6, 0.4, 2.9, -0.3])
@@ -50,7 +52,7 @@ def motion(num=60, seconds=4.0, *, sway=0.0):
 
 
 def frame(arm=None, *, scenario=None, **changes):
-    return frame_of(scenario or Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),)), arm=arm, **changes)
+    return frame_of(scenario or avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),)), arm=arm, **changes)
 
 
 def panel_of(server, notify=lambda *_: None):
@@ -225,8 +227,8 @@ def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(eng
     starts = Starts(scene, ignored, ignored, ignored)
     pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, starts)
     view = View(field=True, streamlines=True, grid=True, onion=True, colour="det")
-    good = replace(initial("draw_s"), space="cspace", view=view)
-    base = replace(good, obstacles=(Sphere((0.0, 0.0, 0.2)),))
+    good = changed(initial("draw_s"), space="cspace", view=view)
+    base = changed(good, obstacles=(Sphere((0.0, 0.0, 0.2)),))
 
     def shown():
         on = {name for name in OF_A_MOTION if pictures.layer(name).visible}
@@ -284,13 +286,13 @@ def test_what_is_drawn_of_another_task_or_scene_is_grey_until_its_own_frame_come
 
 def test_nothing_is_grey_while_something_is_dragged(drawn):
     pictures, scenario = drawn
-    pictures.adopt(replace(scenario, obstacles=(Sphere((0.1, -0.4, 0.3)),), temperature=3.0))
+    pictures.adopt(changed(scenario, obstacles=(Sphere((0.1, -0.4, 0.3)),), temperature=3.0))
     assert not is_grey(pictures)
 
 
 def test_the_status_of_another_task_is_pale_and_says_what_is_done(server):
     panel = panel_of(server)
-    scenario, other = Scenario("draw_s", ()), Scenario("lift_box", ())
+    scenario, other = avoiding("draw_s", ()), avoiding("lift_box", ())
     said = {s.task: replace(frame(scenario=s), task=TASKS[s.task]()) for s in (scenario, other)}
     panel.adopt(scenario)
     panel.report(said["draw_s"], PACE)
@@ -331,7 +333,7 @@ class Begun:
 
 @pytest.mark.parametrize(("chosen", "settles"), [("lift_box", False), ("draw_s", True), ("push_box", True)])
 def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(server, chosen, settles):
-    panel, session = panel_of(server), Begun(Scenario("draw_s", ()))
+    panel, session = panel_of(server), Begun(avoiding("draw_s", ()))
     session.panel = panel
     panel.connect(cast(Session, session))
     panel.adopt(session.scenario)
@@ -433,15 +435,17 @@ CLOSE = CollisionReport(
     Nearest(-0.008, ("link 5",), 2.5), Nearest(0.004, ("link 2", "hand"), 3.0), Nearest(-0.012, ("finger tip 1",), 4.0)
 )
 FAR = CollisionReport(Nearest(0.012, ("link 5",), 2.5), None, Nearest(0.034, ("hand",), 4.0))
+CLOSE_BY = Certificates(0.01, CLOSE, found=CLOSE.warnings)
+ODD = MotionWarning(Kind.OFF_MOTION, "it is odd")
 
 
 def test_the_line_of_a_scene_is_shown_only_while_it_is_as_it_was():
     task = TASKS["draw_j"]()
-    scene, plain = SCENES["two_points"], Scenario("draw_j", ())
+    scene, plain = SCENES["two_points"], avoiding("draw_j", ())
     own = scene.scenario(task)
     assert hint(frame(scenario=plain, task=task)) == task.hint
     assert hint(frame(scenario=own, task=task)) == hint(frame(scenario=replace(own, warp=0.3), task=task)) == scene.line
-    assert hint(frame(scenario=replace(own, layers=own.layers[:1]), task=task)) == CHANGED
+    assert hint(frame(scenario=changed(own, layers=beside(own)[:1]), task=task)) == CHANGED
 
 
 def test_what_is_refused_is_said_beside_the_panel_too(server):
@@ -454,45 +458,46 @@ def test_what_is_refused_is_said_beside_the_panel_too(server):
 
 
 def test_the_status_says_that_every_check_holds_only_when_all_are_made():
-    holds = Health(0.01, collision=FAR)
-    assert "Every check holds" in status_html(frame(health=holds), PACE)
+    holds = Certificates(0.01, FAR)
+    assert "Every check holds" in status_html(frame(certificates=holds), PACE)
     for other in (
-        frame(health=holds, stage=Stage.FINE),
-        frame(health=holds, blocked=("it is in the way",)),
-        frame(health=holds.doubting("it is odd")),
-        frame(health=replace(holds, collision=CLOSE)),
-        frame(health=holds, scenario=Scenario("draw_s", (), warp=0.5)),
+        frame(certificates=holds, stage=Stage.FINE),
+        frame(certificates=holds, blocked=("it is in the way",)),
+        frame(certificates=holds.warning(ODD)),
+        frame(certificates=CLOSE_BY),
+        frame(certificates=holds, scenario=avoiding("draw_s", (), warp=0.5)),
     ):
         assert "Every check holds" not in status_html(other, PACE)
 
 
 def test_the_status_says_what_the_arm_comes_near_to():
-    far = status_html(frame(health=Health(0.01, collision=FAR)), PACE)
+    far = status_html(frame(certificates=Certificates(0.01, FAR)), PACE)
     for text in ("12 mm, link 5", "over 50 mm", "34 mm, hand"):
         assert text in far
-    close = status_html(frame(health=Health(0.01, collision=CLOSE)), PACE)
+    close = status_html(frame(certificates=CLOSE_BY), PACE)
     for text in ("enters by 8 mm, link 5", "4 mm, link 2 – hand", "below by 12 mm, finger tip 1"):
         assert text in close
     hit = replace(FAR, itself=Nearest(0.0, ("link 2", "hand"), 1.0))
-    assert "touches, link 2 – hand" in status_html(frame(health=Health(0.01, collision=hit)), PACE)
+    assert "touches, link 2 – hand" in status_html(frame(certificates=Certificates(0.01, hit)), PACE)
 
 
 @pytest.mark.parametrize(
     ("view", "told"), [(View(), True), (View(arm=False, onion=True), True), (View(arm=False), False)]
 )
 def test_nothing_is_said_against_an_arm_that_is_hidden(view, told):
-    health = Health(0.01, collision=CLOSE).doubting_arm("the arm is odd")
-    said = status_html(frame(scenario=Scenario("draw_s", (), view=view), health=health), PACE)
+    known = CLOSE_BY.warning(MotionWarning(Kind.DAMPED, "the arm is odd", ARM))
+    said = status_html(frame(scenario=avoiding("draw_s", (), view=view), certificates=known), PACE)
     assert ("The arm is odd" in said) == ("below the table" in said) == told
     assert ("Every check holds" in said) == ("arm hidden" in said) == (not told)
-    rollouts = status_html(frame(scenario=Scenario("draw_s", (), view=view), health=health.doubting("it is odd")), PACE)
+    odd = known.warning(ODD)
+    rollouts = status_html(frame(scenario=avoiding("draw_s", (), view=view), certificates=odd), PACE)
     assert "It is odd" in rollouts
 
 
 @pytest.mark.parametrize(("space", "hinted"), [("task", True), ("both", False)])
 def test_an_arm_in_the_obstacle_is_told_how_to_give_way(space, hinted):
-    scenario = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space)
-    said = status_html(frame(scenario=scenario, health=Health(0.01, collision=CLOSE)), PACE)
+    scenario = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space)
+    said = status_html(frame(scenario=scenario, certificates=CLOSE_BY), PACE)
     assert ("Avoid with" in said) == hinted
 
 
@@ -501,14 +506,14 @@ def test_an_arm_in_the_obstacle_is_told_how_to_give_way(space, hinted):
     [(0.85, None, ">0.85<"), (None, 0.5, ">0.50 arm<"), (0.85, 0.5, ">0.85 hand · 0.50 arm<"), (None, None, ">off<")],
 )
 def test_the_status_says_which_flow_runs_how_long(hand, arm, said):
-    assert said in status_html(frame(health=Health(0.01, duration=hand, arm_duration=arm)), PACE)
+    assert said in status_html(frame(durations=(hand,), arm_duration=arm), PACE)
 
 
 @pytest.mark.parametrize(("hand", "flow_time"), [(None, False), (0.4, True)])
 def test_the_status_calls_what_a_bias_point_has_its_strength(hand, flow_time):
-    layers = with_bias_point(with_bias_point((), BiasPoint((0.0, -0.5, 0.4))), BiasPoint((0.1, -0.5, 0.4)))
-    health = Health(0.01, duration=hand, layer_durations=(0.8, None))
-    said = status_html(frame(scenario=Scenario("draw_s", (), layers=layers), health=health), PACE)
+    layers = biases(BiasPoint((0.0, -0.5, 0.4)), BiasPoint((0.1, -0.5, 0.4)))
+    scenario = avoiding("draw_s", (), layers=layers)
+    said = status_html(frame(scenario=scenario, durations=(0.8, None, hand)), PACE)
     assert ">0.80 Bias 1<" in said and ">Strength<" in said
     assert ("Flow time t" in said) == flow_time and ">off<" not in said
 
@@ -527,15 +532,16 @@ def test_no_value_of_the_status_runs_out_of_the_panel_and_no_number_of_a_legend(
     [("task", True, "end effector"), ("cspace", True, "body points"), ("cspace", False, "end effector")],
 )
 def test_the_status_says_whose_clearance_it_is(space, avoidance, whose):
-    scenario = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space, avoidance=avoidance)
+    scenario = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space, avoids=avoidance)
     assert f"10.0 mm, {whose}" in status_html(frame(scenario=scenario), PACE)
 
 
-def test_a_problem_is_said_once_also_if_it_is_a_doubt_already():
-    problem = CLOSE.problems[0]
-    said = status_html(frame(health=Health(0.01, collision=CLOSE, doubts=(f"rollout 2: {problem}",))), PACE)
-    assert said.lower().count(problem.lower()) == 1
-    assert all(other[1:] in said for other in CLOSE.problems)
+def test_what_enters_is_said_once_also_if_a_rollout_is_known_to_enter():
+    enters, *others = CLOSE.warnings
+    known = CLOSE_BY.warning(MotionWarning(Kind.ROLLOUT_ENTERS, f"rollout 2: {enters}", ARM))
+    said = status_html(frame(certificates=known), PACE)
+    assert said.lower().count(enters.text.lower()) == 1
+    assert others and all(other.text[1:] in said for other in others)
 
 
 @pytest.mark.parametrize(("stage", "unknown"), [(Stage.LIVE, "…"), (Stage.CERTIFIED, "–")])
@@ -545,7 +551,8 @@ def test_what_is_not_known_yet_and_what_will_not_be_known_differ(stage, unknown)
 
 
 def test_a_scenario_without_motion_says_why_and_what_is_shown_instead():
-    reasons = ("start 3 is inside the obstacle", "the obstacle touches the <base>")
+    texts = ("start 3 is inside the obstacle", "the obstacle touches the <base>")
+    reasons = tuple(MotionWarning(Kind.ARM_BLOCKED, text) for text in texts)
     said = status_html(frame(blocked=reasons), PACE)
     assert "start 3 is inside the obstacle; the obstacle touches the &lt;base&gt;" in said
     assert "last good" in said

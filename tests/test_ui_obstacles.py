@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from pages import Edited
+from scenes import avoiding, changing
 
 from dt_viz.arm.collision import NOTHING, CollisionReport, Nearest
 from dt_viz.interruption import UnwantedError
@@ -18,7 +19,7 @@ from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, 
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
-from dt_viz.scenario.scenario import MAX_OBSTACLES, Scenario, View
+from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.obstacles import SHAPES, ObstaclePanel, name_of, with_room
@@ -44,7 +45,7 @@ def shown(server):
 
 
 def scenario(*obstacles, selected=0, **changes):
-    return Scenario("draw_s", obstacles, view=View(selected=selected), **changes)
+    return avoiding("draw_s", obstacles, view=View(selected=selected), **changes)
 
 
 # --- The scene ---
@@ -89,7 +90,7 @@ def test_only_the_selected_obstacle_has_handles_and_none_in_a_picture(shown, sel
 def test_obstacles_that_are_not_avoided_are_fainter(shown):
     shown.adopt(scenario(*ALL))
     before = [item.mesh.opacity for item in shown.items]
-    shown.adopt(scenario(*ALL, avoidance=False))
+    shown.adopt(scenario(*ALL, avoids=False))
     assert all(item.mesh.opacity < opacity for item, opacity in zip(shown.items, before, strict=True))
 
 
@@ -127,7 +128,7 @@ def opened(server):
         return Control(handle)
 
     said = []
-    panel = ObstaclePanel(server.gui, bind, lambda text, wrong: said.append((text, wrong)))
+    panel = ObstaclePanel(server.gui, bind, lambda text, wrong: said.append((text, wrong)), later=lambda work: work())
     session: Any = Edited(scenario(BALL), panel)
     panel.connect(session)
     yield SimpleNamespace(panel=panel, session=session, controls=controls, said=said)
@@ -159,7 +160,7 @@ def test_a_new_obstacle_is_near_the_motion_but_covers_no_end_of_it(task, shape):
 
 
 def test_deleting_and_duplicating_act_on_the_selected_obstacle(opened):
-    opened.session.edit("", obstacles=ALL, view=View(selected=1))
+    opened.session.edit("", **changing(opened.session.scenario, obstacles=ALL), view=View(selected=1))
     opened.panel.duplicate()
     assert opened.session.scenario.obstacles[:3] == ALL
     copy = opened.session.scenario.obstacles[3]
@@ -189,7 +190,7 @@ SIZES = [
 
 @pytest.mark.parametrize(("selected", "label", "expected"), SIZES)
 def test_the_sizes_are_those_of_the_selected_obstacle(opened, selected, label, expected):
-    opened.session.edit("", obstacles=SIZED, view=View(selected=selected))
+    opened.session.edit("", **changing(opened.session.scenario, obstacles=SIZED), view=View(selected=selected))
     (control,) = (c for c in opened.controls[label] if c.handle.visible)
     changed = replace(opened.session.scenario, **control.change(opened.session.scenario, 20.0))
     assert changed.obstacles == (*SIZED[:selected], expected, *SIZED[selected + 1 :])
@@ -298,7 +299,7 @@ def test_a_file_whose_visitor_has_left_becomes_no_obstacle(opened):
 
 
 def test_another_file_than_there_is_room_for_is_refused(opened):
-    opened.session.edit("", obstacles=(BALL,) * MAX_OBSTACLES)
+    opened.session.edit("", **changing(opened.session.scenario, obstacles=(BALL,) * MAX_OBSTACLES))
     opened.panel.load(stl(BALL_MESH), "ball.stl", 1.0)
     ((text, wrong),) = opened.said
     assert wrong and "delete one first" in text
@@ -319,7 +320,7 @@ def test_obstacles_are_called_by_number_and_shape():
 
 
 def test_the_status_says_that_there_is_no_obstacle():
-    assert _clearance(float(Union().signed_distance(np.zeros((4, 3))).min()), "end effector") == "no obstacle"
+    assert _clearance(float(Union().signed_distance(np.zeros((4, 3))).min()), whole_arm=False) == "no obstacle"
     report = CollisionReport(NOTHING, None, Nearest(0.034, ("hand",), 4.0))
     assert _collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
 

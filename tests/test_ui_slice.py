@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 from pages import frame_of
 from PIL import Image
+from scenes import avoiding, changed
 
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.shapes import Sphere, rotation
 from dt_viz.pictures.sketchbook import Pictures
 from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture
-from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel.slice import WHOLE_ARM_NOTE, SlicePanel
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.bias import Biases
+from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.export import as_png
 from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
@@ -28,7 +29,7 @@ from dt_viz.ui.scene.scene import Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import VOLUME, ColourSlice, FieldArrows, Streamlines, painted, scale_of
 
-SCENARIO = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),))
+SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
 TASK = TASKS["draw_s"]()
 
@@ -64,7 +65,7 @@ def test_the_frame_lies_where_the_slice_does_and_only_while_it_is_of_use(scene):
 
 def test_one_thing_at_a_time_has_handles_and_none_in_a_picture(scene):
     picture, obstacles = MovableSlice(scene, lambda *_: None), Obstacles(scene, lambda *_: None, lambda _: None)
-    biases = Biases(scene, lambda *_: None, lambda _: None)
+    biases = Anchors(scene, lambda *_: None, lambda _: None)
     picture.draw(frame())
     for moving in (True, False):
         for each in (picture, obstacles, biases):
@@ -258,8 +259,8 @@ def test_the_panel_says_what_the_colours_mean_and_what_is_not_in_them(opened):
     panel.adopt(seen(colour="occupancy"))
     panel.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))  # on its way when another was chosen
     assert panel.legend == OCCUPANCY and "Learned occupancy" in panel.key.content
-    panel.adopt(replace(SCENARIO, space="cspace"))
+    panel.adopt(changed(SCENARIO, space="cspace"))
     assert panel.note.visible and WHOLE_ARM_NOTE in panel.note.content
     assert panel.legend is None and not panel.key.visible
-    panel.adopt(replace(SCENARIO, space="cspace", avoidance=False))
+    panel.adopt(changed(SCENARIO, space="cspace", avoids=False))
     assert not panel.note.visible

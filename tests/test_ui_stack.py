@@ -6,28 +6,29 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from pages import Edited, frame_of
+from scenes import avoiding, beside, biases, changed
 
 from dt_viz.engine.session import Session
-from dt_viz.motion.health import Health
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import AVOIDANCE, IMITATION, MAX_BIAS_POINTS, WHOLE_ARM, bias_points, names, with_bias_point
+from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, selected
 from dt_viz.scenario.tasks import POTS, TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.bias import BiasPanel
 from dt_viz.ui.panel.stack import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, legend_html, rows
 from dt_viz.ui.panel.transform_settings import durations
-from dt_viz.ui.scene.bias import Biases, selected_point
+from dt_viz.ui.panel.transforms import TransformsPanel
+from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.levels import LevelRollouts
 from dt_viz.ui.scene.pots import Pots, surface
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-SCENARIO = Scenario(
+AVOIDANCE = "Avoidance"
+SCENARIO = avoiding(
     "draw_s",
-    (Sphere((0.0, -0.5, 0.4)),),
-    layers=with_bias_point(with_bias_point((), BiasPoint((0.2, -0.5, 0.4), plane=PLANE)), BiasPoint((0.0, -0.4, 0.2))),
+    Sphere((0.0, -0.5, 0.4)),
+    layers=biases(BiasPoint((0.2, -0.5, 0.4), plane=PLANE), BiasPoint((0.0, -0.4, 0.2))),
 )
 
 
@@ -36,8 +37,8 @@ def frame(scenario=SCENARIO, **changes):
         "task": TASKS[scenario.task](),
         "goal": np.zeros(3),
         "levels": tuple((np.full((5, 3), float(k)),) for k in range(4)),
-        "health": Health(0.01, duration=0.4, layer_durations=(0.8, None)),
-        "layer_radii": (0.2, None),
+        "durations": (0.8, None, 0.4),
+        "chosen_values": ({"strength": 0.8, "radius": 0.2}, {}, {"duration": 0.4}),
     }
     return frame_of(scenario, **(given | changes))
 
@@ -51,9 +52,9 @@ def listed(scenario):
 
 def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
     assert list(listed(SCENARIO)) == [AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
-    assert list(listed(replace(SCENARIO, space="both"))) == [WHOLE_ARM, AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
-    assert list(listed(replace(SCENARIO, space="cspace"))) == [WHOLE_ARM, "Bias 2", "Bias 1", IMITATION, BASE]
-    assert list(listed(replace(SCENARIO, obstacles=()))) == ["Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(changed(SCENARIO, space="both"))) == [WHOLE_ARM, AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(changed(SCENARIO, space="cspace"))) == [WHOLE_ARM, "Bias 2", "Bias 1", IMITATION, BASE]
+    assert list(listed(changed(SCENARIO, obstacles=()))) == ["Bias 2", "Bias 1", IMITATION, BASE]
 
 
 def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done():
@@ -89,9 +90,9 @@ def test_a_row_switches_its_transform_off_and_on_again(panel, name):
 def test_rows_move_their_transform_outwards_and_inwards(panel):
     panel, session = panel
     panel.press("Bias 2", "↑")
-    assert names(session.scenario) == ("Bias 1", AVOIDANCE, "Bias 2")
+    assert tuple(layer.name for layer in session.scenario.stack) == ("Bias 1", AVOIDANCE, "Bias 2")
     panel.press("Bias 1", "↑")
-    assert names(session.scenario) == (AVOIDANCE, "Bias 1", "Bias 2")
+    assert tuple(layer.name for layer in session.scenario.stack) == (AVOIDANCE, "Bias 1", "Bias 2")
     panel.press(AVOIDANCE, "↑")
     panel.press(AVOIDANCE, "↑")
     assert session.scenario == SCENARIO
@@ -116,7 +117,7 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
     panel.report(frame())
     shown = [handle.label for handle in panel._rows if handle.visible]
     assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, strength 0.80", IMITATION, BASE]
-    panel.adopt(replace(SCENARIO, layers=(), obstacles=()))
+    panel.adopt(changed(SCENARIO, layers=(), obstacles=()))
     assert [handle.label for handle in panel._rows if handle.visible] == [IMITATION, BASE]
     panel.adopt(SCENARIO)
     assert len(panel._rows) == 5
@@ -153,13 +154,13 @@ def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
 
 
 def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(scene):
-    picture = Biases(scene, lambda *_: None, lambda _: None)
+    picture = Anchors(scene, lambda *_: None, lambda _: None)
     picture.adopt(SCENARIO)
     picture.draw(frame())
     first, second, *others = picture.items
     assert [item.gizmo.visible for item in picture.items] == [True, True, *[False] * len(others)]
-    for item, point in zip((first, second), bias_points(SCENARIO.layers).values(), strict=True):
-        np.testing.assert_allclose(item.gizmo.position, point.position)
+    for item, point in zip((first, second), anchored(SCENARIO).values(), strict=True):
+        np.testing.assert_allclose(item.gizmo.position, cast(Any, point).position)
     assert first.gizmo.active_axes == (True, True, False)  # in the drawing's plane
     assert second.gizmo.active_axes == (True, True, True)
     assert (first.gizmo.opacity, second.gizmo.opacity) == (0.0, 1.0)  # the newest
@@ -171,35 +172,41 @@ def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(
     assert first.region.visible and np.ravel(first.region.scale)[0] == 0.2
     assert not np.any(first.region.points[..., 2]) and np.ptp(second.region.points, axis=(0, 1)).min() > 1.9
     assert not second.region.visible  # nobody knows how large
-    picture.adopt(replace(SCENARIO, layers=()))
+    picture.adopt(changed(SCENARIO, layers=()))
     assert not any(item.gizmo.visible for item in picture.items)
 
 
+def transforms_panel(gui, bind=lambda handle, *_: Control(handle)):
+    return TransformsPanel(gui, bind, later=lambda work: work())
+
+
 def test_bias_points_are_added_changed_and_deleted(server):
-    panel, session = BiasPanel(server.gui, lambda handle, *_: Control(handle)), Edited(replace(SCENARIO, layers=()))
+    panel, session = transforms_panel(server.gui), Edited(changed(SCENARIO, layers=()))
     panel.connect(cast(Session, session))
-    for _ in range(MAX_BIAS_POINTS + 1):
+    for _ in range(BiasPoint.most + 1):
         panel.adopt(session.scenario)
-        panel.add()
-    points = bias_points(session.scenario.layers)
-    assert len(points) == MAX_BIAS_POINTS
-    assert selected_point(session.scenario) == list(points)[-1]
+        panel.add(BiasPoint)
+    points = anchored(session.scenario)
+    assert len(points) == BiasPoint.most
+    assert selected(session.scenario) == list(points)[-1]
     panel.adopt(session.scenario)
     session.edit("select", view=View(bias="Bias 2"))
     panel.delete()
-    assert list(bias_points(session.scenario.layers)) == ["Bias 1", "Bias 3", "Bias 4"]
+    assert list(anchored(session.scenario)) == ["Bias 1", "Bias 3", "Bias 4"]
     for _ in range(4):
         panel.delete()
         panel.adopt(session.scenario)
-    assert session.scenario.layers == ()
+    assert beside(session.scenario) == ()
 
 
 def test_the_panel_shows_what_auto_chose(server):
-    panel = BiasPanel(server.gui, lambda handle, *_: Control(handle))
+    controls = []
+    panel = transforms_panel(server.gui, lambda handle, *_: controls.append(Control(handle)) or controls[-1])
     panel.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
     panel.report(frame())
-    assert panel._radius.value == 20.0
-    assert panel._radius.handle.disabled
+    shown = {control.handle.label: control for control in controls if control.handle.visible}
+    assert shown["Radius [cm]"].value == 20.0
+    assert shown["Radius [cm]"].handle.disabled
 
 
 # --- Pots ---
@@ -225,7 +232,7 @@ def test_pots_are_drawn_for_tasks_that_have_some(scene):
     picture.draw(frame())
     assert picture.handles == ()
     pots = SCENES["left_pot"]
-    picture.draw(frame(Scenario(pots.task, ())))
+    picture.draw(frame(Scenario(pots.task)))
     assert [tuple(handle.position) for handle in picture.handles] == [(pot.x, pot.y, 0.0) for pot in POTS]
     picture.draw(frame())
     assert picture.handles == ()

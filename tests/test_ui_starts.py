@@ -8,8 +8,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scenes import changed
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.motion.following import room_at_rest
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import MAX_STARTS
@@ -38,10 +39,10 @@ def no_arm(_places):
 
 @pytest.mark.parametrize("space", ["cspace", "both"])
 def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_it(engine, initial, robot, space):
-    task, scenario = engine.task("draw_s"), replace(initial("draw_s"), space=space)
+    task, scenario = engine.task("draw_s"), changed(initial("draw_s"), space=space)
     arm_room = partial(room_at_rest, robot, task, scenario.obstacle)
     grid = with_grid(scenario, task.slice, arm_room)
-    hand_only = with_grid(replace(scenario, space="task"), task.slice, no_arm)
+    hand_only = with_grid(changed(scenario, space="task"), task.slice, no_arm)
     assert set(grid.starts) < set(hand_only.starts) and grid.num_blocked > hand_only.num_blocked
     nominal = engine._nominal(replace(scenario, starts=grid.starts), None)
     assert not engine._follower.admitted(nominal, scenario.obstacle).left_out
@@ -53,10 +54,10 @@ def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_i
 def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_that_are_taken(engine, initial):
     area = engine.task("draw_s").slice
     x, y, z = area.at(np.array([INNER, INNER / 3]) * area.half_size)
-    scenario = replace(initial("draw_s"), obstacles=(Sphere((float(x), float(y), float(z))),))
+    scenario = changed(initial("draw_s"), obstacles=(Sphere((float(x), float(y), float(z))),))
     grid = with_grid(scenario, area, no_arm)
     assert len(grid.starts) + grid.num_blocked + grid.num_far == 16 and grid.num_blocked > 0
-    assert (scenario.obstacle.signed_distance(np.array(grid.starts)) >= scenario.margin).all()
+    assert (scenario.obstacle.signed_distance(np.array(grid.starts)) >= scenario.avoidance.margin).all()
     np.testing.assert_allclose((np.array(grid.starts) - area.centre) @ area.normal, 0, atol=1e-9)
     again = with_grid(replace(scenario, starts=grid.starts), area, no_arm)
     assert again.starts == grid.starts

@@ -8,30 +8,32 @@ from typing import Any, cast
 
 import pytest
 from pages import frame_of
+from scenes import avoiding, biases, changing
 
 from dt_viz.arm.collision import CollisionReport, Nearest
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.diffeomorphisms import Integration
-from dt_viz.motion.health import Health
+from dt_viz.motion.certificates import Certificates
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import AVOIDANCE, IMITATION, bias_points, with_bias_point
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.stack import IMITATION, anchored
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel import warp as warp_module
 from dt_viz.ui.panel.panel import status_html
 from dt_viz.ui.panel.transform_settings import TransformSettings, learned_html
 from dt_viz.ui.panel.warp import WarpPlayer
+from dt_viz.warning import Kind
 
-LAYERS = with_bias_point((), BiasPoint((0.2, -0.5, 0.4)))
-SCENARIO = Scenario("draw_s", (Sphere((0.0, -0.5, 0.4)),), layers=LAYERS)
+AVOIDANCE = "Avoidance"
+SCENARIO = avoiding("draw_s", Sphere((0.0, -0.5, 0.4)), layers=biases(BiasPoint((0.2, -0.5, 0.4))))
 PACE = Pace(0.02, 30.0, 0)
 
 
 def frame(scenario=SCENARIO, **changes):
     given: dict[str, Any] = {
-        "health": Health(0.01, duration=0.4, layer_durations=(0.8,)),
+        "chosen_values": ({"strength": 0.8, "radius": 0.2}, {"duration": 0.4}),
         "learned_steps": (4, 4, 4),
     }
     return frame_of(scenario, **(given | changes))
@@ -95,28 +97,28 @@ def test_settings_change_the_transform_that_they_are_shown_for(controls):
     controls.set("Settings of", "Bias 1")
     controls.set("Integrator", "Euler (the paper's)")
     controls.set("Steps", 3)
-    assert bias_points(controls.scenario.layers)["Bias 1"].integration == Integration("euler", 3)
-    assert controls.scenario.integration == SCENARIO.integration
+    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).integration == Integration("euler", 3)
+    assert controls.scenario.avoidance == SCENARIO.avoidance
     controls.set("Settings of", AVOIDANCE)
     assert (controls.value("Integrator"), controls.value("Steps")) == ("auto", 8)
     controls.set("Reach T", 9.0)
-    assert controls.scenario.temperature == 9.0
+    assert controls.scenario.avoidance.temperature == 9.0
 
 
 def test_a_duration_by_hand_goes_on_from_what_auto_chose(controls):
-    for name, chosen in ((AVOIDANCE, 0.4), ("Bias 1", 0.8)):
+    for name, label, chosen in ((AVOIDANCE, "Flow time", 0.4), ("Bias 1", "Strength", 0.8)):
         controls.set("Settings of", name)
         controls.settings.report(frame(controls.scenario))
-        slider = controls.bound["Flow time t"][0]
+        slider = controls.bound[f"{label} t"][0]
         assert slider.handle.disabled and slider.value == chosen
-        assert controls.bound["Flow time t"][2](controls.scenario, 1.5) == {}  # it is `auto` that chooses
-        controls.set("Flow time: auto", False)
+        assert controls.bound[f"{label} t"][2](controls.scenario, 1.5) == {}  # it is `auto` that chooses
+        controls.set(f"{label}: auto", False)
         assert not slider.handle.disabled and slider.value == chosen
-        controls.set("Flow time t", 1.5)
-    assert controls.scenario.duration == 1.5
-    assert bias_points(controls.scenario.layers)["Bias 1"].strength == 1.5
-    controls.set("Flow time: auto", True)
-    assert bias_points(controls.scenario.layers)["Bias 1"].strength is None
+        controls.set(f"{label} t", 1.5)
+    assert controls.scenario.avoidance.duration == 1.5
+    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).strength == 1.5
+    controls.set("Strength: auto", True)
+    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).strength is None
 
 
 def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choose(controls):
@@ -137,17 +139,19 @@ def report(obstacle):
 
 
 def test_a_warp_is_a_hint_and_what_it_enters_no_alarm():
-    health = Health(-0.03, collision=report(-0.04))
-    half = status_html(frame(replace(SCENARIO, warp=0.5), health=health), PACE)
+    entered = report(-0.04)
+    apart = tuple(warning for warning in entered.warnings if warning.kind is not Kind.ARM_ENTERS)
+    known = Certificates(-0.03, entered, found=apart)  # as the engine tells them of a warp
+    half = status_html(frame(replace(SCENARIO, warp=0.5), certificates=known), PACE)
     assert "Warp at 0.50" in half and "-30.0 mm" in half
     assert "finger 1 enters" not in half.lower() and "go through the obstacle" not in half
     assert "Link 5 is 20 mm below the table" in half  # that is none of the obstacle's
-    full = status_html(frame(health=health), PACE)
+    full = status_html(frame(certificates=Certificates(-0.03, entered, found=entered.warnings)), PACE)
     assert "Warp at" not in full and "Finger 1 enters" in full
 
 
 def test_what_is_lost_is_a_number_that_can_be_read():
-    lost = [status_html(frame(health=Health(0.01, round_trip_error=e)), PACE) for e in (0.0, 3e-8, 0.2471)]
+    lost = [status_html(frame(certificates=Certificates(0.01, round_trip_error=e)), PACE) for e in (0.0, 3e-8, 0.2471)]
     for text, expected in zip(lost, (">0.0 mm<", ">3e-05 mm<", ">247.1 mm<"), strict=True):
         assert expected in text
 
@@ -200,7 +204,7 @@ def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(
 
 
 def test_playing_that_ends_as_it_began_leaves_nothing_to_undo(session):
-    session.edit("T", temperature=9.0)
+    session.edit("T", **changing(session.scenario, temperature=9.0))
     session.end_gesture()
     told = []
     player = WarpPlayer(told.append, seconds=0.2)
@@ -222,7 +226,7 @@ def test_playing_stops_when_it_is_told_to_or_something_else_is_moved(session):
     assert told == [True, False]
     player.toggle(session)
     wait_until(lambda: told == [True, False, True])
-    session.edit("obstacle", obstacles=(), warp=0.9)
+    session.edit("obstacle", **changing(session.scenario, obstacles=(), warp=0.9))
     wait_until(lambda: not player.playing)
     assert session.scenario.warp == 0.9
 

@@ -4,24 +4,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import avoiding, biases, changed
 
 import dt_viz.engine.engine
-from dt_viz.engine.engine import Stage
+from dt_viz.engine.frame import Stage
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import place_beside, with_bias_point
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.stack import surroundings
 from dt_viz.transforms.bias import BiasPoint
 
 WARPS = (0.0, 0.15, 0.5, 0.85)
 
 
+def beside(task, scenario):
+    return BiasPoint.beside(surroundings(task, scenario))
+
+
 def stacked(engine, task, **changes):
     """An obstacle on the path and a bias point beside it."""
     task = engine.task(task)
-    plain = Scenario(task.name, (Sphere(task.obstacle_position),))
-    return replace(plain, layers=with_bias_point((), place_beside(task, plain)), **changes)
+    plain = avoiding(task.name, Sphere(task.obstacle_position))
+    return changed(plain, layers=biases(beside(task, plain)), **changes)
 
 
 def stage(engine, scenario, wanted):
@@ -47,10 +52,10 @@ def test_motions_begin_and_end_where_they_should_and_certificates_hold_at_every_
             np.testing.assert_allclose(path[-1], frame.goal, rtol=0, atol=tolerance)
         for times in frame.times:
             assert (np.diff(times) > 0).all()
-    health = frames[-1].health
-    assert health.min_det_jacobian > 0
-    assert health.round_trip_error < 1e-6
-    assert health.lyapunov_falls
+    certificates = frames[-1].certificates
+    assert certificates.min_det_jacobian > 0
+    assert certificates.round_trip_error < 1e-6
+    assert certificates.lyapunov_falls
 
 
 @pytest.mark.parametrize("task", ["draw_s", "lift_box"])
@@ -103,20 +108,20 @@ def test_what_auto_chose_for_the_full_stack_stays_and_is_worked_out_once(new_eng
     full = stage(fresh, scenario, Stage.FINE)
     for warp in (0.9, 0.4, 0.0, 1.0):
         frame = stage(fresh, replace(scenario, warp=warp), Stage.FINE)
-        assert frame.health.duration == full.health.duration
-        assert frame.health.layer_durations == full.health.layer_durations
+        assert len(frame.durations) == 2 and frame.durations == full.durations
+        assert frame.chosen_values == full.chosen_values
     assert len(solved) == 2  # live and fine
-    stage(fresh, replace(scenario, warp=0.4, temperature=3.0), Stage.LIVE)
+    stage(fresh, changed(scenario, warp=0.4, temperature=3.0), Stage.LIVE)
     assert len(solved) == 3
 
 
 def test_where_the_warp_passes_through_the_obstacle_that_is_told_and_not_doubted(engine):
     for space in ("task", "cspace"):
-        scenario = replace(stacked(engine, "draw_s", space=space, warp=0.1), layers=())
+        scenario = changed(stacked(engine, "draw_s", space=space, warp=0.1), layers=())
         *_, frame = engine.frames(scenario)
         depth = max(maximum_collision_distance(path, scenario.obstacle.signed_distance) for path in frame.rollouts)
-        assert depth > 0.02 and frame.health.clearance < -0.02
-        assert frame.health.doubts == ()
+        assert depth > 0.02 and frame.certificates.clearance < -0.02
+        assert frame.certificates.warnings == ()
 
 
 def test_no_warp_of_the_whole_arm_leaves_the_joint_limits(engine, robot):
@@ -147,8 +152,8 @@ def test_the_undeformed_rollouts_and_their_joints_stay_those_of_the_demonstratio
 
 def test_a_bias_point_pulls_less_the_less_it_is_warped(engine):
     task = engine.task("draw_s")
-    target = place_beside(task, Scenario("draw_s", ())).position
-    scenario = Scenario("draw_s", (), imitation=False, layers=with_bias_point((), BiasPoint(target)))
+    target = beside(task, avoiding("draw_s")).position
+    scenario = avoiding("draw_s", imitation=False, layers=biases(BiasPoint(target)))
     nearest = []
     for warp in (0.0, 0.5, 1.0):
         frame = stage(engine, replace(scenario, warp=warp), Stage.FINE)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import changed
 
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import LEVERS
@@ -20,10 +21,6 @@ ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)
 """In the way of the forearm that pushes the box, far from where the hand goes."""
 
 
-def placed(scenario, obstacle):
-    return replace(scenario, obstacles=(obstacle,))
-
-
 class Case:
     """A task's motion, and what the arm makes of it."""
 
@@ -32,7 +29,7 @@ class Case:
         x, y, z = mean[50]
         self.middle = Sphere((float(x), float(y), float(z)), 0.15)
         self.robot = robot
-        self.scenario = placed(replace(initial, space="cspace"), self.middle)
+        self.scenario = changed(initial, space="cspace", obstacles=self.middle)
         self.nominal = engine._nominal(self.scenario, None)
         self.follower = Follower(robot)
         self.arm: WholeArm = self.follower.whole_arm
@@ -40,10 +37,12 @@ class Case:
         self._known: dict[tuple[Scenario, bool], ArmSolution] = {}
 
     def avoiding(self, obstacle=None, *, coarse=False, **changes) -> ArmSolution:
-        scenario = placed(replace(self.scenario, **changes), obstacle or self.middle)
+        scenario = changed(self.scenario, obstacles=obstacle or self.middle, **changes)
         if (scenario, coarse) not in self._known:
             spacing = LIVE.spacing if coarse else FINE.spacing
-            self._known[scenario, coarse] = self.arm.avoiding(self.lifted, scenario, spacing, coarse=coarse)
+            self._known[scenario, coarse] = self.arm.avoiding(
+                self.lifted, scenario.arm_avoidance, spacing, coarse=coarse
+            )
         return self._known[scenario, coarse]
 
     def truth(self, postures, obstacle) -> float:
@@ -227,14 +226,14 @@ class TestNearJointLimits:
 
     def test_start_and_goal_stay(self, push, bent):
         arm, lower = bent
-        far_reaching = replace(push.scenario, temperature=20.0, duration=0.4)  # as far as the goal
+        far_reaching = replace(push.scenario.arm_avoidance, temperature=20.0, duration=0.4)  # as far as the goal
         solution = arm.avoiding(push.lifted, far_reaching, LIVE.spacing, coarse=True)
         np.testing.assert_allclose(solution.p[ends(solution)], solution.q[ends(solution)], rtol=0, atol=1e-6)
         assert (solution.p > lower).all()
 
     def test_postures_beyond_the_limit_are_put_inside(self, push, bent):
         arm, lower = bent
-        solution = arm.avoiding(push.lifted, push.scenario, LIVE.spacing, coarse=True)
+        solution = arm.avoiding(push.lifted, push.scenario.arm_avoidance, LIVE.spacing, coarse=True)
         assert np.isfinite(solution.p).all()
         assert (arm.limits.inside(solution.q) >= lower).all()
 
@@ -259,7 +258,7 @@ class TestNearMisses:
         assert solution.clearance > min(clearance, 0.002) - ROUNDING
 
     def test_motions_that_are_to_avoid_nothing_may_collide(self, case):
-        solution = case.arm.undisturbed(case.lifted, case.scenario, LIVE.spacing)
+        solution = case.arm.undisturbed(case.lifted, case.scenario.arm_avoidance, LIVE.spacing)
         assert not solution.cleared and solution.clearance < -0.05
         np.testing.assert_allclose(solution.p, solution.q, rtol=0, atol=1e-13)
         assert isinstance(solution.transform, Identity) and solution.duration == 0

@@ -15,29 +15,29 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem, stepped
 
 NUM_POLISHING = 4
-"""Newton steps from what `track` finds to the best posture exactly; they converge quadratically."""
+"""Number of Newton steps from the result of `track` to the exact best posture; they converge quadratically."""
 
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """The best postures q = Q(x) of an arm whose end effector is at x: what `dt_viz.arm.tracking.track` follows.
+    """The best postures q = Q(x) of an arm whose end effector is at x, as `dt_viz.arm.tracking.track` finds them.
 
-    Q(x) is where h(q) is smallest among the postures with x(q) = x, h as in `track`. With the multipliers μ of that
-    constraint it solves ∇h + J(q)ᵀμ = 0 and x(q) = x; derivatives of that give the one of Q:
+    Q(x) minimises h(q), as in `track`, among the postures with x(q) = x. With the multipliers μ of that constraint it
+    solves ∇h + J(q)ᵀμ = 0 and x(q) = x, whose derivative gives that of Q:
 
         [ ∇²h + Σ μ_k ∇²x_k   Jᵀ ] [ DQ ]   [ 0 ]
         [ J                   0  ] [ Dμ ] = [ I ].
 
-    This is the pseudo-inverse of J in the metric of the Lagrangian's second derivative, so that J·DQ = I. Joints at
-    their limits are not provided for.
+    This is the pseudo-inverse of J in the metric of the Lagrangian's second derivative, so that J·DQ = I. It does not
+    hold for joints at their limits.
     """
 
     robot: Robot
     reference: Array
-    """(6,) posture that h is measured from, rad."""
+    """(6,) reference posture of h, rad."""
 
     def postures(self, x: Array) -> Array:
-        """Q(x), (*B, T, 6) rad, for paths `x` (*B, T, 3), metres."""
+        """Compute Q(x), (*B, T, 6) rad, for paths `x` (*B, T, 3), metres."""
         start = np.broadcast_to(self.reference, (*x.shape[:-2], NUM_JOINTS))
         q = track(self.robot, x, start, reference=start).q.reshape(-1, NUM_JOINTS)
         targets = x.reshape(-1, 3)
@@ -48,9 +48,9 @@ class Section:
         return q.reshape(*x.shape[:-1], NUM_JOINTS)
 
     def velocities(self, q: Array, velocity: Array) -> Array:
-        """DQ·ẋ, (*B, 6) rad/s, at the postures q = Q(x) (*B, 6) for the end effector's `velocity` ẋ (*B, 3), m/s.
+        """Compute DQ·ẋ, (*B, 6) rad/s, at postures q = Q(x) (*B, 6) for the end effector's `velocity` ẋ (*B, 3), m/s.
 
-        Beside the section, with the multipliers that fit best, it is a smooth continuation that still follows ẋ.
+        At other postures it is the smooth continuation with the best-fitting multipliers, which still follows ẋ.
         """
         flat = velocity.reshape(-1, 3)
         wanted = np.concatenate([np.zeros((len(flat), NUM_JOINTS)), flat], axis=1)
@@ -58,7 +58,7 @@ class Section:
         return np.linalg.solve(K, wanted[..., None])[:, :NUM_JOINTS, 0].reshape(q.shape)
 
     def _derivatives(self, q: Array) -> tuple[Array, Array]:
-        """∇h + Jᵀμ with the best μ, (N, 6), and the matrix above (N, 9, 9), at postures q (N, 6)."""
+        """Compute ∇h + Jᵀμ with the best μ, (N, 6), and the matrix above (N, 9, 9), at postures q (N, 6)."""
         slope, J = self._slopes(q)
         multipliers = -np.linalg.solve(J @ J.transpose(0, 2, 1), J @ slope[..., None])  # (N, 3, 1)
         K = np.zeros((len(q), NUM_JOINTS + 3, NUM_JOINTS + 3))
@@ -70,7 +70,7 @@ class Section:
         return slope + (J.transpose(0, 2, 1) @ multipliers)[..., 0], K
 
     def _slopes(self, q: Any) -> tuple[Array, Array]:  # noqa: ANN401, real or complex
-        """∇h (N, 6) and J (N, 3, 6) at postures q (N, 6), also at complex ones."""
+        """Compute ∇h (N, 6) and J (N, 3, 6) at postures q (N, 6), real or complex."""
         chain, reference = self.robot.chain(q.T), self.reference
         soft_lower = np.minimum(self.robot.lower + LIMIT_MARGIN, reference)
         soft_upper = np.maximum(self.robot.upper - LIMIT_MARGIN, reference)
@@ -86,44 +86,44 @@ class Section:
 class ArmSystem:
     """The pulled-back system ṗ = Dψ_q⁻¹(q)·q̇ = J_ψ(p)⁻¹·q̇ with q = ψ_q(p), q̇ = DQ(x)·ẋ and x = x(q).
 
-    Sec. 4.5 and eq. (4), in exact form: the printed one drops a transpose and flips a sign, see README "Departures".
+    Sec. 4.5 and eq. (4), in exact form: the printed one drops a transpose and flips a sign, see dt_viz/README.md.
     Its states are the postures p = ψ_q⁻¹(Q(x)) of the avoiding manifold. The chain p → q → x → z is a conjugacy to the
     base attractor, hence the system is as stable as that, and its motions are images of the base's.
     """
 
     hand: DiffeomorphicSystem
-    """ẋ of the end effector, metres and seconds."""
+    """System of the end effector's velocity ẋ, m/s."""
     section: Section
-    """x → q."""
+    """Lift x → q."""
     transform: Diffeomorphism
-    """ψ_q, from the postures where the arm moves to those of the undisturbed motion."""
+    """ψ_q, from the postures of the avoiding motion to those of the undisturbed one."""
 
     def postures(self, x: Array) -> Array:
-        """The states (*B, T, 6), rad, whose undisturbed motion has the end effector at `x` (*B, T, 3), metres."""
+        """Compute the states (*B, T, 6), rad, whose undisturbed postures have the end effector at `x` (*B, T, 3), m."""
         return self.transform.inverse(self.section.postures(x))
 
     def velocity(self, p: Array) -> Array:
-        """ṗ, (*B, 6), rad/s, at the states `p` (*B, 6): the derivative of ψ_q⁻¹ along q̇. No Jacobian is inverted."""
+        """Compute ṗ, (*B, 6), rad/s, at states `p` (*B, 6): the derivative of ψ_q⁻¹ along q̇, without an inversion."""
         q = self.transform.forward(p)
         velocity = self.section.velocities(q, self.hand.velocity(self.section.robot.end_effector(q)))
         return self.transform.inverse_tangents(q, velocity[..., None])[1][..., 0]
 
     def lyapunov(self, p: Array) -> Array:
-        """Φ(ψ(x(ψ_q(p)))), (*B,): strictly falling along every motion until the goal."""
+        """Compute Φ(ψ(x(ψ_q(p)))), (*B,), which strictly falls along every motion until the goal."""
         return self.hand.lyapunov(self.section.robot.end_effector(self.transform.forward(p)))
 
     def rollout(self, p0: Array, times: Array) -> Array:
-        """p(t), (*B, T, 6), from the states `p0` (*B, 6) at `times` (T,) or (*B, T), seconds: exact, all at once."""
+        """Compute p(t), (*B, T, 6), exactly, from states `p0` (*B, 6) at `times` (T,) or (*B, T), seconds."""
         x0 = self.section.robot.end_effector(self.transform.forward(p0))
         return self.postures(self.hand.rollout(x0, times))
 
     def stepped_rollout(self, p0: Array, times: Array, substeps: int = 1) -> Array:
-        """The same motion by stepping ṗ = J_ψ(p)⁻¹ q̇ with RK4: the independent oracle for `rollout`.
+        """Compute the same motion by stepping ṗ = J_ψ(p)⁻¹ q̇ with RK4, independently of `rollout`.
 
         Args:
             p0: (*B, 6) states, rad.
-            times: (T,) increasing, seconds; the first is the start's.
-            substeps: RK4 steps between neighbouring times.
+            times: (T,) increasing, seconds; the first is that of `p0`.
+            substeps: number of RK4 steps between neighbouring times.
 
         Returns:
             (*B, T, 6) states.

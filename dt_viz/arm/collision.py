@@ -1,8 +1,8 @@
-"""Collision truth: the arm's meshes against an obstacle, the table and itself, also between the samples of a path.
+"""Collision checks of the arm's meshes with an obstacle, the table and itself, also between the samples of a path.
 
-Nothing here knows of the body points that motions are planned with. Lengths are metres, angles radians, positions in
-the robot's base frame. A path is sampled configurations, continuous joints unwrapped, with straight lines in joint
-space between them.
+The checks are independent of the body points that motions are planned with. Lengths are metres, angles radians,
+positions in the robot's base frame. A path is a sequence of configurations, continuous joints unwrapped, joined by
+straight lines in joint space.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 
 from dt_viz.arm.link_distances import (
     SHAPE_TOLERANCE,
+    AboveTable,
+    BetweenLinks,
     Link,
     Measure,
     Poses,
-    measure_above_table,
-    measure_between,
     measure_from,
 )
 from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
@@ -28,6 +28,7 @@ from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.properties import cached_property
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -36,15 +37,15 @@ if TYPE_CHECKING:
 
 
 TOLERANCE = 1e-4
-"""How much more than the smallest distance on a path may be reported, metres."""
+"""Largest excess of a reported smallest distance on a path, metres."""
 SELF_TOLERANCE = 1e-3
-"""The same for the distance of links from each other."""
+"""Largest excess of a reported distance of links from each other, metres."""
 SELF_REACH = 0.05
-"""Links farther apart than this are not measured, metres: the wrist never has more than 7 cm between its ends."""
+"""Distance of links beyond which it is not measured, metres: the wrist never has more than 7 cm between its ends."""
 SELF_MARGIN = 0.01
-"""Links nearer to each other than this are reported, metres."""
+"""Distance of links below which a problem is reported, metres."""
 KNOT_STRIDE = 4
-"""Samples of a path between those that a search begins with."""
+"""Stride in samples of the coarse path that a search begins with."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Nearest:
     Attributes:
         distance: metres.
         links: names of the link, or of both links.
-        at: where on the path, in samples from its start; 2.5 is halfway from the third to the fourth.
+        at: place on the path, in samples from its start; 2.5 is halfway from the third to the fourth.
     """
 
     distance: float
@@ -63,18 +64,18 @@ class Nearest:
 
 
 NOTHING = Nearest(np.inf, (), 0.0)
-"""Where there is nothing to come near to."""
+"""The result without any obstacle."""
 
 
 @dataclass(frozen=True)
 class CollisionReport:
-    """What a joint path comes near to or collides with.
+    """Smallest distances on a joint path.
 
     Attributes:
-        obstacle: smallest signed distance of the arm from an obstacle, negative inside; infinite if there is none.
+        obstacle: smallest signed distance of the arm from the obstacles, negative inside; infinite without any.
         itself: smallest distance of two links that are not neighbours, 0 where they intersect; None beyond
             `SELF_REACH`.
-        table: smallest signed height above the table of what does not stand on it.
+        table: smallest signed height of the links that do not stand on the table.
     """
 
     obstacle: Nearest
@@ -83,57 +84,56 @@ class CollisionReport:
 
     @property
     def depth(self) -> float:
-        """Maximum collision distance (sec. 5): how deep the arm enters the obstacle, metres; 0 when it is clear."""
+        """Maximum collision distance (sec. 5): greatest depth of the arm in an obstacle, metres; 0 if there is none."""
         return max(0.0, -self.obstacle.distance)
 
     @property
-    def problems(self) -> tuple[str, ...]:
-        """What is wrong, in words for the page; empty when nothing is."""
-        entered = f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm" if self.depth > 0 else ""
-        return ((entered,) if entered else ()) + self.problems_of_its_own
-
-    @property
-    def problems_of_its_own(self) -> tuple[str, ...]:
-        """Those that have nothing to do with the obstacle."""
+    def warnings(self) -> tuple[MotionWarning, ...]:
+        """What is wrong."""
         found = []
+        if self.depth > 0:
+            text = f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm"
+            found.append(MotionWarning(Kind.ARM_ENTERS, text, ARM))
         if self.itself and self.itself.distance < SELF_MARGIN:
             inner, outer = self.itself.links
             gap = self.itself.distance
-            found.append(f"{outer} comes within {1e3 * gap:.0f} mm of {inner}" if gap > 0 else f"{outer} hits {inner}")
+            text = f"{outer} comes within {1e3 * gap:.0f} mm of {inner}" if gap > 0 else f"{outer} hits {inner}"
+            found.append(MotionWarning(Kind.ARM_HITS_ITSELF, text, ARM))
         if self.table.distance < 0:
-            found.append(f"{self.table.links[0]} is {-1e3 * self.table.distance:.0f} mm below the table")
+            text = f"{self.table.links[0]} is {-1e3 * self.table.distance:.0f} mm below the table"
+            found.append(MotionWarning(Kind.ARM_BELOW_TABLE, text, ARM))
         return tuple(found)
 
 
 class _Pieces(NamedTuple):
-    """Pieces of a path, each for one item; lower bounds of its distance at both ends."""
+    """Pieces of a path, each for one item, with lower bounds of its distance at both ends."""
 
     start: Array  # (P,) samples from the path's start
     end: Array
     item: Indices  # (P,)
     at_start: Array  # (P,) metres
     at_end: Array
-    travel: Array  # (P,) bound on how far the item's points move, metres
+    travel: Array  # (P,) upper bound of the distance that the item's points move, metres
 
     def take(self, which: NDArray[np.bool_]) -> _Pieces:
-        """Some of them."""
+        """Select some of them."""
         start, end, item, at_start, at_end, travel = self
         return _Pieces(start[which], end[which], item[which], at_start[which], at_end[which], travel[which])
 
     def lower(self) -> Array:
-        """(P,) bounds from below on the distances anywhere on the pieces."""
+        """Compute lower bounds (P,) of the distances anywhere on the pieces."""
         return (self.at_start + self.at_end - self.travel) / 2
 
 
 class _Search:
-    """Looks for the smallest distance on a path, of all items of a measure.
+    """Search for the smallest distance on a path, over all items of a measure.
 
     As `metrics.maximum_collision_distance`: a distance changes no faster than the link moves, so on a piece of the path
     that moves the link by L it is at least (d₀ + d₁ − L)/2. Pieces that could hold less than the best are halved.
     """
 
     def __init__(self, robot: Robot, measure: Measure, q: Array, travel: Array, ceiling: float) -> None:
-        """Takes the path q (T, 6), bounds travel (T − 1, I) between its samples, and what the result must be below."""
+        """Take the path q (T, 6), bounds travel (T − 1, I) between its samples, and an upper bound of the result."""
         self._robot, self._measure = robot, measure
         self._last = len(q) - 1
         self._q = q if self._last else np.repeat(q, 2, axis=0)  # a path of one sample becomes one that stays there
@@ -142,7 +142,7 @@ class _Search:
         self._best, self._place, self._item = ceiling, 0.0, -1
 
     def run(self, tolerance: float) -> Nearest | None:
-        """The smallest distance, too large by the tolerance at most; None where none is below the ceiling."""
+        """Return the smallest distance, at most `tolerance` too large; None if none is below the ceiling."""
         pieces = self._first_pieces()
         while self._best > self._measure.lowest:
             pieces = pieces.take(pieces.lower() < self._best - tolerance)
@@ -185,19 +185,19 @@ class _Search:
         )
 
     def _travel_to(self, places: Array, items: Indices) -> Array:
-        """How far (N,) the items (N,) have moved at places (N,)."""
+        """Return the distances (N,) that the items (N,) have moved up to places (N,)."""
         before = np.minimum(places.astype(np.intp), len(self._q) - 2)
         fraction = places - before
         return (1 - fraction) * self._travelled[before, items] + fraction * self._travelled[before + 1, items]
 
     def _measured(self, places: Array, items: Indices, travel: Array) -> Array:
-        """Lower bounds (N,) of the distances of items (N,) at places (N,); exact where such travel needs it."""
+        """Compute lower bounds (N,) of the distances of items (N,) at places (N,), exact where `travel` demands it."""
         distinct, rows = np.unique(places, return_inverse=True)
         before = np.minimum(distinct.astype(np.intp), len(self._q) - 2)
         fraction = (distinct - before)[:, None]
         poses = Poses.of(self._robot, (1 - fraction) * self._q[before] + fraction * self._q[before + 1])
         values = self._measure.lower(poses, rows, items)
-        slack = travel / 2  # from there up, the bound of the piece exceeds the best
+        slack = travel / 2  # above the best plus this, the piece's bound exceeds the best
         for k in np.argsort(values - slack):
             if values[k] >= self._best + slack[k]:
                 break
@@ -212,7 +212,7 @@ class CollisionModel:
     """The arm's links as solids.
 
     Attributes:
-        robot: whose kinematics places them.
+        robot: kinematics that places them.
         links: from the base to the finger tips.
     """
 
@@ -222,9 +222,9 @@ class CollisionModel:
 
     @cached_property
     def reach(self) -> Array:
-        """(11, 6) bounds on the distance of each link's points from each joint's axis, in any posture, metres.
+        """Upper bounds (11, 6) of the distance of each link's points from each joint's axis in any posture, metres.
 
-        0 for the joints that do not move the link; elsewhere never less than for the joints that come later.
+        They are 0 for joints that do not move the link, and do not increase from one moving joint to the next.
         """
         steps = np.linalg.norm(self.robot.joint_translations, axis=1)
         sideways = np.linalg.norm(self.robot.joint_translations[:, :2], axis=1)
@@ -241,9 +241,7 @@ class CollisionModel:
         return bounds
 
     def obstacle_distance(self, q: ArrayLike, obstacle: Obstacle) -> tuple[Array, Indices]:
-        """Signed distance of the whole arm from the obstacle, and the nearest link.
-
-        The smallest signed distance from the obstacle of any point of the arm, so minus the depth where it enters.
+        """Compute the smallest signed distance of any point of the arm from the obstacle, and the nearest link.
 
         Args:
             q: (T, 6) configurations, rad.
@@ -267,36 +265,37 @@ class CollisionModel:
         return distances, nearest
 
     def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle) -> Nearest:
-        """The smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.
+        """Find the smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.
 
-        To `TOLERANCE` for a ball; to `SHAPE_TOLERANCE` and, inside, `link_distances.RESOLUTION` for other shapes.
+        It is accurate to `TOLERANCE` for a ball, for other shapes to `SHAPE_TOLERANCE`, inside to
+        `link_distances.RESOLUTION`.
         """
         nearest = NOTHING
         for part in obstacle.parts if isinstance(obstacle, Union) else (obstacle,):
             tolerance = TOLERANCE if isinstance(part, Sphere) else SHAPE_TOLERANCE
             found = self._search(measure_from(self.links, part), q, tolerance)
-            assert found is not None  # without a ceiling there always is one
+            assert found is not None  # always, without a ceiling
             nearest = min(nearest, found, key=lambda near: near.distance)
         return nearest
 
     def nearest_to_itself(self, q: ArrayLike) -> Nearest | None:
-        """The smallest distance of two links on a path q (T, 6), rad, to `SELF_TOLERANCE`; None beyond `SELF_REACH`.
+        """Find the smallest distance of two links on a path q (T, 6), rad; None beyond `SELF_REACH`.
 
-        Links that a joint connects are left out.
+        It is accurate to `SELF_TOLERANCE`. Links that a joint connects are left out.
         """
-        return self._search(measure_between(self.links), q, SELF_TOLERANCE, SELF_REACH)
+        return self._search(BetweenLinks(self.links), q, SELF_TOLERANCE, SELF_REACH)
 
     def nearest_to_table(self, q: ArrayLike) -> Nearest:
-        """The smallest height above the table z = 0 on a path q (T, 6), rad, to `TOLERANCE`.
+        """Find the smallest height above the table z = 0 on a path q (T, 6), rad, accurate to `TOLERANCE`.
 
-        Of all links but the base and link 1, which stand on it.
+        The base and link 1, which stand on it, are left out.
         """
-        found = self._search(measure_above_table(self.links), q, TOLERANCE)
+        found = self._search(AboveTable(self.links), q, TOLERANCE)
         assert found is not None
         return found
 
     def report(self, q: ArrayLike, obstacle: Union | Obstacle) -> CollisionReport:
-        """All of it for one path q (T, 6), rad."""
+        """Compute all distances on one path q (T, 6), rad."""
         return CollisionReport(
             self.nearest_to_obstacle(q, obstacle), self.nearest_to_itself(q), self.nearest_to_table(q)
         )
@@ -306,15 +305,15 @@ class CollisionModel:
         return _Search(self.robot, measure, q, self._travel(measure, q), ceiling).run(tolerance)
 
     def _travel(self, measure: Measure, q: Array) -> Array:
-        """Bounds (T − 1, I) on how far points of the items' links move from sample to sample of q (T, 6)."""
+        """Bound the distances (T − 1, I) that the items' points move from sample to sample of q (T, 6)."""
         poses, turns = Poses.of(self.robot, q), np.abs(np.diff(q, axis=0))
         bounds = np.empty((len(turns), len(measure.bodies)))
         for k, (body, base) in enumerate(zip(measure.bodies, measure.bases, strict=True)):
             link = self.links[body]
             turning = turns[:, base : link.frame]  # by the joints between the two frames
             at_most = turning @ self.reach[body, base : link.frame]
-            # Nearly straight: the speed differs from its mean by at most half the largest acceleration, and how far
-            # a rigid body's points are displaced is convex in the point, so largest in a corner of the box.
+            # The path is nearly straight: its speed differs from the mean by at most half the largest acceleration, and
+            # the displacement of a rigid body is convex in the point, so largest in a corner of the box.
             inverse = poses.rotations[:, base].transpose(0, 2, 1)
             rotation = inverse @ poses.rotations[:, link.frame]
             origin = np.einsum("tij,tj->ti", inverse, poses.origins[:, link.frame] - poses.origins[:, base])
@@ -326,5 +325,5 @@ class CollisionModel:
 
 @lru_cache(maxsize=1)
 def load_collision_model() -> CollisionModel:
-    """The JACO's links, read once."""
+    """Load the JACO's links, once."""
     return CollisionModel(load_jaco(), collision_meshes())

@@ -23,42 +23,76 @@ from dt_viz.properties import cached_property
 
 COMPLEX_STEP = 1e-30
 DIFFERENCE = 1e-4
-"""Metres between a point and those that the slope of an obstacle's distance is taken from."""
+"""Step of the finite differences for the slope of an obstacle's distance, metres."""
 
 REACH_PER_TEMPERATURE = 0.08 / 6
-"""Metres from an obstacle at which its field ends, for each unit of the temperature T."""
+"""Reach of an obstacle's field, metres, for each unit of the temperature T."""
 CORE = 0.5
-"""Where the field has its full strength: part of the way from touching the obstacle to sitting on its middle. Deeper
-inside it is flat, and nothing special happens at the middle itself."""
+"""Depth at which the field has its full strength, as a part of the way from touching the obstacle to its middle; deeper
+inside the strength is constant, so the middle is not singular."""
 SHARPNESS = 2
-"""p of the smooth maximum over body points: the stronger a contact, the more it counts."""
+"""Exponent p of the smooth maximum over body points: stronger contacts count more."""
 FAN = 4.0
-"""Distance behind the obstacle's middle, in its radii, of the point from which escaping points fan out."""
+"""Distance of the source, from which escaping points fan out, behind the obstacle's middle, in the obstacle's radii."""
 BEHIND = 1.25
-"""The same, at least, in distances at which the field ends: the point itself is no place to escape from."""
+"""Lower bound of that distance, in multiples of the field's outer radius, for no point may escape from the source."""
 DAMPING = 0.06
-"""λ of the contact's pseudo-inverse, metres per rad: a contact that joints can hardly move is not chased."""
+"""Damping λ of the contact's pseudo-inverse, m/rad: contacts that joints can hardly move are not chased."""
 HAND_WEIGHT = 100.0
-"""Of the end effector's motion, rad² per m²: a forearm in contact is moved by what leaves the hand where it is."""
+"""Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
 LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
-"""How far the hand moves when a joint turns, metres per rad, about: makes a distance of postures a length."""
+"""Approximate motion of the hand for each joint's turning, m/rad: converts a distance of postures to a length."""
 PIN = 0.04
-"""Size of the region around a pinned posture in which the field fades to nothing, metres of that distance."""
+"""Size of the region around a pinned posture in which the field fades out, metres of that distance."""
 
 BLOCK = 256
-"""Configurations that a field is worked out for at once: of more, what is worked out on the way leaves the cache."""
+"""Number of configurations evaluated in one step, so that intermediate results stay in the cache."""
 
 SPEED = 0.2
-"""Metres that a contact at full strength escapes in a unit of flow time."""
+"""Distance that a contact at full strength escapes in a unit of flow time, metres."""
 
 LIMIT_ZONE = 0.05
-"""Before a joint limit, in which joints are held back, rad."""
+"""Width of the zone before a joint limit in which joints are held back, rad."""
 NEAREST_TO_LIMIT = 0.9
 """Part of that zone that a planned path may use."""
 
 
 @dataclass(frozen=True, eq=False)
-class WholeArmField:
+class ArmField:
+    """Base of the generators V_q on R⁶ of an arm and an obstacle."""
+
+    robot: Robot
+    body: BodyPoints
+    """Body points that can be moved away."""
+    obstacle: Obstacle
+
+    @property
+    def dim(self) -> int:
+        """Dimension of configuration space."""
+        return NUM_JOINTS
+
+    @cached_property
+    def _core(self) -> Array:
+        return -CORE * (self.obstacle.depth + self.body.radius)[:, None]
+
+    def __call__(self, q: Array) -> Array:
+        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        raise NotImplementedError
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        num, d = q.shape
+        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
+        values = self(shifted).reshape(d, num, d)
+        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
+
+    def _distances(self, points: Array) -> Array:
+        """Return the distances (P, N) of the body points' spheres, at `points` (P, 3, N), from the obstacle."""
+        return self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class WholeArmField(ArmField):
     """Generator V_q whose reverse flow takes the arm out of an obstacle along an escape direction.
 
     A body point x_b with sphere radius r_b has the occupancy w_b = S(d(x_b) − r_b), d the distance from the obstacle's
@@ -69,27 +103,18 @@ class WholeArmField:
         −V_q(q) = v · m · χ(q) · H⁻¹ J_cᵀ (J_c H⁻¹ J_cᵀ + λ²I)⁻¹ n_c,   H = I + w_d DᵀD + w_x JᵀJ,
 
     which moves the contact along n_c with as little motion of the joints, the hand's direction (D) and the end effector
-    (J) as can be. χ vanishes at pinned postures, so start and goal stay where they are.
+    (J) as possible. χ vanishes at pinned postures, so start and goal do not move.
 
     The plain gradient ∇_q ΣU(x_b) of the paper (`GradientField`) follows the joints' mobility instead: it sweeps along
-    the path with the first joint and turns sharply, see README "Departures".
+    the path with the first joint and turns sharply, see dt_viz/README.md.
     """
 
-    robot: Robot
-    body: BodyPoints
-    """That can be carried away."""
-    obstacle: Obstacle
     direction: Array
     """n, (3,) unit vector in which the arm escapes."""
     pins: Array
-    """(K, 6) postures that stay, rad."""
+    """(K, 6) postures that do not move, rad."""
     reach: float = 6 * REACH_PER_TEMPERATURE
     """Distance from the obstacle's surface at which the field ends, metres."""
-
-    @property
-    def dim(self) -> int:
-        """Dimension of configuration space."""
-        return NUM_JOINTS
 
     @cached_property
     def _source(self) -> Array:
@@ -97,19 +122,15 @@ class WholeArmField:
         behind = max(FAN * self.obstacle.radius, BEHIND * end)
         return (np.asarray(self.obstacle.position) - behind * self.direction)[:, None]
 
-    @cached_property
-    def _core(self) -> Array:
-        return -CORE * (self.obstacle.depth + self.body.radius)[:, None]
-
     def __call__(self, q: Array) -> Array:
-        """V_q at configurations `q` (N, 6), as (N, 6)."""
+        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
         if len(q) > BLOCK:
             return np.concatenate([self(q[i : i + BLOCK]) for i in range(0, len(q), BLOCK)])
         checkpoint()
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
-        distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        close = (distance.real < self.reach).any(axis=1)  # what stays away from the obstacle has no weight
+        distance = self._distances(points)
+        close = (distance.real < self.reach).any(axis=1)  # points away from the obstacle have no weight
         velocity = np.zeros_like(q)
         if not close.any():
             return velocity
@@ -130,7 +151,7 @@ class WholeArmField:
         ]
         A = np.concatenate(stays, axis=1).transpose(2, 1, 0)  # (M, 6, 6)
         H = np.eye(NUM_JOINTS) + A.transpose(0, 2, 1) @ A
-        # J_c = Σ ŵ_b J_b: each joint turns what lies beyond it
+        # J_c = Σ ŵ_b J_b: each joint moves the points beyond it
         beyond = self.body.is_beyond[:, close]
         lever = (beyond @ (weights[:, None] * points).reshape(len(points), -1)).reshape(NUM_JOINTS, 3, -1)
         lever -= (beyond @ weights)[:, None] * chain.origins
@@ -140,51 +161,37 @@ class WholeArmField:
         velocity[near] = -(mobile @ pull)[..., 0] * self._freedom(q[near])[:, None]
         return velocity
 
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        return by_complex_steps(self, q)
-
     def _freedom(self, q: Array) -> Array:
-        """χ, (N,): 0 at the pins, 1 away from them."""
+        """Compute χ, (N,): 0 at the pins, 1 away from them."""
         return np.prod(1 - np.exp(-squared_lengths(q, self.pins) / (2 * PIN**2)), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
-class GradientField:
+class GradientField(ArmField):
     """The paper's generator V_q = ∇_q Σ_b U(x_b), U the occupancy w_b of `WholeArmField` times the depth it grows over.
 
-    It takes no care of start and goal, nor of how the hand moves.
+    It moves start and goal, too, and ignores the motion of the hand.
     """
 
-    robot: Robot
-    body: BodyPoints
-    """That can be carried away."""
-    obstacle: Obstacle
     reach: float = 6 * REACH_PER_TEMPERATURE
     """Distance from the obstacle's surface at which the field ends, metres."""
 
-    @property
-    def dim(self) -> int:
-        """Dimension of configuration space."""
-        return NUM_JOINTS
-
     def __call__(self, q: Array) -> Array:
-        """V_q at configurations `q` (N, 6), as (N, 6)."""
+        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
-        core = -CORE * (self.obstacle.depth + self.body.radius)[:, None]
-        distance = self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        u = _unit_interval((self.reach - distance) / (self.reach - core))
+        distance = self._distances(points)
+        u = _unit_interval((self.reach - distance) / (self.reach - self._core))
         force: Array = -30 * (u * u * (1 - u) * (1 - u))[:, None] * self._outward(points)  # the slope of `_fading`
         moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
         return (chain.axes[:, 2] * moment).sum(axis=1).T
 
     def _beyond(self, values: Array) -> Array:
-        """Sums (6, 3, N) of `values` (P, 3, N): for each joint over the points that it turns."""
+        """Sum `values` (P, 3, N), for each joint over the points that it moves, (6, 3, N)."""
         return (self.body.is_beyond @ values.reshape(len(values), -1)).reshape(NUM_JOINTS, *values.shape[1:])
 
     def _outward(self, points: Array) -> Array:
-        """Slope (P, 3, N) of the obstacle's distance at `points` (P, 3, N), by differences: analytic as it is."""
+        """Compute the slope (P, 3, N) of the obstacle's distance at `points` (P, 3, N) by differences, analytic."""
         shifts = DIFFERENCE * np.eye(3)[:, None, None]
         s = points.transpose(0, 2, 1)
         near, far = (self._change(s, k * shifts) for k in (1, 2))  # (3, P, N)
@@ -193,21 +200,17 @@ class GradientField:
     def _change(self, s: Array, shifts: Array) -> Array:
         return self.obstacle.signed_distance(s + shifts) - self.obstacle.signed_distance(s - shifts)
 
-    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        return by_complex_steps(self, q)
-
 
 @dataclass(frozen=True, eq=False)
 class JointLimits(Diffeomorphism):
-    """From the configurations inside the joint limits onto all of R⁶: whatever flows there stays inside here.
+    """Map from the configurations inside the joint limits onto R⁶: flows there correspond to flows inside the limits.
 
-    With e the distance by which a joint is inside the zone of width m before its limit, ψ⁻¹ is the flow of ė = −e³
-    for the time 1/(2m²), which carries joints away from their limits:
+    With e the depth of a joint in the zone of width m before its limit, ψ⁻¹ is the flow of ė = −e³ for the time
+    1/(2m²), which carries joints away from their limits:
 
         ψ⁻¹(e) = e/√(1 + (e/m)²) < m,    ψ(e) = e/√(1 − (e/m)²).
 
-    Joints outside the zone, and continuous ones, stay as they are.
+    Joints outside the zone, and continuous ones, are not changed.
     """
 
     lower: Array
@@ -217,7 +220,7 @@ class JointLimits(Diffeomorphism):
     zone: float = LIMIT_ZONE
     """m, rad."""
     fraction: float = 1.0
-    """s, the part of that time that is flown: (e/m)² becomes s·(e/m)² in both formulas."""
+    """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas."""
 
     @property
     def dim(self) -> int:
@@ -225,11 +228,11 @@ class JointLimits(Diffeomorphism):
         return len(self.lower)
 
     def scaled(self, fraction: float) -> JointLimits:
-        """See `Diffeomorphism`. Less than all of it does not hold joints inside their limits."""
+        """See `Diffeomorphism`. A part of the flow does not hold joints inside their limits."""
         return replace(self, fraction=fraction * self.fraction)
 
     def inside(self, q: Array) -> Array:
-        """Configurations (*B, 6) kept a little away from the limits, where ψ is finite."""
+        """Clip configurations (*B, 6) to a little less than the limits, where ψ is finite."""
         slack = (1 - NEAREST_TO_LIMIT) * self.zone
         return np.clip(q, self.lower + slack, self.upper - slack)
 
@@ -242,31 +245,23 @@ class JointLimits(Diffeomorphism):
         return mapped, None if U is None else (stretch**3)[..., None] * U
 
 
-def by_complex_steps(field: WholeArmField | GradientField, q: Array) -> tuple[Array, Array]:
-    """A field (N, 6) and its derivative (N, 6, 6) at configurations `q` (N, 6)."""
-    num, d = q.shape
-    shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # the field takes complex angles, too
-    values = field(shifted).reshape(d, num, d)
-    return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
-
-
 def squared_lengths(q: Array, pins: Array) -> Array:
-    """Squared distances (N, K), m², of the postures `q` (N, 6) from the postures `pins` (K, 6), by `LEVERS`."""
+    """Compute squared distances (N, K), m², of postures `q` (N, 6) from `pins` (K, 6), by `LEVERS`."""
     offset = (q * LEVERS).T[:, None] - (pins * LEVERS).T[..., None]  # the batch last, for long inner loops
     return (offset * offset).sum(axis=0).T
 
 
 def _unit_interval(u: Array) -> Array:
-    """U where it is between 0 and 1, else the nearer of them."""
+    """Clip u, which may be complex, to the interval from 0 to 1."""
     return np.where(u.real <= 0, 0.0, np.where(u.real >= 1, 1.0, u))
 
 
 def _fading(u: Array) -> Array:
-    """A step from 0 at u = 0 to 1 at u = 1 with two derivatives of 0 at both ends."""
+    """Smooth step from 0 at u = 0 to 1 at u = 1, with two derivatives of 0 at both ends."""
     u = _unit_interval(u)
     return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
 def _columns(values: Array, columns: Indices) -> Array:
-    """Some columns of the last axis, which stays the one of the inner loops; indexing would put it first in memory."""
+    """Select columns of the last axis and keep it innermost in memory, which indexing would not."""
     return values.take(columns, axis=-1)

@@ -1,47 +1,45 @@
-"""Which way out: the direction in which an arm escapes from an obstacle with the least detour."""
+"""Escape directions: how an arm leaves an obstacle with the least detour."""
 
 from __future__ import annotations
-
-from functools import lru_cache
 
 import numpy as np
 
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 
 NUM_DIRECTIONS = 128
 SIDEWAYS = 2.0
-"""How much more a direction along the motion costs than one across it, relatively: it bends the path sharply."""
+"""Relative extra cost of a direction along the motion against one across it: it would bend the path sharply."""
 TABLE_WEIGHT = 3.0
-"""Cost of every metre that an escape would lead below the table, against a metre of detour."""
+"""Cost of each metre by which an escape leads below the table, against a metre of detour."""
 ON_THE_WAY = 0.10
-"""Metres of escape after which what comes into the way does not count any more: the arm turns, too, as it goes."""
+"""Length of an escape, metres, beyond which nothing new is in its way: the arm also turns as it moves."""
 ALIKE = np.cos(np.deg2rad(40.0))
-"""Cosine of the angle between directions up to which they are variants of one escape."""
+"""Cosine of the largest angle between two directions of one escape."""
 SELECTIVITY = 0.03
-"""Relative difference in cost that a variant's share in the escape falls by: it turns smoothly while one drags."""
+"""Relative difference in cost over which a direction's share in its escape falls by a factor e, for smooth drags."""
 
 
 def escape_directions(
     points: Array, radius: Array, tangents: Array, obstacle: Obstacle, margin: float = 0.0, *, num: int = 3
 ) -> list[Array]:
-    """Directions in which the arm can escape, the one with the least detour first.
+    """Find directions in which the arm can escape, the one with the least detour first.
 
-    For each direction the detour is how far the arm would have to be shifted, all of it alike, until every sphere that
-    covers it is clear of every ball that covers the obstacle, at each sample.
+    The detour of a direction is the distance by which the whole arm would have to be shifted until, at each sample,
+    every sphere that covers it is clear of every ball that covers the obstacle.
 
     Args:
-        points: (P, 3, M) middles of the spheres that cover the arm, metres, at the M samples that collide.
-        radius: (P,) of these spheres.
-        tangents: (K, 3) directions of the end effector's motion, unit vectors, wherever the escape bends it.
-        obstacle: to escape from.
-        margin: clearance that is wanted, metres.
-        num: directions to return, at most.
+        points: (P, 3, M) centres of the spheres that cover the arm, metres, at the M samples that collide.
+        radius: (P,) radii of these spheres, metres.
+        tangents: (K, 3) unit directions of the end effector's motion where the escape bends it.
+        obstacle: obstacle to escape from.
+        margin: required clearance, metres.
+        num: largest number of directions.
 
     Returns:
-        Unit vectors (3,), none an alike of another.
+        Unit vectors (3,), one for each distinct escape.
     """
-    directions = _directions()
+    directions = golden_spiral(NUM_DIRECTIONS, 0.5)
     centres, radii = obstacle.cover()
     offset = points - centres[:, None, :, None]  # (B, P, 3, M)
     squared, sum_of_radii = (offset**2).sum(axis=2), (radii[:, None] + margin + radius)[:, :, None]
@@ -67,12 +65,3 @@ def escape_directions(
         found.append(escape / np.linalg.norm(escape))
         cost[alike] = np.inf
     return found
-
-
-@lru_cache(maxsize=1)
-def _directions() -> Array:
-    """(K, 3) unit vectors, evenly spread: a Fibonacci lattice."""
-    i = np.arange(NUM_DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * i / NUM_DIRECTIONS, np.pi * (1 + np.sqrt(5)) * i
-    flat = np.sqrt(1 - z**2)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)

@@ -27,21 +27,21 @@ if TYPE_CHECKING:
 
 
 SHAPE_TOLERANCE = 1e-3
-"""How much more than the smallest distance from an obstacle that is no ball may be reported, metres."""
+"""Largest excess of a reported smallest distance from an obstacle that is no ball, metres."""
 SURFACE_SPACING = 2e-3
-"""Of points on a link that its depth in an obstacle is found with, metres; vertices are among them."""
+"""Spacing of points on a link's surface, vertices included, at which its depth in an obstacle is measured, metres."""
 INNER_SPACING = 4e-3
-"""Of points inside, which count where an obstacle is deepest inside the link."""
+"""Spacing of such points inside the link, where an obstacle may be deepest, metres."""
 RESOLUTION = 3.5e-3
-"""Metres by which the depth in an obstacle that is no ball may be larger than reported. On a link's surface 1.5 mm."""
+"""Largest error of a reported depth in an obstacle that is no ball, metres; 1.5 mm on a link's surface."""
 CERTAIN = 3e-3
-"""Depth, metres, that is more than an obstacle's signed distance is off by: what is deeper intersects it."""
+"""Depth, metres, greater than the error of an obstacle's signed distance: a deeper point surely is inside."""
 GROUP_SIZE = 0.02
-"""Of the cells in which these points are told deep or not at once, metres."""
+"""Size of the cells into which these points are grouped, metres."""
 BALL_SIZE = 0.06
-"""Of the cells that a link is divided into for quick bounds, metres."""
+"""Size of the cells into which a link is divided for quick bounds, metres."""
 AT_ONCE = 8
-"""Cells whose points are measured at once."""
+"""Number of groups whose points are measured in one step."""
 
 
 class Poses(NamedTuple):
@@ -52,23 +52,23 @@ class Poses(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, q: Array) -> Poses:
-        """Poses at configurations q (N, 6), rad."""
+        """Compute the poses at configurations q (N, 6), rad."""
         rotations, origins = robot.forward_kinematics(q)
         base = np.broadcast_to(np.eye(3), (len(q), 1, 3, 3))
         return cls(np.concatenate([base, rotations], axis=1), np.pad(origins, [(0, 0), (1, 0), (0, 0)]))
 
 
 class _Groups(NamedTuple):
-    """Points, those near to each other in groups; or balls, when they have radii."""
+    """Points in groups of neighbours; or balls, if they have radii."""
 
     points: Array  # (N, 3), metres, one group after the other
-    ends: Indices  # (G,) where each group ends
-    centres: Array  # (G, 3)
-    radii: Array  # (G,) metres, of the balls around the centres that hold the groups
+    ends: Indices  # (G,) ends of the groups in `points`
+    centres: Array  # (G, 3), metres
+    radii: Array  # (G,) radii of the balls around the centres that hold the groups, metres
 
     @classmethod
     def of(cls, points: Array, size: float, radii: Array | float = 0.0) -> _Groups:
-        """Groups of the points (N, 3) in the cells, that large, of a grid."""
+        """Group the points (N, 3) by the cells, of this size, of a grid."""
         cell = np.floor((points - points.min(axis=0)) / size).astype(np.intp)
         _, member = np.unique(cell, axis=0, return_inverse=True)
         order = np.argsort(member.ravel(), kind="stable")
@@ -80,7 +80,7 @@ class _Groups(NamedTuple):
         return cls(points, ends, centres, np.maximum.reduceat(apart, begins))
 
     def of_group(self, group: int) -> Array:
-        """(M, 3) the points of a group."""
+        """Return the points (M, 3) of a group."""
         return self.points[self.ends[group - 1] if group else 0 : self.ends[group]]
 
 
@@ -88,14 +88,14 @@ class Link:
     """A link as a solid, in the frame of its joint.
 
     Attributes:
-        name: as the page calls it.
+        name: name on the page.
         frame: index of its frame in `Poses`.
-        surface: the mesh, as coal measures it.
-        centre: (3,) of the box around the mesh, metres.
-        half_size: (3,) of that box.
-        radius: of the ball around that centre that holds the mesh.
-        corners: (8, 3) of that box.
-        hull: (H, 3) vertices of the convex hull.
+        surface: coal's model of the mesh.
+        centre: (3,) centre of the box around the mesh, metres.
+        half_size: (3,) half the sides of that box, metres.
+        radius: radius of the ball around that centre that holds the mesh, metres.
+        corners: (8, 3) corners of that box, metres.
+        hull: (H, 3) vertices of the convex hull, metres.
     """
 
     def __init__(self, mesh: LinkMesh) -> None:
@@ -116,7 +116,7 @@ class Link:
 
     @cached_property
     def groups(self) -> _Groups:
-        """Points of the solid, so dense that none of it is farther than `RESOLUTION` from one."""
+        """Points of the solid, so dense that each place in it has one within `RESOLUTION`."""
         surface, _ = surface_samples(self._triangles, SURFACE_SPACING)
         shape = tuple(int(n) for n in np.ceil(2 * self.half_size / INNER_SPACING) + 1)
         origin = self.centre - INNER_SPACING * (np.array(shape) - 1) / 2
@@ -130,102 +130,96 @@ class Link:
         return _Groups.of(self.groups.centres, BALL_SIZE, self.groups.radii)
 
     def contains(self, point: Array) -> bool:
-        """Whether a point (3,) off the surface is inside, by the winding number: the hand's mesh has small holes."""
+        """Return whether a point (3,) is inside, by the winding number, as the hand's mesh has small holes."""
         if np.any(np.abs(point - self.centre) > self.half_size):
             return False
         a, b, c = np.moveaxis(self._triangles - point, 1, 0)
         la, lb, lc = (np.sqrt(np.einsum("ij,ij->i", side, side)) for side in (a, b, c))
-        # Solid angles of the triangles (van Oosterom and Strackee, 1983).
+        # The winding number is the sum of the triangles' solid angles (van Oosterom and Strackee, 1983)
         volume = np.einsum("ij,ij->i", a, np.cross(b, c))
         ab, bc, ca = np.einsum("ij,ij->i", a, b), np.einsum("ij,ij->i", b, c), np.einsum("ij,ij->i", c, a)
         winding = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2 * np.pi)
         return bool(abs(winding) > 0.5)
 
 
-class _Rounded(NamedTuple):
-    """An obstacle as all points within `radius` of a core.
-
-    Where the arm touches the core it counts as `radius` deep, so depth is exact for a core without volume.
-    """
-
-    core: coal.CollisionGeometry
-    rotation: Array  # (3, 3)
-    position: Array  # (3,), metres
-    extent: float  # of the core from its position, metres
-    radius: float  # metres
-
-
-def _rounded(obstacle: Sphere) -> _Rounded:
-    """The obstacle as coal knows it.
-
-    Coal's signed distance of a mesh from a ball is not its depth: once one triangle is inside, whatever else overlaps
-    is skipped. The distance from the ball's centre is positive, and so exact.
-    """
-    return _Rounded(coal.Sphere(0.0), np.eye(3), np.asarray(obstacle.position), 0.0, obstacle.radius)
-
-
 class Measure(Protocol):
-    """Distances of several items (a link, or a pair of links), as a search needs them."""
+    """Distances of several items, each a link or a pair of links."""
 
     lowest: float
-    """No distance is smaller."""
+    """Lower bound of all distances, metres."""
 
     @property
     def bodies(self) -> Indices:
-        """(I,) the link of each item."""
+        """Indices (I,) of the items' moving links."""
         ...
 
     @property
     def bases(self) -> Indices:
-        """(I,) the frame that its motion counts against: what it is measured from moves with that frame."""
+        """Indices (I,) of the frames that the items are measured from and their motion is relative to."""
         ...
 
     def names(self, item: int) -> tuple[str, ...]:
-        """Of the links of an item."""
+        """Return the names of an item's links."""
         ...
 
     def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
-        """Quick lower bounds (N,) of the distances of items (N,) at the poses in rows (N,)."""
+        """Compute quick lower bounds (N,) of the distances of items (N,) at the poses in rows (N,)."""
         ...
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
-        """The distance of one item, exact if it is below the ceiling; else any value from the ceiling to it."""
+        """Compute the distance of an item, exact below the ceiling; else any value between the ceiling and it."""
         ...
 
 
-class _FromBall:
-    """Signed distances of the links from a ball."""
+class _OfLinks:
+    """Base of the measures whose items are links, measured from something that does not move.
 
-    def __init__(self, links: Sequence[Link], obstacle: Sphere) -> None:
-        self._links, self._obstacle = links, _rounded(obstacle)
-        self._frames = np.array([link.frame for link in links])
-        self._centres = np.array([link.centre for link in links])
-        self._half_sizes = np.array([link.half_size for link in links])
-        self.bodies = np.arange(len(links))
-        self.bases = np.zeros(len(links), dtype=np.intp)
-        self.lowest = -self._obstacle.radius
-        self._known: dict[int, list[tuple[Array, float, bool]]] = {}
+    Attributes:
+        bodies: see `Measure`.
+        bases: see `Measure`.
+    """
+
+    def __init__(self, links: Sequence[Link], bodies: Sequence[int]) -> None:
+        self._links = [links[k] for k in bodies]
+        self._frames = np.array([link.frame for link in self._links])
+        self._centres = np.array([link.centre for link in self._links])
+        self._half_sizes = np.array([link.half_size for link in self._links])
+        self.bodies, self.bases = np.array(bodies), np.zeros(len(bodies), dtype=np.intp)
 
     def names(self, item: int) -> tuple[str, ...]:
         return (self._links[item].name,)
 
+
+class _FromBall(_OfLinks):
+    """Signed distances of the links from a ball, measured from its centre.
+
+    Coal's signed distance of a mesh from a ball is not its depth: once one triangle is inside, all other overlaps are
+    skipped. The distance from the centre is positive, and so exact.
+    """
+
+    def __init__(self, links: Sequence[Link], obstacle: Sphere) -> None:
+        super().__init__(links, range(len(links)))
+        self._point, self._position, self._radius = coal.Sphere(0.0), np.asarray(obstacle.position), obstacle.radius
+        self.lowest = -obstacle.radius
+        self._known: dict[int, list[tuple[Array, float, bool]]] = {}
+
     def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
         frames = self._frames[items]
-        offset = self._obstacle.position - poses.origins[rows, frames]
+        offset = self._position - poses.origins[rows, frames]
         local = np.einsum("nji,nj->ni", poses.rotations[rows, frames], offset) - self._centres[items]
         outside = np.maximum(np.abs(local) - self._half_sizes[items], 0.0)
-        return np.maximum(np.linalg.norm(outside, axis=1) - self._obstacle.extent, 0.0) - self._obstacle.radius
+        return np.linalg.norm(outside, axis=1) - self._radius
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
-        link, (core, rotation, position, _, radius) = self._links[item], self._obstacle
+        link = self._links[item]
         turn = poses.rotations[row, link.frame].T
-        centre = turn @ (position - poses.origins[row, link.frame])
-        place = coal.Transform3s(turn @ rotation, centre)
-        gap = _coal_distance(link.surface, coal.Transform3s(), core, place, ceiling + radius)
-        return (0.0 if gap > 0 and self._inside(item, centre, gap) else gap) - radius
+        centre = turn @ (self._position - poses.origins[row, link.frame])
+        place = coal.Transform3s(turn, centre)
+        gap = _coal_distance(link.surface, coal.Transform3s(), self._point, place, ceiling + self._radius)
+        return (0.0 if gap > 0 and self._inside(item, centre, gap) else gap) - self._radius
 
     def _inside(self, item: int, point: Array, gap: float) -> bool:
-        """Whether a point is inside the link, its surface at least `gap` away."""
+        """Return whether a point is inside the link, whose surface is at least `gap` away."""
         known = self._known.setdefault(item, [])
         for other, free, inside in known:
             if np.linalg.norm(point - other) < free:  # no surface in between
@@ -235,37 +229,31 @@ class _FromBall:
         return inside
 
 
-class _FromShape:
+class _FromShape(_OfLinks):
     """Signed distances of the links from an obstacle of any shape.
 
-    Outside, coal's distance of its surface (a mesh's, a cloud's as it is drawn) from the links', which is exact. Where
-    they intersect, the smallest signed distance, as the obstacle knows it, of points that fill the link: the depth may
-    be larger by up to `RESOLUTION`.
+    Outside, it is coal's exact distance between the surfaces of obstacle and link; the surface of a mesh or a cloud is
+    the drawn one. Where they intersect, it is the obstacle's smallest signed distance at points that fill the link; the
+    depth may be larger by up to `RESOLUTION`.
     """
 
     def __init__(self, links: Sequence[Link], obstacle: Obstacle) -> None:
-        self._links, self._obstacle = links, obstacle
-        self._core = _coal_shape(obstacle)
+        super().__init__(links, range(len(links)))
+        self._obstacle, self._core = obstacle, _coal_shape(obstacle)
         self._turn, self._position = rotation(obstacle.wxyz), np.asarray(obstacle.position)
         self._on_surface = self._turn @ obstacle.surface()[0][0] + self._position
-        self._frames = np.array([link.frame for link in links])
-        # the balls of all links, as many for each
+        # the balls of all links, padded to the same number
         most = max(len(link.balls.radii) for link in links)
         fill = [np.minimum(np.arange(most), len(link.balls.radii) - 1) for link in links]
-        self._centres = np.stack([link.balls.centres[k] for link, k in zip(links, fill, strict=True)])
-        self._radii = np.stack([link.balls.radii[k] for link, k in zip(links, fill, strict=True)])
-        self.bodies = np.arange(len(links))
-        self.bases = np.zeros(len(links), dtype=np.intp)
+        self._ball_centres = np.stack([link.balls.centres[k] for link, k in zip(links, fill, strict=True)])
+        self._ball_radii = np.stack([link.balls.radii[k] for link, k in zip(links, fill, strict=True)])
         self.lowest = SHAPE_TOLERANCE - obstacle.depth
-
-    def names(self, item: int) -> tuple[str, ...]:
-        return (self._links[item].name,)
 
     def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
         frames = self._frames[items]
-        turned = np.einsum("nij,nkj->nki", poses.rotations[rows, frames], self._centres[items])
+        turned = np.einsum("nij,nkj->nki", poses.rotations[rows, frames], self._ball_centres[items])
         centres = turned + poses.origins[rows, frames][:, None]
-        return (self._obstacle.signed_distance(centres) - self._radii[items]).min(axis=1)
+        return (self._obstacle.signed_distance(centres) - self._ball_radii[items]).min(axis=1)
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
         link = self._links[item]
@@ -280,7 +268,7 @@ class _FromShape:
         return min(deepest, 0.0)
 
     def _deepest(self, link: Link, turn: Array, origin: Array) -> float:
-        """The smallest signed distance of the link's points, if it is negative; else 0."""
+        """Return the smallest signed distance of the link's points, at most 0."""
         groups, deepest = link.groups, 0.0
         lower = self._obstacle.signed_distance(groups.centres @ turn.T + origin) - groups.radii
         order = np.argsort(lower)
@@ -295,7 +283,7 @@ class _FromShape:
 
 
 def _coal_shape(obstacle: Obstacle) -> coal.CollisionGeometry:
-    """The obstacle's surface in its own frame."""
+    """Return coal's model of the obstacle's surface in its own frame."""
     if isinstance(obstacle, Box):
         return coal.Box(*obstacle.sizes)
     if isinstance(obstacle, Cylinder):
@@ -309,7 +297,7 @@ def _drawn(obstacle: Obstacle) -> coal.CollisionGeometry:
 
 
 def _bounding_volumes(vertices: Array, faces: Indices) -> coal.CollisionGeometry:
-    """Triangles as coal measures them."""
+    """Return coal's model of triangles."""
     model = coal.BVHModelOBBRSS()
     model.beginModel(len(faces), len(vertices))
     model.addVertices(vertices)
@@ -319,17 +307,17 @@ def _bounding_volumes(vertices: Array, faces: Indices) -> coal.CollisionGeometry
 
 
 def measure_from(links: Sequence[Link], obstacle: Obstacle) -> Measure:
-    """Distances of the links from an obstacle."""
+    """Return the measure of the links' signed distances from an obstacle."""
     return _FromBall(links, obstacle) if isinstance(obstacle, Sphere) else _FromShape(links, obstacle)
 
 
-class _BetweenLinks:
-    """Distances of pairs of links."""
+class BetweenLinks:
+    """Distances of those pairs of links that can come near each other."""
 
     lowest = 0.0
 
     def __init__(self, links: Sequence[Link]) -> None:
-        # Neighbours touch by design. No other pair does: each is apart in 96 % or more of random postures.
+        # Neighbours touch by design; each other pair is apart in at least 96 % of random postures.
         apart = [(a, b) for a, b in combinations(range(len(links)), 2) if links[b].frame - links[a].frame > 1]
         self._links = links
         self._pairs = np.array(apart)
@@ -340,10 +328,12 @@ class _BetweenLinks:
         self.bases = self._frames[self._pairs[:, 0]]
 
     def names(self, item: int) -> tuple[str, ...]:
+        """See `Measure`."""
         first, second = self._pairs[item]
         return self._links[first].name, self._links[second].name
 
     def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        """See `Measure`."""
         a, b = self._pairs[items].T
         apart = np.linalg.norm(self._centre(poses, rows, a) - self._centre(poses, rows, b), axis=1)
         return apart - self._radii[a] - self._radii[b]
@@ -354,6 +344,7 @@ class _BetweenLinks:
         return turned + poses.origins[rows, frames]
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        """See `Measure`."""
         first, second = (self._links[k] for k in self._pairs[item])
         place, other_place = (
             coal.Transform3s(poses.rotations[row, link.frame], poses.origins[row, link.frame])
@@ -362,41 +353,25 @@ class _BetweenLinks:
         return _coal_distance(first.surface, place, second.surface, other_place, ceiling)
 
 
-class _AboveTable:
-    """Heights of links above the table."""
+class AboveTable(_OfLinks):
+    """Heights of the links' lowest points above the table, on which the base and link 1 stand."""
 
     lowest = -np.inf
 
     def __init__(self, links: Sequence[Link]) -> None:
-        self._links = [link for link in links if link.frame > 1]  # the base and link 1 stand on it
-        self.bodies = np.array([k for k, link in enumerate(links) if link.frame > 1])
-        self.bases = np.zeros(len(self.bodies), dtype=np.intp)
-        self._frames = np.array([link.frame for link in self._links])
-        self._centres = np.array([link.centre for link in self._links])
-        self._half_sizes = np.array([link.half_size for link in self._links])
-
-    def names(self, item: int) -> tuple[str, ...]:
-        return (self._links[item].name,)
+        super().__init__(links, [k for k, link in enumerate(links) if link.frame > 1])
 
     def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        """See `Measure`."""
         up = poses.rotations[rows, self._frames[items], 2]  # (N, 3)
         sag = (up * self._centres[items] - np.abs(up) * self._half_sizes[items]).sum(axis=1)
         return poses.origins[rows, self._frames[items], 2] + sag
 
     def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        """See `Measure`."""
         link = self._links[item]
         heights = link.hull @ poses.rotations[row, link.frame, 2]
         return float(heights.min() + poses.origins[row, link.frame, 2])
-
-
-def measure_between(links: Sequence[Link]) -> Measure:
-    """Distances of those links from each other that can come near each other."""
-    return _BetweenLinks(links)
-
-
-def measure_above_table(links: Sequence[Link]) -> Measure:
-    """Heights of the links' lowest points."""
-    return _AboveTable(links)
 
 
 _REQUEST = coal.DistanceRequest()
@@ -410,7 +385,7 @@ def _coal_distance(
     place_b: coal.Transform3s,
     ceiling: float,
 ) -> float:
-    """Distance of two shapes, 0 where they intersect, or the ceiling, whatever is smaller."""
+    """Return the distance of two shapes, 0 where they intersect, or the ceiling if that is smaller."""
     result = coal.DistanceResult()
-    result.min_distance = ceiling  # what is farther is skipped
+    result.min_distance = ceiling  # farther pairs are skipped
     return max(0.0, coal.distance(a, place_a, b, place_b, _REQUEST, result))

@@ -1,7 +1,7 @@
-"""Joint velocity limits: a sampled motion is delayed where it is too fast, and slows down gradually before it.
+"""Joint velocity limits: a sampled motion is delayed where it is too fast, and slows down gradually before that.
 
-A positive rescaling of time changes no orbit: the arm passes through the same configurations, only later, so whatever
-holds for the path (free of obstacles, within the joint limits, ending at the goal) still holds.
+A positive rescaling of time changes no orbit: the arm passes through the same configurations, only later, so its path
+stays free of obstacles and within the joint limits, and still ends at the goal.
 """
 
 import numpy as np
@@ -9,13 +9,13 @@ import numpy as np
 from dt_viz.flows.fields import Array
 
 RAMP = 0.3
-"""Seconds in which a motion may slow down from its own pace to a standstill, or back."""
+"""Shortest time in which a motion slows down from its own pace to a standstill, or back, seconds."""
 NEGLIGIBLE = 1e-6
-"""Seconds: a segment that is late by less waits where it is, and nothing slows down around it."""
+"""Delay of a segment, seconds, up to which the motion around it does not slow down."""
 
 
 def within_velocity_limits(times: Array, q: Array, limits: Array) -> Array:
-    """Later times at which the same motion respects the joint velocity limits.
+    """Delay a motion so that it respects the joint velocity limits.
 
     The progress of the motion is the rate g = dt/ds of its own time t in the new time s: at most 1, and at most what
     each segment allows. It changes at most at the rate 1/`RAMP`, and since dg/ds = ½ d(g²)/dt, its square is the
@@ -61,43 +61,6 @@ def within_velocity_limits(times: Array, q: Array, limits: Array) -> Array:
     return times + np.concatenate([[0.0], np.cumsum(delays)])
 
 
-def used_fraction(times: Array, q: Array, limits: Array) -> float:
-    """The largest fraction of a velocity limit that any joint uses in any segment; infinite where the motion jumps.
-
-    Args:
-        times: (T,) seconds, not decreasing.
-        q: (T, 6) joint angles, rad.
-        limits: (6,) rad/s.
-    """
-    intervals, least = np.diff(times), _least_intervals(q, limits)
-    used = np.where(least > 0, np.inf, 0.0)
-    np.divide(least, intervals, out=used, where=intervals > 0)
-    return float(used.max(initial=0.0))
-
-
-def joint_velocities(times: Array, q: Array) -> Array:
-    """Joint velocities at the samples of a motion: those of the chord between the samples before and after.
-
-    That is the mean of the two segments that meet, weighted by their durations, so it stays within limits that the
-    segments respect. Samples at one and the same time get one velocity; a motion that takes no time gets zero.
-
-    Args:
-        times: (T,) seconds, not decreasing.
-        q: (T, 6) joint angles, rad.
-
-    Returns:
-        (T, 6) rad/s, signed.
-    """
-    is_first = np.append(True, np.diff(times) > 0)
-    if is_first.sum() == 1:
-        return np.zeros_like(q)
-    first = np.flatnonzero(is_first)
-    last = np.append(first[1:], len(times)) - 1
-    before, after = np.append(0, last[:-1]), np.append(first[1:], len(times) - 1)
-    velocities = (q[after] - q[before]) / (times[after] - times[before])[:, None]
-    return velocities[np.cumsum(is_first) - 1]
-
-
 def _least_intervals(q: Array, limits: Array) -> Array:
-    """Duration (T − 1,) of each segment of q (T, 6) when its most demanding joint moves at its limit, seconds."""
+    """Return the shortest duration (T − 1,) of each segment of q (T, 6), at a joint's limit, seconds."""
     return (np.abs(np.diff(q, axis=0)) / limits).max(axis=1)

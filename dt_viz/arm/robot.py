@@ -1,8 +1,8 @@
 """The JACO arm: joint limits, kinematics, and the shapes of its links.
 
-Pinocchio reads the URDF once, into plain arrays; everything after that is numpy over whole batches of
-configurations. Lengths are metres, angles radians, positions and directions in the robot's base frame. A configuration
-q is always six angles, also for the continuous joints, which pinocchio keeps as (cos, sin).
+Pinocchio reads the URDF once, into plain arrays; numpy computes everything else, for whole batches of configurations.
+Lengths are metres, angles radians, positions and directions in the robot's base frame. A configuration q is always six
+angles, also for the continuous joints, which pinocchio keeps as (cos, sin).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ HOME = (0.0, 3.2, 1.1, 0.0, 3.4, 0.0)
 
 
 class KinematicChain(NamedTuple):
-    """Forward kinematics with the batch last: there a rotation costs one matrix product for the whole batch."""
+    """Forward kinematics with the batch last, where a rotation costs one matrix product for the whole batch."""
 
     axes: Array
     """(6, 3, 3, N): [joint, column of the rotation, component], base frame."""
@@ -41,18 +41,18 @@ class KinematicChain(NamedTuple):
     position: Array
     """(3, N) of the end effector, metres."""
     direction: Array
-    """(3, N) unit vectors: where the hand points."""
+    """(3, N) unit vectors along the hand."""
 
     def position_jacobian(self) -> Array:
-        """Velocity of the end effector for each joint turning, (6, 3, N), metres per rad."""
+        """Compute the velocity of the end effector for each joint's, (6, 3, N), m/rad."""
         return cross(self.axes[:, 2], self.position - self.origins)
 
     def direction_jacobian(self) -> Array:
-        """Velocity of the hand's direction for each joint turning, (6, 3, N), per rad."""
+        """Compute the velocity of the hand's direction for each joint's, (6, 3, N), per rad."""
         return cross(self.axes[:, 2], self.direction)
 
     def manipulability(self) -> Array:
-        """Square root of det(J Jᵀ) of the position's Jacobian, (N,), m³."""
+        """Compute the square root of det(J Jᵀ), J the position's Jacobian, (N,), m³."""
         J = self.position_jacobian()
         x, y, z = np.einsum("irn,isn->rsn", J, J)
         return np.sqrt(np.maximum((x * cross(y, z)).sum(axis=0), 0.0))
@@ -71,7 +71,6 @@ class Robot:
         joint_translations: (6, 3) position of each joint in the previous one, metres.
         link_rotations: (6, 3, 3) orientation of each joint at angle zero in its *parent link* in the URDF. It differs
             from `joint_rotations` where fixed joints lie in between.
-        end_effector_rotation: (3, 3) orientation of the end effector in the last joint.
         end_effector_offset: (3,) position of the end effector in the last joint, metres.
         home: (6,) ready pose, rad.
     """
@@ -83,24 +82,23 @@ class Robot:
     joint_rotations: Array
     joint_translations: Array
     link_rotations: Array
-    end_effector_rotation: Array
     end_effector_offset: Array
     home: Array
 
     @property
     def reach(self) -> float:
-        """Length of the straightened arm from the second joint to the end effector, metres: no target is farther."""
+        """Length of the straightened arm from the second joint to the end effector, metres."""
         segments = np.vstack([self.joint_translations[2:], self.end_effector_offset])
         return float(np.linalg.norm(segments, axis=1).sum())
 
     def clip(self, q: ArrayLike) -> Array:
-        """Nearest configuration inside the joint limits; q (*B, 6), rad."""
+        """Return the nearest configuration inside the joint limits; q (*B, 6), rad."""
         return np.clip(q, self.lower, self.upper)
 
     # --- Kinematics ---
 
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
-        """Poses of the six joint frames (each turns with the link after it).
+        """Compute the poses of the six joint frames (each turns with the link after it).
 
         Args:
             q: (*B, 6) joint angles, rad.
@@ -115,23 +113,17 @@ class Robot:
         return rotations, origins
 
     def end_effector(self, q: ArrayLike) -> Array:
-        """End-effector positions (*B, 3), metres, of configurations q (*B, 6), rad."""
+        """Compute the end-effector positions (*B, 3), metres, of configurations q (*B, 6), rad."""
         q = np.asarray(q, dtype=float)
         return self.chain(q.reshape(-1, NUM_JOINTS).T).position.T.reshape(*q.shape[:-1], 3)
 
-    def end_effector_pose(self, q: ArrayLike) -> tuple[Array, Array]:
-        """End-effector rotations (*B, 3, 3) and positions (*B, 3), metres, of configurations q (*B, 6), rad."""
-        rotations, origins = self.forward_kinematics(q)
-        last = rotations[..., -1, :, :]
-        return last @ self.end_effector_rotation, origins[..., -1, :] + last @ self.end_effector_offset
-
     def hand_direction(self, q: ArrayLike) -> Array:
-        """Unit vectors (*B, 3), base frame, from the last joint to the end effector; q (*B, 6), rad."""
+        """Compute unit vectors (*B, 3), base frame, from the last joint to the end effector; q (*B, 6), rad."""
         q = np.asarray(q, dtype=float)
         return self.chain(q.reshape(-1, NUM_JOINTS).T).direction.T.reshape(*q.shape[:-1], 3)
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """Linear Jacobian of the end effector in the base frame.
+        """Compute the linear Jacobian of the end effector in the base frame.
 
         Args:
             q: (*B, 6) joint angles, rad.
@@ -144,9 +136,9 @@ class Robot:
         return chain.position_jacobian().transpose(2, 1, 0).reshape(*q.shape[:-1], 3, NUM_JOINTS)
 
     def joint_frames(self, q: ArrayLike) -> Array:
-        """Rotation of each joint's child link in its parent link, as a viewer's scene tree lays the links out.
+        """Compute the rotation of each joint's child link in its parent link, for a viewer's scene tree.
 
-        Positions of these frames do not depend on q: set once, a viewer needs only these rotations.
+        The positions of these frames do not depend on q.
 
         Args:
             q: (*B, 6) joint angles, rad.
@@ -157,11 +149,11 @@ class Robot:
         q = np.asarray(q, dtype=float)
         w, x, y, z = _quaternions(self.link_rotations).T
         c, s = np.cos(q / 2), np.sin(q / 2)
-        # The product of the fixed quaternion with (c, 0, 0, s), a turn about z.
+        # the fixed quaternion times (c, 0, 0, s), a turn about z
         return np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=-1)
 
     def chain(self, q: Array) -> KinematicChain:
-        """Forward kinematics of q (6, N), rad, in the layout that is quickest to compute with."""
+        """Compute the forward kinematics of q (6, N), rad, with the batch last."""
         num = q.shape[1]
         axes = np.empty((NUM_JOINTS, 3, 3, num), dtype=q.dtype)
         origins = np.empty((NUM_JOINTS, 3, num), dtype=q.dtype)
@@ -183,12 +175,12 @@ class Robot:
 
 @dataclass(frozen=True, eq=False)
 class LinkMesh:
-    """The collision shape of a link; the fingers, which do not move, are links of the last joint.
+    """Collision shape of a link; the fingers, which do not move, are links of the last joint.
 
     Attributes:
-        name: of the link in the URDF.
+        name: name of the link in the URDF.
         joint: index of the joint that it moves with, -1 for the base.
-        vertices: (V, 3) metres, in the frame of that joint, the base's in the base frame.
+        vertices: (V, 3) metres, in the frame of that joint; of the base in the base frame.
         faces: (F, 3) indices of vertices.
     """
 
@@ -199,19 +191,19 @@ class LinkMesh:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross products over the second last axis of a (*B, 3, N) and b (*B, 3, N)."""
+    """Compute cross products over the second last axis of a (*B, 3, N) and b (*B, 3, N)."""
     ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
     bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-2)
 
 
 def _quaternions(rotations: Array) -> Array:
-    """Unit quaternions (N, 4), wxyz, of rotations (N, 3, 3)."""
+    """Convert rotations (N, 3, 3) to unit quaternions (N, 4), wxyz."""
     return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
 
 
 def urdf_path() -> Path:
-    """The JACO's URDF in the installed example-robot-data.
+    """Find the JACO's URDF in the installed example-robot-data.
 
     Raises:
         FileNotFoundError: The package is not installed, or its version has no such file.
@@ -230,7 +222,7 @@ def urdf_path() -> Path:
 
 
 def package_folder() -> Path:
-    """The folder in which the `package://` addresses of the URDF's meshes resolve.
+    """Return the folder in which the `package://` addresses of the URDF's meshes resolve.
 
     Raises:
         FileNotFoundError: As `urdf_path`.
@@ -241,7 +233,7 @@ def package_folder() -> Path:
 
 @lru_cache(maxsize=1)
 def load_jaco() -> Robot:
-    """The JACO arm (j2s6s200: six joints, two fingers), read once.
+    """Load the JACO arm (j2s6s200: six joints, two fingers), once.
 
     Raises:
         FileNotFoundError: As `urdf_path`.
@@ -264,7 +256,6 @@ def load_jaco() -> Robot:
         joint_rotations=_constant([model.jointPlacements[i].rotation for i in joints]),
         joint_translations=_constant([model.jointPlacements[i].translation for i in joints]),
         link_rotations=_constant([placement.rotation for placement in in_link]),
-        end_effector_rotation=_constant(hand.rotation),
         end_effector_offset=_constant(hand.translation),
         home=_constant(HOME),
     )
@@ -272,7 +263,7 @@ def load_jaco() -> Robot:
 
 @lru_cache(maxsize=1)
 def collision_meshes() -> tuple[LinkMesh, ...]:
-    """The collision meshes of the URDF, from the base to the finger tips, read once.
+    """Load the collision meshes of the URDF, from the base to the finger tips, once.
 
     Raises:
         FileNotFoundError: As `urdf_path`.
@@ -301,7 +292,7 @@ def collision_meshes() -> tuple[LinkMesh, ...]:
 
 
 def _constant(values: ArrayLike) -> Array:
-    """A copy that cannot be written to."""
+    """Return a read-only copy."""
     array = np.array(values, dtype=float)
     array.flags.writeable = False
     return array

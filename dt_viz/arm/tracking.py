@@ -1,7 +1,7 @@
 """Inverse kinematics, and tracking of end-effector paths with the joints.
 
-Both solve for the configuration of best posture among those that put the end effector in the right place, for whole
-batches at once. Lengths are metres, angles radians, positions and directions in the robot's base frame.
+Both find the configuration of best posture among those with the end effector in the right place, for whole batches.
+Lengths are metres, angles radians, positions and directions in the robot's base frame.
 """
 
 from __future__ import annotations
@@ -20,45 +20,44 @@ if TYPE_CHECKING:
 
 
 HAND_PITCH = np.deg2rad(40.0)
-"""Angle below horizontal at which the hand points when nobody says otherwise."""
+"""Default angle of the hand below horizontal, rad."""
 
 DIRECTION_WEIGHT = 1.5
 """Weight w_d of the hand's direction (unit vectors) against joint angles (rad). Much above 2, the best posture stops
 being unique and tracked joints jump between wrist postures."""
 ASKED_DIRECTION_WEIGHT = 40.0
-"""The same where inverse kinematics is asked for a direction: it picks one posture and need not be continuous."""
+"""That weight where inverse kinematics is given a direction: it chooses one posture and need not be continuous."""
 LIMIT_WEIGHT = 50.0
 """Weight of the springs before the joint limits, against 1 for staying near the reference."""
 LIMIT_MARGIN = 0.15
-"""Where those springs start, rad from the limit."""
+"""Distance from the limit at which those springs start, rad."""
 DAMPING_FLOOR = 1e-6
-"""Least damping λ₀² of the pseudo-inverse, m²: bounds the step at a singularity, shifts nothing elsewhere."""
+"""Least damping λ₀² of the pseudo-inverse, m²: bounds the step at a singularity, is negligible elsewhere."""
 DAMPING_PER_ERROR = 0.2
 """Growth of λ² with the remaining error, m: about half the curvature of the forward kinematics."""
 CURVATURE = 0.1
 """Curvature of the forward kinematics along the null space, m per rad²; see `_newton`."""
 STEP_LIMIT = 0.4
-"""Largest joint motion in one step, rad: beyond it the linear model means nothing."""
+"""Largest joint motion in one step, rad; beyond it the linear model is invalid."""
 
 STRIDE = 0.08
 """Distance along the path that a cold start covers in one step, metres."""
-MAX_SWEEPS = 8
-FINAL_SWEEPS = 3
-"""Sweeps, after those, that leave the posture alone and only finish the waypoints that are still moving."""
+MAX_SWEEPS, FINAL_SWEEPS = 8, 3
+"""Largest number of sweeps, and of those after them that keep the posture and only correct the positions."""
 STEP_TOLERANCE = 1e-3
-"""A waypoint is done after a step smaller than this, rad: the error left is about its square times the reach."""
+"""Step, rad, below which a waypoint is done: the remaining error is about its square times the reach."""
 JUMP_PER_ROOT_METRE = 4.0
 """Joint motion over the root of the hand's, rad/√m, above which a warm start has lost its branch. The stretched arm
-moves by the root: 0.4 rad bend it by 2 cm."""
+follows the root: 0.4 rad bend it by 2 cm."""
 SINGULAR_MANIPULABILITY = 3e-3
 """Manipulability, m³, below which the damping takes about 1 % or more of a step; the workspace has 0.05 to 0.2."""
 
 NUM_RESTARTS = 24
 IK_ITERATIONS = 60
 IK_TOLERANCE = 1e-5
-"""Miss, metres, below which a target counts as reached."""
+"""Distance from the target, metres, below which it counts as reached."""
 NUM_CORRECTIONS = 3
-"""Steps that take millimetres to rounding: their convergence is quadratic."""
+"""Number of Newton steps from an error of millimetres to rounding; their convergence is quadratic."""
 FLOOR_WEIGHT = 100.0
 """Cost per metre of a joint below the table, where inverse kinematics chooses among its solutions."""
 
@@ -86,30 +85,25 @@ class JointPath:
     manipulability: Array
     damped: NDArray[np.bool_]
 
-    @property
-    def min_manipulability(self) -> float:
-        """Smallest manipulability on the path, m³."""
-        return float(self.manipulability.min())
-
 
 class _Posture(NamedTuple):
-    """What the null space is used for; one column a configuration, or one for all."""
+    """Secondary objective in the null space; one column for each configuration, or one for all."""
 
     reference: Array  # (6, N) or (6, 1), rad
     direction: Array  # (3, N) or (3, 1), unit vectors, base frame
-    soft_lower: Array  # (6, N) or (6, 1), rad, where the springs before the limits start
+    soft_lower: Array  # (6, N) or (6, 1), rad, starts of the springs before the limits
     soft_upper: Array
     direction_weight: Array  # (1, N) or (1, 1), against 1 for the reference
 
     def take(self, columns: NDArray[np.intp]) -> _Posture:
-        """The postures of some columns, in their order."""
+        """Select the postures of some columns, in their order."""
         return _Posture(*(field[:, columns] for field in self))
 
 
 def inverse_kinematics(
     robot: Robot, target: ArrayLike, seed: ArrayLike | None = None, hand_direction: ArrayLike | None = None
 ) -> Array:
-    """A natural configuration inside the joint limits that puts the end effector at the target.
+    """Find a natural configuration inside the joint limits with the end effector at the target.
 
     Damped Gauss-Newton steps run from many starts at once: the seed, the ready pose turned towards the target, and
     random ones around both (always the same). Among those that arrive, the one with the best posture wins: near the
@@ -120,7 +114,7 @@ def inverse_kinematics(
         robot: the arm.
         target: (3,) metres, base frame.
         seed: (6,) rad, posture to stay near; by default the ready pose turned towards the target.
-        hand_direction: (3,) where the hand should point, base frame, any length; weighed against the rest of the
+        hand_direction: (3,) desired direction of the hand, base frame, any length; weighed against the rest of the
             posture. By default the seed's direction, or without a seed outwards and `HAND_PITCH` below horizontal.
 
     Returns:
@@ -189,11 +183,11 @@ def track(
 
         δq = J#(x_k − x(q)) − (I − J#J) H⁻¹∇h.
 
-    Since h is measured from one reference, q depends on where the end effector is, not on how it got there: paths that
-    return give joints that return, a dragged path changes its joints continuously, and all paths with the same
-    reference are lifted by one section x → q(x), as long as their starts lie on its branch. And since waypoints do not
-    wait for each other, all of them step at once. A cold start first walks along the path in strides of
-    `STRIDE`, one step each, to stay on one branch; jumps between samples are thereby bridged.
+    Since h is measured from one reference, q depends on the position of the end effector, not on its history: paths
+    that return give joints that return, a dragged path changes its joints continuously, and all paths with the same
+    reference are lifted by one section x → q(x), as long as their starts lie on its branch. As waypoints do not depend
+    on each other, all of them step at once. A cold start first walks along the path in strides of `STRIDE`, one step
+    each, to stay on one branch; this also bridges jumps between samples.
 
     Waypoints out of reach get the nearest reachable position inside the limits; see `error`.
 
@@ -202,11 +196,11 @@ def track(
         path: (*B, T, 3) waypoints, metres, base frame. They need not be evenly spaced.
         start: (*B, 6) configuration to start from, rad; usually reaches the first waypoint.
         initial: (*B, T, 6) tracked joints of a nearby path, rad, from the same start: a warm start for live
-            dragging. If it leads to joints that jump, a cold start follows.
+            dragging. If its joints jump, a cold start follows.
         reference: (*B, 6) or (6,) configuration q_ref that the posture is measured from, rad; by default the start.
 
     Returns:
-        The joint path, with its error, and where limits and singularities interfered.
+        The joint path with its error and the interference of limits and singularities.
 
     Raises:
         ValueError: `start`, `initial` or `reference` do not fit the shape of `path`.
@@ -236,16 +230,16 @@ def track(
 
 
 def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Array:
-    """Postures next to others whose end effector is where it should be.
+    """Correct postures by small motions so that the end effector is at given positions.
 
     Args:
         robot: the arm.
         q: (N, 6) postures a few millimetres off, rad.
-        positions: (N, 3) of the end effector, metres.
+        positions: (N, 3) desired positions of the end effector, metres.
         reference: (6,) as in `track`, rad.
 
     Returns:
-        (N, 6) rad, inside the limits; of positions out of reach, towards the nearest place.
+        (N, 6) rad, inside the limits; for a position out of reach a posture near it.
     """
     posture = _posture(robot, reference[:, None], robot.hand_direction(reference)[:, None], at_reference=True)
     columns, target = q.T, np.ascontiguousarray(positions.T)
@@ -255,7 +249,7 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """The reference configurations (B, 6), one for each start; `shape` is that of the starts, (*B, 6)."""
+    """Return the reference configurations (B, 6), one for each start; `shape` is that of the starts, (*B, 6)."""
     reference = np.asarray(reference, dtype=float)
     if reference.shape not in {shape, shape[-1:]}:
         raise ValueError(f"reference must be {shape} like the start, or one for all, got {reference.shape}")
@@ -263,7 +257,7 @@ def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> A
 
 
 def _walk(robot: Robot, paths: Array, starts: Array, posture: _Posture, stride: float) -> Array:
-    """Rough joints (B, T, 6) for paths (B, T, 3), one stride after the other, all paths at once."""
+    """Walk along paths (B, T, 3), all at once, one stride after the other; return rough joints (B, T, 6)."""
     lines = np.concatenate([robot.end_effector(starts)[:, None], paths], axis=1)
     lengths = np.cumsum(np.linalg.norm(np.diff(lines, axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)
@@ -277,7 +271,7 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: _Posture, stride: 
     q[0] = starts.T
     for k in range(1, num_strides + 1):
         q[k], _ = _newton(robot, q[k - 1], knots[k], posture)
-    # Back to the waypoints, linear in the distance travelled.
+    # interpolate at the waypoints, linearly in the distance travelled
     place = lengths / np.maximum(lengths[:, -1:], 1e-12) * num_strides  # (B, T)
     left = np.minimum(place.astype(int), num_strides - 1)
     fraction = (place - left)[..., None]
@@ -286,7 +280,7 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: _Posture, stride: 
 
 
 def _sweep(robot: Robot, q: Array, paths: Array, posture: _Posture) -> Array:
-    """Steps on all waypoints at once until none moves; q (B, T, 6), paths (B, T, 3), posture of B columns."""
+    """Step all waypoints at once until none moves; q (B, T, 6), paths (B, T, 3), posture of B columns."""
     shape, targets = q.shape, np.array(paths.reshape(-1, 3).T, order="C")
     q = np.array(q.reshape(-1, NUM_JOINTS).T, order="C")
     posture = posture.take(np.repeat(np.arange(shape[0]), shape[1]))
@@ -315,7 +309,7 @@ def _report(robot: Robot, q: Array, path: Array) -> JointPath:
 def _posture(
     robot: Robot, reference: Array, direction: Array, weight: float = DIRECTION_WEIGHT, *, at_reference: bool = False
 ) -> _Posture:
-    """Posture around reference (6, N); `at_reference`: the springs are slack there, so that it is an optimum."""
+    """Make the posture of a reference (6, N); `at_reference` slackens the springs there, so that it is an optimum."""
     soft_lower = np.broadcast_to(robot.lower[:, None] + LIMIT_MARGIN, reference.shape)
     soft_upper = np.broadcast_to(robot.upper[:, None] - LIMIT_MARGIN, reference.shape)
     if at_reference:
@@ -324,23 +318,23 @@ def _posture(
 
 
 def _newton(robot: Robot, q: Array, target: Array, posture: _Posture, gain: float = 1.0) -> tuple[Array, Array]:
-    """One damped resolved-rate step towards the targets, with the posture improved in the null space.
+    """Make one damped resolved-rate step towards the targets and improve the posture in the null space.
 
     With e = target − x(q), H ≈ ∇²h (Gauss-Newton) and p = −H⁻¹∇h:
 
         δq = J#(λ) e + c·(I − J#(λ₀) J) p,   J#(λ) = H⁻¹Jᵀ(J H⁻¹ Jᵀ + λ²I)⁻¹.
 
-    λ² grows with ‖e‖, which keeps steps sane far from the target and out of reach, and falls with it to the small
-    λ₀², which the projector always has: posture does not pull off the target. μ = (J H⁻¹ Jᵀ + λ₀²I)⁻¹ J p are the
+    λ² grows with ‖e‖, which keeps steps moderate far from the target and out of reach, and falls with it to the small
+    λ₀² of the projector, so that the posture does not pull the hand off its target. μ = (J H⁻¹ Jᵀ + λ₀²I)⁻¹ J p are the
     multipliers of x(q) = target, and c = 1/(1 + κ‖μ‖) stands in for the curvature μ·∇²x that they add to H in the
-    null space; without it the posture overshoots for ever near singularities.
+    null space; without it the posture overshoots again and again near singularities.
 
     Args:
         robot: the arm.
         q: (6, N) rad.
         target: (3, N) or (3, 1), metres.
-        posture: Of N columns, or one.
-        gain: Factor of the null-space part; 0 leaves the plain pseudo-inverse.
+        posture: N columns, or one.
+        gain: factor of the null-space part; 0 leaves the plain pseudo-inverse.
 
     Returns:
         The configurations (6, N) after the step, inside the limits, and the largest joint motion (N,), rad.
@@ -373,7 +367,7 @@ def _newton(robot: Robot, q: Array, target: Array, posture: _Posture, gain: floa
 
 
 def _spd_inverse(A: Array, damping: Array | float) -> Array:
-    """Inverses of A + damping·I, by cofactors; A (3, 3, N) symmetric, positive semidefinite."""
+    """Invert A + damping·I by cofactors; A (3, 3, N) symmetric, positive semidefinite."""
     a, b, c = A[0, 0] + damping, A[1, 1] + damping, A[2, 2] + damping
     f, g, h = A[1, 2], A[0, 2], A[0, 1]
     out = np.empty(A.shape)
@@ -385,14 +379,14 @@ def _spd_inverse(A: Array, damping: Array | float) -> Array:
 
 
 def _loses_branch(q: Array, paths: Array) -> NDArray[np.bool_]:
-    """Which (B,) of the joints (B, T, 6) jump by more than paths (B, T, 3) ask of a continuous solution."""
+    """Find which (B,) joints (B, T, 6) jump by more than a continuous solution along paths (B, T, 3) can."""
     moved = np.linalg.norm(np.diff(paths, axis=1), axis=-1)
-    allowed = 0.05 + JUMP_PER_ROOT_METRE * np.sqrt(moved)  # a floor for repeated samples
+    allowed = 0.05 + JUMP_PER_ROOT_METRE * np.sqrt(moved)  # the constant is for repeated samples
     return np.any(np.abs(np.diff(q, axis=1)) > allowed[..., None], axis=(1, 2))
 
 
 def _posture_cost(q: Array, chain: KinematicChain, posture: _Posture) -> Array:
-    """The posture h(q) of `track`, (N,)."""
+    """Compute the posture cost h(q) of `track`, (N,)."""
     excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
     away = ((q - posture.reference) ** 2).sum(axis=0)
     turned = ((chain.direction - posture.direction) ** 2).sum(axis=0)

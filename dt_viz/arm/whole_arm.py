@@ -27,7 +27,7 @@ from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.properties import cached_property
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.transforms.base import ArmAvoidance
 
 NUM_CONFIGURATIONS = 100
 """Of each rollout before refinement."""
@@ -162,52 +162,52 @@ class WholeArm:
         self.body = body.on_moving_links
         self.limits = JointLimits(robot.lower, robot.upper)
 
-    def undisturbed(self, lifted: Lift, scenario: Scenario, spacing: float) -> ArmSolution:
+    def undisturbed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float) -> ArmSolution:
         """The motions as lifted, avoiding nothing."""
-        return _Solver(self, lifted, scenario, None, spacing, coarse=True).solution()
+        return _Solver(self, lifted, avoidance, None, spacing, coarse=True).solution()
 
     def avoiding(
         self,
         lifted: Lift,
-        scenario: Scenario,
+        avoidance: ArmAvoidance,
         spacing: float,
         *,
         coarse: bool,
     ) -> ArmSolution:
-        """The motions around the scenario's obstacle.
+        """The motions around the obstacle.
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
-        scenario's margin, or what the start or goal beside it has. Of several ways out the first is taken that works,
+        margin, or what the start or goal beside it has. Of several ways out the first is taken that works,
         or the one that comes nearest to it. All this looks at the hosts only: guests do not change their motions.
 
         Args:
             lifted: the motions below.
-            scenario: with obstacle, margin, temperature and duration.
+            avoidance: what is to be avoided, and how.
             spacing: largest distance between neighbouring samples, metres at the hand, about.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
         """
         best = None
-        for generator in self._generators(lifted, scenario):
-            solution = _Solver(self, lifted, scenario, generator, spacing, coarse=coarse).solution()
+        for generator in self._generators(lifted, avoidance):
+            solution = _Solver(self, lifted, avoidance, generator, spacing, coarse=coarse).solution()
             if best is None or solution.cleared or solution.clearance > best.clearance:
                 best = solution
-            if solution.cleared or scenario.duration is not None:
+            if solution.cleared or avoidance.duration is not None:
                 break
-        return best or self.undisturbed(lifted, scenario, spacing)
+        return best or self.undisturbed(lifted, avoidance, spacing)
 
     def warped(
-        self, full: ArmSolution, lifted: Lift, scenario: Scenario, fraction: float, spacing: float
+        self, full: ArmSolution, lifted: Lift, avoidance: ArmAvoidance, fraction: float, spacing: float
     ) -> ArmSolution:
         """The motions with the transform of a solution run for a fraction of its duration.
 
         Args:
             full: whose transform it is.
             lifted: the motions below, warped as far.
-            scenario: with obstacle and margin.
+            avoidance: what is avoided.
             fraction: s, from 0 to 1.
             spacing: as in `avoiding`.
         """
-        solver = _Solver(self, lifted, scenario, None, spacing, coarse=True)
+        solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
         return solver.through(full.transform.scaled(fraction), full.duration)
 
     def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
@@ -215,19 +215,19 @@ class WholeArm:
         points = self.body.of_chain(self.robot.chain(q.T))
         return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)
 
-    def _generators(self, lifted: Lift, scenario: Scenario) -> Iterator[VectorField]:
+    def _generators(self, lifted: Lift, avoidance: ArmAvoidance) -> Iterator[VectorField]:
         """The fields to try, the most promising first; none where nothing comes too near an obstacle."""
-        reach = REACH_PER_TEMPERATURE * scenario.temperature
+        reach = REACH_PER_TEMPERATURE * avoidance.temperature
         q = lifted.tracked.q[: lifted.num_hosts]
         points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-        near = scenario.obstacle.parts
-        escapes = [self._escapes(points, tangents, obstacle, scenario.margin) for obstacle in near]
+        near = avoidance.obstacle.parts
+        escapes = [self._escapes(points, tangents, obstacle, avoidance.margin) for obstacle in near]
         met = [(obstacle, found) for obstacle, found in zip(near, escapes, strict=True) if found]
         if not met:
             return
-        if scenario.generator == "probability":
+        if avoidance.generator == "probability":
             yield Sum(tuple(GradientField(self.robot, self.body, obstacle, reach) for obstacle, _ in met))
             return
         pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
@@ -270,7 +270,7 @@ class _Solver:
         self,
         arm: WholeArm,
         lifted: Lift,
-        scenario: Scenario,
+        avoidance: ArmAvoidance,
         generator: VectorField | None,
         spacing: float,
         *,
@@ -278,15 +278,15 @@ class _Solver:
     ) -> None:
         self._arm = arm
         self._lifted = lifted
-        self._scenario = scenario
+        self._avoidance = avoidance
         self._generator = generator
         self._spacing = spacing
         self._coarse = coarse
-        self._room = arm.clearance(lifted.pins, scenario.obstacle) - ROUNDING
+        self._room = arm.clearance(lifted.pins, avoidance.obstacle) - ROUNDING
 
     def solution(self) -> ArmSolution:
         """See `WholeArm.avoiding`."""
-        duration = self._scenario.duration
+        duration = self._avoidance.duration
         if self._generator is None:
             duration = 0.0
         elif duration is None:
@@ -301,7 +301,7 @@ class _Solver:
         p = bundle.positions / LEVERS
         lack = self._lack(p)
         hosts = self._of_hosts(bundle)
-        chosen = self._generator is not None and self._scenario.duration is None
+        chosen = self._generator is not None and self._avoidance.duration is None
         for _ in range(MAX_ROUNDS if chosen else 0):
             if duration >= MAX_DURATION or not (lack[hosts] > ROUNDING).any():
                 break
@@ -309,7 +309,7 @@ class _Solver:
             more = min(self._clearing_duration(p[hosts][lack[hosts] > 0]), MAX_DURATION - duration)
             duration += more
             transform = self._transform(duration)
-            if self._scenario.integration.by_hand:  # a few coarse steps are no such group
+            if self._avoidance.integration.by_hand:  # a few coarse steps are no such group
                 levels = self._evaluate(transform, bundle.index, bundle.fraction)
             else:
                 levels = (self._transform(more).inverse(p) * LEVERS)[:, None]
@@ -327,7 +327,7 @@ class _Solver:
     def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float, lack: Array) -> ArmSolution:
         p = bundle.positions / LEVERS
         hosts, near = self._of_hosts(bundle), lack > ROUNDING
-        clearance = float(self._arm.clearance(p[hosts], self._scenario.obstacle).min())
+        clearance = float(self._arm.clearance(p[hosts], self._avoidance.obstacle).min())
         q = self._lifted.at(bundle.index, bundle.fraction)
         cleared, too_near = not near[hosts].any(), np.unique(bundle.index[near & ~hosts])
         away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
@@ -348,8 +348,8 @@ class _Solver:
         limits = self._arm.limits
         if self._generator is None or duration == 0:
             return Identity(NUM_JOINTS)
-        if self._scenario.integration.by_hand:
-            flow = self._scenario.integration.of(Flow(self._generator, duration))
+        if self._avoidance.integration.by_hand:
+            flow = self._avoidance.integration.of(Flow(self._generator, duration))
         elif self._coarse:
             flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP), sparse=True)
         else:
@@ -367,9 +367,9 @@ class _Solver:
     def _lack(self, p: Array) -> Array:
         """(N,) metres by which configurations (N, 6) miss the clearance that is asked for."""
         distance = np.sqrt(squared_lengths(p, self._lifted.pins))
-        margin = max(self._scenario.margin - OVERSHOOT, 2 * ROUNDING)
+        margin = max(self._avoidance.margin - OVERSHOOT, 2 * ROUNDING)
         asked = np.minimum(margin, (self._room + SLOPE * distance).min(axis=1))
-        return asked - self._arm.clearance(p, self._scenario.obstacle)
+        return asked - self._arm.clearance(p, self._avoidance.obstacle)
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or `MAX_DURATION`."""

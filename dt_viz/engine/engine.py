@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from functools import lru_cache
 from typing import TypeVar
 
@@ -17,9 +16,10 @@ from dt_viz.arm.retiming import within_velocity_limits
 from dt_viz.arm.robot import Robot
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.arm.whole_arm import ArmSolution
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.turns import Turns
 from dt_viz.flows.diffeomorphisms import Flow
-from dt_viz.flows.fields import Array, PlacedField
+from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Bundle
 from dt_viz.interruption import Checkpoint, interruptible
 from dt_viz.learning.imitation import ImitationSettings, Progress
@@ -28,90 +28,32 @@ from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.certificates import (
     MAX_OFF,
     MAX_OFF_TRACKED,
+    Certificates,
     Shown,
     certified,
     certified_arm,
-    clearance_doubts,
-    delay_doubts,
-    hand_doubts,
+    clearance_warnings,
+    delay_warnings,
+    hand_warnings,
 )
-from dt_viz.motion.diagnostics import margin_doubts, motion_doubts, target_doubts
-from dt_viz.motion.following import OUT_OF_REACH, ArmMotion, Follower, arm_samples
-from dt_viz.motion.health import Health, fold_doubts
+from dt_viz.motion.diagnostics import anchor_warnings, fold_warnings, margin_warnings, motion_warnings, target_warnings
+from dt_viz.motion.following import ArmMotion, Follower, arm_samples, far_starts, unreachable
 from dt_viz.motion.holding import held
 from dt_viz.motion.nominal import Learned, Nominal
 from dt_viz.motion.profiles import Profiles, body_profile, hand_profile
 from dt_viz.motion.pushing import Pushed, pushed
 from dt_viz.motion.solve import FINE, LIVE, Precision, Solution, Solved, cut_off, solve
 from dt_viz.motion.warp import warped
+from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
-from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures, Sketchbook, in_frame
-from dt_viz.pictures.slice_fields import Clearance, arrows_and_colour, streamlines
-from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.slices import Slice
+from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
+from dt_viz.pictures.slice_fields import arrows_and_colour, streamlines
+from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import WHOLE_ARM, levels
 from dt_viz.scenario.starts import followed
 from dt_viz.scenario.tasks import Task, TaskEntry
-from dt_viz.transforms.base import named_starts
-
-
-class Stage(IntEnum):
-    """How far a frame is worked out; each stage holds all that the one before it holds."""
-
-    ROLLOUTS = 0
-    """Rollouts and their clearance."""
-    LIVE = 1
-    """Also the arm and what lies on the slice: what follows a drag."""
-    FINE = 2
-    """All of it refined, for a scenario that rests."""
-    CERTIFIED = 3
-    """Also the certificates."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """All that the page draws for a scenario. Read only."""
-
-    scenario: Scenario
-    task: Task
-    stage: Stage
-    ghost: tuple[Array, ...]
-    """Undeformed rollouts, (T_i, 3)."""
-    rollouts: tuple[Array, ...]
-    """(T_i, 3), metres: first those from the task's starts, then those from added ones."""
-    times: tuple[Array, ...]
-    """(T_i,) seconds of the samples of each rollout."""
-    levels: tuple[tuple[Array, ...], ...]
-    """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3)."""
-    goal: Array
-    """(3,) where the demonstrations end."""
-    reached: Array
-    """(3,) where the motions end: elsewhere where the obstacle covers the goal or leaves no way to it."""
-    blocked: tuple[str, ...]
-    """Why there is no motion for this scenario, in words; what is shown then is the last one that there was."""
-    health: Health
-    chosen: int | None = 0
-    """Which rollout the arm follows; None where it cannot begin the one that the scenario asks for."""
-    learned_steps: tuple[int, ...] = ()
-    """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
-    layer_radii: tuple[float | None, ...] = ()
-    """Radius of the region that each layer acts in, in the order of `Scenario.layers`, metres; None where it is off or
-    acts everywhere."""
-    level: int | None = None
-    """Which of `levels` the view shows, with the pictures that are on that manifold; None is the whole stack."""
-    arm: ArmMotion | None = None
-    """None before stage LIVE, and where the arm cannot reach the start."""
-    pictures: Pictures = NO_PICTURES
-    """Of ψ itself and on the slice, as far as the view shows them; empty before stage LIVE."""
-    profiles: Profiles | None = None
-    """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
-    seconds: float = 0.0
-    """From the start of the rebuild until this frame."""
-
-    @property
-    def slice(self) -> Slice:
-        """Where the pictures lie."""
-        return self.task.slice.posed(self.scenario.view.slice)
+from dt_viz.transforms.base import Transform
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 
 @dataclass
@@ -125,8 +67,7 @@ class _Kept:
     """Frames of stage ROLLOUTS."""
     arms: dict[Precision, Frame] = field(default_factory=dict)
     """The same with the arm."""
-    health: Health | None = None
-    """Certified."""
+    certificates: Certificates | None = None
 
 
 _turns = Turns()
@@ -158,7 +99,7 @@ def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
 
 
 class Engine:
-    """Computes frames for one visitor. Not thread-safe: one worker thread calls it.
+    """Computes frames for one visitor. Not thread-safe: one worker thread calls it, but for `task`.
 
     The same scenario always gives the same frame, with two exceptions. Where there is no motion for it the last one
     that there was for the task is shown, marked by `Frame.blocked`. And up to stage LIVE joints are looked for from
@@ -185,10 +126,13 @@ class Engine:
         self._sketchbook = lru_cache(maxsize=2)(_sketchbook)
 
     def task(self, name: str) -> Task:
-        """The task of that name, loaded on first use. Raises DemonstrationError if its file cannot be used."""
-        if name not in self._tasks:
-            self._tasks[name] = self._loaders[name]()
-        return self._tasks[name]
+        """The task of that name, loaded on first use; may be called by any thread.
+
+        Raises:
+            DemonstrationError: its file cannot be used.
+        """
+        known = self._tasks.get(name)
+        return self._tasks.setdefault(name, self._loaders[name]()) if known is None else known
 
     def frames(
         self, scenario: Scenario, progress: Progress | None = None, checkpoint: Checkpoint = lambda: None
@@ -217,20 +161,21 @@ class Engine:
             UnreachableError: the arm cannot get to where the motions start.
         """
         nominal = self._nominal(scenario, None)
-        if _uses_whole_arm(scenario):
-            blocked = self._follower.obstructions(nominal, scenario.obstacle)
+        avoidance = scenario.arm_avoidance
+        if avoidance is not None:
+            blocked = self._follower.obstructions(nominal, avoidance.obstacle)
             if blocked:
                 *_, frame = self._stages_without_motion(nominal, scenario, blocked)
                 return frame, ()
-            nominal = self._follower.admitted(nominal, scenario.obstacle)
+            nominal = self._follower.admitted(nominal, avoidance.obstacle)
         fine = self._solved(nominal, scenario, FINE)
         frame = self._frame(scenario, fine)
-        arms, health = [], frame.health
+        arms, certificates = [], frame.certificates
         for rollout in range(len(frame.rollouts)):
-            arm, doubts = self._arm(frame, fine, rollout, exact=True)
+            arm, warnings = self._arm(frame, fine, rollout, exact=True)
             arms.append(arm)
-            health = health.doubting_arm(*doubts)
-        return replace(frame, stage=Stage.FINE, health=health), tuple(arms)
+            certificates = certificates.warning(*warnings)
+        return replace(frame, stage=Stage.FINE, certificates=certificates), tuple(arms)
 
     def pushed(self, scenario: Scenario, q: Array, rng: np.random.Generator) -> Pushed | None:
         """The arm's motion after the hand is pushed aside; None unless a motion of this scenario is shown.
@@ -267,10 +212,11 @@ class Engine:
     def _stages(self, nominal: Nominal, scenario: Scenario, checkpoint: Checkpoint = lambda: None) -> Iterator[Frame]:
         kept = self._kept
         if kept is None or not kept.scenario.moves_like(scenario):
-            if _uses_whole_arm(scenario):
+            avoidance = scenario.arm_avoidance
+            if avoidance is not None:
                 with _in_turn():
-                    blocked = self._follower.obstructions(nominal, scenario.obstacle)
-                    admitted = nominal if blocked else self._follower.admitted(nominal, scenario.obstacle)
+                    blocked = self._follower.obstructions(nominal, avoidance.obstacle)
+                    admitted = nominal if blocked else self._follower.admitted(nominal, avoidance.obstacle)
                 if blocked:
                     yield from self._stages_without_motion(nominal, scenario, blocked, checkpoint)
                     return
@@ -301,70 +247,76 @@ class Engine:
             self._good[scenario.task] = frame, fine
             self._shown = fine
         yield frame
-        if kept.health is None:
+        if kept.certificates is None:
             with _in_turn(checkpoint):
-                health = self._certified(frame, fine)
+                certificates = self._certified(frame, fine)
             if frame.arm is not None:
                 with interruptible(checkpoint):  # out of turn: the first time it prepares meshes for seconds
-                    health = _with_meshes(health, frame, fine)
-            kept.health = health
-        yield replace(frame, stage=Stage.CERTIFIED, health=kept.health)
+                    certificates = _with_meshes(certificates, frame, fine)
+            kept.certificates = certificates
+        yield replace(frame, stage=Stage.CERTIFIED, certificates=kept.certificates)
 
-    def _certified(self, frame: Frame, fine: Solved) -> Health:
+    def _certified(self, frame: Frame, fine: Solved) -> Certificates:
         """Certificates of the motions that the frame shows, with the transforms that they were solved with."""
-        health = self._certified_hand(frame, fine) if fine.arm is None else self._certified_arm(frame, fine, fine.arm)
+        known = self._certified_hand(frame, fine) if fine.arm is None else self._certified_arm(frame, fine, fine.arm)
         if frame.arm is None or frame.chosen is None:
-            return health
+            return known
         path, due = frame.rollouts[frame.chosen], frame.times[frame.chosen]
         if fine.arm is None:
             keep = arm_samples(len(path))
-            health = health.doubting_arm(*hand_doubts(health, self._robot, frame.arm.q, path[keep]))
+            known = known.warning(*hand_warnings(self._robot, frame.arm.q, path[keep], source=ARM))
             due = due[keep]
-        return health.doubting_arm(*delay_doubts(self._robot, frame.arm.q, frame.arm.times, due))
+        return known.warning(*delay_warnings(self._robot, frame.arm.q, frame.arm.times, due))
 
-    def _certified_hand(self, frame: Frame, fine: Solved) -> Health:
+    def _certified_hand(self, frame: Frame, fine: Solved) -> Certificates:
         stack, obstacle, path = fine.stack, frame.scenario.obstacle, np.concatenate(frame.rollouts)
         shown = Shown(stack.bundle.index, stack.bundle.fraction, np.concatenate(frame.times), path)
-        health = certified(frame.health, stack, fine.ends, shown)
-        health = health.doubting(*clearance_doubts(health.clearance, float(obstacle.signed_distance(path).min())))
+        known = certified(frame.certificates, stack, fine.ends, shown)
+        known = known.warning(*clearance_warnings(known.clearance, float(obstacle.signed_distance(path).min())))
         depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
-        return replace(health, clearance=-depth if depth > 0 else health.clearance)
+        return replace(known, clearance=-depth if depth > 0 else known.clearance)
 
-    def _certified_arm(self, frame: Frame, fine: Solved, arm: ArmSolution) -> Health:
+    def _certified_arm(self, frame: Frame, fine: Solved, arm: ArmSolution) -> Certificates:
         scenario, robot, whole_arm = frame.scenario, self._robot, self._follower.whole_arm
-        p, undisturbed, health = arm.p.copy(), whole_arm.limits.inside(arm.q), frame.health
+        p, undisturbed, known = arm.p.copy(), whole_arm.limits.inside(arm.q), frame.certificates
         if frame.arm is not None:
             p[arm.index == frame.chosen] = frame.arm.q
         path, times = np.concatenate(frame.rollouts), np.concatenate(frame.times)
-        health = health.doubting(
-            *hand_doubts(health, robot, p, path, tolerance=MAX_OFF),
-            *fold_doubts(WHOLE_ARM, arm.transform, scenario.integration, p, undisturbed),
+        avoidance = scenario.arm_avoidance
+        assert avoidance is not None
+        integration = avoidance.integration
+        known = known.warning(
+            *hand_warnings(robot, p, path, tolerance=MAX_OFF),
+            *fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed),
         )
-        by_hand = scenario.integration.by_hand
-        health, q = certified_arm(health, arm.transform, p, undisturbed, by_hand=by_hand)
+        known, q = certified_arm(known, arm.transform, p, undisturbed, by_hand=integration.by_hand)
         shown = Shown(arm.index, arm.fraction, times, robot.end_effector(q))
-        health = certified(health, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
+        known = certified(known, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
         hosts = arm.index < len(frame.rollouts) - fine.nominal.num_added
-        kept = float(whole_arm.clearance(p[hosts], scenario.obstacle).min())
-        return health.doubting(*clearance_doubts(health.clearance, kept))
+        kept = float(whole_arm.clearance(p[hosts], avoidance.obstacle).min())
+        return known.warning(*clearance_warnings(known.clearance, kept))
 
     def _stages_without_motion(
-        self, nominal: Nominal, scenario: Scenario, blocked: tuple[str, ...], checkpoint: Checkpoint = lambda: None
+        self,
+        nominal: Nominal,
+        scenario: Scenario,
+        blocked: tuple[MotionWarning, ...],
+        checkpoint: Checkpoint = lambda: None,
     ) -> Iterator[Frame]:
         """The last good motion at every stage, or the undisturbed one, refined, if there is none."""
         if scenario.task not in self._good:
-            undisturbed = self._stages(nominal, replace(scenario, avoidance=False), checkpoint)
+            undisturbed = self._stages(nominal, replace(scenario, stack=_without_obstacles(scenario.stack)), checkpoint)
             next(frame for frame in undisturbed if frame.stage is Stage.FINE)
         good, solved = self._good[scenario.task]
         seen = replace(good.scenario, view=scenario.view)
         changed = not seen.computes_like(good.scenario)
         good = replace(good, level=_level(seen, solved.stack))
         clearance = float(self._follower.whole_arm.clearance(self._any_arm(good), scenario.obstacle).min())
-        health = Health(clearance=clearance)
+        certificates = Certificates(clearance)
         for stage in Stage:
             if changed and stage in (Stage.LIVE, Stage.FINE):
                 good = replace(good, pictures=self._pictures(seen, solved, coarse=stage is Stage.LIVE))
-            yield replace(good, scenario=scenario, stage=stage, blocked=blocked, health=health)
+            yield replace(good, scenario=scenario, stage=stage, blocked=blocked, certificates=certificates)
 
     def _nominal(self, scenario: Scenario, progress: Progress | None) -> Nominal:
         key = (scenario.task, scenario.imitation, scenario.objective)
@@ -384,18 +336,20 @@ class Engine:
             return Solved(scenario, nominal, below, stack, None, None)
         exact = precision is not LIVE
         lifted, whole_arm = self._follower.behaving(nominal, stack, exact=exact), self._follower.whole_arm
-        arm = whole_arm.warped(full.arm, lifted, scenario, scenario.warp, precision.spacing)
+        assert scenario.arm_avoidance is not None
+        arm = whole_arm.warped(full.arm, lifted, scenario.arm_avoidance, scenario.warp, precision.spacing)
         return Solved(scenario, nominal, below, stack, arm, lifted)
 
     def _fully_solved(self, nominal: Nominal, scenario: Scenario, precision: Precision) -> Solved:
         known = self._full.get(precision)
         if known is not None and nominal.moves_like(known.nominal) and scenario.moves_like(known.scenario):
             return known
-        stack, arm, lifted, follower = solve(nominal, scenario, precision), None, None, self._follower
-        if _uses_whole_arm(scenario):
+        stack, arm, lifted, follower = solve(nominal, scenario.active, precision), None, None, self._follower
+        avoidance = scenario.arm_avoidance
+        if avoidance is not None:
             exact = precision is not LIVE
             lifted = follower.behaving(nominal, stack, exact=exact) if stack.built else follower.undisturbed(nominal)
-            arm = follower.whole_arm.avoiding(lifted, scenario, precision.spacing, coarse=precision is LIVE)
+            arm = follower.whole_arm.avoiding(lifted, avoidance, precision.spacing, coarse=precision is LIVE)
         solved = self._full[precision] = Solved(scenario, nominal, nominal, stack, arm, lifted)
         return solved
 
@@ -410,9 +364,11 @@ class Engine:
             clearance = arm.clearance
         shown = Bundle(index, fraction, positions[:, None])
         reached = positions[-1]
-        doubts = motion_doubts(solved, clearance, float(np.linalg.norm(reached - nominal.goal)))
-        if scenario.avoidance and scenario.obstacles and scenario.warp == 1:
-            doubts += target_doubts(solved, self._robot)
+        warnings = motion_warnings(solved, float(np.linalg.norm(reached - nominal.goal)))
+        warnings += anchor_warnings(stack)
+        if scenario.avoids and scenario.warp == 1:
+            warnings += target_warnings(solved, self._robot)
+        made = [stack.at(place) for place in range(len(scenario.stack))]
         return Frame(
             scenario=scenario,
             task=nominal.task,
@@ -426,45 +382,43 @@ class Engine:
             goal=nominal.goal,
             reached=reached,
             blocked=(),
-            health=Health(
-                clearance=clearance,
-                duration=stack.duration_at(None),
-                layer_durations=tuple(stack.duration_at(place) for place in range(len(scenario.layers))),
-                arm_duration=arm.duration if arm else None,
-                doubts=doubts,
-            ),
+            certificates=Certificates(clearance, found=warnings),
             learned_steps=_learned_steps(nominal),
-            layer_radii=tuple(_region_radius(stack, place) for place in range(len(scenario.layers))),
+            durations=tuple(applied.made.duration if applied else None for applied in made),
+            chosen_values=tuple(applied.made.chosen if applied else {} for applied in made),
+            arm_duration=arm.duration if arm else None,
         )
 
     def _with_arm(self, frame: Frame, solved: Solved, *, exact: bool) -> Frame:
         nominal = solved.nominal
-        arm, doubts = None, ()
+        arm, warnings = None, ()
         try:
             far = self._follower.out_of_reach(nominal)
             if frame.chosen is not None and not far[frame.chosen]:
-                arm, doubts = self._arm(frame, solved, frame.chosen, exact=exact)
-            doubts += tuple(named_starts(np.flatnonzero(far), nominal.num_demonstrated, OUT_OF_REACH))
+                arm, warnings = self._arm(frame, solved, frame.chosen, exact=exact)
+            warnings += tuple(far_starts(np.flatnonzero(far), nominal.num_demonstrated))
         except UnreachableError as error:
-            doubts = (f"the arm cannot reach the starts: {error}",)
-        return replace(frame, arm=arm, health=frame.health.doubting_arm(*doubts))
+            warnings = (unreachable(error),)
+        return replace(frame, arm=arm, certificates=frame.certificates.warning(*warnings))
 
-    def _arm(self, frame: Frame, solved: Solved, chosen: int, *, exact: bool) -> tuple[ArmMotion, tuple[str, ...]]:
+    def _arm(
+        self, frame: Frame, solved: Solved, chosen: int, *, exact: bool
+    ) -> tuple[ArmMotion, tuple[MotionWarning, ...]]:
         """The joint motion along a rollout, and what is wrong with it."""
         nominal, times = solved.nominal, frame.times[chosen]
         if solved.arm is not None and solved.lifted is not None:
             rows = solved.arm.index == chosen
             q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
-            doubts = self._follower.doubts(solved.lifted.tracked, chosen)
+            warnings = self._follower.warnings(solved.lifted.tracked, chosen)
         else:
             bundle = solved.stack.bundle
             path, fraction = frame.rollouts[chosen], bundle.split(bundle.fraction)[chosen]
             keep = arm_samples(len(path))
             joints = self._follower.along(nominal, chosen, path[keep], exact=exact)
             q, times, fraction = joints.q, times[keep], fraction[keep]
-            doubts = self._follower.doubts(joints, chosen)
+            warnings = self._follower.warnings(joints, chosen)
         without = self._follower.undisturbed(nominal.only([chosen])).at(np.zeros(len(fraction), int), fraction)
-        return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), doubts
+        return ArmMotion(within_velocity_limits(times, q, self._robot.velocity_limits), q, without), warnings
 
     def _profiles(self, frame: Frame, solved: Solved, chosen: int) -> Profiles:
         """Of a rollout, with and without behaviours."""
@@ -501,7 +455,8 @@ class Engine:
         level = _level(scenario, stack)
         built = stack.built[:level]
         system = stack.system if level is None else cut_off(nominal, stack, level)
-        clearance = _clearance(scenario, avoided=any(applied.place is None for applied in built))
+        # no motion comes to where an obstacle is that is avoided below this level
+        clearance = Union(tuple(part for applied in built for part in applied.transform.avoided.parts)).signed_distance
         field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
         return Pictures(
             field=field,
@@ -519,16 +474,19 @@ class Engine:
         return self._robot.home[None] if frame.arm is None else frame.arm.q
 
 
-def _with_meshes(health: Health, frame: Frame, fine: Solved) -> Health:
-    """Health with what the meshes of the arm come near to: of the one that is shown, and of all that avoid."""
+def _with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates:
+    """What is known with what the meshes of the arm come near to: of the one that is shown, and of all that avoid."""
     assert frame.arm is not None
-    model, scenario = load_collision_model(), frame.scenario
-    health = replace(health, collision=model.report(frame.arm.q, scenario.obstacle))
-    if fine.arm is None:
-        return health
+    model, scenario, avoidance = load_collision_model(), frame.scenario, frame.scenario.arm_avoidance
+    report = model.report(frame.arm.q, scenario.obstacle)
+    # what gives way only in part may still be in the obstacle
+    apart = {Kind.ARM_ENTERS} if scenario.warp < 1 else set()
+    known = replace(known, collision=report).warning(*(w for w in report.warnings if w.kind not in apart))
+    if fine.arm is None or avoidance is None:
+        return known
     hosts = range(len(frame.rollouts) - fine.nominal.num_added)
-    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], scenario.obstacle) for host in hosts]
-    return health.doubting_arm(*margin_doubts(scenario, nearest))
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], avoidance.obstacle) for host in hosts]
+    return known.warning(*margin_warnings(scenario, nearest))
 
 
 _Made = TypeVar("_Made")
@@ -541,20 +499,18 @@ def _once(kept: dict[Precision, _Made], precision: Precision, make: Callable[[],
     return kept[precision]
 
 
-def _uses_whole_arm(scenario: Scenario) -> bool:
-    return scenario.avoidance and scenario.space != "task"
+def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
+    """The stack with all that avoids switched off."""
+    return tuple(replace(layer, on=layer.on and not _avoids(layer.transform)) for layer in stack)
+
+
+def _avoids(transform: Transform) -> bool:
+    return transform.arm_avoidance is not None or bool(transform.avoided.parts)
 
 
 def _learned_steps(nominal: Nominal) -> tuple[int, ...]:
     flows = in_frame(nominal.system.transform)
     return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
-
-
-def _region_radius(stack: Solution, place: int) -> float | None:
-    """Radius of the region that the layer at a place acts in, if it is on and has one."""
-    applied = stack.at(place)
-    flow = applied.made.transform if applied else None
-    return flow.field.scale if isinstance(flow, Flow) and isinstance(flow.field, PlacedField) else None
 
 
 def _level(scenario: Scenario, stack: Solution) -> int | None:
@@ -566,8 +522,3 @@ def _level(scenario: Scenario, stack: Solution) -> int | None:
 def _sketchbook(learned: Learned) -> Sketchbook:
     """What makes the pictures of ψ."""
     return Sketchbook(learned.task, in_frame(learned.system.transform), learned.system, learned.demonstrated.rays)
-
-
-def _clearance(scenario: Scenario, *, avoided: bool) -> Clearance:
-    """Distance from where no motion comes: nowhere, or into the obstacle."""
-    return scenario.obstacle.signed_distance if avoided else lambda points: np.full(len(points), np.inf)

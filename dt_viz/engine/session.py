@@ -13,7 +13,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.worker import LatestWorker
 from dt_viz.errors import DataError
 from dt_viz.flows.fields import Array
@@ -22,7 +23,7 @@ from dt_viz.learning.imitation import ImitationError
 from dt_viz.motion.pushing import Pushed
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import IMITATION, names
+from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
 
 logger = logging.getLogger(__name__)
@@ -73,7 +74,7 @@ def _end_if(superseded: Callable[[], bool]) -> None:
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
     """The scenario, its view naming no level that is gone: another layer may get its name."""
     level = scenario.view.level
-    if not level or level in (IMITATION, *names(scenario)):
+    if not level or level in (IMITATION, *(layer.name for layer in scenario.stack)):
         return scenario
     return replace(scenario, view=replace(scenario.view, level=""))
 
@@ -198,15 +199,12 @@ class Session:
             if self.scenario.scene:  # of the paper: leaves nothing behind
                 self._begin("task", self._as_seen(fresh))
                 return
-            kept = zip(fresh.obstacles, self.scenario.obstacles, strict=False)
             self.edit(
                 "task",
                 task=name,
                 arm_rollout=0,
                 starts=fresh.starts,
-                obstacles=tuple(had.moved(there.position, had.wxyz) for there, had in kept),
-                layers=fresh.layers,
-                avoidance_level=fresh.avoidance_level,
+                stack=as_fresh(self.scenario, fresh),
                 view=replace(self.scenario.view, slice=None),
             )
             self.end_gesture()

@@ -1,1 +1,1 @@
-"""Measurements from the command line, `python -m dt_viz.evaluate`: each prints a table and writes what it came from."""
+"""Measurements from the command line, `python -m dt_viz.evaluate`: each prints a table and writes its data."""

@@ -11,7 +11,7 @@ BAD_INPUT = 2
 """Exit status for what the user can put right; argparse uses the same."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.evaluate") -> int:
     """Run one subcommand; returns the process' exit status, or raises SystemExit where argparse does."""
     # numerical libraries read these when they are first imported; one thread is how the figures compare
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from dt_viz.evaluate.options import InputError, with_negative_values  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
 
-    parser = argparse.ArgumentParser(prog="python -m dt_viz.evaluate", description="Measure DT-Viz.")
+    parser = argparse.ArgumentParser(prog=prog, description="Measure DT-Viz.")
     subcommands = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
     for name, module in {
         "imitation": imitation,
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return options.run(options)
     except (DataError, ImitationError, InputError) as error:
-        print(f"{parser.prog} {options.subcommand}: {error}", file=sys.stderr)
+        print(f"{prog} {options.subcommand}: {error}", file=sys.stderr)
         return BAD_INPUT
 
 

@@ -1,6 +1,6 @@
-"""Put a sphere into a motion and measure what the end effector and the whole arm do.
+"""Put a sphere into a motion and measure the motion of the end effector and the whole arm.
 
-The npz file holds for each rollout i, as the page shows it when it rests:
+The npz file holds for each rollout i, as the page finally shows it:
 
 ``q_i`` (T, 6), ``times_i`` (T,)
     joint angles, rad, continuous joints unwrapped, and seconds.
@@ -9,8 +9,8 @@ The npz file holds for each rollout i, as the page shows it when it rests:
 ``demo_i`` (T_i, 3)
     its demonstration, metres.
 
-The whole arm is judged by its collision meshes, also between the samples; the spheres that avoidance computes with play
-no part in that.
+The whole arm is measured by its collision meshes, also between the samples; the body points of the avoidance are not
+used for that.
 """
 
 from __future__ import annotations
@@ -27,68 +27,66 @@ from dt_viz.arm.collision import CollisionReport, load_collision_model
 from dt_viz.arm.robot import Robot, load_jaco
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine.engine import ArmMotion, Engine
+from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
-    add_generator,
-    add_space,
+    add_avoidance,
     add_task,
     chosen_task,
     point,
     positive_number,
     print_table,
     ready_to_write,
+    scenario_around,
+    write_npz,
 )
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
-from dt_viz.metrics import discrete_frechet, maximum_collision_distance, resample_by_arc_length, sharpest_turn
+from dt_viz.metrics import maximum_collision_distance, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Scenario
 
-NUM_COMPARED = 400
-"""Points by arc length that a Fréchet distance is taken between."""
 LIMIT_TOLERANCE = 1e-9
-"""Rad by which rounding may take a joint over its limit."""
+"""Excess over a joint limit, rad, that counts as rounding."""
 TURN_ARC = 0.2
-"""Length of the arc over which a turn is measured, in radii of the obstacle."""
+"""Length of the path over which a turn is measured, in radii of the obstacle."""
 NO_MOTION = 1
-"""Exit status where the obstacle leaves no motion."""
+"""Exit status if the obstacle leaves no motion."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What there is to say of one rollout; lengths in metres."""
+    """Measurements of one rollout; lengths in metres."""
 
     x: Array
-    """(T, 3) end effector."""
+    """(T, 3) positions of the end effector."""
     frechet: float
     """Discrete Fréchet distance of the end effector to the demonstration."""
     hand_depth: float
-    """How deep the end effector enters the obstacle."""
+    """Greatest depth of the end effector in the obstacle."""
     hand_clearance: float
-    """Its smallest distance from the obstacle, negative inside."""
+    """Smallest distance of the end effector from the obstacle, negative inside."""
     arm: CollisionReport
-    """Of the whole arm."""
+    """Collisions of the whole arm."""
     depth_without: float
-    """How deep the arm would enter the obstacle without avoidance."""
+    """Greatest depth of the arm in the obstacle without avoidance."""
     num_outside: int
-    """Configurations outside the joint limits."""
+    """Number of configurations outside the joint limits."""
     turn: float
     """Sharpest turn of the end effector over `TURN_ARC`, degrees."""
     turn_without: float
-    """The same without avoidance."""
+    """Sharpest turn without avoidance, degrees."""
     goal_miss: float
-    """Distance of its last position from the demonstrations' goal."""
+    """Distance of the end effector's last position from the demonstrations' goal."""
 
 
 def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Sphere, robot: Robot) -> Measured:
     """Measure one rollout of the arm."""
     model = load_collision_model()
     x, arc = robot.end_effector(motion.q), TURN_ARC * obstacle.radius
-    a, b = (resample_by_arc_length(path, NUM_COMPARED) for path in (x, demonstration))
     depth = maximum_collision_distance(x, obstacle.signed_distance) + 0.0  # never -0
     outside = (motion.q < robot.lower - LIMIT_TOLERANCE) | (motion.q > robot.upper + LIMIT_TOLERANCE)
     return Measured(
         x=x,
-        frechet=float(discrete_frechet(a, b)),
+        frechet=float(frechet([x], [demonstration])[0]),
         hand_depth=depth,
         hand_clearance=-depth if depth > 0 else float(obstacle.signed_distance(x).min()),
         arm=model.report(motion.q, obstacle),
@@ -105,9 +103,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_task(parser)
     parser.add_argument("--obstacle", type=point, required=True, metavar="X,Y,Z", help="centre of the sphere, metres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), required=True, metavar="D", help="metres")
-    add_space(parser)
-    add_generator(parser)
-    parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
+    add_avoidance(parser, "task")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
@@ -118,11 +114,8 @@ def run(options: argparse.Namespace) -> int:
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
     obstacle = Sphere(options.obstacle, options.diameter)
-    scenario = Scenario(
-        task.name, (obstacle,), avoidance=not options.no_avoidance, space=options.space, generator=options.generator
-    )
     try:
-        frame, motions = engine.arm_motions(scenario)
+        frame, motions = engine.arm_motions(scenario_around(obstacle, task, options))
     except UnreachableError as error:
         print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
         return NO_MOTION
@@ -136,11 +129,10 @@ def run(options: argparse.Namespace) -> int:
     for i, (motion, demonstration) in enumerate(zip(motions, task.paths, strict=True)):
         measured.append(measure(motion, demonstration, frame.goal, obstacle, robot))
         arrays |= {f"q_{i}": motion.q, f"x_{i}": measured[-1].x, f"times_{i}": motion.times, f"demo_{i}": demonstration}
-    with out.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+    write_npz(out, **arrays)
     _print(options, task.name, measured, motions)
-    for doubt in dict.fromkeys(frame.health.doubts):
-        print(f"doubt: {doubt}")
+    for warning in frame.certificates.warnings:
+        print(f"warning: {warning}")
     return 0
 
 

@@ -1,13 +1,13 @@
-"""How well motions are reproduced that were not learned from, beside what needs no learning at all.
+"""Reproduction of motions that were not learned from, compared with two ways that need no learning.
 
-The demonstrations of a shape are dealt into folds; those of a fold are held out, and followed from their own start by
+The demonstrations of a shape are divided into folds; those of a fold are held out, and followed from their start by
 
 ``learned``
     the motion fitted to the others;
 ``mean``
     the mean of the others by arc length, shifted to that start by an offset that fades linearly to the end;
 ``nearest``
-    the one of the others that starts nearest, shifted likewise.
+    the other demonstration with the nearest start, shifted likewise.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 
 WAYS = ("learned", "mean", "nearest")
 AT_GOAL = 5e-5
-"""Metres from the goal at which a rollout ends."""
+"""Distance from the goal at which a rollout ends, metres."""
 NUM_SAMPLES = 1000
-"""Of a rollout, evenly in time."""
+"""Number of samples of a rollout, evenly in time."""
 NUM_COMPARED = 400
-"""Points by arc length that a Fréchet distance is taken between."""
+"""Number of points, evenly by arc length, between which a Fréchet distance is computed."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What the table says of a shape: mean discrete Fréchet distances to the demonstrations that were held out."""
+    """Row of the table: mean discrete Fréchet distances to the held-out demonstrations of a shape."""
 
     name: str
     folds: int
@@ -46,12 +47,12 @@ def follow(demonstrations: Sequence[Demonstration], settings: ImitationSettings,
     """Follow each demonstration in each of `WAYS` without having learned from it.
 
     Args:
-        demonstrations: of one shape, two or more.
-        settings: of the fits.
-        folds: how many; at most as many as demonstrations.
+        demonstrations: two or more, of one shape.
+        settings: settings of the fits.
+        folds: number of folds, at most that of demonstrations.
 
     Returns:
-        For each demonstration the paths (T, d) by their way, metres.
+        For each demonstration the path (T, d), metres, of each way.
 
     Raises:
         ImitationError: nothing can be learned from the others.
@@ -72,22 +73,26 @@ def follow(demonstrations: Sequence[Demonstration], settings: ImitationSettings,
 
 
 def rollouts_from(imitation: Imitation, starts: Array) -> tuple[Array, Array]:
-    """Learned motions (R, T, d) from `starts` (R, d), metres, until they are at the goal, and their times (R, T), s."""
-    transform, base = imitation.transform, imitation.base
-    # near the goal ψ⁻¹ stretches by at most the norm of its Jacobian there
-    stretch = np.linalg.norm(transform.inverse_jacobian(base.goal)[1], 2)
-    ends = base.arrival_time(transform.forward(starts), float(AT_GOAL / max(stretch, 1.0)))
+    """Return learned motions (R, T, d) from `starts` (R, d), metres, up to the goal, and their times (R, T), s."""
+    ends = arrival_times(imitation.system, imitation.transform.forward(starts))
     times = ends[:, None] * np.linspace(0.0, 1.0, NUM_SAMPLES)
     return imitation.system.rollout(starts, times), times
 
 
+def arrival_times(system: DiffeomorphicSystem, z0: Array) -> Array:
+    """Return the times (R,), s, at which motions from `z0` (R, d) in base space are within `AT_GOAL` of the goal."""
+    # near the goal ψ⁻¹ stretches by at most the norm of its Jacobian there
+    stretch = np.linalg.norm(system.transform.inverse_jacobian(system.base.goal)[1], 2)
+    return system.base.arrival_time(z0, float(AT_GOAL / max(stretch, 1.0)))
+
+
 def shifted_to(start: Array, path: Array) -> Array:
-    """A path (T, d) that begins at `start` (d,) instead, by an offset that fades linearly to none at its end."""
+    """Shift a path (T, d) to begin at `start` (d,), by an offset that fades linearly to none at its end."""
     return path + np.linspace(1, 0, len(path))[:, None] * (start - path[0])
 
 
 def frechet(paths: Sequence[Array], references: Sequence[Array]) -> Array:
-    """Discrete Fréchet distances (R,) of paths to their references, both at `NUM_COMPARED` points by arc length."""
+    """Compute discrete Fréchet distances (R,) of paths to references, both at `NUM_COMPARED` points by arc length."""
     a, b = (np.stack([resample_by_arc_length(path, NUM_COMPARED) for path in these]) for these in (paths, references))
     return discrete_frechet(a, b)
 
@@ -95,6 +100,6 @@ def frechet(paths: Sequence[Array], references: Sequence[Array]) -> Array:
 def summed_up(
     name: str, folds: int, arrays: Mapping[str, Array], references: Sequence[Array], millimetres: float
 ) -> HeldOut:
-    """The figures of arrays ``WAY_i`` (T, d), in a unit of so many millimetres, against `references` in that unit."""
+    """Compare arrays ``WAY_i`` (T, d), in a unit of so many millimetres, with `references` in that unit."""
     distances = [frechet([arrays[f"{way}_{i}"] for i in range(len(references))], references).mean() for way in WAYS]
     return HeldOut(name, folds, *(millimetres * float(distance) for distance in distances))

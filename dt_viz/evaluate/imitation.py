@@ -1,18 +1,18 @@
-"""Fit demonstrations and compare each rollout with its own demonstration: in-sample, unless left out.
+"""Fit demonstrations and compare each rollout with its own demonstration, in-sample or left out.
 
-Of each file the folder gets an npz, all lengths in the file's own unit (LASA: millimetres, others: metres):
+For each file the folder gets an npz, all lengths in the file's own unit (LASA: millimetres, others: metres):
 
 ``rollout_i`` (T, d), ``times_i`` (T,)
     the motion learned, from the first point of demonstration i until it is at the goal; seconds from 0.
 ``goal`` (d,)
-    where it ends.
+    common end of the motions.
 ``fit_seconds``
     the whole of `dt_viz.learning.imitation.fit`, certificates included, never from a cache.
 ``min_det_jacobian``, ``round_trip_error``
     smallest det J and largest ‖ψ⁻¹(ψ(x)) − x‖ on a grid over the demonstrations' box grown by half its size on every
     side, computed here, not taken from the fit.
 
-With ``--leave-one-out`` each demonstration is also followed by what was learned from the others, and by two ways that
+With ``--leave-one-out`` each demonstration is also followed by the motion learned from the others, and by two ways that
 need no learning (see `dt_viz.evaluate.held_out`): SHAPE-held-out.npz holds ``learned_i``, ``mean_i`` and ``nearest_i``
 (T, d) for each demonstration i.
 
@@ -25,24 +25,23 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dt_viz.evaluate.held_out import WAYS, HeldOut, follow, frechet, rollouts_from, summed_up
-from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json
+from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json, write_npz
 from dt_viz.evaluate.picture import Panel, draw_panels
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
-from dt_viz.learning.imitation import Imitation, ImitationError, ImitationSettings, fit
+from dt_viz.learning.imitation import OBJECTIVES, Imitation, ImitationError, ImitationSettings, fit, grown_grid
 from dt_viz.metrics import rms_at_equal_times
 
-OBJECTIVES = ("trajectory", "velocity")
 GRID = {2: 101, 3: 25}
-"""Points a side of the grid of the certificates, by dimension."""
+"""Number of points on each side of the certificates' grid, by dimension."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Figures:
-    """What the table says of a shape, in-sample: of each rollout to the demonstration it was learned from."""
+    """Row of the table: distances of a shape's rollouts from the demonstrations they were learned from."""
 
     name: str
     demonstrations: int
     frechet_mean_mm: float
     frechet_max_mm: float
     rms_mm: float
-    """At the demonstration's own times; mean over demonstrations."""
+    """Root mean square distance at the demonstration's own times; mean over demonstrations."""
     fit_seconds: float
     end_error_mm: float
     """Largest distance of a rollout's last point from the goal."""
@@ -87,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 2 if one of the shapes could not be fitted."""
-    settings = _settings(options.objective)
+    settings = ImitationSettings(options.objective)
     if options.folds and not options.leave_one_out:
         raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
     sources = _sources(options.files)
@@ -111,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
         for warning in imitation.warnings:
             print(f"{source.path}: {warning}", file=sys.stderr)
         arrays = measured(imitation, source, seconds)
-        np.savez_compressed(folder / f"{source.path.stem}.npz", allow_pickle=False, **arrays)
+        write_npz(folder / f"{source.path.stem}.npz", **arrays)
         results.append(compared(arrays, source))
         demonstrations = [d.positions / source.unit for d in source.demonstrations]
         panels.append(Panel(source.path.stem, demonstrations, _rollouts(arrays, len(demonstrations))))
@@ -127,10 +126,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def measured(imitation: Imitation, source: Source, fit_seconds: float) -> dict[str, Any]:
-    """The arrays of the file's npz: see the module's docstring."""
+    """Compute the arrays of the file's npz; see the module's docstring."""
     transform = imitation.transform
     rollouts, times = rollouts_from(imitation, np.stack([d.positions[0] for d in source.demonstrations]))
-    grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]))
+    grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]), GRID[transform.dim])
     arrays: dict[str, Any] = {
         "fit_seconds": fit_seconds,
         "min_det_jacobian": min_det_jacobian(transform.jacobian, grid),
@@ -144,7 +143,7 @@ def measured(imitation: Imitation, source: Source, fit_seconds: float) -> dict[s
 
 
 def compared(arrays: dict[str, Any], source: Source) -> Figures:
-    """The figures that the arrays of a file's npz give."""
+    """Compute the figures from the arrays of a file's npz."""
     demonstrations = [d.positions / source.unit for d in source.demonstrations]
     rollouts = _rollouts(arrays, len(demonstrations))
     distances = frechet(rollouts, demonstrations)
@@ -168,40 +167,21 @@ def compared(arrays: dict[str, Any], source: Source) -> Figures:
 
 
 def _held_out(source: Source, settings: ImitationSettings, folds: int | None, folder: Path) -> HeldOut:
-    """Follow each demonstration without having learned from it; the arrays go to the folder."""
+    """Follow each demonstration without having learned from it, and write the paths to the folder."""
     num = len(source.demonstrations)
-    if num < 2:
-        raise InputError("--leave-one-out", f"one demonstration in {str(source.path)!r}", "two or more")
     folds = min(folds or num, num)
     arrays = {
         f"{way}_{i}": path / source.unit
         for i, followed in enumerate(follow(source.demonstrations, settings, folds))
         for way, path in followed.items()
     }
-    np.savez_compressed(folder / f"{source.path.stem}-held-out.npz", allow_pickle=False, **arrays)
+    write_npz(folder / f"{source.path.stem}-held-out.npz", **arrays)
     demonstrations = [d.positions / source.unit for d in source.demonstrations]
     return summed_up(source.path.stem, folds, arrays, demonstrations, 1e3 * source.unit)
 
 
-def grown_grid(points: Array) -> Array:
-    """A regular grid (N, d) over the bounding box of `points` (M, d) grown by half its size on every side."""
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    margin = (upper - lower) / 2
-    num = GRID[points.shape[1]]
-    axes = [np.linspace(a, b, num) for a, b in zip(lower - margin, upper + margin, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, points.shape[1])
-
-
-def _settings(objective: str) -> ImitationSettings:
-    if "objective" in {field.name for field in fields(ImitationSettings)}:
-        return replace(ImitationSettings(), **{"objective": objective})
-    if objective != OBJECTIVES[0]:
-        raise InputError("--objective", repr(objective), f"{OBJECTIVES[0]}, the only objective that can be fitted yet")
-    return ImitationSettings()
-
-
 def _sources(paths: Sequence[Path]) -> list[Source]:
-    """All files, read before any is fitted."""
+    """Read all files."""
     sources: dict[str, Source] = {}
     for path in paths:
         if path.stem in sources:

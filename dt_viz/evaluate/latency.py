@@ -1,22 +1,21 @@
 """Drag an obstacle or a bias point through a motion and measure the time from each edit until its frame is ready.
 
-The real session, worker and engine run; only the page is replaced, by a display that records. The JSON file holds, in
+Session, worker and engine are the real ones; a display that records replaces the page. The JSON file holds, in
 milliseconds and over all sessions together:
 
 ``median_ms``, ``p95_ms``
     from an edit until its rollouts are ready (stage ROLLOUTS, the first frame of a rebuild).
 ``live_median_ms``, ``live_p95_ms``
-    until the vector field and the arm are ready, too (stage LIVE).
+    from an edit until the vector field and the arm are ready, too (stage LIVE).
 ``rebuild_median_ms``
-    of computing the rollouts alone, without the wait for the frame before.
+    for computing the rollouts alone, without the wait for the frame before.
 ``frames``, ``skipped``
-    rebuilds, and edits that a newer one overtook before they were begun.
+    rebuilds, and edits that a newer one replaced before they were begun.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import platform
 import sys
@@ -30,12 +29,14 @@ import numpy as np
 
 from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.evaluate.options import (
     InputError,
     add_space,
     add_task,
+    avoiding,
     chosen_task,
     positive_number,
     print_table,
@@ -45,20 +46,21 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.motion.nominal import NUM_SAMPLES
-from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.stack import plane_of
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.bias import Biasing, BiasPoint
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.bias import BiasPoint
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
 AMPLITUDE = 0.06
-"""Of the obstacle's motion to each side, metres."""
+"""Amplitude of the obstacle's motion, metres."""
 PERIODS = 2.9, 4.3
-"""Of the obstacle's motion along the two axes of the task's slice, seconds; it comes back only after many rounds."""
+"""Periods of its motion along the two axes of the task's slice, seconds; their ratio is not simple."""
 PATIENCE = 120.0
-"""Seconds that the last frames may take."""
+"""Longest time to wait for the last frames, seconds."""
 
 
 @dataclass
@@ -66,9 +68,9 @@ class Recorder:
     """A display that only records."""
 
     frames: list[tuple[Stage, float, float]] = field(default_factory=list)
-    """Stage, seconds from the edit until the frame was ready, seconds of computing alone."""
+    """Stage, seconds from the edit until the frame was ready, and seconds of computing alone, of each frame."""
     num_skipped: int = 0
-    """Since the session began."""
+    """Number of skipped edits since the session began."""
     num_rollouts: int = 0
     error: Exception | None = None
 
@@ -176,38 +178,35 @@ def run(options: argparse.Namespace) -> int:
 
 
 def moving_through(task: Task) -> Callable[[float], tuple[float, float, float]]:
-    """Where the obstacle is at a time in seconds: on a smooth curve around the middle of the mean demonstration."""
+    """Return a smooth closed curve, (3,) at a time in seconds, around the middle of the mean demonstration."""
     middle = task.mean_path[50]
 
     def position(seconds: float) -> tuple[float, float, float]:
-        offset = [AMPLITUDE * math.sin(2 * math.pi * seconds / period) for period in PERIODS]
-        x, y, z = middle + task.slice.axes @ offset
-        return float(x), float(y), float(z)
+        return as_point(middle + task.slice.axes @ (AMPLITUDE * np.sin(2 * np.pi * seconds / np.array(PERIODS))))
 
     return position
 
 
 def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
-    """The scene that the drag begins with: obstacles along the mean path, and a bias point where that is dragged."""
+    """Return the initial scenario: obstacles along the mean path, and a bias point if that is dragged."""
     places = np.linspace(0, 100, options.obstacles + 2).round().astype(int)[1:-1]
     diameter = Sphere(task.obstacle_position).diameter / max(1, options.obstacles)
     if options.drag == "obstacle" and options.obstacles == 0:
         raise InputError("--obstacles", "0", "1 or more, or --drag bias")
-    obstacles = tuple(Sphere((float(x), float(y), float(z)), diameter) for x, y, z in task.mean_path[places])
+    obstacles = tuple(Sphere(as_point(place), diameter) for place in task.mean_path[places])
+    scenario = avoiding(task, Avoidance(obstacles, space=options.space))
+    if options.drag == "obstacle":
+        return scenario
     bias = BiasPoint(task.obstacle_position, plane=plane_of(task))
-    layers = (Layer(Biasing(bias), name="Bias 1"),) if options.drag == "bias" else ()
-    return Scenario(task.name, obstacles, layers=layers, space=options.space)
+    return replace(scenario, stack=with_added(scenario, bias)[0])
 
 
 def _moved(scenario: Scenario, place: tuple[float, float, float]) -> dict[str, Any]:
-    """The fields of the scenario with what is dragged somewhere else."""
-    if not scenario.layers:
-        first, *others = scenario.obstacles
-        return {"obstacles": (first.moved(place), *others)}
-    (layer,) = scenario.layers
-    assert isinstance(layer.behaviour, Biasing)
-    point = replace(layer.behaviour.point, position=place)
-    return {"layers": (replace(layer, behaviour=Biasing(point)),)}
+    """Return the changed fields of the scenario after the drag to a place."""
+    for name, point in anchored(scenario).items():
+        return {"stack": with_transform(scenario, name, point.anchored(place))}
+    first, *others = scenario.avoidance.obstacles
+    return {"stack": with_avoidance(scenario, obstacles=(first.moved(place), *others))}
 
 
 def _drag(
@@ -215,7 +214,7 @@ def _drag(
 ) -> tuple[int, float]:
     """Edit all sessions at `EDITS_PER_SECOND` from this thread, as a server's event loop does.
 
-    Each session is at a place of its own on the curve. Returns the number of edits and the seconds that they took.
+    Each session is at a place of its own on the curve. Return the number of edits and their time in seconds.
     """
     began = time.perf_counter()
     ticks = max(1, round(EDITS_PER_SECOND * seconds))

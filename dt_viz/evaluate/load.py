@@ -1,20 +1,18 @@
-"""Have visitors drag at once in a started server, as browsers do, and measure when each is shown what it did.
+"""Let several visitors drag at once in a real server, as browsers do, and measure how soon each sees its edits.
 
-The server is a process of its own; the visitors speak viser's protocol from this one, and decode all that they are
-sent. Each drags the obstacle around its place, 20 edits a second. The pose of the obstacle that a picture belongs to is
-found by comparing its rollouts with those that the engine computes for each pose here. The JSON file holds:
+The server is a separate process; the visitors speak viser's protocol from this one, and decode all messages. Each drags
+the obstacle around its place, 20 edits a second. The obstacle's pose in a picture is found by comparing the rollouts
+with those that the engine computes here for each pose. The JSON file holds:
 
 ``first_picture_s``
-    for each round and visitor, from the handshake of all until rollouts and status line are there; null if they never
-    were.
+    for each round and visitor, from the start of all until its rollouts and status line arrive; null if they do not.
 ``median_ms``, ``p95_ms``
     from the edit that a picture shows until it is decoded, over all pictures of all visitors while they drag.
 ``visitors``
-    for each: ``frames`` (pictures of a pose that it dragged to), ``others`` (further ones: finer, while it rests),
-    ``median_ms``, ``p95_ms``, ``megabytes`` received, and ``last_shown``, whether the last pose is the one that is
-    shown in the end.
+    for each: ``frames`` (pictures of a pose that it dragged to), ``others`` (finer pictures at rest), ``median_ms``,
+    ``p95_ms``, ``megabytes`` received, and ``last_shown``, whether the last picture is of the last pose.
 ``peak_memory_mb``, ``threads``
-    of the server; null where its process is not known, or the system does not say.
+    of the server; null if its process is unknown, or the system does not report them.
 """
 
 from __future__ import annotations
@@ -38,9 +36,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
+    avoiding,
     chosen_task,
     positive_number,
     print_table,
@@ -50,46 +50,44 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.evaluate.protocol_client import ROLLOUTS, LostError, ProtocolClient
 from dt_viz.learning.store import FitStore, default_cache_folder
-from dt_viz.obstacles.shapes import Point, Sphere
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.obstacles.shapes import Point, Sphere, as_point
 from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.avoidance import Avoidance
 
 EDITS_PER_SECOND = 20
-"""Edits of a drag; no page sends more."""
+"""Rate of a drag's edits; no page sends more."""
 NUM_POSES, RADIUS = 100, 0.06
-"""Poses on the circle around the obstacle's place, in the task's slice, and its radius, metres."""
+"""Number of poses on the circle around the obstacle's place, in the task's slice, and its radius, metres."""
 FIRST_PICTURE = 20.0
-"""Seconds within which each visitor must have a picture."""
+"""Longest accepted time until a visitor has a picture, seconds."""
 REST = 3.0
-"""Seconds after the drag until what is shown is final; more are waited for if it is not the last pose."""
+"""Time after the drag until the picture is final, seconds."""
 PATIENCE = 60.0
-"""Seconds that the server may take to start, and to show the last pose."""
+"""Longest time to wait for the last pose, seconds."""
 SAME = 1e-4
-"""Largest distance between rollouts that count as the same, metres; those of neighbouring poses lie 1 mm apart."""
+"""Largest distance between equal rollouts, metres; those of neighbouring poses differ by 1 mm."""
 
 Segments = NDArray[np.float32]
 
 
 class Poses:
-    """The poses that the obstacle is dragged to, and what the engine has to show for each."""
+    """The poses that the obstacle is dragged to, with the engine's rollouts for each."""
 
     def __init__(self, engine: Engine, task: Task) -> None:
         self._engine, self._task = engine, task
         angles = 2 * np.pi * np.arange(NUM_POSES) / NUM_POSES
         circle = RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         centre = np.asarray(task.obstacle_position)
-        self.positions: list[Point] = [
-            (float(x), float(y), float(z)) for x, y, z in centre + circle @ task.slice.axes.T
-        ]
-        """Of the obstacle's centre, metres."""
+        self.positions: list[Point] = [as_point(place) for place in centre + circle @ task.slice.axes.T]
+        """Positions of the obstacle's centre, metres."""
         self._coarse = [self._segments(next(self._frames(index))) for index in range(NUM_POSES)]
 
     def find(self, shown: Segments) -> int | None:
-        """Index of the pose whose first frame has these rollouts."""
+        """Return the index of the pose whose first frame has these rollouts."""
         return next((index for index, segments in enumerate(self._coarse) if _same(segments, shown)), None)
 
     def has(self, index: int, shown: Segments | None) -> bool:
-        """Whether these rollouts are of this pose, in any of its frames."""
+        """Return whether these rollouts are of this pose, in any of its frames."""
         for frame in self._frames(index):
             if shown is not None and _same(self._segments(frame), shown):
                 return True
@@ -98,7 +96,7 @@ class Poses:
         return False
 
     def _frames(self, index: int) -> Iterator[Frame]:
-        return self._engine.frames(Scenario(self._task.name, (Sphere(self.positions[index]),)))
+        return self._engine.frames(avoiding(self._task, Avoidance(Sphere(self.positions[index]))))
 
     def _segments(self, frame: Frame) -> Segments:
         paths = frame.rollouts[: len(self._task.demonstrations)]
@@ -107,29 +105,29 @@ class Poses:
 
 @dataclass
 class Visit:
-    """What one visitor sees in the last round."""
+    """One visitor in the last round."""
 
     client: ProtocolClient
     poses: Poses
     first: int
     """Index of the pose that its drag begins with."""
     edits: list[float] = field(default_factory=list)
-    """When each was sent, seconds of `time.perf_counter`."""
+    """Times at which they were sent, seconds of `time.perf_counter`."""
     latencies: list[float] = field(default_factory=list)
-    """Of each picture of a pose, seconds."""
+    """Latency of each picture of a pose, seconds."""
     num_frames: int = 0
     num_others: int = 0
     num_bytes: int = 0
-    """Received when the drag began."""
+    """Number of bytes received before the drag."""
     lost: str = ""
-    """Why the connection ended, if it did."""
+    """Reason for the end of the connection; empty while it lasts."""
 
     def pose(self, edit: int) -> int:
-        """Index of the pose of an edit."""
+        """Return the index of an edit's pose."""
         return (self.first + edit) % NUM_POSES
 
     async def drag(self, seconds: float) -> None:
-        """Drag the obstacle, then let go of it and wait until what is shown is final."""
+        """Drag the obstacle, release it, and wait for the final picture."""
         self.num_bytes = self.client.num_bytes
         self.client.changed = self._see
         try:
@@ -146,13 +144,13 @@ class Visit:
             self.lost = str(error)
 
     def shows_the_last_pose(self) -> bool:
-        """Whether the picture that is shown now is of the last edit."""
+        """Return whether the current picture is of the last edit."""
         return not self.lost and self.poses.has(self.pose(len(self.edits) - 1), self.client.rollouts)
 
     _latest: int | None = None
 
     def _see(self, name: str, changes: Any, now: float) -> None:  # noqa: ANN401 - properties of a node
-        """Find the edit that a picture shows."""
+        """Find the edit that a new picture shows."""
         if name != ROLLOUTS or "points" not in changes:
             return
         shown = self.client.rollouts
@@ -230,7 +228,7 @@ def run(options: argparse.Namespace) -> int:
 async def _visit(
     options: argparse.Namespace, url: str, process: int | None, poses: Poses
 ) -> tuple[list[list[float | None]], list[Visit], int | None]:
-    """Seconds until the first picture of each round and visitor, what those of the last saw, and the most threads."""
+    """Run all rounds; return seconds until each visitor's first picture, the last visits, and the most threads."""
     firsts = []
     num_threads = [_status(process, "Threads")]
     for last in [False] * (options.rounds - 1) + [True]:
@@ -251,7 +249,7 @@ async def _visit(
 
 
 async def _first_picture(stack: AsyncExitStack, client: ProtocolClient, began: float) -> float | None:
-    """Open a page; seconds until it has a picture, None if it has none in time."""
+    """Open a page; return the seconds until it has a picture, None if it has none in time."""
     try:
         await stack.enter_async_context(client)
         await client.look()
@@ -264,7 +262,7 @@ async def _first_picture(stack: AsyncExitStack, client: ProtocolClient, began: f
 
 @contextmanager
 def _server(options: argparse.Namespace) -> Iterator[tuple[str, int | None]]:
-    """Address of the WebSocket, and the server's process if it is started here."""
+    """Yield the address of the WebSocket, and the server's process if it is started here."""
     if options.url is not None:
         yield options.url, None
         return
@@ -287,7 +285,7 @@ def _server(options: argparse.Namespace) -> Iterator[tuple[str, int | None]]:
 
 
 def _status(process: int | None, name: str) -> int | None:
-    """A number of /proc/PID/status: kB, or a count; None where there is none."""
+    """Read a number of /proc/PID/status, kB or a count; None if there is none."""
     try:
         text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
     except OSError:

@@ -1,4 +1,4 @@
-"""What the subcommands ask on the command line alike: tasks, numbers, and files to write."""
+"""Shared parts of the subcommands: options of the command line, files to write, and tables."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dt_viz.obstacles.occupancy import GENERATORS
-from dt_viz.scenario.scenario import SPACES
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, lasa_tasks
+from dt_viz.transforms.avoidance import SPACE_NAMES, Avoidance
 
 
 class InputError(ValueError):
-    """What was asked for cannot be done."""
+    """A request on the command line that cannot be met."""
 
     def __init__(self, field: str, found: str, accepted: str) -> None:
         super().__init__(f"{field}: found {found}; accepted: {accepted}")
@@ -27,28 +31,33 @@ def add_task(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
 
 
-def add_space(parser: argparse.ArgumentParser) -> None:
+def add_space(parser: argparse.ArgumentParser, default: str = "task") -> None:
     """Add `--space`."""
-    parser.add_argument(
-        "--space",
-        type=_space,
-        default="task",
-        help="what avoids: the end effector (task), the whole arm (cspace), or both",
-    )
+    what = "what avoids: the end effector (task), the whole arm (cspace), or both (default: %(default)s)"
+    parser.add_argument("--space", choices=tuple(SPACE_NAMES), default=default, help=what)
 
 
-def add_generator(parser: argparse.ArgumentParser) -> None:
-    """Add `--generator`."""
-    parser.add_argument(
-        "--generator",
-        choices=GENERATORS,
-        default=GENERATORS[0],
-        help="probability is the paper's (default: %(default)s)",
-    )
+def add_avoidance(parser: argparse.ArgumentParser, space: str) -> None:
+    """Add `--space`, `--generator` and `--no-avoidance`."""
+    add_space(parser, space)
+    paper = "probability is the paper's (default: %(default)s)"
+    parser.add_argument("--generator", choices=GENERATORS, default=GENERATORS[0], help=paper)
+    parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
+
+
+def scenario_around(obstacle: Obstacle, task: Task, options: argparse.Namespace) -> Scenario:
+    """Return the scenario of an obstacle with the options of `add_avoidance`."""
+    avoidance = Avoidance(obstacle, space=options.space, generator=options.generator)
+    return avoiding(task, avoidance, on=not options.no_avoidance)
+
+
+def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
+    """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
+    return Scenario(task.name, (Layer(avoidance, on, avoidance.title),))
 
 
 def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], Task]:
-    """All tasks by name, and the chosen one, loaded.
+    """Return all tasks by name, and the chosen one, loaded.
 
     Raises:
         InputError: there is none of this name.
@@ -62,7 +71,7 @@ def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], T
 
 
 def whole_number(minimum: int) -> Callable[[str], int]:
-    """A type for argparse: a whole number of at least `minimum`, which is not negative."""
+    """Return a type for argparse: a whole number of at least `minimum`, which is not negative."""
 
     def convert(text: str) -> int:
         number = int(text) if text.isdecimal() else -1
@@ -74,7 +83,7 @@ def whole_number(minimum: int) -> Callable[[str], int]:
 
 
 def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
-    """A type for argparse: a number above 0 and up to `maximum`."""
+    """Return a type for argparse: a number above 0 and up to `maximum`."""
 
     def convert(text: str) -> float:
         number = _number(text)
@@ -86,7 +95,7 @@ def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
 
 
 def point(text: str) -> tuple[float, float, float]:
-    """A type for argparse: X,Y,Z in metres."""
+    """Convert X,Y,Z, metres; a type for argparse."""
     numbers = [_number(part) for part in text.split(",")]
     if len(numbers) != 3 or not all(math.isfinite(number) for number in numbers):
         raise argparse.ArgumentTypeError(f"found {text!r}; accepted: three numbers X,Y,Z in metres, such as 0,-0.5,0.4")
@@ -106,52 +115,51 @@ def with_negative_values(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
-def ready_to_write(path: Path, suffix: str, field: str = "--out") -> Path:
-    """Check, before minutes of measuring, that a file can be written; its folder is made.
+def ready_to_write(path: Path, suffix: str) -> Path:
+    """Check, before minutes of measuring, that `--out` can be written; make its folder.
 
     Raises:
         InputError: it has another suffix, is a folder, or cannot be written.
     """
     if path.suffix.lower() != suffix:
-        raise InputError(field, repr(str(path)), f"a file that ends in {suffix}")
+        raise InputError("--out", repr(str(path)), f"a file that ends in {suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab"):
             pass
     except OSError as error:
         found = f"{str(path)!r}, which cannot be written ({error.strerror or error})"
-        raise InputError(field, found, "a file in a folder that can be written to") from error
+        raise InputError("--out", found, "a file in a folder that can be written to") from error
     return path
 
 
-def ready_folder(path: Path, field: str = "--out") -> Path:
-    """Make a folder to write to. Raises InputError where that is not possible."""
+def ready_folder(path: Path) -> Path:
+    """Make the folder `--out`. Raises InputError if that is not possible."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         found = f"{str(path)!r}, which cannot be made ({error.strerror or error})"
-        raise InputError(field, found, "a folder, existing or new") from error
+        raise InputError("--out", found, "a folder, existing or new") from error
     return path
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write figures as JSON that other languages read, too: without NaN."""
+    """Write figures as standard JSON, without NaN."""
     path.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
+def write_npz(path: Path, **arrays: Any) -> None:  # noqa: ANN401 - numbers and arrays
+    """Write arrays to an npz file of exactly this name."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under a header, the first column to the left, the others to the right."""
+    """Print rows under a header, the first column aligned left, the others right."""
     widths = [max(len(row[k]) for row in (header, *rows)) for k in range(len(header))]
     for row in (header, *rows):
         cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
         print("  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip())
-
-
-def _space(text: str) -> str:
-    if text not in SPACES:
-        accepted = ", ".join(SPACES)
-        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
-    return text
 
 
 def _number(text: str) -> float:

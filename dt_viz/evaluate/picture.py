@@ -1,4 +1,4 @@
-"""The picture of what was learned: generated motions on their demonstrations, shape by shape (the paper's fig. 5)."""
+"""Picture of learned motions over their demonstrations, one panel for each shape (the paper's fig. 5)."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from PIL import Image, ImageDraw, ImageFont
 from dt_viz.flows.fields import Array
 
 PANEL, LABEL, BORDER = 320, 30, 22
-"""Pixels: side of a panel, height of its name, and free space around the motions."""
+"""Side of a panel, height of its name, and margin around the motions, pixels."""
 MAX_COLUMNS = 6
 FINER = 3
-"""Drawn this many times finer, then reduced: smooth lines."""
+"""Supersampling factor, for smooth lines."""
 DEMONSTRATION, GENERATED, GOAL, INK = (126, 204, 138), (200, 24, 36), (20, 20, 20), (60, 60, 60)
-"""Green and red as in the paper; the one light and the other dark, for those who cannot tell them apart by hue."""
+"""Colours: light green and dark red as in the paper, which differ in lightness, too; and those of goal and text."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One shape."""
+    """Motions of one shape."""
 
     name: str
     demonstrations: Sequence[Array]
@@ -73,7 +73,7 @@ def _disc(draw: ImageDraw.ImageDraw, centre: tuple[float, float], colour: tuple[
 
 
 def _widest_directions(points: Array) -> Array:
-    """Orthonormal columns (d, 2): in the plane its axes, in space the widest horizontal direction and up."""
+    """Return orthonormal columns (d, 2): the axes of the plane, or in space the widest horizontal direction and up."""
     if points.shape[1] == 2:
         return np.eye(2)
     spread = points - points.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Put a sphere to the middle of the demonstrations and to random places nearby, and measure the whole arm at each.
+"""Put a sphere at the middle of the demonstrations and at random places nearby, and measure the whole arm for each.
 
 The npz file holds the places (K, 3), metres, the middle of the mean demonstration first, and for each place and rollout
 (K, R): ``arm_depth``, ``arm_clearance``, ``depth_without``, ``frechet``, ``goal_miss`` in metres, ``turn`` and
@@ -17,14 +17,15 @@ from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.avoidance import Measured, measure
 from dt_viz.evaluate.options import (
-    add_generator,
-    add_space,
+    add_avoidance,
     add_task,
     chosen_task,
     positive_number,
     print_table,
     ready_to_write,
+    scenario_around,
     whole_number,
+    write_npz,
 )
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
@@ -33,7 +34,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import Task
 
 WITHIN = 0.05
-"""Metres of the middle."""
+"""Largest distance of a random place from the middle, metres."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,10 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=whole_number(0), default=20, help="random places (default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the places (default: %(default)s)")
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
-    add_space(parser)
-    parser.set_defaults(space="cspace")
-    add_generator(parser)
-    parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
+    add_avoidance(parser, "cspace")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
@@ -60,23 +58,16 @@ def run(options: argparse.Namespace) -> int:
     rows = []
     for k, (x, y, z) in enumerate(places):
         obstacle = Sphere((x, y, z), options.diameter)
-        scenario = Scenario(
-            task.name, (obstacle,), avoidance=not options.no_avoidance, space=options.space, generator=options.generator
-        )
+        scenario = scenario_around(obstacle, task, options)
         frame, motions = engine.arm_motions(scenario)
-        found.append(
-            [
-                measure(motion, path, frame.goal, obstacle, robot)
-                for motion, path in zip(motions, task.paths, strict=False)
-            ]
-        )
-        rows.append((str(k), *_row(found[-1], scenario), *(frame.blocked or frame.health.doubts)[:1]))
+        pairs = zip(motions, task.paths, strict=False)
+        found.append([measure(motion, path, frame.goal, obstacle, robot) for motion, path in pairs])
+        rows.append((str(k), *_row(found[-1], scenario), *map(str, (frame.blocked or frame.certificates.warnings)[:1])))
     names = ("frechet", "depth_without", "turn", "turn_without", "num_outside", "goal_miss")
     arrays = {name: _table(found, len(task.paths), lambda m, name=name: getattr(m, name)) for name in names}
     arrays["arm_depth"] = _table(found, len(task.paths), lambda m: m.arm.depth)
     arrays["arm_clearance"] = _table(found, len(task.paths), lambda m: m.arm.obstacle.distance)
-    with out.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, places=places, **arrays)
+    write_npz(out, places=places, **arrays)
     print(f"{task.name}, sphere of {options.diameter:g} m; lengths in mm, the worst rollout of each place")
     header = (
         "place", "M.C.D. without", "M.C.D. arm", "clearance", "F.D.", "F.D./forced", "turn (without)",
@@ -95,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _places(task: Task, count: int, rng: np.random.Generator) -> Array:
-    """The middle of the mean demonstration, and places evenly spread in the ball around it, (1 + count, 3), metres."""
+    """Return the middle of the mean demonstration and random places in a ball around it, (1 + count, 3), metres."""
     middle = task.mean_path[50]
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -111,7 +102,7 @@ def _row(measured: list[Measured], scenario: Scenario) -> tuple[str, ...]:
         f"{1e3 * max(m.arm.depth for m in measured):.1f}",
         f"{1e3 * min(m.arm.obstacle.distance for m in measured):.1f}",
         f"{1e3 * max(m.frechet for m in measured):.0f}",
-        f"{max(m.frechet / (m.depth_without + scenario.margin) for m in measured):.2f}",
+        f"{max(m.frechet / (m.depth_without + scenario.avoidance.margin) for m in measured):.2f}",
         f"{worst.turn:.0f}° ({worst.turn_without:.0f}°)",
         f"{1e3 * max(m.goal_miss for m in measured):.3f}",
         f"{sum(m.num_outside for m in measured)}",

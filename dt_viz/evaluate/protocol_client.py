@@ -1,19 +1,18 @@
-"""A visitor without a browser: speaks viser's protocol, keeps what it is shown, and moves what can be moved.
+"""A visitor without a browser: speaks viser's protocol, keeps the state of the page, and drags and sets things.
 
-Each message from the server is one frame of a WebSocket: two lengths (little-endian, 8 bytes each), a map of msgpack
-compressed with zstd, and the arrays that stand in that map as placeholders, each beginning at a multiple of 8 bytes. A
-message to the server is one map of msgpack. Everything has a time limit.
+A frame of the WebSocket from the server has two lengths (little-endian, 8 bytes each), a msgpack map compressed with
+zstd, and the arrays for which that map has placeholders, each at a multiple of 8 bytes. A message to the server is one
+msgpack map.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -26,45 +25,46 @@ from websockets.typing import Subprotocol
 ROLLOUTS, OBSTACLE = "/rollouts", "/obstacles/0"
 """Names of the rollouts' lines and of the first obstacle's gizmo in the scene tree."""
 STATUS, CHECKED = "Smallest det J", "every check holds"
-"""What the status line says of every frame, and of a frame whose certificates all hold."""
+"""Texts in the status line of every frame, and of a frame whose certificates all hold."""
 MAX_MESSAGE = 64 * 2**20
-"""Bytes of a message from the server."""
-PART = 512 * 1024
-"""Bytes of a part of an upload, as in viser's own page."""
+"""Largest size of a message from the server, bytes."""
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
+T = TypeVar("T", bound="ProtocolClient")
+
+
 class LostError(ConnectionError):
-    """The server has closed the connection."""
+    """A connection that the server has closed."""
 
 
 class ProtocolClient:
-    """One visitor: an asynchronous context manager, connected while it is entered."""
+    """A visitor: an asynchronous context manager that is connected inside its block."""
 
     def __init__(self, url: str, *, origin: str | None = None, protocol: str | None = None) -> None:
         """Visit a server.
 
         Args:
-            url: of the WebSocket, such as ``ws://127.0.0.1:8080``.
-            origin: of the page that it pretends to be; None sends none.
+            url: address of the WebSocket, such as ``ws://127.0.0.1:8080``.
+            origin: origin of the page that it imitates; None sends none.
             protocol: WebSocket subprotocol; that of the installed viser if None.
         """
         self._url, self._origin = url, origin
         self._protocol = Subprotocol(protocol or f"viser-v{version('viser')}")
         self.nodes: dict[str, dict[str, Any]] = {}
-        """Properties of what is in the scene, by name; arrays are flat."""
+        """Properties of the scene's nodes, by name; arrays are flat."""
         self.controls: dict[str, dict[str, Any]] = {}
-        """Properties of what is in the panel, by its identifier."""
+        """Properties of the panel's controls, by identifier."""
         self.notices: list[str] = []
-        """What popped up."""
+        """Texts of the notifications."""
         self.num_bytes = self.num_messages = 0
-        """Received."""
+        """Numbers of bytes and messages received."""
         self.changed: Callable[[str, Mapping[str, Any], float], None] = lambda _name, _changes, _now: None
-        """Told of each node that came or changed its name, the properties, and when, seconds of `time.perf_counter`."""
+        """Called for each new or changed node with its name, properties, and the time of `time.perf_counter`."""
         self._news = asyncio.Event()
         self._ended: Exception | None = None
 
-    async def __aenter__(self) -> ProtocolClient:
+    async def __aenter__(self: T) -> T:
         self._socket: ClientConnection = await connect(
             self._url,
             origin=websockets.Origin(self._origin) if self._origin is not None else None,
@@ -83,18 +83,18 @@ class ProtocolClient:
         await self._receiving
 
     async def send(self, kind: str, **fields: Any) -> None:  # noqa: ANN401 - as the message has them
-        """Send a message of this kind. Raises LostError."""
+        """Send a message. Raises LostError."""
         await self.send_raw(msgspec.msgpack.encode({"type": kind, **fields}))
 
     async def send_raw(self, raw: bytes | str) -> None:
-        """Send what may be no message. Raises LostError."""
+        """Send anything. Raises LostError."""
         try:
             await self._socket.send(raw)
         except websockets.ConnectionClosed as error:
             raise LostError(str(error)) from error
 
     async def look(self, width: int = 1280, height: int = 720) -> None:
-        """Say where the camera is; the server builds the page when it first knows."""
+        """Report the camera; the server then builds the page."""
         await self.send(
             "ViewerCameraMessage",
             wxyz=UPRIGHT,
@@ -109,10 +109,10 @@ class ProtocolClient:
         )
 
     async def wait_for(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Wait until a condition on what is shown holds; False if it does not within so many seconds.
+        """Wait until a condition on the page holds; return False if it does not in time.
 
         Raises:
-            LostError: the connection ended before.
+            LostError: the connection ended first.
         """
         deadline = time.monotonic() + seconds
         while not condition():
@@ -125,16 +125,13 @@ class ProtocolClient:
                 return bool(condition())
         return True
 
-    async def wait_until_lost(self, seconds: float) -> bool:
-        """Wait until the server has closed the connection; False if it does not within so many seconds."""
-        done, _ = await asyncio.wait([self._receiving], timeout=seconds)
-        return bool(done)
-
     @property
     def rollouts(self) -> NDArray[np.float32] | None:
-        """Segments (K, 2, 3) of the rollouts that are shown, metres; None before there are any."""
+        """Segments (K, 2, 3) of the rollouts on the page, metres; None before there are any."""
         points = self.nodes.get(ROLLOUTS, {}).get("points")
-        return points.reshape(-1, 2, 3) if points is not None and points.size > 6 else None  # one stands there empty
+        return (
+            points.reshape(-1, 2, 3) if points is not None and points.size > 6 else None
+        )  # at first there is one empty segment
 
     @property
     def status(self) -> str:
@@ -144,26 +141,15 @@ class ProtocolClient:
 
     @property
     def has_picture(self) -> bool:
-        """Whether motions are shown, and how far they are to be trusted."""
+        """Whether rollouts and status line are on the page."""
         return self.rollouts is not None and bool(self.status)
 
-    def find(self, label: str) -> str:
-        """Identifier of the control with this label. Raises KeyError."""
-        for uuid, control in self.controls.items():
-            if control.get("label") == label:
-                return uuid
-        raise KeyError(label)
-
-    async def set(self, label: str, value: bool | float | str) -> None:
-        """Set a control, as a visitor does."""
-        await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
-
     async def grab(self, name: str = OBSTACLE) -> None:
-        """Take hold of a gizmo."""
+        """Begin to drag a gizmo."""
         await self.send("TransformControlsDragStartMessage", name=name, owner=self.nodes[name]["owner"])
 
     async def move(self, position: ArrayLike, name: str = OBSTACLE) -> None:
-        """Drag it to a place (3,), metres."""
+        """Drag a gizmo to a place (3,), metres."""
         await self.send(
             "TransformControlsUpdateMessage",
             name=name,
@@ -173,34 +159,8 @@ class ProtocolClient:
         )
 
     async def release(self, name: str = OBSTACLE) -> None:
-        """Let go of it."""
+        """End the drag of a gizmo."""
         await self.send("TransformControlsDragEndMessage", name=name, owner=self.nodes[name]["owner"])
-
-    async def upload(
-        self, label: str, name: str, content: bytes, *, announced: int | None = None, transfer: str = "transfer"
-    ) -> None:
-        """Send a file with an upload button.
-
-        Args:
-            label: of the button.
-            name: of the file.
-            content: all its bytes.
-            announced: bytes that are said to come; as many as do if None.
-            transfer: identifier of the transfer.
-        """
-        size = len(content) if announced is None else announced
-        common = {"source_component_uuid": self.find(label), "transfer_uuid": transfer}
-        parts = [content[k : k + PART] for k in range(0, len(content), PART)]
-        await self.send(
-            "FileTransferStartUpload",
-            **common,
-            filename=name,
-            mime_type="",
-            part_count=math.ceil(size / PART),
-            size_bytes=size,
-        )
-        for index, part in enumerate(parts):
-            await self.send("FileTransferPart", **common, part_index=index, content=part)
 
     async def _receive(self) -> None:
         try:
@@ -219,7 +179,7 @@ class ProtocolClient:
             self._news.set()
 
     def _apply(self, message: Mapping[str, Any], now: float) -> None:
-        """Keep what a message says that is shown."""
+        """Update the state of the page by a message."""
         kind = message["type"]
         if kind == "NotificationShowMessage":
             self.notices.append(message["props"]["body"])
@@ -242,7 +202,7 @@ class ProtocolClient:
 
 
 def decoded(raw: bytes) -> list[dict[str, Any]]:
-    """The messages in one frame from the server, with their arrays, which are flat."""
+    """Decode the messages in a frame from the server; their arrays are flat."""
     num_packed = int.from_bytes(raw[8:16], "little")
     unpacked = zstandard.ZstdDecompressor().decompress(
         raw[16 : 16 + num_packed], max_output_size=int.from_bytes(raw[:8], "little")

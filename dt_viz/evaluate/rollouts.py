@@ -1,17 +1,17 @@
 """Time exact rollouts against stepping the same system to the same accuracy.
 
-Eight rollouts of 200 points at even times, without an obstacle and with one on the motion. How it is kept fair:
+Eight rollouts of 200 points at even times, without an obstacle and with one on the motion. For a fair comparison:
 
 - The truth is a much finer stepping, with the flows of ψ integrated far more finely, too.
-- Both sides must be within the same distance of it at every point. On each side the cheapest setting that is so is
-  timed: of exact rollouts the tolerance of the obstacle's flow (nothing else in them is approximate), of stepping the
-  step and that tolerance.
+- Both sides must be within the same distance of it at every point, and the cheapest such setting of each is timed: for
+  exact rollouts the tolerance of the obstacle's flow (nothing else in them is approximate), for stepping the step and
+  that tolerance.
 - Stepping may choose between the Runge–Kutta steps of `DiffeomorphicSystem.stepped_rollout`, fixed in length, and
   scipy's DOP853: eighth order, adaptive, with dense output, so that it need not stop at every point. It steps all eight
   rollouts together, and gets ẏ from one integration of ψ with its Jacobian. The faster of the two is compared.
 
-An exact rollout needs no point before the next, so all points are evaluated together, which stepping cannot do. How
-much of the ratio that makes is said, too: the same exact rollouts are timed one rollout, and one point, at a time.
+The points of an exact rollout do not depend on each other, so all are evaluated together, which stepping cannot do. To
+separate this effect, the same exact rollouts are also timed one rollout, and one point, at a time.
 
 Stepping takes minutes near an obstacle's centre; a coarser `--accuracy` takes less.
 """
@@ -32,6 +32,7 @@ from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.options import (
     add_task,
+    avoiding,
     chosen_task,
     point,
     positive_number,
@@ -45,32 +46,32 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.transforms.avoidance import Avoidance
 
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 ARRIVED = 1e-4
-"""Metres from the goal in base space at which the last of the rollouts ends."""
+"""Distance from the goal in base space at which the last rollout ends, metres."""
 FINER = 1e-3
-"""The truth's tolerances, relative to the accuracy asked for."""
+"""Tolerance of the truth, relative to the required accuracy."""
 NUM_REFINEMENTS = 4
-"""Tolerances that are tried on each side, each a tenth of the one before; the truth's is finer than the last."""
+"""Number of tolerances that are tried on each side, each a tenth of the one before."""
 MAX_STEPS = 64
-"""Fixed steps between neighbouring points, tried from 1 by doubling."""
+"""Largest number of fixed steps between neighbouring points; tried by doubling from 1."""
 
 Systems = Callable[[float], DiffeomorphicSystem]
-"""The system with the obstacle's flow integrated to a tolerance in metres."""
+"""Function from the tolerance of the obstacle's flow, metres, to the system."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """The cheapest setting of one side that is accurate enough."""
+    """Result of the cheapest setting of one side that is accurate enough."""
 
     setting: str
     seconds: float
     error: float
     """Largest distance from the truth, metres."""
     accurate: bool
-    """Whether that is within what was asked for."""
+    """Whether the error is within the required accuracy."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -98,10 +99,10 @@ def run(options: argparse.Namespace) -> int:
     clock = learned.base
     # the learned pace has kinks, which a stepping of high order would have to find: that would flatter the exact side
     learned = replace(learned, base=Attractor(clock.goal, clock.speed, clock.smoothing))
-    scenario = Scenario(task.name, (Sphere(options.obstacle or task.obstacle_position, options.diameter),))
-    frame = next(iter(Engine(tasks, fits, load_jaco()).frames(scenario)))
-    field = scenario.obstacle.field(scenario.generator, scenario.temperature)
-    duration = frame.health.duration or 0.0
+    avoidance = Avoidance(Sphere(options.obstacle or task.obstacle_position, options.diameter))
+    frame = next(iter(Engine(tasks, fits, load_jaco()).frames(avoiding(task, avoidance))))
+    field = avoidance.avoided.field(avoidance.generator, avoidance.temperature)
+    duration = frame.durations[0] or 0.0
 
     def with_obstacle(tolerance: float) -> DiffeomorphicSystem:
         avoiding = AdaptiveFlow(field, duration, tolerance)
@@ -123,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
         rows += [(f"{scene}, exact, {how}", f"{1e3 * seconds:.1f}", "", "") for how, seconds in apart.items()]
     if out is not None:
         settings = {"task": task.name, "accuracy": options.accuracy, "repeats": options.repeats}
-        settings |= {"obstacle": scenario.obstacles[0].position, "diameter": options.diameter, "duration": duration}
+        settings |= {"obstacle": avoidance.obstacles[0].position, "diameter": options.diameter, "duration": duration}
         write_json(out, {**results, "settings": settings})
     print(
         f"{task.name}, {NUM_ROLLOUTS} rollouts × {NUM_POINTS} points, both within {options.accuracy:g} m of the truth"
@@ -133,13 +134,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def compare(systems: Systems, starts: Array, accuracy: float, repeats: int) -> tuple[Run, Run, dict[str, float]]:
-    """The cheapest accurate exact rollouts, the cheapest accurate stepping, and the former less batched, all timed.
+    """Time the cheapest accurate exact rollouts, the cheapest accurate stepping, and the former less batched.
 
     Args:
-        systems: what to roll out.
+        systems: the system for each tolerance.
         starts: (R, 3), metres.
         accuracy: largest distance from the truth, metres.
-        repeats: of each timing.
+        repeats: number of repetitions of each timing.
     """
     finest = systems(0.1 * FINER * accuracy)
     end = finest.base.arrival_time(finest.transform.forward(starts), ARRIVED).max()
@@ -182,7 +183,7 @@ def compare(systems: Systems, starts: Array, accuracy: float, repeats: int) -> t
 
 
 def _apart(system: DiffeomorphicSystem, starts: Array, times: Array, repeats: int) -> dict[str, float]:
-    """Seconds that exact rollouts (R, T, 3) take with less of them evaluated together."""
+    """Time exact rollouts (R, T, 3), in seconds, with fewer points evaluated together."""
 
     def by_point() -> Array:
         motion = [[system.rollout(start[None], times[[k]]) for k in range(len(times))] for start in starts]
@@ -198,7 +199,7 @@ def _apart(system: DiffeomorphicSystem, starts: Array, times: Array, repeats: in
 
 
 def stepped_adaptively(system: DiffeomorphicSystem, starts: Array, times: Array, tolerance: float) -> Array:
-    """The motion (R, T, 3) by DOP853 on ẏ = J⁻¹ f(ψ(y)), all rollouts in one state, steps to `tolerance` metres."""
+    """Compute the motion (R, T, 3) by DOP853 on ẏ = J⁻¹ f(ψ(y)), all rollouts in one state, to `tolerance` metres."""
 
     def velocity(_: float, state: Array) -> Array:
         z, J = system.transform.jacobian(state.reshape(starts.shape))
@@ -216,7 +217,7 @@ def _cheapest(
     repeats: int,
     give_up: float = np.inf,
 ) -> Run:
-    """The first accurate one of settings in order of cost, or the last tried: none after one that took `give_up` s."""
+    """Return the first accurate setting in order of cost, or the last one tried, at most `give_up` seconds each."""
     best = Run("", np.inf, np.inf, False)
     for setting, motion in settings:
         began = time.perf_counter()
@@ -239,7 +240,7 @@ def _median_seconds(motion: Callable[[], Array], repeats: int) -> float:
 
 
 def _eight(starts: Array) -> Array:
-    """Eight starts: the task's own, and where these are fewer, middles between neighbours."""
+    """Return eight starts: the task's own, and if these are fewer, middles between neighbours."""
     while len(starts) < NUM_ROLLOUTS:
         starts = np.concatenate([starts, (starts + np.roll(starts, -1, axis=0)) / 2])
     return starts[:NUM_ROLLOUTS]

@@ -1,8 +1,8 @@
-"""Start a learned motion from many random places and look whether all arrive.
+"""Start a learned motion from many random places and check that all arrive at the goal.
 
 Starts are spread evenly over the demonstrations' box grown by half its size on every side; a drawing's stay in its
-plane. Rollouts in closed form end at the goal whatever they are, if only ψ⁻¹ is the inverse of ψ. So the first of the
-starts are stepped, too: ẏ = J⁻¹ f(ψ(y)), eq. (1), knows neither the closed form nor ψ⁻¹, and must lead along the same
+plane. Rollouts in closed form end at the goal by construction, if only ψ⁻¹ is the inverse of ψ. So the first of the
+starts are stepped, too: ẏ = J⁻¹ f(ψ(y)), eq. (1), uses neither the closed form nor ψ⁻¹, and must lead along the same
 rollouts to the same goal.
 
 The npz file, if one is asked for, holds ``starts`` and ``ends`` (N, 3) in metres, ``min_det_jacobian`` (N,), the
@@ -17,28 +17,28 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to_write, whole_number
+from dt_viz.evaluate.held_out import arrival_times
+from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to_write, whole_number, write_npz
 from dt_viz.flows.fields import Array
 from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.store import FitStore, default_cache_folder
 
-AT_GOAL = 5e-5
-"""Metres from the goal at which a rollout ends."""
 NUM_SAMPLES = 50
-"""Of each rollout, where det J is looked at."""
+"""Number of samples of a rollout at which det J is computed."""
 CHUNK = 500
-"""Rollouts at a time."""
+"""Number of rollouts that are computed together."""
 NUM_STEPPED_PLACES = 5
-"""Places, evenly in time, at which a stepped motion is compared with the exact rollout."""
+"""Number of places, evenly in time, at which a stepped motion is compared with the exact rollout."""
 STEP_TOLERANCE = 1e-6
-"""Estimated error of a step of theirs, metres."""
+"""Largest estimated error of a step, metres."""
 ARRIVED = 1e-4
-"""Metres from the goal within which a motion has arrived."""
+"""Distance from the goal within which a motion has arrived, metres."""
 MAX_DEPARTURE = 1e-3
-"""Metres of a stepped motion from the exact rollout: where space is squeezed, errors of steps grow a hundredfold."""
+"""Largest accepted distance of a stepped motion from the exact rollout, metres: where space is compressed, errors of
+steps grow a hundredfold."""
 FAILED = 1
-"""Exit status where a motion does not arrive, or departs from the exact one."""
+"""Exit status if a motion does not arrive, or departs from the exact one."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,12 +64,11 @@ def run(options: argparse.Namespace) -> int:
     uniform = np.random.default_rng(options.seed).uniform(size=(options.count, points.shape[1]))
     starts = task.to_world(lower - margin + uniform * (upper - lower + 2 * margin))
 
-    stretch = np.linalg.norm(system.transform.inverse_jacobian(system.base.goal)[1], 2)
     ends, det, missed, durations = np.empty_like(starts), np.empty(len(starts)), 0.0, np.empty(len(starts))
     for first in range(0, len(starts), CHUNK):
         chunk = slice(first, first + CHUNK)
         z0 = system.transform.forward(starts[chunk])
-        arrival = system.base.arrival_time(z0, float(AT_GOAL / max(stretch, 1.0)))
+        arrival = arrival_times(system, z0)
         z = system.base.flow(z0, arrival[:, None] * np.linspace(0.0, 1.0, NUM_SAMPLES))
         paths, J_inverse = system.transform.inverse_jacobian(z)
         missed = max(missed, float(np.linalg.norm(paths[:, 0] - starts[chunk], axis=1).max()))
@@ -78,8 +77,7 @@ def run(options: argparse.Namespace) -> int:
     stepped, departures = stepped_beside(system, starts[: options.stepped], durations[: options.stepped])
     if out is not None:
         arrays = {"starts": starts, "ends": ends, "min_det_jacobian": det, "goal": goal}
-        with out.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays, stepped=stepped, departures=departures)
+        write_npz(out, **arrays, stepped=stepped, departures=departures)
 
     distance = np.linalg.norm(ends - goal, axis=1)
     left = np.linalg.norm(stepped[:, -1] - goal, axis=1)

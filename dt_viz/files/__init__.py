@@ -1,1 +1,1 @@
-"""Readers of files that anyone may have written: bounded in time and memory."""
+"""Readers of untrusted files, bounded in time and memory."""

@@ -1,35 +1,36 @@
-"""The triangles of a GLB file (glTF 2.0, binary), and nothing else of it.
+"""Reader of the triangles in a GLB file (glTF 2.0, binary).
 
-What a scene shows is added up from the file's own words before anything of it is made: a few kilobytes can place one
-mesh ten thousand times. Images, materials, skins and animations are not looked at; nothing is read from elsewhere.
+The size of a scene is added up from its description before any array is made: a few kilobytes can place one mesh ten
+thousand times. Images, materials, skins and animations are ignored; no other file is read.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_most, too_many
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.interruption import checkpoint
 
 MAX_JSON = 4_000_000
-"""Largest number of bytes in the description of the scene: as Python objects they take some thirty times the room."""
+"""Largest number of bytes of the scene's description, which takes some thirty times as many as Python objects."""
 MAX_PLACED = 10_000
-"""Largest number of nodes, and of parts that they show."""
+"""Largest number of nodes, and of the parts that they place."""
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
 TRIANGLES, STRIP, FAN = 4, 5, 6
-"""Modes of primitives; the others are points and lines."""
+"""Modes of primitives that have triangles; the others are points and lines."""
 HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_mesh_quantization")
-"""How extensions begin that leave triangles where they are."""
+"""Prefixes of extensions that do not change triangles."""
 
 Json: TypeAlias = Any
 
@@ -39,11 +40,11 @@ class _Part:
     """A primitive in one of its places."""
 
     place: Array
-    """(4, 4) from its own frame into the scene's."""
+    """(4, 4) transform from its own frame to the scene's."""
     positions: Json
-    """Accessor."""
+    """Accessor of the vertices."""
     indices: Json | None
-    """Accessor; None where vertices follow each other."""
+    """Accessor of the corners; None where they are the vertices in order."""
     mode: int
 
     @property
@@ -57,16 +58,15 @@ class _Part:
 
 
 def read_glb(content: bytes, *, max_vertices: int, max_triangles: int) -> tuple[Array, Indices]:
-    """Vertices (V, 3) and triangles (F, 3) of all that the scene shows, each part in its place.
+    """Read vertices (V, 3) and triangles (F, 3) of the whole scene, each part in its place.
 
     Args:
         content: all bytes of the file.
-        max_vertices: largest number of vertices, counted as often as they are shown.
-        max_triangles: the same of triangles.
+        max_vertices: largest number of vertices, all instances counted.
+        max_triangles: largest number of triangles, all instances counted.
 
     Raises:
-        FormatError: it is no GLB file, a damaged one, one that shows more than that, or one of whose parts is packed
-            in a way that is not read.
+        FormatError: it is no complete GLB file, shows more than that, or has a part that is packed in another way.
         Exception: of almost any kind, if its description is no scene.
     """
     scene, data = _chunks(content)
@@ -78,11 +78,11 @@ def read_glb(content: bytes, *, max_vertices: int, max_triangles: int) -> tuple[
     for part in _parts(scene):
         num_vertices, num_triangles = num_vertices + part.num_vertices, num_triangles + part.num_triangles
         if num_triangles > max_triangles:
-            raise FormatError("faces", f"more than {max_triangles}, all instances counted", f"at most {max_triangles}")
+            raise too_many("faces", max_triangles, "of all instances")
         if num_vertices > max_vertices:
-            raise FormatError("vertices", f"more than {max_vertices}, all instances counted", f"at most {max_vertices}")
+            raise too_many("vertices", max_vertices, "of all instances")
         if len(parts) == MAX_PLACED:
-            raise FormatError("JSON", f"more than {MAX_PLACED} parts", f"at most {MAX_PLACED}")
+            raise too_many("JSON", MAX_PLACED, "parts")
         parts.append(part)
     vertices, faces = np.empty((num_vertices, 3)), np.empty((num_triangles, 3), dtype=np.intp)
     v = f = 0
@@ -101,15 +101,14 @@ def read_glb(content: bytes, *, max_vertices: int, max_triangles: int) -> tuple[
 
 
 def _chunks(content: bytes) -> tuple[Json, memoryview]:
-    """The description of the scene, and its binary data."""
+    """Return the description of the scene and its binary data."""
     if len(content) < 20 or content[:4] != MAGIC:
         raise FormatError("header", repr(content[:4]), "'glTF', as GLB files begin")
     version, length, json_length = struct.unpack_from("<III", content, 4)
     if version != 2 or length != len(content) or json_length > len(content) - 20 or content[16:20] != JSON_CHUNK:
         found = f"version {version} and {len(content)} of {length} bytes"
         raise FormatError("header", found, "a complete GLB file of version 2")
-    if json_length > MAX_JSON:
-        raise FormatError("JSON", f"{json_length} bytes", f"at most {MAX_JSON}")
+    check_at_most("JSON", json_length, MAX_JSON, "bytes")
     scene = json.loads(content[20 : 20 + json_length])
     if not isinstance(scene, dict):
         raise FormatError("JSON", "no scene", "a glTF scene")
@@ -123,10 +122,9 @@ def _chunks(content: bytes) -> tuple[Json, memoryview]:
 
 
 def _parts(scene: Json) -> Iterator[_Part]:
-    """All primitives of triangles in all their places, in the order of the scene; their accessors checked."""
+    """Yield the primitives of triangles in all their places, in the order of the scene, their accessors checked."""
     nodes = scene.get("nodes", [])
-    if len(nodes) > MAX_PLACED:
-        raise FormatError("JSON", f"{len(nodes)} nodes", f"at most {MAX_PLACED}")
+    check_at_most("JSON", len(nodes), MAX_PLACED, "nodes")
     if scene.get("scenes"):
         roots = _item(scene, "scenes", scene.get("scene", 0)).get("nodes", [])
     else:
@@ -175,19 +173,10 @@ def _accessor(scene: Json, index: Json) -> Json:
 
 
 def _placement(node: Json) -> Array:
-    """(4, 4) from the frame of a node into that of its parent."""
+    """Return the transform (4, 4) from the frame of a node to that of its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=float).reshape(4, 4).T  # columns come first in the file
-    x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
-    norm = math.hypot(x, y, z, w)
-    x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = Rotation.from_quat(np.array(node.get("rotation", (0, 0, 0, 1)), dtype=float).reshape(4)).as_matrix()
     place = np.eye(4)
     place[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), dtype=float).reshape(3)
     place[:3, 3] = np.array(node.get("translation", (0, 0, 0)), dtype=float).reshape(3)
@@ -195,7 +184,7 @@ def _placement(node: Json) -> Array:
 
 
 def _numbers(scene: Json, data: memoryview, accessor: Json, kind: str) -> Array:
-    """The numbers (count, width) of an accessor, as float64 or, of indices, as they are."""
+    """Return the numbers (count, width) of an accessor: positions as float64, indices in their own type."""
     component, width = COMPONENTS.get(accessor.get("componentType")), WIDTHS[kind]
     if component is None or accessor.get("type") != kind or (kind == "SCALAR" and component[-2] != "u"):
         found = f"{str(accessor.get('type'))[:20]} of type {str(accessor.get('componentType'))[:20]}"
@@ -219,7 +208,7 @@ def _numbers(scene: Json, data: memoryview, accessor: Json, kind: str) -> Array:
 
 
 def _corners(scene: Json, data: memoryview, part: _Part) -> Indices:
-    """Triangles (F, 3) of a part, as indices of its own vertices."""
+    """Return the triangles (F, 3) of a part as indices of its own vertices."""
     if part.indices is None:
         order = np.arange(part.num_vertices)
     else:
@@ -229,5 +218,5 @@ def _corners(scene: Json, data: memoryview, part: _Part) -> Indices:
     k = np.arange(part.num_triangles)
     if part.mode == FAN:
         return np.stack([order[k * 0], order[k + 1], order[k + 2]], axis=1)
-    odd = k % 2  # of a strip every other triangle is turned round
+    odd = k % 2  # every other triangle of a strip is turned round
     return np.stack([order[k], order[k + 1 + odd], order[k + 2 - odd]], axis=1)

@@ -1,4 +1,4 @@
-"""The triangles of STL and OBJ files. Nothing is read from elsewhere: materials and pictures are not looked at."""
+"""Readers of the triangles in STL and OBJ files. Materials and pictures are ignored; no other file is read."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from array import array
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_most, too_many
 from dt_viz.files.text import MAX_LENGTH, numbered_lines
 from dt_viz.flows.fields import Array, Indices
 
 STL_HEADER = 84
-"""Number of bytes before the first triangle of a binary STL file; the last four say how many there are."""
+"""Number of bytes before the first triangle of a binary STL file; the last four are the number of triangles."""
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def read_stl(content: bytes, *, max_triangles: int) -> tuple[Array, Indices]:
-    """Vertices (V, 3), three for each triangle, and triangles (F, 3) of an STL file, binary or text.
+    """Read vertices (V, 3), three for each triangle, and triangles (F, 3) of an STL file, binary or text.
 
     Raises:
-        FormatError: it is no STL file, a damaged one, or one with more triangles than that.
+        FormatError: it is no complete STL file, or has more triangles than that.
     """
     count = struct.unpack_from("<I", content, STL_HEADER - 4)[0] if len(content) >= STL_HEADER else 0
     size = STL_HEADER + STL_TRIANGLE.itemsize * count
@@ -32,18 +33,17 @@ def read_stl(content: bytes, *, max_triangles: int) -> tuple[Array, Indices]:
         if len(content) < STL_HEADER:
             found = f"{len(content)} bytes"
             raise FormatError("file", found, f"a complete STL file, with a header of {STL_HEADER} bytes")
-        _check_triangles(count, max_triangles)
+        check_at_most("faces", count, max_triangles)
         if len(content) < size:
-            raise FormatError(
-                "file", f"{len(content)} bytes for {count} triangles", f"a complete STL file, {size} bytes"
-            )
+            found = f"{len(content)} bytes for {count} triangles"
+            raise FormatError("file", found, f"a complete STL file, {size} bytes")
         triangles = np.frombuffer(content, STL_TRIANGLE, count, STL_HEADER)
         corners = triangles["corners"].reshape(-1, 3).astype(float)
     return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
 def _stl_text(content: bytes, max_triangles: int) -> Array:
-    """Corners (3F, 3)."""
+    """Read the corners (3F, 3)."""
     corners, ended, num_facets = array("d"), False, 0
     for number, line in numbered_lines(content, errors="replace"):
         words = line.lower().split()
@@ -51,7 +51,7 @@ def _stl_text(content: bytes, max_triangles: int) -> Array:
             corners.extend(_coordinates(words[1:4], number))
         elif words[:1] == ["endfacet"]:
             num_facets += 1
-            _check_triangles(num_facets, max_triangles)
+            check_at_most("faces", num_facets, max_triangles)
             if len(corners) != 9 * num_facets:
                 raise FormatError(f"line {number}", "a facet without three vertices", "three for each facet")
         elif words:
@@ -62,15 +62,15 @@ def _stl_text(content: bytes, max_triangles: int) -> Array:
 
 
 def read_obj(content: bytes, *, max_vertices: int, max_triangles: int) -> tuple[Array, Indices]:
-    """Vertices (V, 3) and triangles (F, 3) of an OBJ file; polygons are split into fans of triangles.
+    """Read vertices (V, 3) and triangles (F, 3) of an OBJ file; polygons are split into fans of triangles.
 
     Raises:
-        FormatError: a vertex or face cannot be read, or there are more than that.
+        FormatError: a vertex or face cannot be read, or there are more vertices or triangles than that.
     """
     vertices, corners, begun = array("d"), array("q"), ""
     for number, text in numbered_lines(content, errors="replace"):
         line, begun = begun + text, ""
-        if line.endswith("\\"):  # goes on in the next line
+        if line.endswith("\\"):  # the line continues on the next one
             if len(line) > MAX_LENGTH:
                 raise FormatError(f"line {number}", "a line that goes on and on", f"at most {MAX_LENGTH} characters")
             begun = line[:-1]
@@ -79,19 +79,19 @@ def read_obj(content: bytes, *, max_vertices: int, max_triangles: int) -> tuple[
         if words[:1] == ["v"]:
             vertices.extend(_coordinates(words[1:4], number))
             if len(vertices) > 3 * max_vertices:
-                raise FormatError("vertices", f"more than {max_vertices}", f"at most {max_vertices}")
+                raise too_many("vertices", max_vertices)
         elif words[:1] == ["f"]:
             polygon = [_obj_index(word, len(vertices) // 3, number) for word in words[1:]]
             if len(polygon) < 3:
                 raise FormatError(f"line {number}", repr(line[:60]), "at least three vertices for a face")
             for second, third in itertools.pairwise(polygon[1:]):
                 corners.extend((polygon[0], second, third))
-            _check_triangles(len(corners) // 3, max_triangles)
+            check_at_most("faces", len(corners) // 3, max_triangles)
     return np.asarray(vertices).reshape(-1, 3), np.asarray(corners).reshape(-1, 3)
 
 
 def _obj_index(word: str, num_vertices: int, line: int) -> int:
-    """From 0, of a vertex that a face names: from 1, or backwards from −1."""
+    """Return the index, from 0, of a vertex that a face counts from 1, or backwards from −1."""
     try:
         index = int(word.split("/", 1)[0])
     except ValueError as error:
@@ -107,8 +107,3 @@ def _coordinates(words: list[str], line: int) -> list[float]:
     except ValueError as error:
         raise FormatError(f"line {line}", repr(" ".join(words)[:60]), "three coordinates") from error
     return [x, y, z]
-
-
-def _check_triangles(num: int, most: int) -> None:
-    if num > most:
-        raise FormatError("faces", f"{num}", f"at most {most}")

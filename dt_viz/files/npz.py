@@ -1,8 +1,8 @@
-"""Arrays of numbers in an npz archive, read so that no archive takes more room than the caller allows.
+"""Reader of the arrays in an npz archive that never takes more memory than the caller allows.
 
 `numpy.load` believes what an archive says of itself, unpacks members that need gigabytes for a few bytes (bzip2, LZMA)
-and evaluates their headers. Here members are stored or deflated, are counted while they are unpacked, and a header is
-compared with what numpy writes. Nothing is ever unpickled.
+and evaluates their headers. This reader takes only stored or deflated members, counts their bytes while it unpacks
+them, and compares their headers with what numpy writes. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import IO
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_most, too_many
 from dt_viz.interruption import checkpoint
 
 MAX_MEMBERS = 10_000
@@ -25,34 +26,34 @@ MAX_NPY_HEADER = 1000
 """Largest number of bytes in the header of a member; numpy writes some 120."""
 MAX_AXES = 8
 CHUNK = 2**18
-"""Number of bytes that are unpacked at once."""
+"""Number of bytes that are unpacked in one step."""
 DIRECTORY_ENTRY = b"PK\x01\x02"
 ENCRYPTED = 0x1
-"""Flag of members."""
+"""Flag of an encrypted member."""
 NPY_HEADER = re.compile(
     r"\{'descr': '([<>|]?)([biuf][1248]|U\d{1,6})', 'fortran_order': (True|False), 'shape': \(([\d, ]*)\),? *\} *\n?"
 )
-"""Header of plain numbers or text, as numpy and others write it."""
+"""Pattern of the header of plain numbers or text, as numpy and others write it."""
 REAL_NUMBERS = {"b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"}
-"""Types of numbers in numpy's notation, without their byte order."""
+"""Types of real numbers in numpy's notation, without their byte order."""
 
 
 class NpzFile:
-    """The arrays of an archive, each unpacked when it is asked for."""
+    """The arrays of an archive; each is unpacked when it is read."""
 
     def __init__(self, content: bytes, *, max_bytes: int) -> None:
         """Read the directory of the archive.
 
         Args:
             content: all bytes of the file.
-            max_bytes: largest number of bytes that all arrays that are asked for may unpack to.
+            max_bytes: largest number of bytes that the arrays read may unpack to, all together.
 
         Raises:
             FormatError: it has too many members, or two of one name.
             Exception: of almost any kind, as `zipfile.ZipFile`, if it is no archive or damaged.
         """
         if content.count(DIRECTORY_ENTRY) > MAX_MEMBERS:  # before the directory is read
-            raise FormatError("file", f"more than {MAX_MEMBERS} members", f"at most {MAX_MEMBERS} arrays")
+            raise too_many("file", MAX_MEMBERS, "members")
         self._archive = zipfile.ZipFile(io.BytesIO(content))
         self._members: dict[str, zipfile.ZipInfo] = {}
         for member in self._archive.infolist():
@@ -71,7 +72,7 @@ class NpzFile:
         """Unpack an array of real numbers or of text (boolean, integer, floating point or Unicode).
 
         Raises:
-            FormatError: it is packed in another way, larger than is allowed, or has anything else in it.
+            FormatError: it is packed in another way, too large, or holds anything else.
             Exception: of almost any kind, as `zipfile.ZipFile.open`, if it is damaged.
         """
         field, member = f"array {name[:40]!r}", self._members[name]
@@ -92,20 +93,20 @@ class NpzFile:
             raise FormatError("file", found, f"at most {self._max_bytes} bytes")
         self._left -= size
         data = file.take(size)
-        if file.take(1, or_less=True):  # also has zipfile look at the checksum, at the end
+        if file.take(1, or_less=True):  # at the end of the member zipfile compares its checksum
             raise FormatError(field, f"more than the {size} bytes of its header", "an array as numpy writes it")
         return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 class _Bytes:
-    """Takes bytes off a member while it is unpacked."""
+    """Reads the bytes of a member while it is unpacked."""
 
     def __init__(self, file: IO[bytes], field: str) -> None:
         self._file = file
         self._field = field
 
     def take(self, size: int, *, or_less: bool = False) -> bytes:
-        """The next `size` bytes; room is made for what is there, not for what is asked for."""
+        """Return the next `size` bytes; memory is taken for those that are there only."""
         data = bytearray()
         while len(data) < size:
             checkpoint()
@@ -119,13 +120,12 @@ class _Bytes:
 
 
 def _npy_header(file: _Bytes, field: str) -> tuple[str, str, bool, tuple[int, ...]]:
-    """Type of numbers, byte order, whether the first axis is the fastest, and shape."""
+    """Return the type of numbers, the byte order, whether the first axis is the fastest, and the shape."""
     start = file.take(8)
     if start[:6] != b"\x93NUMPY" or start[6] not in (1, 2, 3):
         raise FormatError(field, f"{start[:8]!r}", "an array as numpy writes it")
     length = int.from_bytes(file.take(2 if start[6] == 1 else 4), "little")
-    if length > MAX_NPY_HEADER:
-        raise FormatError(field, f"a header of {length} bytes", f"at most {MAX_NPY_HEADER} bytes")
+    check_at_most(field, length, MAX_NPY_HEADER, "bytes of a header")
     text = file.take(length).decode("latin-1")
     match = NPY_HEADER.fullmatch(text)
     if match is None:
@@ -133,6 +133,5 @@ def _npy_header(file: _Bytes, field: str) -> tuple[str, str, bool, tuple[int, ..
         raise FormatError(field, f"the header {text.strip()[:80]!r}", accepted)
     order, kind, fortran, axes = match.groups()
     shape = tuple(int(axis) for axis in axes.replace(" ", "").split(",") if axis)
-    if len(shape) > MAX_AXES:
-        raise FormatError(field, f"{len(shape)} axes", f"at most {MAX_AXES}")
+    check_at_most(field, len(shape), MAX_AXES, "axes")
     return kind, order, fortran == "True", shape

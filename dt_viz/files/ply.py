@@ -1,4 +1,4 @@
-"""Vertices, triangles and labels of a PLY file, text or binary; what else it holds is skipped."""
+"""Reader of the vertices, triangles and labels of a PLY file, text or binary; everything else is skipped."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_most, too_many
 from dt_viz.files.text import LINES_PER_CHECKPOINT, numbered_lines
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.interruption import checkpoint
@@ -18,9 +19,9 @@ from dt_viz.interruption import checkpoint
 MAX_HEADER = 100_000
 """Largest number of bytes of the header."""
 MAX_PROPERTIES = 100
-"""Largest number of properties in all."""
+"""Largest number of properties, of all elements together."""
 MAX_OTHERS = 1_000_000
-"""Largest number of an element that is skipped."""
+"""Largest number of instances of an element that is skipped."""
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -31,34 +32,32 @@ TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-"""Numpy's names of PLY's types."""
-CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
-"""The names that `struct` has for them."""
+"""Types of PLY in numpy's notation."""
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-"""Byte order of a format; none for text."""
-CORNERS = ("vertex_indices", "vertex_index")
-LABELS = ("occupied", "occupancy", "label")
+"""Byte order of each format; empty for text."""
+CORNERS, LABELS = ("vertex_indices", "vertex_index"), ("occupied", "occupancy", "label")
+"""Accepted names of the property with a face's corners, and of that with a vertex's label."""
 
 
 @dataclass(frozen=True)
 class Ply:
-    """What a PLY file holds."""
+    """The content of a PLY file."""
 
     vertices: Array
     """(V, 3) in the file's unit."""
     faces: Indices
-    """(F, 3); polygons are split into fans of triangles. Indices are as in the file: they may be wrong."""
+    """(F, 3) triangles; polygons are split into fans. Their indices are those of the file and may be wrong."""
     labels: Array | None
-    """(V,) the property of the vertices that is called as one of `LABELS`."""
+    """(V,) values of the first property of the vertices that has a name of `LABELS`."""
 
 
 @dataclass(frozen=True)
 class _Property:
     name: str
     kind: str
-    """Of its numbers, as numpy calls it."""
+    """Type of its numbers in numpy's notation."""
     count: str = ""
-    """Type of the number that says how many there are; none if there is always one."""
+    """Type of a list's length; empty for a single number."""
 
 
 @dataclass
@@ -94,15 +93,13 @@ def read_ply(content: bytes, *, max_vertices: int, max_triangles: int) -> Ply:
     """Read a PLY file.
 
     Raises:
-        FormatError: it is no PLY file, or a damaged one; its header promises more than there is in it, or more than is
-            allowed, before room is made for it; or a vertex has not the coordinates x, y and z.
+        FormatError: it is no complete PLY file; its header announces more than the file holds or than is allowed, which
+            is found before memory is taken; or a vertex lacks one of the coordinates x, y and z.
     """
     order, elements, body = _header(content)
     limits = {"vertex": max_vertices, "face": max_triangles}
     for element in elements:
-        limit = limits.get(element.name, MAX_OTHERS)
-        if element.num > limit:
-            raise FormatError(f"element {element.name[:40]}", f"{element.num}", f"at most {limit}")
+        check_at_most(f"element {element.name[:40]}", element.num, limits.get(element.name, MAX_OTHERS))
     _check_room(elements, order, len(content) - body)
     read = _text_columns(content[body:], elements) if not order else _binary_columns(content, body, elements, order)
     columns = dict(read)
@@ -117,7 +114,7 @@ def read_ply(content: bytes, *, max_vertices: int, max_triangles: int) -> Ply:
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], int]:
-    """Byte order, elements, and where the header ends."""
+    """Return the byte order, the elements, and the position after the header."""
     end = re.search(rb"end_header[ \t]*\r?\n", content[:MAX_HEADER])
     if not content.startswith(b"ply") or end is None:
         raise FormatError("header", "no 'ply' … 'end_header'", "a PLY file")
@@ -135,7 +132,7 @@ def _header(content: bytes) -> tuple[str, list[_Element], int]:
         elif words[:1] == ["property"] and elements:
             num_properties += 1
             if num_properties > MAX_PROPERTIES:
-                raise FormatError("header", f"more than {MAX_PROPERTIES} properties", f"at most {MAX_PROPERTIES}")
+                raise too_many("header", MAX_PROPERTIES, "properties")
             elements[-1].properties.append(_property(words, line))
     if order is None:
         raise FormatError("header", "no format that is known", f"one of {', '.join(FORMATS)}")
@@ -168,10 +165,9 @@ def _check_room(elements: list[_Element], order: str, left: int) -> None:
 
 
 def _fans(corners: _Lists, max_triangles: int) -> Indices:
-    """Triangles (F, 3) of polygons; of those with fewer than three corners none."""
+    """Split polygons into triangles (F, 3); those with fewer than three corners have none."""
     num = np.maximum(corners.lengths - 2, 0)
-    if num.sum() > max_triangles:
-        raise FormatError("faces", f"{num.sum()} triangles", f"at most {max_triangles}")
+    check_at_most("faces", num.sum(), max_triangles, "triangles")
     first = np.repeat(np.cumsum(corners.lengths) - corners.lengths, num)
     second = first + 1 + np.arange(num.sum()) - np.repeat(np.cumsum(num) - num, num)
     return np.stack([corners.numbers[first], corners.numbers[second], corners.numbers[second + 1]], axis=1)
@@ -206,7 +202,7 @@ def _text_columns(body: bytes, elements: list[_Element]) -> Iterator[tuple[str, 
 
 
 def _text_cells(properties: list[_Property], wanted: tuple[str, ...], words: list[str]) -> Iterator[list[str]]:
-    """The wanted properties of an element, given its line."""
+    """Yield the cells of an element's wanted properties, given the words of its line."""
     at = 0
     for p in properties:
         num = 1
@@ -249,7 +245,7 @@ def _whole(numbers: Array) -> Indices:
 
 
 def _equal_rows(content: bytes, at: int, element: _Element, order: str) -> np.ndarray | None:
-    """The rows of an element, if those lists that have the same name are all as long as in the first row."""
+    """Return the rows of an element; None unless each list is as long in every row as in the first."""
     fields: list[tuple] = []
     size = 0
     for k, p in enumerate(element.properties):
@@ -273,10 +269,10 @@ def _equal_rows(content: bytes, at: int, element: _Element, order: str) -> np.nd
 
 
 def _unequal_rows(content: bytes, at: int, element: _Element, order: str) -> tuple[int, Columns]:
-    """Where an element ends whose lists are not equally long, and its columns."""
+    """Return the position after an element whose lists differ in length, and its columns."""
     numbers: dict[str, list[bytes]] = {name: [] for name in element.wanted}
     lengths: dict[str, array[int]] = {name: array("q") for name in element.wanted}
-    counts = [struct.Struct(order + CODES[p.count]) if p.count else None for p in element.properties]
+    counts = [struct.Struct(order + np.dtype(p.count).char) if p.count else None for p in element.properties]
     sizes = [np.dtype(p.kind).itemsize for p in element.properties]
     for row in range(element.num):
         if row % LINES_PER_CHECKPOINT == 0:

@@ -1,20 +1,21 @@
-"""Lines and tables of text files, read one line at a time: no file makes them take more memory than its own size."""
+"""Readers of lines and tables, one line at a time: none takes more memory than the size of its file."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 from dt_viz.errors import FormatError
+from dt_viz.files.checks import too_many
 from dt_viz.interruption import checkpoint
 
 MAX_LINES = 2_000_000
-"""Largest number of lines of a file, empty ones and comments included."""
+"""Largest number of lines of a file, empty lines and comments included."""
 MAX_LENGTH = 100_000
 """Largest number of characters in a line."""
 LINES_PER_CHECKPOINT = 1000
-"""Number of lines between two checkpoints: about a millisecond."""
+"""Number of lines between two checkpoints, about a millisecond of reading."""
 
 
 def numbered_lines(content: bytes, *, errors: str = "strict", max_lines: int = MAX_LINES) -> Iterator[tuple[int, str]]:
@@ -22,11 +23,11 @@ def numbered_lines(content: bytes, *, errors: str = "strict", max_lines: int = M
 
     Args:
         content: all bytes of the file.
-        errors: what is done about bytes that are no UTF-8, as in `bytes.decode`.
+        errors: treatment of bytes that are no UTF-8, as in `bytes.decode`.
         max_lines: largest number of lines.
 
     Raises:
-        FormatError: it is no text in UTF-8, has more lines than that, or a line longer than `MAX_LENGTH`.
+        FormatError: it is no text in UTF-8, has more lines than that, or a line is longer than `MAX_LENGTH`.
     """
     if b"\0" in content:
         raise FormatError("file", "a zero byte", "text in UTF-8")
@@ -41,12 +42,10 @@ def numbered_lines(content: bytes, *, errors: str = "strict", max_lines: int = M
             return
         number += 1
         if number > max_lines:
-            raise FormatError("file", f"more than {max_lines} lines", f"at most {max_lines} lines")
+            raise too_many("file", max_lines, "lines")
         line = line.rstrip("\n")
         if len(line) > MAX_LENGTH:
-            raise FormatError(
-                f"line {number}", f"more than {MAX_LENGTH} characters", f"lines of at most {MAX_LENGTH} characters"
-            )
+            raise too_many(f"line {number}", MAX_LENGTH, "characters")
         if number % LINES_PER_CHECKPOINT == 0:
             checkpoint()
         yield number, line
@@ -55,20 +54,20 @@ def numbered_lines(content: bytes, *, errors: str = "strict", max_lines: int = M
 def read_table(
     content: bytes, headers: Collection[tuple[str, ...]], *, max_rows: int
 ) -> tuple[tuple[str, ...], Iterator[tuple[int, list[str]]]]:
-    """Read comma-separated text: its header line at once, its rows while they are iterated over.
+    """Read comma-separated text: the header line immediately, the rows during iteration.
 
     Args:
         content: all bytes of the file, UTF-8.
-        headers: the names of columns, in lower case, that are accepted.
+        headers: accepted headers, each the names of its columns in lower case.
         max_rows: largest number of lines after the header.
 
     Returns:
-        Which of the headers it is; and, of each line that is not empty, its number and its cells without the blanks
-        around them, as many as the header has.
+        The header of this table; and for each line that is not empty its number and its cells, stripped of blanks, as
+        many as the header has.
 
     Raises:
-        FormatError: the header is none of them; or, while iterating, as `numbered_lines`, or a line has not as many
-            cells as the header.
+        FormatError: the header is none of them; during iteration as `numbered_lines`, or if a line has another number
+            of cells than the header.
     """
     rows = _rows(numbered_lines(content, max_lines=max_rows + 1))
     _, cells = next(rows, (1, []))
@@ -96,3 +95,11 @@ def _of_width(rows: Iterator[tuple[int, list[str]]], width: int) -> Iterator[tup
         if len(cells) != width:
             raise FormatError(f"line {number}", f"{len(cells)} columns", f"{width}, as in the header")
         yield number, cells
+
+
+def decimal_numbers(cells: Sequence[str], line: int) -> list[float]:
+    """Return the numbers in the cells of a line. Raises FormatError if one of them is none."""
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError as error:
+        raise FormatError(f"line {line}", repr(",".join(cells)[:60]), "decimal numbers") from error

@@ -318,6 +318,30 @@ class PlacedField:
 
 
 @dataclass(frozen=True)
+class InPlane:
+    """A field of R³ of which only the part along a plane is left, so that its flow stays at every depth."""
+
+    inner: VectorField
+    axes: Array
+    """(3, 2) orthonormal columns along the plane."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.inner.dim
+
+    def __call__(self, s: Array) -> Array:
+        """V at the points `s` (N, 3), as (N, 3)."""
+        return self.inner(s) @ self.axes @ self.axes.T
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V (N, 3) and DV (N, 3, 3) at the points `s` (N, 3)."""
+        V, DV = self.inner.with_jacobian(s)
+        along = self.axes @ self.axes.T
+        return V @ along, along @ DV
+
+
+@dataclass(frozen=True)
 class Sum:
     """Several fields of the same dimension, added up; at least one."""
 

@@ -1,4 +1,4 @@
-"""Demonstrations: what they are, how they are checked, how files become them.
+"""Demonstrations: recorded motions, their checks, and their files.
 
 Three kinds of file are read, and a folder of the first:
 
@@ -29,20 +29,24 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.errors import DataError, parsing
+from dt_viz.errors import DataError, FormatError, naming, parsing
+from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers, too_many
 from dt_viz.files.npz import NpzFile
-from dt_viz.files.text import read_table
+from dt_viz.files.text import decimal_numbers, read_table
 from dt_viz.learning.matfile import Value, read_variable
 
 DIMENSIONS = (2, 3)
-MAX_BYTES = 16 * 2**20  # of a file, and of what an npz unpacks to; some 300,000 samples
+MAX_BYTES = 16 * 2**20
+"""Largest number of bytes of a file, and of what an npz unpacks to; some 300,000 samples."""
 MAX_CSV_ROWS = 600_000
 MAX_DEMONSTRATIONS = 1000
-MAX_NAME = 1000  # characters
+MAX_NAME = 1000
+"""Largest number of characters of a name."""
 CSV_HEADERS = (("demo", "t", "x", "y"), ("demo", "t", "x", "y", "z"), ("t", "x", "y"), ("t", "x", "y", "z"))
-MAX_COORDINATE = 100.0  # metres; beyond it the numbers are in another unit
-MAX_DURATION = 3600.0  # seconds; beyond it the numbers are in another unit
-MIN_EXTENT = 1e-6  # metres; a motion that stays within it is a point
+MAX_COORDINATE, MAX_DURATION = 100.0, 3600.0
+"""Largest coordinate (m) and duration (s); numbers beyond them are in another unit."""
+MIN_EXTENT = 1e-6
+"""Smallest extent of a motion, metres; a smaller one is a point."""
 METRES_PER_LASA_UNIT = 1e-3
 
 
@@ -96,78 +100,81 @@ def check_demonstrations(
             the number of samples, the finite values or the increasing times that :class:`Demonstration` promises, does
             not move, has values so large that its unit must be another one, or a name that cannot be shown.
     """
-    if not demonstrations:
-        raise DemonstrationError(source, "demonstrations", "none", "at least one")
-    if len(demonstrations) > MAX_DEMONSTRATIONS:
-        raise DemonstrationError(source, "demonstrations", f"{len(demonstrations)}", f"at most {MAX_DEMONSTRATIONS}")
-    checked = []
-    for i, demonstration in enumerate(demonstrations):
-        where = (lambda row: f"sample {row + 1}") if lines is None else (lambda row, n=lines[i]: f"line {n[row]}")
-        checked.append(_check_one(demonstration, source, where))
-        first, this = checked[0], checked[-1]
-        if this.dimension != first.dimension:
-            raise DemonstrationError(
-                source,
-                "dimension",
-                f"{first.dimension} in {first.name!r} but {this.dimension} in {this.name!r}",
-                "one dimension for all",
-            )
+    with naming(DemonstrationError, source):
+        check_at_most("demonstrations", len(demonstrations), MAX_DEMONSTRATIONS)
+        checked = []
+        for demonstration, (times, positions) in zip(demonstrations, samples_of(demonstrations, lines), strict=True):
+            name = demonstration.name
+            if len(name) > MAX_NAME or re.search("[\ud800-\udfff]", name):  # a page cannot be sent half a character
+                raise FormatError("name", repr(name[:40]), f"text of at most {MAX_NAME} characters")
+            where = _places(lines, len(checked))
+            farthest = np.abs(positions).max(axis=1)
+            if farthest.max() > MAX_COORDINATE:
+                found = f"{farthest.max():.6g} m {where(int(farthest.argmax()))}; is the file in millimetres?"
+                accepted = f"metres, at most {MAX_COORDINATE:g} from the origin"
+                raise FormatError(f"positions of {name!r}", found, accepted)
+            if times[-1] > MAX_DURATION:
+                found = f"a duration of {times[-1]:.6g} s; is the file in milliseconds?"
+                accepted = f"seconds, at most {MAX_DURATION:g} from first to last"
+                raise FormatError(f"times of {name!r}", found, accepted)
+            if np.ptp(positions, axis=0).max() < MIN_EXTENT:
+                raise FormatError(f"positions of {name!r}", "a motion that stays at one point", "a motion")
+            times.setflags(write=False)
+            positions.setflags(write=False)
+            checked.append(Demonstration(times, positions, name))
     return tuple(checked)
 
 
-def _check_one(demonstration: Demonstration, source: str | Path, where: Callable[[int], str]) -> Demonstration:
-    name = demonstration.name
-    if len(name) > MAX_NAME or re.search("[\ud800-\udfff]", name):  # halves of characters cannot be sent to a page
-        raise DemonstrationError(source, "name", repr(name[:40]), f"text of at most {MAX_NAME} characters")
-    times_field, positions_field = f"times of {name!r}", f"positions of {name!r}"
-    times = _real_numbers(demonstration.times, source, times_field)
-    positions = _real_numbers(demonstration.positions, source, positions_field)
-    if times.ndim != 1:
-        raise DemonstrationError(source, times_field, f"an array of shape {times.shape}", "shape (T,)")
-    if positions.ndim != 2 or positions.shape[1] not in DIMENSIONS:
-        raise DemonstrationError(source, positions_field, f"an array of shape {positions.shape}", "(T, 2) or (T, 3)")
-    if len(times) != len(positions):
-        found = f"{len(positions)} positions for {len(times)} times"
-        raise DemonstrationError(source, positions_field, found, "as many positions as times")
-    if len(times) < 2:
-        raise DemonstrationError(source, positions_field, f"{len(times)} sample(s)", "at least 2 samples")
-    for field, values in ((times_field, times[:, None]), (positions_field, positions)):
-        if not np.isfinite(values).all():
-            row, column = np.argwhere(~np.isfinite(values))[0]
-            raise DemonstrationError(source, field, f"{values[row, column]} at {where(row)}", "finite numbers")
-    _check_times(times, source, times_field, where)
-    if np.abs(positions).max() > MAX_COORDINATE:
-        row = int(np.abs(positions).max(axis=1).argmax())
-        found = f"{np.abs(positions[row]).max():.6g} m at {where(row)}; is the file in millimetres?"
-        raise DemonstrationError(source, positions_field, found, f"metres, at most {MAX_COORDINATE:g} from the origin")
-    if np.ptp(positions, axis=0).max() < MIN_EXTENT:
-        raise DemonstrationError(source, positions_field, "a motion that stays at one point", "a motion")
-    times = times - times[0]
-    times.setflags(write=False)
-    positions.setflags(write=False)
-    return Demonstration(times, positions, name)
+def samples_of(
+    demonstrations: Sequence[Demonstration], lines: Sequence[Sequence[int]] | None = None
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the times (T,) from 0 and the positions (T, d) of demonstrations as new float64 arrays.
+
+    Args:
+        demonstrations: recorded motions.
+        lines: as in :func:`check_demonstrations`.
+
+    Raises:
+        FormatError: there are none, they differ in dimension, or one of them has not the shapes, the number of samples,
+            the finite values or the increasing times that :class:`Demonstration` promises.
+    """
+    if not demonstrations:
+        raise FormatError("demonstrations", "none", "at least one")
+    samples = []
+    for i, demonstration in enumerate(demonstrations):
+        name, where = demonstration.name, _places(lines, i)
+        times_field, positions_field = f"times of {name!r}", f"positions of {name!r}"
+        times = real_numbers(demonstration.times, times_field)
+        positions = real_numbers(demonstration.positions, positions_field)
+        if times.ndim != 1:
+            raise FormatError(times_field, f"an array of shape {times.shape}", "shape (T,)")
+        if positions.ndim != 2 or positions.shape[1] not in DIMENSIONS:
+            raise FormatError(positions_field, f"an array of shape {positions.shape}", "(T, 2) or (T, 3)")
+        if len(times) != len(positions):
+            found = f"{len(positions)} positions for {len(times)} times"
+            raise FormatError(positions_field, found, "as many positions as times")
+        if len(times) < 2:
+            raise FormatError(positions_field, f"{len(times)} sample(s)", "at least 2 samples")
+        check_finite(times[:, None], times_field, where)
+        check_finite(positions, positions_field, where)
+        with np.errstate(over="ignore"):
+            elapsed = times - times[0]  # what will be stored: rounding may make close times equal
+        still = np.flatnonzero(elapsed[1:] <= elapsed[:-1])
+        if len(still):
+            row = int(still[0]) + 1
+            found = f"{times[row]:.9g} s {where(row)}, after {times[row - 1]:.9g} s"
+            raise FormatError(times_field, found, "times that increase from each sample to the next")
+        samples.append((elapsed, positions))
+        first, this = samples[0][1].shape[1], positions.shape[1]
+        if this != first:
+            found = f"{first} in {demonstrations[0].name!r} but {this} in {name!r}"
+            raise FormatError("dimension", found, "one dimension for all")
+    return samples
 
 
-def _check_times(times: np.ndarray, source: str | Path, field: str, where: Callable[[int], str]) -> None:
-    with np.errstate(over="ignore"):
-        elapsed = times - times[0]  # what will be stored: rounding may make close times equal
-    still = np.flatnonzero(elapsed[1:] <= elapsed[:-1])
-    if len(still):
-        row = int(still[0]) + 1
-        found = f"{times[row]:.9g} s at {where(row)}, after {times[row - 1]:.9g} s"
-        raise DemonstrationError(source, field, found, "times that increase from each sample to the next")
-    if elapsed[-1] > MAX_DURATION:
-        found = f"a duration of {elapsed[-1]:.6g} s; is the file in milliseconds?"
-        raise DemonstrationError(source, field, found, f"seconds, at most {MAX_DURATION:g} from first to last")
-
-
-def _real_numbers(values: object, source: str | Path, field: str, unit: float = 1.0) -> np.ndarray:
-    """Return as float64 what must be an array of integers or real numbers, times ``unit``."""
-    array = np.asarray(values)
-    if array.dtype.kind not in "iuf":
-        raise DemonstrationError(source, field, f"values of type {array.dtype}", "integers or real numbers")
-    with np.errstate(over="ignore", invalid="ignore"):  # what becomes inf or nan is refused later
-        return array.astype(np.float64) * unit
+def _places(lines: Sequence[Sequence[int]] | None, index: int) -> Callable[[int], str]:
+    """Return what describes the place of a sample of the demonstration with this index."""
+    return lambda row: f"at sample {row + 1}" if lines is None else f"at line {lines[index][row]}"
 
 
 def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:
@@ -181,18 +188,12 @@ def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:
             demonstrations that :func:`check_demonstrations` refuses. Nothing else is raised, whatever the file holds.
     """
     path = Path(path)
-    try:
+    with parsing(DemonstrationError, path, "path", "a readable file or folder"):
         if path.is_dir():
             return _load_csv_folder(path)
-        if not path.is_file():
-            raise DemonstrationError(path, "path", "no such file or folder", "a readable file or folder")
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise DemonstrationError(path, "file", f"{size} bytes", f"at most {MAX_BYTES} bytes")
-        content = path.read_bytes()
-    except OSError as error:
-        found = f"nothing that can be read ({error.strerror or error})"
-        raise DemonstrationError(path, "path", found, "a readable file or folder") from error
+        if not path.exists():
+            raise FormatError("path", "no such file or folder", "a readable file or folder")
+        content = read_bytes(path, MAX_BYTES)
     return read_demonstrations(content, path)
 
 
@@ -207,13 +208,11 @@ def read_demonstrations(content: bytes, source: str | Path) -> tuple[Demonstrati
         DemonstrationError: as :func:`load_demonstrations`.
     """
     source = Path(source)
-    reader = _READERS.get(source.suffix.lower())
-    if reader is None:
-        found = repr(source.suffix) if source.suffix else "no suffix"
-        raise DemonstrationError(source, "suffix", found, f"{', '.join(_READERS)} or a folder of .csv files")
-    if not content:
-        raise DemonstrationError(source, "file", "an empty file", "at least one demonstration")
-    return reader(content, source)
+    with naming(DemonstrationError, source):
+        read, accepted = _READERS[checked_suffix(content, source, _READERS, MAX_BYTES)]
+    with parsing(DemonstrationError, source, "file", accepted):
+        demonstrations, lines = read(content, source.stem)
+    return check_demonstrations(demonstrations, source, lines)
 
 
 def save_demonstrations(path: str | Path, demonstrations: Sequence[Demonstration]) -> None:
@@ -248,134 +247,108 @@ def lasa_files(folder: str | Path) -> dict[str, Path]:
     Raises:
         DemonstrationError: there is no such folder, it cannot be read, or it holds no ``.mat`` file.
     """
-    folder = Path(folder)
-    files = {path.stem: path for path in _files_of(folder) if path.suffix.lower() == ".mat"}
+    files = {path.stem: path for path in _files_of(Path(folder), ".mat")}
     if not files:
         raise DemonstrationError(folder, "folder", "no .mat file", "one .mat file per shape")
     return files
 
 
-def load_lasa_folder(folder: str | Path) -> dict[str, tuple[Demonstration, ...]]:
-    """Read every shape of a LASA folder, by name.
-
-    Raises:
-        DemonstrationError: as :func:`lasa_files`, or any one of the files cannot be used: none is left out.
-    """
-    return {name: load_demonstrations(path) for name, path in lasa_files(folder).items()}
-
-
-def _files_of(folder: Path) -> list[Path]:
-    """Return the visible files of a folder, by name."""
-    try:
-        return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    except OSError as error:
-        found = f"nothing that can be read ({error.strerror or error})"
-        raise DemonstrationError(folder, "folder", found, "a readable folder") from error
+def _files_of(folder: Path, *suffixes: str) -> list[Path]:
+    """Return the visible files of a folder with one of these suffixes, by name."""
+    with parsing(DemonstrationError, folder, "folder", "a readable folder"):
+        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        return [path for path in files if path.suffix.lower() in suffixes]
 
 
 def _load_csv_folder(folder: Path) -> tuple[Demonstration, ...]:
-    files = _files_of(folder)
-    others = [path.name for path in files if path.suffix.lower() in {".npz", ".mat"}]
-    if others:
-        raise DemonstrationError(folder, "folder", f"{others[0]!r}", "only .csv files; load other files one by one")
-    tables = [path for path in files if path.suffix.lower() == ".csv"]
+    if others := _files_of(folder, ".npz", ".mat"):
+        raise FormatError("folder", f"{others[0].name!r}", "only .csv files; load other files one by one")
+    tables = _files_of(folder, ".csv")
     if not tables:
-        raise DemonstrationError(folder, "folder", "no .csv file", "one or more .csv files")
+        raise FormatError("folder", "no .csv file", "one or more .csv files")
     return check_demonstrations([demo for path in tables for demo in load_demonstrations(path)], folder)
 
 
-def _read_csv(content: bytes, source: Path) -> tuple[Demonstration, ...]:
+Read = tuple[list[Demonstration], "list[array[int]] | None"]
+"""Demonstrations of a file before they are checked, and for each the lines of its samples in a text file."""
+
+
+def _read_csv(content: bytes, stem: str) -> Read:
     samples: dict[str, array[float]] = {}
     lines: dict[str, array[int]] = {}
-    with parsing(DemonstrationError, source, "file", "comma-separated text in UTF-8"):
-        header, rows = read_table(content, CSV_HEADERS, max_rows=MAX_CSV_ROWS)
-        columns = [name for name in header if name != "demo"]
-        for line, row in rows:
-            label = source.stem if len(row) == len(columns) else row[0]
-            if label not in samples:
-                if len(samples) == MAX_DEMONSTRATIONS:
-                    found = f"more than {MAX_DEMONSTRATIONS}"
-                    raise DemonstrationError(source, "demonstrations", found, f"at most {MAX_DEMONSTRATIONS}")
-                samples[label], lines[label] = array("d"), array("q")
-            samples[label].extend(_csv_numbers(row[-len(columns) :], columns, line, source))
-            lines[label].append(line)
+    header, rows = read_table(content, CSV_HEADERS, max_rows=MAX_CSV_ROWS)
+    columns = [name for name in header if name != "demo"]
+    for line, row in rows:
+        label = stem if len(row) == len(columns) else row[0]
+        if label not in samples:
+            if len(samples) == MAX_DEMONSTRATIONS:
+                raise too_many("demonstrations", MAX_DEMONSTRATIONS)
+            samples[label], lines[label] = array("d"), array("q")
+        samples[label].extend(decimal_numbers(row[-len(columns) :], line))
+        lines[label].append(line)
     tables = {label: np.asarray(numbers).reshape(-1, len(columns)) for label, numbers in samples.items()}
     demonstrations = [Demonstration(table[:, 0], table[:, 1:], label) for label, table in tables.items()]
-    return check_demonstrations(demonstrations, source, list(lines.values()))
+    return demonstrations, list(lines.values())
 
 
-def _csv_numbers(cells: Sequence[str], columns: Sequence[str], line: int, source: Path) -> list[float]:
-    numbers = []
-    for cell, column in zip(cells, columns, strict=True):
-        try:
-            numbers.append(float(cell))
-        except ValueError as error:
-            found = repr(cell[:40])
-            raise DemonstrationError(source, f"line {line}, column {column}", found, "a decimal number") from error
-    return numbers
-
-
-def _read_npz(content: bytes, source: Path) -> tuple[Demonstration, ...]:
-    with parsing(DemonstrationError, source, "file", "an npz archive"):
-        archive = NpzFile(content, max_bytes=MAX_BYTES)
+def _read_npz(content: bytes, stem: str) -> Read:
+    archive = NpzFile(content, max_bytes=MAX_BYTES)
     accepted = "times_0, positions_0, times_1, positions_1, … and optionally name_0, name_1, …"
     numbers = set()
     for key in archive.names:
         match = re.fullmatch(r"(?:times|positions|name)_(0|[1-9][0-9]{0,8})", key)
         if match is None:
-            raise DemonstrationError(source, "arrays", repr(key[:40]), accepted)
+            raise FormatError("arrays", repr(key[:40]), accepted)
         numbers.add(int(match[1]))
 
     def read(key: str) -> np.ndarray:
         if key not in archive.names:
-            raise DemonstrationError(source, "arrays", f"no {key!r}", accepted)
-        with parsing(DemonstrationError, source, f"array {key!r}", "plain numbers; pickled objects are never opened"):
-            return archive.read(key)
+            raise FormatError("arrays", f"no {key!r}", accepted)
+        return archive.read(key)
 
     demonstrations = []
     for i in sorted(numbers):
-        name = f"{source.stem} {i}"
+        name = f"{stem} {i}"
         if f"name_{i}" in archive.names:
-            text = read(f"name_{i}")
+            text = archive.read(f"name_{i}")
             if text.dtype.kind != "U" or text.ndim:
-                raise DemonstrationError(source, f"name_{i}", f"{text.dtype} of shape {text.shape}", "one string")
-            with parsing(DemonstrationError, source, f"name_{i}", "one string"):
-                name = str(text)
-        demonstrations.append(Demonstration(read(f"times_{i}"), read(f"positions_{i}"), name))
-    return check_demonstrations(demonstrations, source)
+                raise FormatError(f"name_{i}", f"{text.dtype} of shape {text.shape}", "one string")
+            name = str(text)
+        times, positions = (read(key) for key in (f"times_{i}", f"positions_{i}"))
+        demonstrations.append(Demonstration(times, positions, name))
+    return demonstrations, None
 
 
-def _read_lasa(content: bytes, source: Path) -> tuple[Demonstration, ...]:
+def _read_lasa(content: bytes, stem: str) -> Read:
     accepted = "a cell array of structures with t and pos"
-    with parsing(DemonstrationError, source, "file", "a MATLAB file of version 5 to 7"):
-        try:
-            recordings = read_variable(content, "demos")
-        except KeyError as error:
-            raise DemonstrationError(source, "variable 'demos'", "no such variable", accepted) from error
+    try:
+        recordings = read_variable(content, "demos")
+    except KeyError as error:
+        raise FormatError("variable 'demos'", "no such variable", accepted) from error
     if not isinstance(recordings, list):
-        raise DemonstrationError(source, "variable 'demos'", "no cells", accepted)
+        raise FormatError("variable 'demos'", "no cells", accepted)
     demonstrations = []
     for i, recording in enumerate(recordings):
-        times = _lasa_field(recording, "t", f"demos{{{i + 1}}}", source)
-        positions = _lasa_field(recording, "pos", f"demos{{{i + 1}}}", source, METRES_PER_LASA_UNIT)
+        times, positions = (_lasa_field(recording, field, f"demos{{{i + 1}}}.{field}") for field in ("t", "pos"))
         if times.ndim != 2 or 1 not in times.shape:
-            raise DemonstrationError(source, f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
-        demonstrations.append(Demonstration(times.ravel(), positions.T, f"{source.stem} {i}"))
-    return check_demonstrations(demonstrations, source)
+            raise FormatError(f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
+        demonstrations.append(Demonstration(times.ravel(), positions.T * METRES_PER_LASA_UNIT, f"{stem} {i}"))
+    return demonstrations, None
 
 
-def _lasa_field(recording: Value, field: str, where: str, source: Path, unit: float = 1.0) -> np.ndarray:
+def _lasa_field(recording: Value, field: str, where: str) -> np.ndarray:
     fields = recording[0] if isinstance(recording, list) and len(recording) == 1 else recording
     if not isinstance(fields, dict) or field not in fields:
-        raise DemonstrationError(source, f"{where}.{field}", "no such field", "a structure with t (1×T) and pos (d×T)")
+        raise FormatError(where, "no such field", "a structure with t (1×T) and pos (d×T)")
     numbers = fields[field]
     if not isinstance(numbers, np.ndarray):
-        raise DemonstrationError(source, f"{where}.{field}", "something else than numbers", "a matrix of real numbers")
-    return _real_numbers(numbers, source, f"{where}.{field}", unit)
+        raise FormatError(where, "something else than numbers", "a matrix of real numbers")
+    return real_numbers(numbers, where)
 
 
-_READERS: dict[str, Callable[[bytes, Path], tuple[Demonstration, ...]]] = {
-    ".csv": _read_csv,
-    ".npz": _read_npz,
-    ".mat": _read_lasa,
+_READERS: dict[str, tuple[Callable[[bytes, str], Read], str]] = {
+    ".csv": (_read_csv, "comma-separated text in UTF-8"),
+    ".npz": (_read_npz, "an npz archive of plain numbers; pickled objects are never opened"),
+    ".mat": (_read_lasa, "a MATLAB file of version 5 to 7"),
 }
+"""Reader of each kind of file, given all its bytes and the stem of its name, and the accepted content."""

@@ -1,4 +1,4 @@
-"""A chain of stationary flows with its sensitivities: what the fit of a motion adjusts.
+"""Chains of stationary flows with their sensitivities: the model that is fitted to demonstrations.
 
 ψ⁻¹ is a composition of L layers (sec. 4.1), each the flow of one Gaussian field in a few explicit Euler steps
 s ← s + h·F(s). While fitting, a field is written F(s) = Φ(s)·θ in whitened features Φ = k(s, ŝ)·C⁻ᵀ, K = C·Cᵀ the
@@ -20,12 +20,12 @@ from dt_viz.flows.diffeomorphisms import Chain, Flow
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 
-JITTER = 1e-4  # added to the kernel matrix: overlapping Gaussians are nearly dependent
+JITTER = 1e-4  # diagonal added to the kernel matrix, since overlapping Gaussians are nearly dependent
 
 
 @dataclass(frozen=True)
 class Layer:
-    """The features of one stationary field: a grid of Gaussians, of which only those near the data are in use."""
+    """Features of one stationary field: the Gaussians of a grid that are near the data."""
 
     grid: GaussianGrid
     active: NDArray[np.integer[Any]]
@@ -35,13 +35,13 @@ class Layer:
 
     @classmethod
     def near(cls, points: Array, sigma: float, *, spacing: float, reach: float) -> Layer:
-        """Gaussians of width `sigma` on a grid around `points` (N, d).
+        """Make a layer of Gaussians of width `sigma` on a grid around `points` (N, d).
 
         Args:
-            points: where the field must be able to act.
+            points: places where the field must be able to act.
             sigma: width of a Gaussian, in the unit of the points.
             spacing: distance between neighbouring inducing points, in σ.
-            reach: inducing points farther than this from all points are left out, in σ.
+            reach: distance from the points, in σ, beyond which inducing points are left out.
         """
         grid = GaussianGrid.covering(points, sigma, spacing=spacing, pad=reach)
         distance, _ = KDTree(points).query(grid.inducing_points)
@@ -49,7 +49,7 @@ class Layer:
 
     @classmethod
     def of(cls, grid: GaussianGrid, active: NDArray[np.integer[Any]] | None = None) -> Layer:
-        """The Gaussians with indices `active` of a grid; None takes all."""
+        """Make a layer of the Gaussians of a grid with indices `active`; None takes all."""
         if active is None:
             active = np.arange(grid.num_points)
         centres = grid.inducing_points[active]
@@ -63,24 +63,24 @@ class Layer:
         return len(self.active)
 
     def features(self, s: Array) -> Array:
-        """Φ (N, m) at the points `s` (N, d)."""
+        """Compute Φ (N, m) at the points `s` (N, d)."""
         return self._products([f[0] for f in self.grid.factors(s)]) @ self.whitening
 
     def features_with_derivatives(self, s: Array) -> tuple[Array, list[Array]]:
-        """The raw Gaussians k(s, ŝ) (N, m) at the points `s` (N, d), and their d partial derivatives."""
+        """Compute the raw Gaussians k(s, ŝ) (N, m) at the points `s` (N, d), and their d partial derivatives."""
         factors = self.grid.factors(s, 1)
         value = self._products([f[0] for f in factors])
         d = self.grid.dim
         return value, [self._products([factors[i][int(i == j)] for i in range(d)]) for j in range(d)]
 
     def field(self, theta: Array) -> GridRBF:
-        """The field with coefficients `theta` (m, d), on the whole grid."""
+        """Return the field with coefficients `theta` (m, d), on the whole grid."""
         weights = np.zeros((self.grid.num_points, self.grid.dim))
         weights[self.active] = self.whitening @ theta
         return GridRBF(self.grid, weights)
 
     def _products(self, factors: Sequence[Array]) -> Array:
-        """Products over the axes of 1-D Gaussians (N, n_j), for the inducing points in use, (N, m)."""
+        """Multiply 1-D Gaussians (N, n_j) over the axes, for the inducing points in use, (N, m)."""
         columns = np.unravel_index(self.active, self.grid.shape)
         value = factors[0][:, columns[0]]
         for factor, column in zip(factors[1:], columns[1:], strict=True):
@@ -94,7 +94,7 @@ class Stack:
 
     layers: tuple[Layer, ...]
     steps: int
-    """Euler steps of each layer."""
+    """Number of Euler steps of each layer."""
 
     @property
     def dim(self) -> int:
@@ -103,20 +103,20 @@ class Stack:
 
     @property
     def sizes(self) -> list[int]:
-        """Number of unknowns of each layer, m_l·d."""
+        """Numbers of unknowns of the layers, m_l·d."""
         return [layer.num_features * self.dim for layer in self.layers]
 
     def split(self, vector: Array) -> list[Array]:
-        """Coefficients of all layers from one vector of unknowns, in which a component's m_l numbers are contiguous."""
+        """Split a vector of unknowns, a component's m_l numbers contiguous, into the layers' coefficients."""
         ends = np.cumsum(self.sizes)
         return [part.reshape(self.dim, -1).T for part in np.split(vector[: ends[-1]], ends[:-1])]
 
     def join(self, thetas: Sequence[Array]) -> Array:
-        """The inverse of `split`."""
+        """Join the coefficients of all layers: the inverse of `split`."""
         return np.concatenate([theta.T.reshape(-1) for theta in thetas])
 
     def inverse(self, z: Array, thetas: Sequence[Array]) -> Array:
-        """ψ⁻¹(z), (N, d)."""
+        """Compute ψ⁻¹(z), (N, d)."""
         h = 1.0 / self.steps
         for layer, theta in zip(self.layers, thetas, strict=True):
             raw = layer.whitening @ theta
@@ -125,7 +125,7 @@ class Stack:
         return z
 
     def inverse_with_sensitivity(self, z: Array, thetas: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """ψ⁻¹ and its derivatives.
+        """Compute ψ⁻¹ and its derivatives.
 
         Returns:
             ψ⁻¹(z) (N, d), its derivative by z (N, d, d), and its derivative by the unknowns (N, d, P), ordered as in
@@ -157,12 +157,12 @@ class Stack:
         return z, later, sensitivity.transpose(1, 0, 2)
 
     def min_step_determinant(self, thetas: Sequence[Array]) -> float:
-        """Smallest determinant of an Euler step's derivative, of all layers and over all of space."""
+        """Return the smallest determinant of an Euler step's derivative, over all layers and all of space."""
         pairs = zip(self.layers, thetas, strict=True)
         return min(min_step_determinant(layer.field(theta), 1.0 / self.steps) for layer, theta in pairs)
 
     def transform(self, thetas: Sequence[Array], centre: Array, scale: float) -> Chain:
-        """ψ in the user's coordinates y = centre + scale·s, with an inverse exact to rounding.
+        """Return ψ in the user's coordinates y = centre + scale·s, with an inverse exact to rounding.
 
         ψ⁻¹ is the cheap direction, explicit Euler: rollouts are images under ψ⁻¹, and ψ is needed only at their starts.
         """
@@ -175,7 +175,7 @@ class Stack:
 
 
 def min_step_determinant(field: GridRBF, h: float) -> float:
-    """Smallest determinant of the derivative of the Euler step s + h·V(s), over all of space.
+    """Return the smallest determinant of the derivative of the Euler step s + h·V(s), over all of space.
 
     With a bounded V the step is proper, so by Hadamard's theorem it is a diffeomorphism of R^d if this determinant is
     positive everywhere. Away from the grid the field vanishes and it is 1; on the grid it is computed every quarter of
@@ -189,13 +189,13 @@ def min_step_determinant(field: GridRBF, h: float) -> float:
 
 
 def scaled_field(field: GridRBF, centre: Array, scale: float) -> GridRBF:
-    """The field in coordinates y = centre + scale·s."""
+    """Return the field in coordinates y = centre + scale·s."""
     axes = tuple(c + scale * axis for c, axis in zip(centre, field.grid.axes, strict=True))
     return GridRBF(GaussianGrid(axes, field.grid.ell / scale**2), scale * field.weights)
 
 
 def equally_spaced_grid(points: Array, num: int, ell: float) -> GaussianGrid:
-    """`num` Gaussians over the box of `points` (N, d) and a width more, as equally spaced as factors of `num` allow."""
+    """Place `num` Gaussians over the box of `points` (N, d) and a width more, as evenly as factors of `num` allow."""
     sigma = np.sqrt(0.5 / ell)
     lower, upper = points.min(axis=0) - sigma, points.max(axis=0) + sigma
 
@@ -207,7 +207,7 @@ def equally_spaced_grid(points: Array, num: int, ell: float) -> GaussianGrid:
 
 
 def _factorings(num: int, parts: int) -> list[tuple[int, ...]]:
-    """All ways to write `num` as a product of `parts` factors of at least 2."""
+    """List all ways to write `num` as a product of `parts` factors of at least 2."""
     if parts == 1:
         return [(num,)] if num > 1 else []
     return [(n, *rest) for n in range(2, num) if num % n == 0 for rest in _factorings(num // n, parts - 1)]

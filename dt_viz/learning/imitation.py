@@ -20,65 +20,59 @@ from dt_viz.learning.timing import TimedAttractor, learn_timing
 from dt_viz.learning.trajectory import TrajectoryFit
 from dt_viz.learning.unbending import layers_along, regress, unbending
 from dt_viz.learning.velocity import VelocityFit
-from dt_viz.metrics import arc_length, interpolate
+from dt_viz.metrics import interpolate
 from dt_viz.properties import cached_property
 
 Progress = Callable[[float, str], None]
 
 Objective = Literal["trajectory", "velocity"]
-"""What is fitted to the demonstrations: the rollouts themselves, or their velocities (eq. (3))."""
+"""Objective of a fit: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
-MIN_STEP_DETERMINANT = 0.05  # of an Euler step's derivative; at 0 it would fold
-STEP_LENGTH = 0.8  # how far an Euler step of the start may move a point, in σ
+MIN_STEP_DETERMINANT = 0.05  # smallest determinant of an Euler step's derivative; at 0 space would fold
+STEP_LENGTH = 0.8  # longest Euler step of the initial guess, in σ
 MAX_LAYERS = 10
-MAX_ATTEMPTS = 5  # each smoother than the one before
-STRAYED = 0.6  # of the spread: a rollout that far off at some time is worth a word
-VELOCITY_REGULARISATION = 100.0  # how much more of it the velocity objective takes
+MAX_ATTEMPTS = 5  # number of fits, each smoother than the one before
+STRAYED = 0.6  # distance of a rollout from its demonstration, in spreads, from which a warning is given
+VELOCITY_REGULARISATION = 100.0  # factor on the regularisation for the velocity objective
 NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
 
 
 @dataclass(frozen=True)
 class ImitationSettings:
-    """How to fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean).
+    """Settings of a fit. Lengths are relative to the demonstrations' spread (RMS distance from their mean).
 
     Raises:
         ImitationError: there is no such objective.
     """
 
     objective: Objective = "trajectory"
-    """What is fitted: the rollouts themselves, or the velocities at the demonstrations' points (eq. (3))."""
     num_layers: int = 3
-    """Stationary flows that ψ is composed of, at least; motions that turn far get more. The velocity objective
-    has one, with the steps of all."""
+    """Smallest number of stationary flows that ψ is composed of; motions that turn far get more. The velocity objective
+    has one flow, with the steps of all."""
     steps: int = 4
-    """Euler steps of each flow."""
+    """Number of Euler steps of each flow."""
     sigma: float | None = None
-    """Width of a Gaussian. None takes 1 in the plane and 0.6 in space, less for motions folded into little room; half
-    of that for the velocity objective."""
+    """Width of a Gaussian. None takes 1 in the plane and 0.6 in space, less for long motions in little space; half of
+    that for the velocity objective."""
     ell: float | None = None
     """ℓ of the Gaussians in 1/m², instead of `sigma`."""
     num_inducing: int | None = None
-    """Inducing points of a layer, equally spaced over a box; None takes what `spacing` and `reach` give."""
+    """Number of inducing points of a layer, equally spaced over a box; None lets `spacing` and `reach` decide."""
     spacing: float = 1.0
     """Distance between neighbouring inducing points, in σ."""
     reach: float = 1.25
-    """Inducing points farther than this from the data are left out, in σ."""
+    """Distance from the data, in σ, beyond which inducing points are left out."""
     regularisation: float = 3e-5
     """Weight of the squared RKHS norm, summed over layers, against the mean squared distance."""
     num_points: int = 30
-    """Points a demonstration that the fit looks at, at least; long motions get more."""
+    """Smallest number of points of a demonstration that are fitted; long motions get more."""
     max_iterations: int = 20
-    """Of Gauss–Newton; L-BFGS, whose iterations are cheaper, may take ten times as many."""
+    """Largest number of Gauss–Newton iterations; L-BFGS, whose iterations are cheaper, takes up to ten times more."""
 
     def __post_init__(self) -> None:
         if self.objective not in OBJECTIVES:
             raise ImitationError(f"objective: found {self.objective!r}; accepted: {' or '.join(OBJECTIVES)}")
-
-
-def paper_preset(objective: Objective = "velocity") -> ImitationSettings:
-    """The paper's choices (sec. 5): m = 720 equally spaced states, ℓ = 0.005 with LASA in millimetres, Euler steps."""
-    return ImitationSettings(objective, ell=0.005e6, num_inducing=720)
 
 
 @dataclass(frozen=True)
@@ -90,14 +84,14 @@ class Imitation:
     base: TimedAttractor
     """The base system; its goal is z_e = ψ(goal)."""
     starts: Array
-    """(R, d) where the demonstrations start."""
+    """(R, d) starts of the demonstrations."""
     goal: Array
-    """(d,) where they all end."""
+    """(d,) common end of the demonstrations."""
     fit_seconds: float
     min_det_jacobian: float
-    """Smallest det J over the demonstrations' box grown by half its size."""
+    """Smallest det J over the demonstrations' box grown by half its size on every side."""
     round_trip_error: float
-    """Largest ‖ψ⁻¹(ψ(x)) − x‖ there."""
+    """Largest ‖ψ⁻¹(ψ(x)) − x‖ over the same box."""
     warnings: tuple[str, ...] = ()
 
     @cached_property
@@ -127,7 +121,7 @@ class Imitation:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> Imitation:
-        """The inverse of `to_arrays`. Raises KeyError or ValueError on arrays that are none of ours."""
+        """Make the imitation that `to_arrays` describes. Raises KeyError or ValueError on other arrays."""
         goal = np.asarray(arrays["goal"], dtype=float)
         d = len(goal)
         flows: list[Diffeomorphism] = []
@@ -154,17 +148,15 @@ class Imitation:
 
 
 def fit(
-    demonstrations: Sequence[Demonstration],
-    settings: ImitationSettings | None = None,
-    progress: Progress | None = None,
+    demonstrations: Sequence[Demonstration], settings: ImitationSettings | None = None, progress: Progress | None = None
 ) -> Imitation:
     """Learn a stable system from demonstrations of one motion.
 
     Args:
         demonstrations: at least one, all ending at (about) the same place.
         settings: None takes the defaults.
-        progress: called with the fraction done, from 0 to 1, and what is being done. An exception that it raises, to
-            cancel, ends the fit and is let through.
+        progress: called with the fraction done, from 0 to 1, and a description of the current step. An exception that
+            it raises, to cancel, ends the fit and is let through.
 
     Raises:
         ImitationError: no stable system can be learned from these demonstrations.
@@ -180,7 +172,7 @@ def fit(
     progress(0.92, "learning the timing")
     base = learn_timing(transform, motions.goal, motions.times, motions.positions)
     progress(0.96, "checking that the map is invertible")
-    box = _grown_box(np.concatenate(motions.positions), 40 if transform.dim == 2 else 12)
+    box = grown_grid(np.concatenate(motions.positions), 40 if transform.dim == 2 else 12)
     result = Imitation(
         transform,
         base,
@@ -201,9 +193,8 @@ def fit(
 
 
 def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
-    """ψ by the trajectory objective, as closely as it can be had without folding the space."""
-    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / motions.spread
-    num_points = int(np.clip(4 * length, settings.num_points, max(settings.num_points, 60)))
+    """Fit ψ by the trajectory objective, as closely as possible without folding space."""
+    num_points = int(np.clip(4 * motions.length, settings.num_points, max(settings.num_points, 60)))
     points = motions.resampled(num_points)
     centre, scale = points.mean(axis=(0, 1)), motions.spread
     normalised = (points - centre) / scale
@@ -236,7 +227,7 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
 
 
 def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Progress) -> tuple[Chain, list[str]]:
-    """ψ by the velocity objective: one flow, ψ in explicit Euler steps as in the paper and ψ⁻¹ their exact inverse."""
+    """Fit ψ by the velocity objective: one flow in explicit Euler steps, as in the paper, inverted exactly."""
     scale, duration = motions.spread, float(np.mean([t[-1] for t in motions.times]))
     centre = motions.resampled(settings.num_points).mean(axis=(0, 1))
     positions, velocities = [], []
@@ -245,7 +236,6 @@ def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Pro
         positions.append(interpolate(even, t, path))
         velocities.append(interpolate(even, t, np.gradient(path, t, axis=0)))
     x, v = (np.concatenate(positions) - centre) / scale, np.concatenate(velocities) * duration / scale
-    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / scale
     sigma = _width(motions, settings)
     if settings.num_inducing is None:
         grid = GaussianGrid.covering(x, sigma, spacing=settings.spacing, pad=settings.reach)
@@ -262,27 +252,25 @@ def _fit_velocities(motions: Motions, settings: ImitationSettings, progress: Pro
             x,
             v,
             (motions.goal - centre) / scale,
-            speed=length,
-            smoothing=0.1 * length,
+            speed=motions.length,
+            smoothing=0.1 * motions.length,
             regularisation=settings.regularisation * VELOCITY_REGULARISATION * 10.0**attempt,
             steps=steps,
         )
         field = GridRBF(grid, problem.solve(max_iterations, report))
         if min_step_determinant(field, 1.0 / steps) > MIN_STEP_DETERMINANT:
-            return Chain([Flow(scaled_field(field, centre, scale), 1.0, steps, euler, implicit_euler)]), _smoothed(
-                attempt
-            )
+            flow = Flow(scaled_field(field, centre, scale), 1.0, steps, euler, implicit_euler)
+            return Chain([flow]), _smoothed(attempt)
     raise ImitationError(NOT_INVERTIBLE)
 
 
 def _width(motions: Motions, settings: ImitationSettings) -> float:
-    """σ of the Gaussians in units of the spread."""
+    """Return σ of the Gaussians in units of the spread."""
     if settings.ell is not None:
         return float(np.sqrt(0.5 / settings.ell)) / motions.spread
     if settings.sigma is not None:
         return settings.sigma
-    length = float(np.mean([arc_length(path)[-1] for path in motions.positions])) / motions.spread
-    width = (1.0 if len(motions.goal) == 2 else 0.6) * min(1.0, 7.5 / length)
+    width = (1.0 if len(motions.goal) == 2 else 0.6) * min(1.0, 7.5 / motions.length)
     return width if settings.objective == "trajectory" else 0.5 * width
 
 
@@ -296,7 +284,7 @@ def _smoothed(attempt: int) -> list[str]:
 
 
 def _strayed(motions: Motions, system: DiffeomorphicSystem) -> list[str]:
-    """A word on each motion that the rollouts do not follow."""
+    """Return a warning for each motion that its rollout does not follow."""
     warnings = []
     for name, times, path in zip(motions.names, motions.times, motions.positions, strict=True):
         at = np.linspace(0, len(times) - 1, min(len(times), 100)).astype(int)
@@ -306,9 +294,9 @@ def _strayed(motions: Motions, system: DiffeomorphicSystem) -> list[str]:
     return warnings
 
 
-def _grown_box(points: Array, num: int, growth: float = 0.5) -> Array:
-    """A regular grid (num^d, d) over the bounding box of `points` grown by `growth` times its size in all."""
+def grown_grid(points: Array, num: int) -> Array:
+    """Return a regular grid (num^d, d) over the box of `points` (N, d) grown by half its size on every side."""
     lower, upper = points.min(axis=0), points.max(axis=0)
-    margin = growth * (upper - lower)
+    margin = (upper - lower) / 2
     axes = [np.linspace(a, b, num) for a, b in zip(lower - margin, upper + margin, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, points.shape[1])

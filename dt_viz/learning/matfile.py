@@ -1,7 +1,7 @@
-"""Read one variable of a MATLAB v5 to v7 file: numbers, cells and structures, all that a demonstration needs.
+"""Reader of one variable in a MATLAB v5 to v7 file: numbers, cells and structures, all that a demonstration needs.
 
 On some damaged files scipy's ``loadmat`` crashes the whole process, which a server that takes uploads cannot afford.
-This reader is plain Python: whatever the bytes, it ends, in bounded memory, with a value or an exception.
+This reader is plain Python and returns a value or raises, in bounded memory, whatever the bytes.
 The layout is that of the "MAT-File Level 5 File Format" (The MathWorks).
 """
 
@@ -21,21 +21,21 @@ from dt_viz.interruption import checkpoint
 Value: TypeAlias = Union[np.ndarray, "list[Value]", "dict[str, Value]", None]
 
 MAX_UNPACKED_BYTES = 16 * 2**20
-MAX_VARIABLES = 1000  # looked at
-MAX_VALUES = 100_000  # matrices, cells and structures of the variable, inside each other
-MAX_DEPTH = 8  # of cells and structures inside each other
+MAX_VARIABLES = 1000  # number of variables before and including the one that is read
+MAX_VALUES = 100_000  # number of nested matrices, cells and structures in the variable
+MAX_DEPTH = 8  # depth of nested cells and structures
 MAX_AXES = 32
-MAX_FIELDS = 1000  # of a structure
+MAX_FIELDS = 1000  # number of fields of a structure
 HEADER_BYTES = 128
-BYTE_ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}  # the last four bytes of the header
+BYTE_ORDERS = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}  # byte order by the last four bytes of the header
 MATRIX, COMPRESSED = 14, 15  # types of elements; the others are numbers:
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 CELL, STRUCTURE, NUMERIC = 1, 2, range(6, 16)  # classes of matrices
-COMPLEX = 0x800  # a flag of matrices
+COMPLEX = 0x800  # flag of complex matrices
 
 
 class MatFileError(ValueError):
-    """The bytes are no MATLAB v5 to v7 file, or a damaged one."""
+    """Bytes that are no MATLAB v5 to v7 file, or a damaged one."""
 
 
 def read_variable(content: bytes, name: str) -> Value:
@@ -43,10 +43,10 @@ def read_variable(content: bytes, name: str) -> Value:
 
     Args:
         content: all bytes of the file.
-        name: of the variable.
+        name: name of the variable.
 
     Raises:
-        MatFileError: the bytes are no MATLAB v5 to v7 file (7.3 is another format), or damaged before its end.
+        MatFileError: the bytes are no MATLAB v5 to v7 file (7.3 is another format), or damaged.
         KeyError: the file has no such variable.
     """
     order = BYTE_ORDERS.get(content[HEADER_BYTES - 4 : HEADER_BYTES])
@@ -60,7 +60,7 @@ def read_variable(content: bytes, name: str) -> Value:
 
 
 def _variables(content: bytes, order: str) -> Iterator["_Elements"]:
-    """Yield the inside of each variable, unpacked."""
+    """Yield the content of each variable, unpacked."""
     left = MAX_UNPACKED_BYTES
     elements = _Elements(memoryview(content)[HEADER_BYTES:], order)
     for num in itertools.count(1):
@@ -85,15 +85,15 @@ def _variables(content: bytes, order: str) -> Iterator["_Elements"]:
 
 
 class _Elements:
-    """Successive elements, each a type, a number of bytes and the bytes, filled up to a multiple of 8.
+    """Successive elements, each a type, a number of bytes and the bytes, padded to a multiple of 8.
 
     Attributes:
-        data: what has not been taken yet.
+        data: the bytes that have not been taken yet.
     """
 
     def __init__(self, data: memoryview, order: str, tickets: Iterator[int] | None = None) -> None:
         self.data = data
-        self._order = order  # of the bytes in a number, as struct and numpy write it
+        self._order = order  # byte order of numbers, as struct and numpy write it
         self._tickets = tickets or iter(())  # one for each value that may still be made
 
     def take(self) -> tuple[int, memoryview]:
@@ -102,7 +102,7 @@ class _Elements:
             raise MatFileError("it ends too early")
         kind, size = struct.unpack(f"{self._order}II", self.data[:8])
         start = 8
-        if kind >> 16:  # up to four bytes stand in the tag itself
+        if kind >> 16:  # up to four bytes are stored in the tag itself
             kind, size, start = kind & 0xFFFF, kind >> 16, 4
         end = start + size
         if end > (8 if start == 4 else len(self.data)):
@@ -129,9 +129,9 @@ class _Elements:
         return numbers.tolist()
 
     def header(self) -> tuple[int, tuple[int, ...], str]:
-        """Take what a matrix begins with: its class (0 for one that is not read), its shape and its name."""
+        """Take the head of a matrix: its class (0 for one that is not read), its shape and its name."""
         if not self.data:
-            return NUMERIC[0], (0, 0), ""  # nothing at all stands for an empty matrix
+            return NUMERIC[0], (0, 0), ""  # an empty matrix may have no elements at all
         flags, shape = self.integers(), tuple(self.integers())
         if not flags or not shape or min(shape) < 0:
             raise MatFileError("a matrix without class or shape")
@@ -139,7 +139,7 @@ class _Elements:
         return 0 if flags[0] & COMPLEX else flags[0] & 0xFF, shape, name
 
     def value(self, kind: int, shape: tuple[int, ...], depth: int) -> Value:
-        """Take the rest of a matrix, whose header has been taken; ``depth`` levels may follow inside it."""
+        """Take the rest of a matrix after its header; it may nest ``depth`` more levels."""
         count = math.prod(shape)
         if kind in NUMERIC:
             numbers = self.numbers() if self.data or count else np.empty(0)

@@ -1,4 +1,4 @@
-"""Demonstrations made ready for a fit: a common goal, clean motions, and a word on everything that had to be done."""
+"""Preparation of demonstrations for a fit: a common goal, clean motions, and a warning about every change."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
-from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.metrics import arc_length, resample_by_arc_length
+from dt_viz.properties import cached_property
 
-# All in units of the spread, the RMS distance of the demonstrations' points from their mean.
-SAME_GOAL = 1e-3  # ends closer than this to each other are the same place
-MAX_MOVED_END = 0.3  # ends up to this far off are moved to the common goal
-AT_GOAL = 0.05  # a motion that starts closer to the goal than this has nowhere to go
-STANDING_STEP = 1e-3  # covering less than this in 1 % of the duration is standing still
-LONG_STAND = 0.1  # part of the duration from which standing still is worth a word
+# Lengths are in units of the spread, the RMS distance of the demonstrations' points from their mean.
+SAME_GOAL = 1e-3  # distance from the goal up to which an end is at the goal
+MAX_MOVED_END = 0.3  # distance from the goal up to which an end is moved there
+AT_GOAL = 0.05  # distance from the goal up to which a start is at the goal
+STANDING_STEP = 1e-3  # length of a step, lasting 1 % of the motion, below which the motion stands still
+LONG_STAND = 0.1  # part of the duration from which standing still is reported
 
 
 class ImitationError(ValueError):
@@ -25,22 +27,27 @@ class ImitationError(ValueError):
 
 @dataclass(frozen=True)
 class Motions:
-    """What a fit works on."""
+    """Prepared motions, the input of a fit."""
 
     names: tuple[str, ...]
     times: tuple[Array, ...]
-    """For each motion (T_i,) seconds, increasing from 0."""
+    """(T_i,) times of each motion, seconds, increasing from 0."""
     positions: tuple[Array, ...]
-    """For each motion (T_i, d), the last row the goal."""
+    """(T_i, d) positions of each motion, the last row the goal."""
     goal: Array
-    """(d,) where all end."""
+    """(d,) common end."""
     spread: float
     """RMS distance of all points from their mean."""
     warnings: tuple[str, ...]
-    """What was done to which demonstration."""
+    """Descriptions of the changes to the demonstrations."""
+
+    @cached_property
+    def length(self) -> float:
+        """Mean length of the motions, in units of the spread."""
+        return float(np.mean([arc_length(path)[-1] for path in self.positions])) / self.spread
 
     def resampled(self, num: int) -> Array:
-        """All motions at `num` points equally spaced along each, (R, num, d)."""
+        """Resample all motions at `num` points equally spaced along each, (R, num, d)."""
         return np.stack([resample_by_arc_length(path, num) for path in self.positions])
 
 
@@ -48,14 +55,17 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     """Check demonstrations and give them a common goal.
 
     Raises:
-        ImitationError: there are none, they are damaged, or they do not end at one place.
+        ImitationError: there are none, they are damaged, or most do not end at one place.
     """
-    _check(demonstrations)
+    try:
+        samples = samples_of(demonstrations)
+    except FormatError as error:
+        raise ImitationError(str(error)) from error
     warnings: list[str] = []
     usable = []
-    for demonstration in demonstrations:
-        if arc_length(demonstration.positions)[-1] > 0:
-            usable.append(demonstration)
+    for demonstration, (times, positions) in zip(demonstrations, samples, strict=True):
+        if arc_length(positions)[-1] > 0:
+            usable.append(Demonstration(times, positions, demonstration.name))
         else:
             warnings.append(f"'{demonstration.name}' never moves; it is left out")
     if not usable:
@@ -65,7 +75,7 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
 
     names, times, positions = [], [], []
     for demonstration in usable:
-        t, path = demonstration.times - demonstration.times[0], _end_moved(demonstration.positions, goal)
+        t, path = demonstration.times, _end_moved(demonstration.positions, goal)
         away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
         if len(away) == 0:
             warnings.append(f"'{demonstration.name}' stays at the goal; it is left out")
@@ -77,35 +87,13 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
                 f"its first {t[first]:.2g} s are left out"
             )
             t, path = t[first:] - t[first], path[first:]
-        _remark_on(demonstration.name, t, path, spread, warnings)
+        _warn_about(demonstration.name, t, path, spread, warnings)
         names.append(demonstration.name)
         times.append(t)
         positions.append(path)
     if not positions:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
     return Motions(tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
-
-
-def _check(demonstrations: Sequence[Demonstration]) -> None:
-    if not demonstrations:
-        raise ImitationError("there are no demonstrations; at least one is needed")
-    d = demonstrations[0].positions.shape[-1]
-    if d not in (2, 3):
-        raise ImitationError(
-            f"'{demonstrations[0].name}' has {d} coordinates; motions in the plane or in space can be fitted"
-        )
-    for demonstration in demonstrations:
-        name, t, path = demonstration.name, demonstration.times, demonstration.positions
-        if path.shape != (len(t), d):
-            raise ImitationError(f"'{name}': positions have shape {path.shape}; ({len(t)}, {d}) was expected")
-        if len(t) < 2:
-            raise ImitationError(f"'{name}' has {len(t)} sample; at least 2 are needed")
-        if not (np.isfinite(t).all() and np.isfinite(path).all()):
-            bad = int(np.flatnonzero(~(np.isfinite(t) & np.isfinite(path).all(axis=1)))[0])
-            raise ImitationError(f"'{name}': sample {bad} is not a finite number")
-        if (np.diff(t) <= 0).any():
-            bad = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
-            raise ImitationError(f"'{name}': the time of sample {bad} is not later than the one before")
 
 
 def _spread(demonstrations: Sequence[Demonstration]) -> float:
@@ -116,7 +104,7 @@ def _spread(demonstrations: Sequence[Demonstration]) -> float:
 def _with_common_goal(
     demonstrations: list[Demonstration], spread: float, warnings: list[str]
 ) -> tuple[list[Demonstration], Array]:
-    """The demonstrations that end at the place where most of them do, and that place."""
+    """Return the demonstrations that end where most of them do, and that goal."""
     ends = np.array([demonstration.positions[-1] for demonstration in demonstrations])
     near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= MAX_MOVED_END * spread
     if 2 * near.sum() <= len(ends):
@@ -136,14 +124,14 @@ def _with_common_goal(
 
 
 def _end_moved(path: Array, goal: Array) -> Array:
-    """The path with its end moved to the goal, and the rest the less the farther it is from the end."""
+    """Move the end of a path to the goal, and its other points less the farther they are from the end."""
     length = arc_length(path)
     moved = path + (length / length[-1])[:, None] ** 2 * (goal - path[-1])
     moved[-1] = goal
     return moved
 
 
-def _remark_on(name: str, t: Array, path: Array, spread: float, warnings: list[str]) -> None:
+def _warn_about(name: str, t: Array, path: Array, spread: float, warnings: list[str]) -> None:
     even = np.linspace(t[0], t[-1], 101)
     steps = np.linalg.norm(np.diff([np.interp(even, t, x) for x in path.T], axis=1), axis=0)
     standing = float((steps[1:-1] < STANDING_STEP * spread).mean())
@@ -156,7 +144,7 @@ def _remark_on(name: str, t: Array, path: Array, spread: float, warnings: list[s
 
 
 def _crosses_itself(path: Array) -> bool:
-    """Whether two segments of a polyline (T, 2) that are not neighbours cross."""
+    """Return whether two segments of a polyline (T, 2) that are not neighbours cross."""
     a, b = path[:-1], path[1:]
 
     def side(p: Array, q: Array, r: Array) -> Array:

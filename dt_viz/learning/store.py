@@ -1,4 +1,4 @@
-"""Learned imitations, kept in memory and in the user's cache folder by the content they were learned from."""
+"""Store of learned imitations, in memory and in the user's cache folder, keyed by what they were learned from."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fi
 logger = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Raised whenever the fit or its file changes, so that older files are not taken for newer ones."""
+"""Version of the fit and its file; raised with every change, so that older files are not used."""
 
 LONGEST_WRITE = 3600.0
-"""Age after which a file that is still being written was left behind by a server that ended meanwhile, seconds."""
+"""Age after which an incomplete file counts as left behind by a server that has ended, seconds."""
 
 LONGEST_WITHOUT_REPORT = 0.2
-"""Seconds after which those who wait for a fit are told again how far it is."""
+"""Longest time between two progress reports to those who wait for a fit, seconds."""
 
 
 def default_cache_folder() -> Path:
-    """`$XDG_CACHE_HOME/dt-viz`, or `~/.cache/dt-viz`."""
+    """Return `$XDG_CACHE_HOME/dt-viz`, or `~/.cache/dt-viz`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dt-viz"
 
 
 class _AbandonedError(Exception):
-    """Nobody waits for a fit any more."""
+    """A fit that nobody waits for any more."""
 
 
 class _RunningFit:
-    """A fit on a thread of its own, for as long as somebody waits for it."""
+    """A fit on a thread of its own that runs as long as somebody waits for it."""
 
     def __init__(self, work: Callable[[Progress], Imitation]) -> None:
-        """Begin; whoever makes it waits for it."""
+        """Start the thread; the caller counts as waiting."""
         self._work = work
         self._changed = threading.Condition()
         self._num_waiting = 1
-        self._num_reports, self._report = 0, (0.0, "looking whether it is known")
+        self._num_reports, self._report = 0, (0.0, "looking for a stored fit")
         self._result: Imitation | None = None
         self._error: Exception | None = None
         threading.Thread(target=self._run, name="fit", daemon=True).start()
 
     def join(self) -> bool:
-        """Wait for it, too, from now on; False if it has been abandoned."""
+        """Join those who wait; return False if the fit has been abandoned."""
         with self._changed:
             self._num_waiting += self._num_waiting > 0
             return self._num_waiting > 0
 
     def wait(self, progress: Progress) -> Imitation:
-        """Its result. What `progress` raises is let through, and ends the fit if nobody else waits for it."""
+        """Return the result. What `progress` raises is let through, and ends the fit if nobody else waits for it."""
         seen = 0
         try:
             while True:
@@ -84,7 +84,7 @@ class _RunningFit:
         result, failed = None, None
         try:
             result = self._work(self._tell)
-        except Exception as error:  # whatever it is, it belongs to those who wait
+        except Exception as error:  # any error is for those who wait
             failed = error
         with self._changed:
             self._result, self._error = result, failed
@@ -102,8 +102,8 @@ class _RunningFit:
 class FitStore:
     """Fits on demand, once for all visitors; a damaged file is fitted anew, never trusted.
 
-    Each fit has a thread of its own: who wants one that is known does not wait for another that is being made, and
-    who does not want to wait any more leaves it to the others.
+    Each fit has a thread of its own, so that nobody waits for the fit of another motion, and one visitor can stop
+    waiting while others go on.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -120,14 +120,14 @@ class FitStore:
         settings: ImitationSettings | None = None,
         progress: Progress | None = None,
     ) -> Imitation:
-        """The imitation of these demonstrations, fitted if it is new.
+        """Return the imitation of these demonstrations, fitted if it is new.
 
         Args:
-            demonstrations: what to imitate.
-            settings: of the fit; None takes the defaults.
-            progress: see `dt_viz.learning.imitation.fit`; not called for a fit that is known. It is called repeatedly
-                while nothing is new, so that it can raise an exception to cancel: that is let through, and the fit
-                goes on only if somebody else waits for it.
+            demonstrations: motions to imitate.
+            settings: settings of the fit; None takes the defaults.
+            progress: see `dt_viz.learning.imitation.fit`; not called for a known fit. It is also called repeatedly
+                without news, so that it can raise an exception to cancel: that is let through, and the fit goes on
+                only if somebody else waits for it.
 
         Raises:
             ImitationError: as `dt_viz.learning.imitation.fit`.
@@ -143,7 +143,7 @@ class FitStore:
         return running.wait(progress or (lambda _fraction, _message: None))
 
     def _begin(self, key: str, demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> _RunningFit:
-        """Read or fit on another thread. Called with the lock held."""
+        """Start to read or fit on another thread; the lock must be held."""
 
         def work(progress: Progress) -> Imitation:
             try:
@@ -159,11 +159,7 @@ class FitStore:
         return running
 
     def _fit(
-        self,
-        key: str,
-        demonstrations: tuple[Demonstration, ...],
-        settings: ImitationSettings,
-        progress: Progress,
+        self, key: str, demonstrations: tuple[Demonstration, ...], settings: ImitationSettings, progress: Progress
     ) -> Imitation:
         imitation = fit(demonstrations, settings, progress)
         if self._folder is not None:
@@ -186,7 +182,7 @@ class FitStore:
             return None
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                if damaged := arrays.zip.testzip():  # numpy stops reading before a member's checksum is looked at
+                if damaged := arrays.zip.testzip():  # numpy stops reading before a member's checksum
                     raise ValueError(f"{damaged} does not match its checksum")
                 return Imitation.from_arrays(arrays)
         except Exception as error:  # damaged bytes make zipfile, zlib and numpy raise almost anything
@@ -195,7 +191,7 @@ class FitStore:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove files that nobody goes on writing; those of another running server are younger."""
+    """Remove incomplete files of servers that have ended; those of running servers are younger."""
     for path in folder.glob("*.partial"):
         with suppress(OSError):  # another server may be faster
             if time.time() - path.stat().st_mtime > LONGEST_WRITE:

@@ -1,7 +1,7 @@
-"""When a motion is where: an attractor whose speed along its rays is learned from demonstrations.
+"""Timing of a learned motion: an attractor whose speed along its rays is learned from demonstrations.
 
 Multiplying a vector field by a positive function changes no orbit and no stability, only time. So what the transform
-has learned of the demonstrations' shape stays as it is, and their timing is learned afterwards, on the straight rays.
+has learned of the demonstrations' shape is kept, and their timing is learned afterwards, on the straight rays.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from scipy.optimize import lsq_linear
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import Attractor, asinh_exp, log_sinh
+from dt_viz.metrics import interpolate
 from dt_viz.properties import cached_property
 
-ARRIVED = 3e-4  # part of a ray's length: a demonstration's last point counts as this far from the goal
-MIN_PACE = 0.15  # a motion is at most about seven times as fast as the plain attractor
+ARRIVED = 3e-4  # distance from the goal, relative to the ray's length, that counts as a demonstration's end
+MIN_PACE = 0.15  # smallest pace: a motion is at most about seven times as fast as the plain attractor
 SMOOTHNESS = 0.03  # weight of a pace's second differences against errors in time, relative to the duration
-SHARPNESS = 0.1  # of the blend between demonstrations, relative to the distance between neighbours
+SHARPNESS = 0.1  # width of the blend between demonstrations, relative to the distance between neighbours
 
 
 @dataclass(frozen=True, kw_only=True)
 class TimedAttractor(Attractor):
-    """An `Attractor` that takes its own time: ż = −v·tanh(r/ρ)·r̂ / m(τ(r), r̂), m > 0.
+    """An `Attractor` with a learned pace: ż = −v·tanh(r/ρ)·r̂ / m(τ(r), r̂), m > 0.
 
     τ(r) = ρ/v·log sinh(r/ρ) is the clock of the plain attractor (τ̇ = −1 there; here τ̇ = −1/m). The pace m is
     Σ_i w_i(r̂)·m_i(τ): for each demonstration i a function that is linear between knots and constant beyond them,
@@ -40,17 +41,17 @@ class TimedAttractor(Attractor):
     knots: Array
     """(K,) increasing and equally spaced values of τ, seconds."""
     paces: Array
-    """(R, K) m_i at the knots, positive. At the first knot, nearest the goal, all are equal: it is smooth there."""
+    """(R, K) m_i at the knots, positive; all equal at the first knot, nearest the goal, so that ż is smooth there."""
 
     def velocity(self, z: Array) -> Array:
-        """ż, (*B, d), m/s."""
+        """Compute ż, (*B, d), m/s."""
         offset = z - self.goal
         clock = self._clock(np.linalg.norm(offset, axis=-1))
         pace = _interpolate_rows(self._position(clock), self._blended(offset))
         return super().velocity(z) / pace[..., None]
 
     def flow(self, z0: Array, times: Array) -> Array:
-        """z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T) in seconds, in closed form."""
+        """Compute z(t), (*B, T, d), from `z0` (*B, d) at `times` (T,) or (*B, T), seconds, in closed form."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
         paces = self._blended(offset)
@@ -60,7 +61,7 @@ class TimedAttractor(Attractor):
         return self.goal + shrink[..., None] * offset[..., None, :]
 
     def times_at(self, z0: Array, distances: Array) -> Array:
-        """Seconds, (*B, T), at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of the goal."""
+        """Compute when, (*B, T), s, motions from `z0` (*B, d) come within `distances` (*B, T), m, of the goal."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
         paces = self._blended(offset)
@@ -68,7 +69,7 @@ class TimedAttractor(Attractor):
         return self._time_to_go(self._clock(r0), paces) - togo
 
     def placed(self, origin: Array, axes: Array, scale: float) -> TimedAttractor:
-        """The same attractor in a space of more dimensions: a point z becomes origin + scale·axes·z.
+        """Return the same attractor in a space of more dimensions: a point z becomes origin + scale·axes·z.
 
         Args:
             origin: (D,), metres.
@@ -84,7 +85,7 @@ class TimedAttractor(Attractor):
         )
 
     def _clock(self, r: Array) -> Array:
-        """τ(r); a number far below all knots at the goal itself."""
+        """Compute τ(r); at the goal itself a number far below all knots."""
         return self.smoothing / self.speed * log_sinh(np.maximum(r / self.smoothing, 1e-300))
 
     @property
@@ -92,27 +93,27 @@ class TimedAttractor(Attractor):
         return float(self.knots[1] - self.knots[0])
 
     def _position(self, clock: Array) -> Array:
-        """Where τ lies among the knots, 0 at the first and K − 1 at the last, and there beyond them."""
+        """Return the place of τ among the knots, from 0 at the first to K − 1 at the last."""
         return np.clip((clock - self.knots[0]) / self._spacing, 0.0, len(self.knots) - 1)
 
     def _blended(self, offset: Array) -> Array:
-        """Paces m at the knots, (*B, K), for the rays on which the points goal + `offset` (*B, d) lie."""
+        """Blend the paces m at the knots, (*B, K), for the rays through the points goal + `offset` (*B, d)."""
         radius = np.linalg.norm(offset, axis=-1, keepdims=True)
         direction = offset / np.maximum(radius, 1e-300)
         squared = ((direction[..., None, :] - self.directions) ** 2).sum(axis=-1)
-        # Inverse distances to the fourth power: at a demonstration's direction its own pace, far away the mean of all.
+        # Inverse distances to the fourth power give a demonstration's own pace on its ray, the mean of all far away.
         weights = 1.0 / (squared + self._blur**2) ** 2
         return (weights / weights.sum(axis=-1, keepdims=True)) @ self.paces
 
     @cached_property
     def _blur(self) -> Array:
-        """Distances (R,) below which directions count as one demonstration's."""
+        """Distances (R,) from the demonstrations' directions within which their own pace holds."""
         distance = np.linalg.norm(self.directions[:, None] - self.directions, axis=-1)
         np.fill_diagonal(distance, 1.0)
         return np.maximum(SHARPNESS * distance.min(axis=1), 1e-4)
 
     def _time_to_go(self, clock: Array, paces: Array) -> Array:
-        """T(τ), (*B, N), zero at the first knot, for `clock` (*B, N) on rays with `paces` (*B, K)."""
+        """Compute T(τ), (*B, N), zero at the first knot, for `clock` (*B, N) on rays with `paces` (*B, K)."""
         at_knots = _cumulative(paces, self._spacing)
         position = self._position(clock)
         index = np.minimum(position.astype(int), len(self.knots) - 2)
@@ -123,7 +124,7 @@ class TimedAttractor(Attractor):
         return value + beyond + np.minimum(clock - self.knots[0], 0) * paces[..., :1]
 
     def _clock_at(self, togo: Array, paces: Array) -> Array:
-        """The inverse of `_time_to_go`: τ (*B, N) at times to go (*B, N)."""
+        """Invert `_time_to_go`: compute τ (*B, N) at times to go (*B, N)."""
         at_knots = _cumulative(paces, self._spacing)
         index = np.clip((togo[..., None] >= at_knots[..., None, :]).sum(axis=-1) - 1, 0, len(self.knots) - 2)
         start, first, second = (_take(a, index) for a in (at_knots, paces[..., :-1], paces[..., 1:]))
@@ -144,7 +145,7 @@ def learn_timing(
     num_ray: int = 400,
     num_samples: int = 120,
 ) -> TimedAttractor:
-    """The attractor in whose time the rollouts are where the demonstrations were, as nearly as their paths allow.
+    """Learn the attractor whose rollouts follow the demonstrations in time, as nearly as their paths allow.
 
     Args:
         transform: ψ, already fitted.
@@ -167,12 +168,7 @@ def learn_timing(
     rays = end + fractions[:, None] * offsets[:, None]
     rollouts = transform.inverse(rays)
     stamps = [np.linspace(0, t[-1], num_samples) for t in times]
-    samples = np.stack(
-        [
-            np.stack([np.interp(at, t, x) for x in path.T], axis=1)
-            for at, t, path in zip(stamps, times, positions, strict=True)
-        ]
-    )
+    samples = np.stack([interpolate(at, t, path) for at, t, path in zip(stamps, times, positions, strict=True)])
     matched = _monotone_match(samples, rollouts)
     clocks = plain.smoothing / plain.speed * log_sinh(fractions * radii[:, None] / plain.smoothing)
     nearest, farthest = clocks[:, -1].min(), clocks[:, 0].max()
@@ -190,7 +186,7 @@ def learn_timing(
 
 
 def _monotone_match(samples: Array, curves: Array) -> Array:
-    """For each sample (R, n, d) the index of a point of its curve (R, N, d), never going back, nearest in all.
+    """Match samples (R, n, d) with points of their curves (R, N, d), never going back, as near as possible in all.
 
     Dynamic programming over all pairs; the first sample is held to the first point and the last to the last.
     """
@@ -214,10 +210,10 @@ def _monotone_match(samples: Array, curves: Array) -> Array:
 
 
 def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array:
-    """Pace m (K,) at the knots such that ∫m dτ from each `clock` up to the first is `elapsed`.
+    """Fit the pace m (K,) at the knots so that ∫m dτ from each `clock` up to the first is `elapsed`.
 
-    Weighted by the speed: an error δ in time is an error speed·δ in space. Second differences are held
-    small, for where the data say nothing.
+    The errors are weighted by the speed: an error δ in time is an error speed·δ in space. Second differences are kept
+    small, which decides where there are no data.
     """
     spacing = knots[1] - knots[0]
     rows = _hat_integrals((clock - knots[0]) / spacing, len(knots)) * spacing
@@ -233,7 +229,7 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array
 
 
 def _hat_integrals(position: Array, num: int) -> Array:
-    """∫ from 0 to each `position` (N,) of the piecewise linear hat functions at 0, 1, …, num − 1, as (N, num)."""
+    """Integrate the piecewise linear hat functions at 0, 1, …, num − 1 from 0 to each `position` (N,), as (N, num)."""
     offset = position[:, None] - np.arange(num)
     rising = np.clip(offset + 1, 0, 1)
     falling = np.clip(offset, 0, 1)
@@ -246,18 +242,18 @@ def _speeds(times: Array, path: Array) -> Array:
 
 
 def _cumulative(paces: Array, spacing: float) -> Array:
-    """Trapezoidal integral (*B, K) of `paces` (*B, K), zero at the first knot."""
+    """Integrate `paces` (*B, K) by trapezoids, (*B, K), from zero at the first knot."""
     areas = 0.5 * spacing * (paces[..., 1:] + paces[..., :-1])
     return np.concatenate([np.zeros_like(paces[..., :1]), np.cumsum(areas, axis=-1)], axis=-1)
 
 
 def _take(table: Array, index: NDArray[np.integer[Any]]) -> Array:
-    """Row by row table[index], (*B, N), of `table` (*B, K) at `index` (*B, N)."""
+    """Take table[index], (*B, N), row by row of `table` (*B, K) at `index` (*B, N)."""
     return np.take_along_axis(table, index, axis=-1)
 
 
 def _interpolate_rows(position: Array, table: Array) -> Array:
-    """Linear interpolation (*B,) in the rows of `table` (*B, K) at `position` (*B,) from 0 to K − 1."""
+    """Interpolate linearly, (*B,), in the rows of `table` (*B, K) at `position` (*B,) from 0 to K − 1."""
     index = np.minimum(position.astype(int), table.shape[-1] - 2)[..., None]
     first, second = _take(table, index)[..., 0], _take(table, index + 1)[..., 0]
     return first + (position - index[..., 0]) * (second - first)

@@ -16,7 +16,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import Stack
 
-IMAGE_PRIOR = 1e-7  # against drifting, on the images of the rays' ends, which are otherwise free
+IMAGE_PRIOR = 1e-7  # damping of the images of the rays' ends, which could otherwise drift
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class TrajectoryFit:
     targets: Array
     """(R, n, d) points of the demonstrations, the last one the common goal."""
     fractions: Array
-    """(R, n) where on its ray, from 0 (start) to 1 (goal), each point belongs."""
+    """(R, n) place of each point on its ray, from 0 (start) to 1 (goal)."""
     regularisation: float
     end_weight: float = 20.0
     """Weight of a residual at a ray's end against one between."""
     along_weight: float = 0.3
-    """Weight of a residual's component along the motion: being early or late is not being off the path."""
+    """Weight of a residual's component along the motion, where an error is one of timing only."""
 
     def weights(self) -> Array:
-        """(R, n, d, d) what a residual vector is multiplied with."""
+        """Return the matrices (R, n, d, d) that weight the residual vectors."""
         d = self.stack.dim
         tangents = np.gradient(self.targets, axis=1)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True), 1e-12)
@@ -55,10 +55,10 @@ class TrajectoryFit:
         """Minimise from coefficients `thetas` and images `ends` (R + 1, d) of the starts and, last, the goal.
 
         Args:
-            thetas: a start, one array (m_l, d) a layer.
-            ends: a start for the unknown images.
-            max_iterations: of Gauss–Newton.
-            tolerance: stop when the cost falls by less than this part of it.
+            thetas: initial coefficients, one array (m_l, d) for each layer.
+            ends: initial images.
+            max_iterations: largest number of Gauss–Newton iterations.
+            tolerance: relative decrease of the cost below which the iteration stops.
             report: called with the iteration and the root mean square distance; an exception that it raises ends the
                 fit.
 
@@ -118,7 +118,7 @@ class TrajectoryFit:
         return cost if np.isfinite(cost) else np.inf
 
     def _linearise(self, vector: Array, weights: Array) -> tuple[Array, Array]:
-        """Weighted residuals (N·d,) and the Jacobian of the weighted rollouts (N·d, P + (R + 1)·d)."""
+        """Return the weighted residuals (N·d,) and the Jacobian of the weighted rollouts (N·d, P + (R + 1)·d)."""
         num, n, d = self.targets.shape
         x, by_z, by_theta = self.stack.inverse_with_sensitivity(self._rays(vector), self.stack.split(vector))
         residual = np.matmul(weights, (self.targets.reshape(-1, d) - x)[..., None])[..., 0]
@@ -151,7 +151,7 @@ class _DampedSystem:
             self._normal = jacobian.T @ jacobian
 
     def solve(self, gradient: Array, first: float, second: float) -> Array | None:
-        """The step for D = (first, …, first, second, …), or None where rounding makes the matrix indefinite."""
+        """Solve for D = (first, …, first, second, …); None where rounding makes the matrix indefinite."""
         diagonal = np.full(len(gradient), second)
         diagonal[: self._num_first] = first
         try:

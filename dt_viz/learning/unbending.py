@@ -1,7 +1,7 @@
-"""The start of a fit: straighten the mean demonstration in stages, and learn each stage by linear regression.
+"""Initial guess of a fit: the mean demonstration is straightened in stages, each learned by linear regression.
 
-A motion that turns through large angles cannot be found from the identity map by descent: it must first be known which
-way the plane is to be bent. The mean demonstration's tangent turns along the motion; scaling that turning by τ from 1
+Descent from the identity map cannot find a motion that turns through large angles: the direction in which space bends
+must be known first. The mean demonstration's tangent turns along the motion; scaling that turning by τ from 1
 to 0 unbends it into a straight line. The other demonstrations are carried along in the moving frame of the mean.
 """
 
@@ -21,21 +21,21 @@ from scipy.spatial.transform import Rotation
 from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import Layer, Stack
 
-SMOOTHING = 0.04  # width of the filter before tangents are taken, as a fraction of the motion
-APART = 0.8  # motions are of one group when their mean distance is below this, in units of the spread
+SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motion
+APART = 0.8  # mean distance, in spreads, below which motions belong to one group
 
 
 def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) -> list[Array]:
-    """Shapes of the motions from rays (first) to themselves (last), about equally far from each other.
+    """Return shapes of the motions from rays (first) to themselves (last), about equally far from each other.
 
     Motions that come to the goal in several ways are unbent group by group. Then each group keeps its direction at the
     goal, so that the groups stay side by side in the order in which they arrive.
 
     Args:
-        motions: (R, n, d) motions with a common goal, points of one index belonging together; d is 2 or 3. Normalised:
-            their spread (RMS distance from the mean) is about 1.
+        motions: (R, n, d) motions with a common goal, points of one index corresponding to each other; d is 2 or 3.
+            Their spread (RMS distance from the mean) is about 1.
         num_stages: smallest number of maps that bend; one more before them spreads the rays.
-        longest: how far a map may move a point; if need be there are more maps.
+        longest: largest distance by which a map may move a point; it decides the number of maps.
         max_stages: largest number of maps.
 
     Returns:
@@ -62,7 +62,7 @@ def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) 
 
 
 def _groups(motions: Array) -> NDArray[np.integer[Any]]:
-    """Group number (R,) of each motion, from 0."""
+    """Number the groups of the motions, (R,), from 0."""
     if len(motions) == 1:
         return np.zeros(1, dtype=int)
     distance = np.linalg.norm(motions[:, None] - motions[None], axis=-1).mean(axis=-1)
@@ -71,7 +71,7 @@ def _groups(motions: Array) -> NDArray[np.integer[Any]]:
 
 
 class _Unbending:
-    """The motions of one group as a function of how much of their turning is left."""
+    """The motions of one group as a function of the remaining part of their turning."""
 
     def __init__(self, motions: Array, *, keep_arrival: bool) -> None:
         solid = _solid(motions)
@@ -85,7 +85,7 @@ class _Unbending:
         self._kept = len(turned) - 1 if keep_arrival else int(np.argmin(middle))
 
     def shape(self, tau: float) -> Array:
-        """The motions (R, n, d) when their turning is scaled by `tau`: 1 leaves them, 0 straightens their mean."""
+        """Return the motions (R, n, d) with their turning scaled by `tau`: 1 keeps them, 0 straightens their mean."""
         rotation = _chain_rotations(tau * self._increments, self._kept, self._frames[self._kept]) * self._frames.inv()
         segments = rotation[:-1].apply(np.diff(self._mean, axis=0))
         curve = self._mean[-1] - np.concatenate([np.cumsum(segments[::-1], axis=0)[::-1], np.zeros((1, 3))])
@@ -94,12 +94,12 @@ class _Unbending:
 
 
 def _solid(motions: Array) -> Array:
-    """Motions in the plane as motions in space."""
+    """Return motions in the plane as motions in space."""
     return np.concatenate([motions, np.zeros((*motions.shape[:-1], 3 - motions.shape[-1]))], axis=-1)
 
 
 def _turned(mean: Array) -> tuple[Array, Rotation]:
-    """Total turning (n, 3) of the tangent up to each point, in the moving frame, and that rotation-minimising frame."""
+    """Compute the tangent's turning (n, 3) up to each point, in the rotation-minimising frame, and that frame."""
     tangents = np.gradient(gaussian_filter1d(mean, SMOOTHING * len(mean), axis=0, mode="nearest"), axis=0)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
     axis = np.cross(tangents[:-1], tangents[1:])
@@ -115,7 +115,7 @@ def _turned(mean: Array) -> tuple[Array, Rotation]:
 
 
 def _chain_rotations(increments: Array, kept: int, start: Rotation) -> Rotation:
-    """Frames whose body-fixed increments are given (n − 1, 3), with the frame of index `kept` equal to `start`."""
+    """Chain body-fixed increments (n − 1, 3) to frames, of which the one with index `kept` equals `start`."""
     steps = Rotation.from_rotvec(increments)
     frames = {kept: start}
     for k in range(kept, len(increments)):
@@ -126,13 +126,16 @@ def _chain_rotations(increments: Array, kept: int, start: Rotation) -> Rotation:
 
 
 def regress(stack: Stack, shapes: Sequence[Array], regularisation: float, iterations: int = 5) -> list[Array]:
-    """Coefficients of each layer such that it carries its shape to the next one, layer after layer.
+    """Fit each layer, one after the other, to carry its shape to the next one.
 
     Args:
         stack: L layers.
         shapes: L + 1 arrays (R, n, d).
         regularisation: weight of the squared RKHS norm against the mean squared distance.
-        iterations: of the fixed-point iteration for the path through the layer's Euler steps.
+        iterations: number of fixed-point iterations for the path through the layer's Euler steps.
+
+    Returns:
+        The coefficients (m_l, d) of each layer.
     """
     h = 1.0 / stack.steps
     current = shapes[0].reshape(-1, stack.dim)
@@ -155,7 +158,7 @@ def regress(stack: Stack, shapes: Sequence[Array], regularisation: float, iterat
 
 
 def layers_along(shapes: Sequence[Array], sigma: float, *, spacing: float, reach: float) -> tuple[Layer, ...]:
-    """One layer for each pair of neighbouring shapes (R, n, d), with Gaussians only near the two."""
+    """Make a layer for each pair of neighbouring shapes (R, n, d), with Gaussians near the two only."""
     d = shapes[0].shape[-1]
     return tuple(
         Layer.near(np.concatenate([a, b]).reshape(-1, d), sigma, spacing=spacing, reach=reach)

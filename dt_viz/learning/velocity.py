@@ -1,7 +1,7 @@
 """The velocity objective, eq. (3): least squares between the system's velocities and the demonstrations'.
 
-One stationary flow, integrated by Euler's method as in the paper. The gradient is exact: an adjoint pass through the
-flow of the states and of one tangent each.
+ψ is one stationary flow, integrated by Euler's method as in the paper. The gradient is exact: an adjoint pass through
+the flow of the states and of one tangent each.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class VelocityFit:
         """Minimise by L-BFGS from W = 0.
 
         Args:
-            max_iterations: of L-BFGS.
+            max_iterations: largest number of L-BFGS iterations.
             report: called with the iteration and the cost; an exception that it raises ends the fit.
 
         Returns:
@@ -61,7 +61,7 @@ class VelocityFit:
         return found.x.reshape(shape)
 
     def cost_and_gradient(self, weights: Array) -> tuple[float, Array]:
-        """The objective and its derivative by the weights W (m, d)."""
+        """Compute the objective and its derivative by the weights W (m, d)."""
         num, d = self.positions.shape
         h = 1.0 / self.steps
         points = np.concatenate([self.positions, self.goal[None]])
@@ -101,7 +101,7 @@ class VelocityFit:
         return cost, gradient
 
     def _gram_times(self, weights: Array) -> Array:
-        """K·W, axis by axis: the kernel matrix of a grid is a Kronecker product."""
+        """Compute K·W axis by axis: the kernel matrix of a grid is a Kronecker product."""
         table = weights.reshape(*self.grid.shape, -1)
         for j, axis in enumerate(self.grid.axes):
             gram = np.exp(-self.grid.ell * (axis[:, None] - axis) ** 2)
@@ -109,7 +109,7 @@ class VelocityFit:
         return table.reshape(weights.shape)
 
     def _pull_back(self, s: Array, by_value: Array, w: Array, by_slope: Array) -> Array:
-        """Derivative (m, d) by W of Σ_n by_value·V(s) + by_slope·DV(s)·w."""
+        """Compute the derivative (m, d) by W of Σ_n by_value·V(s) + by_slope·DV(s)·w."""
         d = self.grid.dim
         factors = self.grid.factors(s, 1)
         total = np.zeros((self.grid.num_points, d))
@@ -122,7 +122,7 @@ class VelocityFit:
         return total
 
     def _second_derivative(self, weights: Array, s: Array, left: Array, right: Array) -> Array:
-        """Σ_ab left_a·∂²V_a/∂s_b∂s_j·right_b, (N, d)."""
+        """Compute Σ_ab left_a·∂²V_a/∂s_b∂s_j·right_b, (N, d)."""
         d = self.grid.dim
         orders = second_orders(d)
         values = dict(zip(orders, self.grid.contract(s, weights, tuple(orders.values())), strict=True))
@@ -139,7 +139,7 @@ class VelocityFit:
 
 
 def base_derivative(base: Attractor, z: Array) -> Array:
-    """∂ż/∂z (N, d, d) of the plain attractor: −v·(sech²(r/ρ)/ρ·r̂r̂ᵀ + tanh(r/ρ)/r·(I − r̂r̂ᵀ))."""
+    """Compute ∂ż/∂z (N, d, d) of the plain attractor: −v·(sech²(r/ρ)/ρ·r̂r̂ᵀ + tanh(r/ρ)/r·(I − r̂r̂ᵀ))."""
     offset = z - base.goal
     r = np.maximum(np.linalg.norm(offset, axis=-1)[:, None, None], 1e-9 * base.smoothing)
     along = (offset[:, :, None] / r) * (offset[:, None, :] / r)

@@ -12,14 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.arm.collision import CollisionReport
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.retiming import within_velocity_limits
 from dt_viz.arm.robot import Robot
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
-from dt_viz.motion.health import FOLDS, MAX_ROUND_TRIP, RISES, THERE_AND_BACK, Health, in_millimetres
 from dt_viz.motion.solve import Solution
+from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres, told
 
 NUM_CHECKED, NUM_CHECKED_POSTURES = 400, 100
 """Samples on which det J and what is lost there and back are computed, of the hand's stack and of the whole arm's
@@ -43,8 +44,38 @@ MAX_DELAY_ERROR = 1e-9
 """Seconds by which the times of the arm may differ from those that its velocity limits ask for."""
 MAX_CLEARANCE_ERROR = 1e-6
 """Metres by which a clearance may differ from the one that is said."""
-OFF_MOTION = "beside the motion of the base system"
-"""Words of the doubt about samples that are no images of the base motion."""
+MAX_ROUND_TRIP = 1e-6
+"""Largest ‖ψ⁻¹(ψ(y)) − y‖, metres, that is not said; the workspace is about one metre wide."""
+
+
+@dataclass(frozen=True)
+class Certificates:
+    """What is known about how far a result is to be trusted; None is what has not been computed."""
+
+    clearance: float
+    """Smallest distance from the obstacle of what avoids it, metres, negative inside: of the end effector, or of the
+    spheres that cover the arm on the motions from the task's starts."""
+    collision: CollisionReport | None = None
+    """What the arm's meshes come near to on the motion that it shows."""
+    min_det_jacobian: float | None = None
+    """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism. Where ψ⁻¹,
+    integrated by hand, folds what is drawn, its det is taken. It is as exact as tangents are: where space is squeezed
+    strongly, off by some per cent (see `AdaptiveFlow.tolerance`)."""
+    round_trip_error: float | None = None
+    """Largest ‖ψ⁻¹(ψ(y)) − y‖ along the rollouts, metres."""
+    lyapunov_falls: bool | None = None
+    """Whether Φ(ψ(y(t))) falls strictly along every rollout."""
+    found: tuple[MotionWarning, ...] = ()
+    """All warnings, also those that only follow from others."""
+
+    @property
+    def warnings(self) -> tuple[MotionWarning, ...]:
+        """Why the result is not to be trusted: what is to be told."""
+        return told(self.found)
+
+    def warning(self, *warnings: MotionWarning) -> Certificates:
+        """The same with more warnings."""
+        return replace(self, found=self.found + warnings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +92,13 @@ class Shown:
     """(N, 3), metres."""
 
 
-def certified(health: Health, stack: Solution, ends: Array, shown: Shown, *, tolerance: float = MAX_OFF) -> Health:
-    """Add the certificates of a stack along the motions that are shown of it, and a doubt for each that fails.
+def certified(
+    known: Certificates, stack: Solution, ends: Array, shown: Shown, *, tolerance: float = MAX_OFF
+) -> Certificates:
+    """Add the certificates of a stack along the motions that are shown of it, and a warning for each that fails.
 
     Args:
-        health: what is known already.
+        known: what is known already.
         stack: ψ and the rays of the base system.
         ends: (R + 1, 3) where the motions are to begin, and where all are to end, metres.
         shown: the motions.
@@ -78,12 +111,11 @@ def certified(health: Health, stack: Solution, ends: Array, shown: Shown, *, tol
     # coarse steps there and back are no inverses: then ψ⁻¹, which is what is drawn, is compared and looked at for folds
     off = transform.inverse(base_motion) - y if by_hand else z - base_motion
     det = _determinant(transform, y[keep], base_motion[keep] if by_hand else None)
-    folds = health.says(FOLDS)
-    health = _with_map(health, det, _longest(transform.inverse(z[keep]) - y[keep]))
+    known = _with_map(known, det, _longest(transform.inverse(z[keep]) - y[keep]))
     falls = _falls(np.linalg.norm(z - stack.rays.base.goal, axis=1), shown)
-    if not (falls or folds):  # where a step is known to fold space, that has a cause
-        health = health.doubting(RISES)
-    return replace(health, lyapunov_falls=falls).doubting(
+    rises = () if falls else (MotionWarning(Kind.NOT_FALLING, "the Lyapunov value does not fall all the way"),)
+    return replace(known, lyapunov_falls=falls).warning(
+        *rises,
         *_beside(_longest(off), tolerance),
         *_of_ends(np.concatenate([stack.rays.z0, stack.rays.base.goal[None]]) - transform.forward(ends), shown),
         *_of_times(stack, shown, base_motion),
@@ -91,12 +123,12 @@ def certified(health: Health, stack: Solution, ends: Array, shown: Shown, *, tol
 
 
 def certified_arm(
-    health: Health, transform: Diffeomorphism, p: Array, undisturbed: Array, *, by_hand: bool
-) -> tuple[Health, Array]:
+    known: Certificates, transform: Diffeomorphism, p: Array, undisturbed: Array, *, by_hand: bool
+) -> tuple[Certificates, Array]:
     """Add the certificates of the whole arm's transform along the postures that are shown.
 
     Args:
-        health: what is known already.
+        known: what is known already.
         transform: ψ_q.
         p: (N, 6) the postures, rad.
         undisturbed: (N, 6) the postures inside the joint limits that ψ_q⁻¹ is said to lead to them, rad.
@@ -109,35 +141,36 @@ def certified_arm(
     keep = _evenly(moved if len(moved) else np.arange(len(p)), NUM_CHECKED_POSTURES)
     det = _determinant(transform, p[keep], undisturbed[keep] if by_hand else None)
     back = transform.inverse(transform.forward(p[keep]))
-    health = _with_map(health, det, _longest((back - p[keep]) * LEVERS))
+    known = _with_map(known, det, _longest((back - p[keep]) * LEVERS))
     if by_hand:
         q, off = undisturbed, transform.inverse(undisturbed) - p
     else:
         q = _quicker(transform).forward(p)
         off = q - undisturbed
-    return health.doubting(*_beside(_longest(off * LEVERS), MAX_OFF_POSTURE)), q
+    return known.warning(*_beside(_longest(off * LEVERS), MAX_OFF_POSTURE)), q
 
 
-def hand_doubts(
-    health: Health, robot: Robot, q: Array, path: Array, *, tolerance: float = MAX_HAND_MISS
-) -> tuple[str, ...]:
-    """Whether the hand of the arm is where its rollouts are, in words.
+def hand_warnings(
+    robot: Robot, q: Array, path: Array, *, source: str = "", tolerance: float = MAX_HAND_MISS
+) -> tuple[MotionWarning, ...]:
+    """Whether the hand of the arm is where its rollouts are.
 
     Args:
-        health: what is known already.
         robot: whose hand it is.
         q: (N, 6) postures, rad.
         path: (N, 3) the samples that belong to them, metres.
+        source: of the warnings.
         tolerance: distance before it is said, metres.
     """
     missed = _longest(robot.end_effector(q) - path)
-    if missed <= tolerance or health.says("misses the path"):
+    if missed <= tolerance:
         return ()
-    return (f"the hand of the arm is up to {in_millimetres(missed)} beside its rollout",)
+    text = f"the hand of the arm is up to {in_millimetres(missed)} beside its rollout"
+    return (MotionWarning(Kind.HAND_BESIDE, text, source),)
 
 
-def delay_doubts(robot: Robot, q: Array, times: Array, due: Array) -> tuple[str, ...]:
-    """Whether the arm is as late as its velocity limits ask for, in words.
+def delay_warnings(robot: Robot, q: Array, times: Array, due: Array) -> tuple[MotionWarning, ...]:
+    """Whether the arm is as late as its velocity limits ask for.
 
     Args:
         robot: whose limits they are.
@@ -147,39 +180,46 @@ def delay_doubts(robot: Robot, q: Array, times: Array, due: Array) -> tuple[str,
     """
     if np.abs(times - within_velocity_limits(due, q, robot.velocity_limits)).max() <= MAX_DELAY_ERROR:
         return ()
-    return ("the arm does not keep the times of its rollout and its velocity limits",)
+    text = "the arm does not keep the times of its rollout and its velocity limits"
+    return (MotionWarning(Kind.OTHER_DELAY, text, ARM),)
 
 
-def clearance_doubts(said: float, kept: float) -> tuple[str, ...]:
-    """Whether the motions that are shown keep the clearance that is said of them, both in metres, in words."""
+def clearance_warnings(said: float, kept: float) -> tuple[MotionWarning, ...]:
+    """Whether the motions that are shown keep the clearance that is said of them, both in metres."""
     if said == kept or abs(said - kept) <= MAX_CLEARANCE_ERROR:
         return ()
-    return (f"the motions shown keep {1e3 * kept:.1f} mm from the obstacle, not {1e3 * said:.1f} mm",)
+    text = f"the motions shown keep {1e3 * kept:.1f} mm from the obstacle, not {1e3 * said:.1f} mm"
+    return (MotionWarning(Kind.OTHER_CLEARANCE, text),)
 
 
-def _beside(off: float, tolerance: float) -> tuple[str, ...]:
-    return () if off <= tolerance else (f"what is shown is up to {in_millimetres(off)} {OFF_MOTION}",)
+def _beside(off: float, tolerance: float) -> tuple[MotionWarning, ...]:
+    if off <= tolerance:
+        return ()
+    text = f"what is shown is up to {in_millimetres(off)} beside the motion of the base system"
+    return (MotionWarning(Kind.OFF_MOTION, text),)
 
 
-def _of_ends(missed: Array, shown: Shown) -> tuple[str, ...]:
-    """What there is to say of starts and goal: of base motions by which they miss theirs (R + 1, d), and of samples."""
-    doubts = []
+def _of_ends(missed: Array, shown: Shown) -> tuple[MotionWarning, ...]:
+    """Warnings about starts and goal: of base motions that miss theirs by (R + 1, d), and of samples."""
+    texts = []
     first = np.r_[True, np.diff(shown.index) > 0]
     last = np.append(first[1:], True)
     if not _longest(missed) <= MAX_OFF or (shown.index[first] != np.arange(len(missed) - 1)).any():
-        doubts.append(f"the motions begin or end up to {in_millimetres(_longest(missed))} beside where they are to")
+        texts.append(f"the motions begin or end up to {in_millimetres(_longest(missed))} beside where they are to")
     if (shown.fraction[first] != 0).any() or (shown.fraction[last] != 1).any():
-        doubts.append("a motion is not shown from its start to its goal")
-    return tuple(doubts)
+        texts.append("a motion is not shown from its start to its goal")
+    return tuple(MotionWarning(Kind.OTHER_ENDS, text) for text in texts)
 
 
-def _of_times(stack: Solution, shown: Shown, base_motion: Array) -> tuple[str, ...]:
+def _of_times(stack: Solution, shown: Shown, base_motion: Array) -> tuple[MotionWarning, ...]:
     """Whether the base motion is elsewhere (N, d) at the times that are said."""
     then = stack.rays.base.flow(stack.rays.z0[shown.index], shown.times[:, None])[:, 0]
     off = np.linalg.norm(then - base_motion, axis=1) - np.where(shown.fraction == 1, ARRIVED, 0.0)
     if off.max() <= MAX_OFF:
         return ()
-    return (f"the times are not those of the motion: at them it is up to {in_millimetres(float(off.max()))} elsewhere",)
+    elsewhere = in_millimetres(float(off.max()))
+    text = f"the times are not those of the motion: at them it is up to {elsewhere} elsewhere"
+    return (MotionWarning(Kind.OTHER_TIMES, text),)
 
 
 def _falls(distance: Array, shown: Shown) -> bool:
@@ -207,17 +247,20 @@ def _determinant(transform: Diffeomorphism, y: Array, drawn_from: Array | None) 
     return float(det.min())
 
 
-def _with_map(health: Health, det: float, round_trip: float) -> Health:
-    """Health with certificates of a map that may be worse than those it has, and a doubt for each new failure."""
-    if not (det > 0 or health.says(FOLDS)):
-        health = health.doubting(f"det J falls to {det:.2g}: the map {FOLDS}, the stack is no diffeomorphism there")
-    if not round_trip <= MAX_ROUND_TRIP and not health.says(THERE_AND_BACK):
-        health = health.doubting(f"{THERE_AND_BACK} again misses by {1e3 * round_trip:.3g} mm: steps too coarse")
+def _with_map(known: Certificates, det: float, round_trip: float) -> Certificates:
+    """What is known with certificates of a map that may be worse than those before, and a warning for each failure."""
+    warnings = []
+    if not det > 0:
+        text = f"det J falls to {det:.2g}: the map folds space, the stack is no diffeomorphism there"
+        warnings.append(MotionWarning(Kind.NO_DIFFEOMORPHISM, text))
+    if not round_trip <= MAX_ROUND_TRIP:
+        text = f"there and back again misses by {1e3 * round_trip:.3g} mm: steps too coarse"
+        warnings.append(MotionWarning(Kind.ROUND_TRIP, text))
     return replace(
-        health,
-        min_det_jacobian=min(det, np.inf if health.min_det_jacobian is None else health.min_det_jacobian),
-        round_trip_error=max(round_trip, health.round_trip_error or 0.0),
-    )
+        known,
+        min_det_jacobian=min(det, np.inf if known.min_det_jacobian is None else known.min_det_jacobian),
+        round_trip_error=max(round_trip, known.round_trip_error or 0.0),
+    ).warning(*warnings)
 
 
 def _evenly(rows: Indices, num: int) -> Indices:

@@ -1,9 +1,8 @@
-"""Why a motion is not to be trusted, in words."""
+"""Warnings about a motion: what it wants and does not get, and what integrators cost that were chosen by hand."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,145 +10,209 @@ import numpy as np
 from dt_viz.arm.collision import Nearest
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import Robot
+from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Integration
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import MAX_SAMPLES
-from dt_viz.motion.health import in_millimetres, integration_doubts
+from dt_viz.motion.certificates import MAX_ROUND_TRIP
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.solve import Applied, Solution, Solved
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
-from dt_viz.transforms.avoidance import BESIDE, GOAL_INSIDE, ROUNDING, STAYS_INSIDE, smallest_kept
-from dt_viz.transforms.base import Motion, named_starts
-from dt_viz.transforms.bias import OFF_PLANE, Biasing
+from dt_viz.scenario.starts import REACH, SHOULDER
+from dt_viz.transforms.base import MotionBelow, start_warnings
+from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres
 
 MAX_GOAL_MISS = 1e-3
 """Metres by which motions may end beside the goal before it is said."""
-UNSAMPLED = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"
 MARGIN_TOLERANCE = 1e-3
 """Metres by which the arm's meshes may come nearer to the obstacle than the margin before it is said."""
-MAX_TARGET_MISS = 0.013
-"""Metres by which motions that avoid may miss a bias point before it is said: a centimetre, and what the arm's joints,
-interpolated between samples, are off by while a hand moves."""
+NUM_CHECKED_LIVE = 300
+"""Number of samples on which it is computed what an integrator costs that was chosen by hand."""
 
 
-def motion_doubts(solved: Solved, clearance: float, missed: float) -> tuple[str, ...]:
-    """Why the motion is not to be trusted, in words.
+def motion_warnings(solved: Solved, missed: float) -> tuple[MotionWarning, ...]:
+    """Why the motion is not to be trusted.
 
     Args:
         solved: the motion.
-        clearance: of the motion, metres.
         missed: metres by which it ends beside the goal.
     """
     nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
-    doubts = [*nominal.imitation.warnings, *stack.doubts]
+    warnings = [MotionWarning(Kind.IMITATION, text) for text in nominal.imitation.warnings]
+    warnings += stack.warnings
     if max(len(stack.bundle.index), len(arm.index) if arm else 0) >= MAX_SAMPLES:
-        doubts.append(UNSAMPLED)
+        text = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"
+        warnings.append(MotionWarning(Kind.UNSAMPLED, text))
     integration = _of_integration(solved)
     if scenario.warp < 1:  # what does not do yet what it is made for has not failed
-        return (*doubts, *integration, *nominal.doubts)
-    covered = any(GOAL_INSIDE in doubt for doubt in doubts)
+        return (*warnings, *integration, *nominal.warnings)
     if arm is not None:
-        if not arm.cleared:
-            doubts.append(
-                "the arm finds no way around the obstacle: a motion comes too near to it"
-                if scenario.duration is None
-                else "a motion of the arm comes too near to the obstacle at this flow time"
-            )
-        numbers, num = np.array(nominal.numbers), nominal.num_demonstrated
-        doubts += named_starts(numbers[arm.too_near], num, "without a way around the obstacle for the arm")
-        beside = np.setdiff1d(arm.moved, arm.too_near)
-        doubts += named_starts(numbers[beside], num, "so near to the obstacle that the arm begins elsewhere")
-    else:
-        doubts += _of_clearance(solved, clearance)
-    for applied in stack.unsatisfied:
-        if applied.place is not None and not (applied.made.hopeless and applied.made.doubts):
-            doubts.append(f"{applied.name or 'a layer'}: not every motion does what it asks for")
-    doubts += integration
-    if missed > MAX_GOAL_MISS and not covered and not _moves_goal(nominal, stack):
+        warnings += _of_arm(solved)
+    for applied in stack.built:
+        # where the arm gives way, how near the end effector comes is not the question
+        if arm is None or applied.transform.arm_avoidance is None:
+            top = _top(solved, applied, stack.bundle.index, stack.bundle.positions)
+            warnings += applied.transform.shortfall(top, applied.made, satisfied=applied.satisfied)
+    warnings += integration
+    if missed > MAX_GOAL_MISS and not _moves_goal(nominal, stack):
         # what an integrator loses there and back it loses at the goal, too
         cause = "" if integration else "the obstacle leaves no way to the goal: "
-        doubts.append(f"{cause}motions end {1e3 * missed:.0f} mm beside {'it' if cause else 'the goal'}")
-    return (*doubts, *nominal.doubts)
+        text = f"{cause}motions end {1e3 * missed:.0f} mm beside {'it' if cause else 'the goal'}"
+        warnings.append(MotionWarning(Kind.GOAL_MISSED, text))
+    return (*warnings, *nominal.warnings)
 
 
-def _of_clearance(solved: Solved, clearance: float) -> tuple[str, ...]:
-    """What there is to say of how near the end effector comes to the obstacle that it avoids, in words."""
-    avoidance = solved.stack.at(None)
-    if avoidance is None or (clearance >= 0 and avoidance.satisfied):
-        return ()
-    nominal, bundle = solved.nominal, solved.stack.bundle
-    kept = smallest_kept(Motion(solved.scenario, nominal.starts, nominal.goal, bundle.index, bundle.positions))
-    # where a goal is covered, what ends nearly on the surface is beside it
-    if kept < (-BESIDE if _says(avoidance, GOAL_INSIDE) else -ROUNDING):
-        said = _says(avoidance, STAYS_INSIDE)
-        return () if said else (f"a motion enters the obstacle by {in_millimetres(-kept)}",)
-    if avoidance.satisfied or np.isinf(kept):
-        return ()
-    far = avoidance.made.hopeless and not avoidance.made.integration.by_hand
-    why = ": the field does not reach farther; a higher T or a smaller margin helps" if far else ""
-    return (f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle{why}",)
+def _of_arm(solved: Solved) -> list[MotionWarning]:
+    """Warnings about the way that the whole arm finds."""
+    nominal, arm, avoidance, warnings = solved.nominal, solved.arm, solved.scenario.arm_avoidance, []
+    assert arm is not None
+    assert avoidance is not None
+    if not arm.cleared:
+        text = (
+            "the arm finds no way around the obstacle: a motion comes too near to it"
+            if avoidance.duration is None
+            else "a motion of the arm comes too near to the obstacle at this flow time"
+        )
+        warnings.append(MotionWarning(Kind.ARM_BLOCKED, text, WHOLE_ARM))
+    numbers, num = np.array(nominal.numbers), nominal.num_demonstrated
+    how = "without a way around the obstacle for the arm"
+    warnings += start_warnings(numbers[arm.too_near], num, Kind.ARM_BLOCKED, how, WHOLE_ARM)
+    beside = np.setdiff1d(arm.moved, arm.too_near)
+    how = "so near to the obstacle that the arm begins elsewhere"
+    return warnings + start_warnings(numbers[beside], num, Kind.START_COVERED, how, WHOLE_ARM)
 
 
-def target_doubts(solved: Solved, robot: Robot) -> tuple[str, ...]:
-    """Which bias points the stack leads the motion to, but giving way to the obstacle leads past, in words.
+def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
+    """Warnings about transforms that lead motions to where the arm's hand cannot be."""
+    warnings = []
+    for applied in stack.built:
+        anchor = applied.transform.anchor
+        if anchor is None:
+            continue
+        away = float(np.linalg.norm(np.subtract(anchor, SHOULDER)))
+        if anchor[2] < 0:
+            warnings.append(
+                MotionWarning(Kind.MISPLACED, f"{applied.name}: the point is below the table", applied.name)
+            )
+        if away > REACH:
+            text = f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m"
+            warnings.append(MotionWarning(Kind.MISPLACED, f"{applied.name}: {text}", applied.name))
+    return tuple(warnings)
 
-    In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
-    """
-    nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
+
+def _top(solved: Solved, applied: Applied, index: Indices, positions: Array) -> MotionBelow:
+    """Samples of the whole stack's motions, as a transform of the stack is asked about them."""
+    nominal = solved.nominal
+    return MotionBelow(
+        nominal.starts,
+        nominal.goal,
+        index,
+        positions,
+        name=applied.name,
+        num_demonstrated=nominal.num_demonstrated,
+    )
+
+
+def target_warnings(solved: Solved, robot: Robot) -> tuple[MotionWarning, ...]:
+    """Warnings about transforms that the stack satisfies, but the avoidance of obstacles does not."""
+    stack, arm = solved.stack, solved.arm
     bundle = stack.bundle if arm is None else arm
     positions = stack.bundle.positions if arm is None else robot.end_effector(arm.p)
-    motion = Motion(
-        scenario, nominal.starts, nominal.goal, bundle.index, positions, num_demonstrated=nominal.num_demonstrated
+    who = "a motion" if arm is None else "the arm"
+    return tuple(
+        warning
+        for applied in stack.built
+        if applied.satisfied
+        for warning in applied.transform.deflected(_top(solved, applied, bundle.index, positions), applied.made, who)
     )
-    doubts = []
-    for applied in stack.built:
-        bias = applied.behaviour
-        if not isinstance(bias, Biasing) or not applied.satisfied or bias.point.strength is not None:
-            continue
-        if not _says(applied, OFF_PLANE):
-            bias = replace(bias, point=replace(bias.point, plane=None))
-        missed = float(bias.distances(motion).max())
-        if missed > MAX_TARGET_MISS:
-            who, does = "a motion" if arm is None else "the arm", "ends" if bias.point.moves_goal else "passes"
-            doubts.append(f"{applied.name}: {who} gives way to the obstacle and {does} {1e3 * missed:.0f} mm from it")
-    return tuple(doubts)
 
 
-def margin_doubts(scenario: Scenario, nearest: Sequence[Nearest]) -> tuple[str, ...]:
-    """What the arm's meshes keep of the margin that they are to avoid the obstacle by, in words; empty if all of it.
+def margin_warnings(scenario: Scenario, nearest: Sequence[Nearest]) -> tuple[MotionWarning, ...]:
+    """What the arm's meshes keep of the margin that they are to avoid the obstacle by; empty if all of it.
 
     Args:
         scenario: whose margin it is.
         nearest: of each motion that the whole arm avoids with.
     """
-    kept = min(nearest, key=lambda near: near.distance)
-    asks = scenario.avoidance and scenario.warp == 1 and scenario.duration is None
-    if not asks or kept.distance >= scenario.margin - MARGIN_TOLERANCE:
+    kept, avoidance = min(nearest, key=lambda near: near.distance), scenario.arm_avoidance
+    asks = avoidance is not None and scenario.warp == 1 and avoidance.duration is None
+    if avoidance is None or not asks or kept.distance >= avoidance.margin - MARGIN_TOLERANCE:
         return ()
-    where, asked = f"on rollout {nearest.index(kept) + 1} the arm's {kept.links[0]}", in_millimetres(scenario.margin)
+    where, asked = f"on rollout {nearest.index(kept) + 1} the arm's {kept.links[0]}", in_millimetres(avoidance.margin)
     if kept.distance < 0:
-        return (f"{where} enters the obstacle by {-1e3 * kept.distance:.0f} mm; a margin of {asked} was asked for",)
-    return (f"{where} keeps {in_millimetres(kept.distance)} from the obstacle; {asked} were asked for",)
+        text = f"{where} enters the obstacle by {-1e3 * kept.distance:.0f} mm; a margin of {asked} was asked for"
+        return (MotionWarning(Kind.ROLLOUT_ENTERS, text, ARM),)
+    text = f"{where} keeps {in_millimetres(kept.distance)} from the obstacle; {asked} were asked for"
+    return (MotionWarning(Kind.ARM_TOO_NEAR, text, ARM),)
 
 
-def _says(applied: Applied, words: str) -> bool:
-    """Whether what there is to say of a behaviour has these words."""
-    return any(words in doubt for doubt in applied.doubts)
-
-
-def _of_integration(solved: Solved) -> tuple[str, ...]:
-    """What the integrators cost that were chosen by hand, in words."""
-    scenario, stack, arm = solved.scenario, solved.stack, solved.arm
-    doubts, bundle = [], stack.bundle
+def _of_integration(solved: Solved) -> tuple[MotionWarning, ...]:
+    """What the integrators cost that were chosen by hand."""
+    stack, arm, avoidance = solved.stack, solved.arm, solved.scenario.arm_avoidance
+    warnings, bundle = [], stack.bundle
     for level, applied in enumerate(stack.built, 1):
         y, x, made = bundle.levels[:, level], bundle.levels[:, level - 1], applied.made
-        doubts += integration_doubts(applied.name, made.transform, made.integration, y, x)
-    if arm is not None:
-        doubts += integration_doubts(WHOLE_ARM, arm.transform, scenario.integration, arm.p, arm.q, LEVERS)
-    return tuple(doubts)
+        warnings += integration_warnings(applied.name, made.transform, made.integration, y, x)
+    if arm is not None and avoidance is not None:
+        warnings += integration_warnings(WHOLE_ARM, arm.transform, avoidance.integration, arm.p, arm.q, LEVERS)
+    return tuple(warnings)
 
 
 def _moves_goal(nominal: Nominal, stack: Solution) -> bool:
-    """Whether some behaviour other than avoidance means to end elsewhere."""
+    """Whether some transform means to end motions elsewhere."""
     goals = [nominal.goal, *(applied.made.goal for applied in stack.built)]
     moves = (bool(np.any(a != b)) for a, b in pairwise(goals))
-    return any(m and applied.place is not None for m, applied in zip(moves, stack.built, strict=True))
+    return any(m and not applied.transform.yields_goal for m, applied in zip(moves, stack.built, strict=True))
+
+
+def integration_warnings(
+    name: str, flow: Diffeomorphism, integration: Integration, y: Array, x: Array, unit: Array | float = 1.0
+) -> tuple[MotionWarning, ...]:
+    """What it costs that the integration of a transform's flow was chosen by hand; nothing if it was not.
+
+    Quick enough for a drag. A flow in other coordinates, as the whole arm's, is too slow to be looked at for folds
+    here: see `fold_warnings`.
+
+    Args:
+        name: of the transform.
+        flow: its ψ.
+        integration: of that flow.
+        y: (N, d) samples of the motions with the transform.
+        x: (N, d) the samples below, which ψ⁻¹ leads to `y`.
+        unit: metres for one unit of each coordinate.
+    """
+    if not integration.by_hand:
+        return ()
+    keep = np.unique(np.linspace(0, len(y) - 1, NUM_CHECKED_LIVE).astype(int))
+    lost = float(np.linalg.norm((flow.inverse(flow.forward(y[keep])) - y[keep]) * unit, axis=1).max())
+    folds = fold_warnings(name, flow, integration, y[keep], x[keep]) if isinstance(flow, Flow) else ()
+    if lost <= MAX_ROUND_TRIP:
+        return folds
+    text = f"{name}: {integration} loses {in_millimetres(lost)} there and back"
+    return (*folds, MotionWarning(Kind.INEXACT_INVERSE, text, name))
+
+
+def fold_warnings(
+    name: str, flow: Diffeomorphism, integration: Integration, y: Array, x: Array
+) -> tuple[MotionWarning, ...]:
+    """Whether a step of a flow whose integration was chosen by hand folds space.
+
+    Only the steps that start from or lead to these samples are looked at: what folds beside them is not found.
+
+    Args:
+        name: of the transform.
+        flow: its ψ, if it has steps in these or other coordinates; nothing is said of others.
+        integration: of that flow.
+        y: (N, d) samples of the motions with the transform.
+        x: (N, d) the samples below, which ψ⁻¹ leads to `y`.
+    """
+    while isinstance(flow, Conjugated):
+        flow, y, x = flow.inner, flow.by.forward(y), flow.by.forward(x)
+    if not integration.by_hand or not isinstance(flow, Flow):
+        return ()
+    # ψ⁻¹ is looked at on its way to the samples: after a coarse ψ it starts elsewhere
+    det = min(flow.min_step_determinant(y, inverse=False), flow.min_step_determinant(x, inverse=True))
+    if det > 0:
+        return ()
+    text = f"{name}: a step of {integration} folds space (det {det:.2g}); take more steps or less time"
+    return (MotionWarning(Kind.FOLDS, text, name),)

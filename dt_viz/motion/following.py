@@ -20,7 +20,8 @@ from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.base import named_starts
+from dt_viz.transforms.base import start_warnings
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 BY_FRACTION = 0.3
 """Part of the even spacing of postures that goes by the fraction of the base ray, not by the length of the path."""
@@ -123,16 +124,16 @@ class Follower:
         self._before[nominal.learned, number] = joints.q
         return joints
 
-    def obstructions(self, nominal: Nominal, obstacle: Union) -> tuple[str, ...]:
-        """Why the whole arm cannot move from the task's starts to the goal, in words; empty where nothing does."""
+    def obstructions(self, nominal: Nominal, obstacle: Union) -> tuple[MotionWarning, ...]:
+        """Why the whole arm cannot move from the task's starts to the goal; empty where it can."""
         try:
             lifted = self.undisturbed(nominal.learned.demonstrated)
         except UnreachableError as error:
-            return (f"the arm cannot reach the starts: {error}",)
+            return (unreachable(error),)
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
-        reasons = named_starts(np.flatnonzero(missed[:, 0]), len(missed), OUT_OF_REACH)
+        reasons = far_starts(np.flatnonzero(missed[:, 0]), len(missed))
         if missed[:, 1].any():
-            reasons.append("the goal is out of the arm's reach")
+            reasons.append(MotionWarning(Kind.OUT_OF_REACH, "the goal is out of the arm's reach", ARM))
         for part in obstacle.parts:
             reasons += self._touching(lifted.pins, part)
         return tuple(reasons)
@@ -165,11 +166,12 @@ class Follower:
         if not (far | touches).any():
             return nominal
         numbers = np.array(nominal.numbers)
-        doubts = named_starts(numbers[far], num, OUT_OF_REACH) + named_starts(numbers[touches], num, TOUCHES)
-        return nominal.only(np.flatnonzero(~(far | touches)), doubts)
+        # of the motions, not of the arm that is shown: these have none
+        warnings = far_starts(numbers[far], num, source="") + _touching_starts(numbers[touches], num)
+        return nominal.only(np.flatnonzero(~(far | touches)), warnings)
 
-    def _touching(self, pins: Array, obstacle: Obstacle) -> list[str]:
-        """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6), in words."""
+    def _touching(self, pins: Array, obstacle: Obstacle) -> list[MotionWarning]:
+        """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6)."""
         pedestal = self.body.on_pedestal
         distance = obstacle.signed_distance(pedestal.positions(self.robot, pins[0])) - pedestal.radius
         if (distance >= 0).all() and (self.whole_arm.clearance(pins, obstacle) >= 0).all():
@@ -179,22 +181,26 @@ class Follower:
         gaps, links = model.obstacle_distance(pins, obstacle)
         name = model.links[int(links[0])].name
         if gaps[0] < 0 and name in PEDESTAL:
-            return [f"the obstacle touches the arm's {name}, which cannot move away"]
-        reasons = named_starts(np.flatnonzero(gaps[:-1] < 0), len(gaps) - 1, TOUCHES)
+            text = f"the obstacle touches the arm's {name}, which cannot move away"
+            return [MotionWarning(Kind.ARM_BLOCKED, text, ARM)]
+        reasons = _touching_starts(np.flatnonzero(gaps[:-1] < 0), len(gaps) - 1)
         if gaps[-1] < 0:
-            reasons.append("the goal is inside the obstacle: the arm there touches it")
+            text = "the goal is inside the obstacle: the arm there touches it"
+            reasons.append(MotionWarning(Kind.GOAL_COVERED, text, ARM))
         return reasons
 
-    def doubts(self, joints: JointPath, rollout: int) -> tuple[str, ...]:
+    def warnings(self, joints: JointPath, rollout: int) -> tuple[MotionWarning, ...]:
         """Why the joints along a rollout, counted from 0, are not to be trusted."""
-        doubts = []
+        warnings = []
         worst = float(joints.error.max())
         if worst > MAX_TRACKING_ERROR:
             because = ", a joint is at its limit" if joints.limits_hit.any() else ""
-            doubts.append(f"the arm misses the path of rollout {rollout + 1} by up to {1e3 * worst:.0f} mm{because}")
+            text = f"the arm misses the path of rollout {rollout + 1} by up to {1e3 * worst:.0f} mm{because}"
+            warnings.append(MotionWarning(Kind.PATH_MISSED, text, ARM))
         if joints.damped.any():
-            doubts.append("the arm is stretched out or folded on the way: its pseudo-inverse is damped there")
-        return tuple(doubts)
+            text = "the arm is stretched out or folded on the way: its pseudo-inverse is damped there"
+            warnings.append(MotionWarning(Kind.DAMPED, text, ARM))
+        return tuple(warnings)
 
     def _lift_demonstrated(self, learned: Learned) -> Lift:
         bundle, starts = learned.demonstrated.bundle, learned.task.starts
@@ -222,6 +228,21 @@ class Follower:
         return bool(reached.error[0] <= MAX_TRACKING_ERROR)
 
 
+def unreachable(error: UnreachableError) -> MotionWarning:
+    """The warning that the arm cannot get to where the motions start."""
+    return MotionWarning(Kind.OUT_OF_REACH, f"the arm cannot reach the starts: {error}", ARM)
+
+
+def far_starts(which: Indices, num_demonstrated: int, source: str = ARM) -> list[MotionWarning]:
+    """Warnings about starts, counted from 0, that are out of the arm's reach."""
+    return start_warnings(which, num_demonstrated, Kind.OUT_OF_REACH, "out of the arm's reach", source)
+
+
+def _touching_starts(which: Indices, num_demonstrated: int) -> list[MotionWarning]:
+    how = "inside the obstacle: the arm there touches it"
+    return start_warnings(which, num_demonstrated, Kind.START_COVERED, how)
+
+
 def arm_samples(num: int) -> Indices:
     """Which of the `num` samples of a rollout of the end effector the arm follows, (`NUM_ARM_SAMPLES`,)."""
     return np.linspace(0, num - 1, NUM_ARM_SAMPLES).round().astype(int)
@@ -241,6 +262,3 @@ def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Ar
 
 PEDESTAL = ("base", "link 1")
 """What no joint carries away from an obstacle."""
-
-OUT_OF_REACH = "out of the arm's reach"
-TOUCHES = "inside the obstacle: the arm there touches it"

@@ -64,19 +64,19 @@ def held(
     pushed, room = onwards(follower, solved, posture, start[None], np.zeros(1))
 
     missed, depth = float(np.linalg.norm(pushed.path[0] - place)), -float(scenario.obstacle.signed_distance(place))
-    doubt = ""
+    warning = ""
     if depth > 0:
-        doubt = "inside the obstacle"
+        warning = "inside the obstacle"
     elif missed > MAX_TRACKING_ERROR:
         far = arm is None or track(robot, place[None], posture, reference=reference).error[0] > MAX_TRACKING_ERROR
-        doubt = "out of the arm's reach" if far else "the arm gives way to the obstacle here"
+        warning = "out of the arm's reach" if far else "the arm gives way to the obstacle here"
     elif place[2] < 0:
-        doubt = "below the table"
-    elif scenario.avoidance and scenario.warp == 1 and room.obstacle < 0:
-        doubt = "the motion from here touches the obstacle"
+        warning = "below the table"
+    elif scenario.avoids and scenario.warp == 1 and room.obstacle < 0:
+        warning = "the motion from here touches the obstacle"
     elif room.tracking < 0:
-        doubt = "the arm cannot follow the motion from here"
-    return replace(pushed, doubt=doubt)
+        warning = "the arm cannot follow the motion from here"
+    return replace(pushed, warning=warning)
 
 
 def _hands(follower: Follower, arm: ArmSolution, posture: Array, reference: Array) -> Hands:

@@ -17,6 +17,7 @@ from dt_viz.obstacles.shapes import Point
 from dt_viz.properties import cached_property
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
+from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
 """Of each rollout before refinement: from the task's starts, and from added ones."""
@@ -116,8 +117,8 @@ class Nominal:
     """Those of the task's starts first."""
     left_out: tuple[int, ...] = ()
     """Numbers of the starts, the task's first, that have no rollout here."""
-    doubts: tuple[str, ...] = ()
-    """Why they have none, in words."""
+    warnings: tuple[MotionWarning, ...] = ()
+    """Why they have none."""
 
     @property
     def task(self) -> Task:
@@ -159,11 +160,11 @@ class Nominal:
         """Which rollout begins at the start of this number; None if it has none."""
         return self.numbers.index(number) if number in self.numbers else None
 
-    def only(self, rollouts: Sequence[int] | Indices, doubts: Sequence[str] = ()) -> Nominal:
+    def only(self, rollouts: Sequence[int] | Indices, warnings: Sequence[MotionWarning] = ()) -> Nominal:
         """Some of the rollouts, and why the others are left out."""
         kept = {self.numbers[k] for k in rollouts}
         left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
-        return Nominal(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(doubts))
+        return Nominal(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(warnings))
 
     def moves_like(self, other: Nominal) -> bool:
         """Whether both have the same rollouts."""

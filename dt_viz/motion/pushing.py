@@ -45,7 +45,7 @@ class Pushed:
     """(T, 3) the end effector at the times of the motion, metres."""
     begins: int
     """The sample where the push is over and the system's own motion begins."""
-    doubt: str = ""
+    warning: str = ""
     """Why the arm is not where it should be, or its motion not to be trusted, in words."""
 
 
@@ -169,6 +169,6 @@ def onwards(
     if arm is not None:
         clearance = float(follower.whole_arm.clearance(joints, scenario.obstacle).min())
     else:
-        clearance = float(scenario.obstacle.signed_distance(path if scenario.avoidance else aside).min())
+        clearance = float(scenario.obstacle.signed_distance(path if scenario.avoids else aside).min())
     room = Room(float(path[:, 2].min()) - lowest, MAX_TRACKING_ERROR - float(tracked.error.max()), clearance)
     return Pushed(scenario, motion, path, len(aside) - 1), room

@@ -13,10 +13,10 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.motion.nominal import Nominal
+from dt_viz.obstacles.shapes import Point
 from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.stack import AVOIDANCE
-from dt_viz.transforms.avoidance import ObstacleAvoidance
-from dt_viz.transforms.base import Behaviour, Built, Motion
+from dt_viz.transforms.base import Built, MotionBelow, Transform
+from dt_viz.warning import MotionWarning
 
 MAX_ATTEMPTS = 4
 """At a duration that clears the samples that refinement finds, too."""
@@ -41,23 +41,15 @@ FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
 
 @dataclass(frozen=True)
 class Applied:
-    """A behaviour of a scenario that is on, as it was made."""
+    """A layer of a stack as it was made."""
 
-    place: int | None
-    """Of its layer among the scenario's, which may be equal; None of the end effector's avoidance."""
+    place: int
+    """Place of the layer in the whole stack, in which some may be off."""
     name: str
-    """Of its layer."""
-    behaviour: Behaviour
+    transform: Transform
     made: Built
     satisfied: bool
     """Whether it finds in the motion what it was made for."""
-
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Of the behaviour, in words, that of a layer by its name."""
-        if self.place is None:
-            return self.made.doubts
-        return tuple(f"{self.name or 'a layer'}: {doubt}" for doubt in self.made.doubts)
 
     @property
     def may_improve(self) -> bool:
@@ -73,7 +65,7 @@ class Solution:
     rays: Rays
     bundle: Bundle
     built: tuple[Applied, ...]
-    """The behaviours that are on, from the inside out."""
+    """The layers that are on, from the inside out."""
 
     @property
     def system(self) -> DiffeomorphicSystem:
@@ -81,26 +73,13 @@ class Solution:
         return DiffeomorphicSystem(self.transform, self.rays.base)
 
     @property
-    def unsatisfied(self) -> tuple[Applied, ...]:
-        """Those that do not find what they were made for."""
-        return tuple(applied for applied in self.built if not applied.satisfied)
+    def warnings(self) -> tuple[MotionWarning, ...]:
+        """The warnings of the transforms."""
+        return tuple(warning for applied in self.built for warning in applied.made.warnings)
 
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Of the behaviours, in words."""
-        return tuple(doubt for applied in self.built for doubt in applied.doubts)
-
-    def at(self, place: int | None) -> Applied | None:
-        """What was made of the layer at this place among the scenario's, None where that is off.
-
-        Place None is the end effector's avoidance.
-        """
+    def at(self, place: int) -> Applied | None:
+        """What was made of the layer at this place in the whole stack; None where that is off."""
         return next((applied for applied in self.built if applied.place == place), None)
-
-    def duration_at(self, place: int | None) -> float | None:
-        """T of the flow of what is `at` this place, under a warp that of the full one; None where that is off."""
-        applied = self.at(place)
-        return applied.made.duration if applied else None
 
     def positions_at(self, index: Indices, fraction: Array) -> Array:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
@@ -146,45 +125,38 @@ def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
     return np.stack(levels, axis=1)
 
 
-def stacked(scenario: Scenario) -> tuple[tuple[int | None, Layer], ...]:
-    """What is stacked on the imitation, from the inside out, without the layers that are off.
+def solve(nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision: Precision) -> Solution:
+    """Build the transforms for the motion below them, and the exact rollouts of the whole stack.
 
-    Each comes with its place among the scenario's layers; that of the end effector's avoidance is None.
-    """
-    order: list[tuple[int | None, Layer]] = [(place, layer) for place, layer in enumerate(scenario.layers)]
-    level = len(order) if scenario.avoidance_level is None else scenario.avoidance_level
-    order.insert(level, (None, Layer(ObstacleAvoidance(), name=AVOIDANCE)))
-    return tuple((place, layer) for place, layer in order if layer.on)
-
-
-def solve(nominal: Nominal, scenario: Scenario, precision: Precision) -> Solution:
-    """Build the behaviours for the motion below them, and the exact rollouts of the whole stack.
-
-    A behaviour is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
-    behaviours move change the motion a little; so look whether the behaviours still fit, and mend them if not. Where
+    A transform is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
+    transforms move change the motion a little; so look whether the transforms still fit, and mend them if not. Where
     there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
+
+    Args:
+        nominal: the undisturbed motion.
+        layers: those that act, from the inside out, each with its place in the whole stack; see `Scenario.active`.
+        precision: how exactly.
     """
-    solution, stack = None, stacked(scenario)
-    layers = [layer.behaviour for _, layer in stack]
+    solution = None
     for keeps_goal in (True, False):
         rays, bundle = nominal.rays, nominal.bundle
         ends_below = nominal.ends
         durations, above = [0.0] * len(layers), (None,) * len(layers)
         for _ in range(MAX_ATTEMPTS):
-            lowest = Motion(
-                scenario,
+            lowest = MotionBelow(
                 nominal.starts,
                 nominal.goal,
                 bundle.index,
                 bundle.levels[:, 0],
+                tolerance=precision.tolerance,
                 keeps_goal=keeps_goal,
                 num_demonstrated=nominal.num_demonstrated,
             )
-            built = _build(layers, lowest, precision.tolerance, durations, above)
+            built = _build(layers, lowest, durations, above)
             above = _above([made for _, made in built])
-            durations = [made.duration if made else 0.0 for _, made in built]
-            outer = [made.transform for _, made in built if made]
-            goal = next((made.goal for _, made in reversed(built) if made), nominal.goal)
+            durations = [made.duration for _, made in built]
+            outer = [made.transform for _, made in built]
+            goal = built[-1][1].goal if built else nominal.goal
 
             ends = np.concatenate([nominal.starts, [goal]])
             below = Chain(outer).forward(ends) if outer else ends
@@ -196,52 +168,53 @@ def solve(nominal: Nominal, scenario: Scenario, precision: Precision) -> Solutio
             bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
             transforms = [nominal.system.transform, *outer]
             bundle = refined(bundle, lambda i, u, r=rays, s=transforms: climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            solution = Solution(Chain(transforms), rays, bundle, _applied(stack, built, above, bundle))
+            solution = Solution(Chain(transforms), rays, bundle, _applied(layers, built, above, bundle))
             if not any(applied.may_improve for applied in solution.built):
                 return solution
         assert solution is not None
-        avoidance = solution.at(None)
-        if avoidance is None or not avoidance.may_improve:
+        if not any(applied.transform.yields_goal and applied.may_improve for applied in solution.built):
             break  # the goal has nothing to do with it
     assert solution is not None
     return solution
 
 
 def _build(
-    layers: Sequence[Behaviour],
-    motion: Motion,
-    tolerance: float,
+    layers: Sequence[tuple[int, Layer]],
+    motion: MotionBelow,
     durations: Sequence[float],
     above: Sequence[Diffeomorphism | None],
-) -> list[tuple[Motion, Built | None]]:
-    """Each behaviour's transform, None where it is off, with the motion that it was made for."""
-    built = []
-    for k, behaviour in enumerate(layers):
-        motion = replace(motion, above=above[k])
-        made = behaviour.build(motion, tolerance, durations[k])
+) -> list[tuple[MotionBelow, Built]]:
+    """Each layer's transform, with the motion that it was made for."""
+    built: list[tuple[MotionBelow, Built]] = []
+    targets: list[Point] = []
+    for (_, layer), at_least, outer in zip(layers, durations, above, strict=True):
+        told = {"name": layer.name, "at_least": at_least, "above": outer, "targets": tuple(targets)}
+        motion = replace(motion, **told)
+        made = layer.transform.build(motion)
         built.append((motion, made))
-        if made and k < len(layers) - 1:
+        if layer.transform.anchor is not None:
+            targets.append(layer.transform.anchor)
+        if len(built) < len(layers):
             motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
     return built
 
 
-def _above(built: Sequence[Built | None]) -> tuple[Diffeomorphism | None, ...]:
-    """For each behaviour, the transforms of those above it."""
-    transforms = [[made.transform for made in built[k + 1 :] if made] for k in range(len(built))]
+def _above(built: Sequence[Built]) -> tuple[Diffeomorphism | None, ...]:
+    """For each transform, the chain of those above it."""
+    transforms = [[made.transform for made in built[k + 1 :]] for k in range(len(built))]
     return tuple(Chain(stacked) if stacked else None for stacked in transforms)
 
 
 def _applied(
-    stack: Sequence[tuple[int | None, Layer]],
-    built: Sequence[tuple[Motion, Built | None]],
+    layers: Sequence[tuple[int, Layer]],
+    built: Sequence[tuple[MotionBelow, Built]],
     above: Sequence[Diffeomorphism | None],
     bundle: Bundle,
 ) -> tuple[Applied, ...]:
-    """The behaviours that are on, and whether they find in the bundle what they were made for."""
+    """The layers as they were made, and whether they find in the bundle what they were made for."""
     found = []
-    for (place, layer), (motion, made), outer in zip(stack, built, above, strict=True):
-        if made:
-            at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
-            satisfied = layer.behaviour.satisfied(replace(motion, index=bundle.index, **at))
-            found.append(Applied(place, layer.name, layer.behaviour, made, satisfied))
+    for (place, layer), (motion, made), outer in zip(layers, built, above, strict=True):
+        at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
+        satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at))
+        found.append(Applied(place, layer.name, layer.transform, made, satisfied))
     return tuple(found)

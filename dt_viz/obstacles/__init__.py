@@ -1,1 +1,1 @@
-"""Shapes to avoid, what is believed of them, and the files they come from."""
+"""Obstacles: their shapes, the occupancy learned from them, and the files they come from."""

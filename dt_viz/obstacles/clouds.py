@@ -1,4 +1,4 @@
-"""Point clouds as solids: what is occupied between the points, and the surface around it."""
+"""Point clouds as solids: the occupied space between the points, and its surface."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from dt_viz.obstacles.triangles import grid_nodes
 from dt_viz.properties import cached_property
 
 NUM_NODES = 44**3
-"""Of the grid that the surface is found on, about."""
+"""Approximate number of nodes of the grid on which the surface is found."""
 REACH = 1.2
-"""What counts as occupied around a point without label, in distances of the sixth nearest (that nine in ten have):
-points that lie at random on a surface then leave no hole."""
+"""Radius of the occupied ball around an unlabelled point, in units of the ninth decile of the distance from the sixth
+nearest point: random points on a surface then leave no hole."""
 FEWEST_CELLS = 1.2
-"""The same at least, in cells of the grid: what is thinner would be full of holes."""
+"""Smallest such radius in cells of the grid: thinner walls would have holes."""
 KERNELS_ACROSS = 5
-"""Kernel widths along the largest side of what is labelled as occupied."""
+"""Number of kernel widths along the largest side of the occupied points."""
 NUM_SAMPLES = 2000
-"""Labelled points that the map is learned from, at most."""
+"""Largest number of labelled points that the map is learned from."""
 REGULARISATION = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points in metres, all of them on or in something, or labelled; compared and hashed by what it holds."""
+    """Points on or in a solid, or labelled points; compared and hashed by content."""
 
     points: Array
     """(K, 3) metres, in the cloud's own frame."""
@@ -48,7 +48,7 @@ class Cloud:
 
     @cached_property
     def digest(self) -> bytes:
-        """Of points and labels."""
+        """Hash of points and labels."""
         labels = b"" if self.labels is None else self.labels.tobytes()
         return hashlib.blake2b(self.points.tobytes() + labels, digest_size=16).digest()
 
@@ -60,10 +60,10 @@ class Cloud:
 
     @property
     def solid(self) -> Solid:
-        """What it occupies; computed once for all equal clouds.
+        """Solid that it occupies; computed once for all equal clouds.
 
-        With labels, where the occupancy map learned from them (sec. 4.4) says p > 1/2. Without, what is within a few
-        distances between neighbours of a point, and what that encloses: a scan of a surface is filled.
+        With labels it is where the occupancy map learned from them (sec. 4.4) has p > 1/2. Without, it is the space
+        near the points, and the space enclosed by that: a scan of a surface is filled.
 
         Raises:
             ValueError: nothing is occupied.
@@ -92,7 +92,7 @@ def _solid(cloud: Cloud) -> Solid:
         cell = _cell(upper - lower + 2 * width)
         origin, nodes, shape = _grid(lower - width, upper + width, cell)
         level = -occupancy.logit(nodes).reshape(shape)
-    for axis in range(3):  # free all around
+    for axis in range(3):  # the border of the grid is free
         ends = np.moveaxis(level, axis, 0)
         ends[[0, -1]] = np.maximum(ends[[0, -1]], np.abs(level).max() * 1e-3)
     if not (level < 0).any():
@@ -106,17 +106,17 @@ def _cell(sizes: Array) -> float:
 
 
 def _grid(lower: Array, upper: Array, cell: float) -> tuple[Array, Array, tuple[int, int, int]]:
-    """A grid's first node, all its nodes (N, 3), and how many there are per axis; two cells more on each side."""
+    """Return a grid's first node, all its nodes (N, 3), and their number per axis; two cells more on each side."""
     x, y, z = (int(num) for num in np.ceil((upper - lower) / cell) + 5)
     origin = (lower + upper) / 2 - cell * (np.array([x, y, z]) - 1) / 2
     return origin, grid_nodes(origin, cell, (x, y, z)), (x, y, z)
 
 
 def zero_level(level: Array) -> tuple[Array, Indices]:
-    """The closed surface between negative and positive nodes of a grid (n_x, n_y, n_z), outward (surface nets).
+    """Find the closed surface between negative and positive nodes of a grid (n_x, n_y, n_z), outward (surface nets).
 
-    Each cell with nodes of both signs has one vertex, the mean of where its edges cross the level; each edge that
-    crosses it has a quadrilateral of the four cells around.
+    Each cell with nodes of both signs has one vertex, the mean of its edges' crossings with the level; each edge that
+    crosses the level has a quadrilateral, whose corners are the vertices of the four cells around it.
 
     Returns:
         Vertices (V, 3), counted in cells from the first node, and faces (F, 3).

@@ -1,4 +1,4 @@
-"""Shapes of obstacles from files: closed meshes and point clouds, checked.
+"""Readers of obstacles' shapes from files: closed meshes and point clouds.
 
 Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB. They must be closed; small holes and seams are mended
 (see `dt_viz.obstacles.mending`).
@@ -9,7 +9,7 @@ Point clouds, in metres (or scaled to them):
     CSV (``.csv``), UTF-8: a header line ``x,y,z`` or ``x,y,z,occupied`` and one line per point.
     Labels are 1 (occupied) or 0 (free); without them every point is occupied.
 
-A shape's origin is put into the middle of its bounding box.
+The origin of a shape is moved to the middle of its bounding box.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.errors import DataError, FormatError, parsing
+from dt_viz.errors import DataError, FormatError, naming, parsing
+from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers
 from dt_viz.files.glb import read_glb
 from dt_viz.files.meshes import read_obj, read_stl
 from dt_viz.files.npz import NpzFile
 from dt_viz.files.ply import read_ply
-from dt_viz.files.text import read_table
+from dt_viz.files.text import decimal_numbers, read_table
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.clouds import Cloud
@@ -38,16 +39,15 @@ MAX_UNPACKED = 2 * MAX_BYTES
 """Largest number of bytes that an npz unpacks to."""
 MAX_FACES = 500_000
 MAX_VERTICES = 3 * MAX_FACES
-MAX_POINTS = 1_000_000
+MIN_POINTS, MAX_POINTS = 50, 1_000_000
 ENOUGH_POINTS = 100_000
-"""Of a cloud; of more, so many are taken at random."""
-MIN_POINTS = 50
+"""Number of points that are used of a cloud; of more, so many are taken at random."""
 MIN_SIZE, MAX_SIZE = 0.01, 1.0
-"""Metres, of the largest side of the bounding box."""
+"""Smallest and largest length of the bounding box's longest side, metres."""
 UNITS = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
-"""Of files, in metres; the first that gives a sensible size is suggested."""
+"""Units of files, in metres; the first that gives a sensible size is suggested."""
 LOST = 0.8
-"""Part of the volume that the distances know of, below which it is said that a shape is too thin."""
+"""Part of a mesh's volume inside the distance grid below which its thin parts are reported as lost."""
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CLOUD_SUFFIXES = (".ply", ".npz", ".csv")
 
@@ -61,7 +61,7 @@ class SizeError(ShapeError):
 
     Attributes:
         unit: one of `UNITS` in which its size would be sensible, if there is one.
-        sizes: of its bounding box, in the file's unit.
+        sizes: sides of its bounding box, in the file's unit.
     """
 
     unit: str | None = None
@@ -69,7 +69,7 @@ class SizeError(ShapeError):
 
     @property
     def question(self) -> str | None:
-        """What to ask about it, if another unit would do."""
+        """The question whether to read the file in that unit; None if no unit would do."""
         if self.unit is None:
             return None
         box = " × ".join(f"{size:.4g}" for size in self.sizes)
@@ -83,7 +83,7 @@ class LoadedMesh:
     solid: Solid
     name: str
     notes: tuple[str, ...] = ()
-    """What was mended, and what is not to be trusted, in words for the page."""
+    """Descriptions, for the page, of what was mended and of what is inexact."""
 
 
 @dataclass(frozen=True)
@@ -93,21 +93,21 @@ class LoadedCloud:
     cloud: Cloud
     name: str
     notes: tuple[str, ...] = ()
-    """What was left out, in words for the page."""
+    """Descriptions, for the page, of what was left out."""
 
 
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> LoadedMesh:
     """Read a closed mesh from a file.
 
     Args:
-        path: of an STL, OBJ, PLY or GLB file.
+        path: an STL, OBJ, PLY or GLB file.
         scale: metres for one unit of the file.
 
     Raises:
         ShapeError: there is no such file, it cannot be read, is not what its suffix says, or holds no closed mesh of
             a sensible size. Nothing else is raised, whatever the file holds.
     """
-    return read_mesh(_content(Path(path)), path, scale=scale)
+    return read_mesh(_content(path), path, scale=scale)
 
 
 def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> LoadedMesh:
@@ -122,16 +122,16 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> Load
         ShapeError: as :func:`load_mesh`.
     """
     source = Path(source)
-    suffix = _checked_suffix(content, source, MESH_SUFFIXES, scale)
+    suffix = _suffix(content, source, MESH_SUFFIXES, scale)
     with parsing(ShapeError, source, "file", f"a {suffix} file of a mesh"):
         vertices, faces = _triangles(content, suffix)
-    checkpoint()
-    if not len(faces):
-        raise ShapeError(source, "faces", "none", "a closed mesh of triangles; a point cloud is loaded as a cloud")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        wrong = faces.min() if faces.min() < 0 else faces.max()
-        raise ShapeError(source, "faces", f"vertex {wrong}", f"indices of the {len(vertices)} vertices")
-    _check_finite(vertices, source, "vertices", "vertex")
+        checkpoint()
+        if not len(faces):
+            raise FormatError("faces", "none", "a closed mesh of triangles; a point cloud is loaded as a cloud")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            wrong = faces.min() if faces.min() < 0 else faces.max()
+            raise FormatError("faces", f"vertex {wrong}", f"indices of the {len(vertices)} vertices")
+        check_finite(vertices, "vertices", lambda row: f"in vertex {row + 1}")
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     vertices = _checked_size(vertices, vertices[used], source, scale)
@@ -154,14 +154,14 @@ def load_cloud(path: str | Path, *, scale: float = 1.0) -> LoadedCloud:
     """Read a point cloud from a file.
 
     Args:
-        path: of a PLY, npz or CSV file, see the module's docstring.
+        path: a PLY, npz or CSV file; see the module's docstring.
         scale: metres for one unit of the file.
 
     Raises:
         ShapeError: there is no such file, it cannot be read, is not what its suffix says, or holds no points that
             make a solid of a sensible size. Nothing else is raised, whatever the file holds.
     """
-    return read_cloud(_content(Path(path)), path, scale=scale)
+    return read_cloud(_content(path), path, scale=scale)
 
 
 def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> LoadedCloud:
@@ -176,29 +176,25 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
         ShapeError: as :func:`load_cloud`.
     """
     source = Path(source)
-    suffix = _checked_suffix(content, source, CLOUD_SUFFIXES, scale)
+    suffix = _suffix(content, source, CLOUD_SUFFIXES, scale)
     with parsing(ShapeError, source, "file", f"a {suffix} file of points"):
         points, labels = {".ply": _ply_points, ".npz": _npz_points, ".csv": _csv_points}[suffix](content)
-    checkpoint()
-    if len(points) < MIN_POINTS:
-        raise ShapeError(source, "points", f"{len(points)}", f"at least {MIN_POINTS}")
-    if len(points) > MAX_POINTS:
-        raise ShapeError(source, "points", f"{len(points)}", f"at most {MAX_POINTS}")
-    _check_finite(points, source, "points", "point")
-    if labels is not None:
-        _check_labels(labels, source)
-    occupied = points if labels is None else points[labels > 0.5]
-    if len(occupied) < MIN_POINTS:
-        raise ShapeError(source, "labels", f"{len(occupied)} occupied points", f"at least {MIN_POINTS}")
-    points, notes = _checked_size(points, occupied, source, scale), []
-    if len(points) > ENOUGH_POINTS:
-        some = np.sort(np.random.default_rng(0).permutation(len(points))[:ENOUGH_POINTS])
-        notes.append(f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random")
-        points, labels = points[some], None if labels is None else labels[some]
-    if labels is None:  # a search among very many points in one place takes the square of their number
-        points = np.unique(points, axis=0)
-        if len(points) < MIN_POINTS:
-            raise ShapeError(source, "points", f"{len(points)} different ones", f"at least {MIN_POINTS}")
+        checkpoint()
+        _check_enough("points", len(points), "")
+        check_at_most("points", len(points), MAX_POINTS)
+        check_finite(points, "points", lambda row: f"in point {row + 1}")
+        if labels is not None:
+            _check_labels(labels)
+        occupied = points if labels is None else points[labels > 0.5]
+        _check_enough("labels", len(occupied), " occupied points")
+        points, notes = _checked_size(points, occupied, source, scale), []
+        if len(points) > ENOUGH_POINTS:
+            some = np.sort(np.random.default_rng(0).permutation(len(points))[:ENOUGH_POINTS])
+            notes.append(f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random")
+            points, labels = points[some], None if labels is None else labels[some]
+        if labels is None:  # a search among very many points in one place takes the square of their number
+            points = np.unique(points, axis=0)
+            _check_enough("points", len(points), " different ones")
     cloud = Cloud(points, labels)
     checkpoint()
     with parsing(ShapeError, source, "points", "points that something occupies"):
@@ -208,39 +204,25 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
     return LoadedCloud(cloud, source.stem, tuple(notes))
 
 
-def _content(path: Path) -> bytes:
-    try:
-        if not path.is_file():
-            raise ShapeError(path, "path", "no such file", "a readable file")
-        if (size := path.stat().st_size) > MAX_BYTES:
-            raise ShapeError(path, "file", f"{size / 1e6:.1f} MB", f"at most {MAX_BYTES / 1e6:.0f} MB")
-        return path.read_bytes()
-    except OSError as error:
-        found = f"nothing that can be read ({error.strerror or error})"
-        raise ShapeError(path, "path", found, "a readable file") from error
+def _content(path: str | Path) -> bytes:
+    with parsing(ShapeError, path, "path", "a readable file"):
+        return read_bytes(Path(path), MAX_BYTES)
 
 
-def _checked_suffix(content: bytes, source: Path, accepted: tuple[str, ...], scale: float) -> str:
-    suffix = source.suffix.lower()
-    if suffix not in accepted:
-        raise ShapeError(source, "suffix", repr(suffix) if suffix else "no suffix", ", ".join(accepted))
-    if len(content) > MAX_BYTES:
-        raise ShapeError(source, "file", f"{len(content) / 1e6:.1f} MB", f"at most {MAX_BYTES / 1e6:.0f} MB")
-    if not content:
-        raise ShapeError(source, "file", "an empty file", "at least one shape")
-    if not (np.isfinite(scale) and scale > 0):
-        raise ShapeError(source, "scale", f"{scale}", "metres for one unit of the file, above 0")
-    return suffix
+def _suffix(content: bytes, source: Path, accepted: tuple[str, ...], scale: float) -> str:
+    with naming(ShapeError, source):
+        if not (np.isfinite(scale) and scale > 0):
+            raise FormatError("scale", f"{scale}", "metres for one unit of the file, above 0")
+        return checked_suffix(content, source, accepted, MAX_BYTES)
 
 
-def _check_finite(points: Array, source: Path, field: str, one: str) -> None:
-    if not np.isfinite(points).all():
-        row, column = np.argwhere(~np.isfinite(points))[0]
-        raise ShapeError(source, field, f"{points[row, column]} in {one} {row + 1}", "finite numbers")
+def _check_enough(field: str, num: int, what: str) -> None:
+    if num < MIN_POINTS:
+        raise FormatError(field, f"{num}{what}", f"at least {MIN_POINTS}")
 
 
 def _checked_size(points: Array, shape: Array, source: Path, scale: float) -> Array:
-    """Points in metres, the middle of the shape's bounding box at 0."""
+    """Return the points in metres, with the middle of the shape's bounding box at 0."""
     with np.errstate(over="ignore"):
         lower, upper = shape.min(axis=0), shape.max(axis=0)
         sizes = upper - lower
@@ -263,18 +245,18 @@ def _box(sizes: Array) -> str:
     return " × ".join(f"{size:.4g}" for size in sizes) + " m"
 
 
-def _check_labels(labels: Array, source: Path) -> None:
+def _check_labels(labels: Array) -> None:
     wrong = np.flatnonzero((labels != 0) & (labels != 1))
     if len(wrong):
         found = f"{labels[wrong[0]]:g} for point {wrong[0] + 1}"
-        raise ShapeError(source, "labels", found, "1 for occupied and 0 for free")
+        raise FormatError("labels", found, "1 for occupied and 0 for free")
     if (labels == labels[0]).all():
         kind = "occupied" if labels[0] else "free"
-        raise ShapeError(source, "labels", f"all {len(labels)} points {kind}", "both kinds, or no labels")
+        raise FormatError("labels", f"all {len(labels)} points {kind}", "both kinds, or no labels")
 
 
 def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
-    """Vertices (V, 3) and faces (F, 3) of all parts of a file."""
+    """Read vertices (V, 3) and faces (F, 3) of all parts of a file."""
     if suffix == ".stl":
         return read_stl(content, max_triangles=MAX_FACES)
     if suffix == ".obj":
@@ -295,24 +277,19 @@ def _npz_points(content: bytes) -> tuple[Array, Array | None]:
     if "points" not in archive.names:
         found = ", ".join(archive.names)[:80] or "none"
         raise FormatError("arrays", found, "'points' and optionally 'labels'")
-    points, labels = archive.read("points"), archive.read("labels") if "labels" in archive.names else None
-    for name, values in (("points", points), ("labels", labels)):
-        if values is not None and values.dtype.kind not in "biuf":
-            raise FormatError(f"array {name!r}", f"values of type {values.dtype}", "integers or real numbers")
+    points = real_numbers(archive.read("points"), "array 'points'", "biuf")
+    labels = real_numbers(archive.read("labels"), "array 'labels'", "biuf") if "labels" in archive.names else None
     if points.ndim != 2 or points.shape[1] != 3:
         raise FormatError("array 'points'", f"shape {points.shape}", "shape (K, 3)")
     if labels is not None and labels.shape != (len(points),):
         raise FormatError("array 'labels'", f"shape {labels.shape}", f"shape ({len(points)},)")
-    return points.astype(float), None if labels is None else labels.astype(float)
+    return points, labels
 
 
 def _csv_points(content: bytes) -> tuple[Array, Array | None]:
     header, rows = read_table(content, (("x", "y", "z"), ("x", "y", "z", "occupied")), max_rows=MAX_POINTS)
     numbers = array("d")
     for line, row in rows:
-        try:
-            numbers.extend(map(float, row))
-        except ValueError as error:
-            raise FormatError(f"line {line}", repr(",".join(row)[:60]), "decimal numbers") from error
+        numbers.extend(decimal_numbers(row, line))
     values = np.asarray(numbers).reshape(-1, len(header))
     return values[:, :3], values[:, 3] if len(header) == 4 else None

@@ -1,7 +1,7 @@
-"""Triangles made into one closed surface, outward, where that invents next to nothing.
+"""Mending of triangles into one closed surface, outward, where hardly anything has to be invented.
 
-Vertices in the same place are merged, small holes are filled and triangles that face the other way are turned. A hole
-that is not small has no one right surface: a bowl is not a half ball, so such a mesh is refused, not guessed.
+Vertices in the same place are merged, small holes are filled and triangles that face inwards are turned. A large hole
+has no unique surface (a bowl is not a half ball), so a mesh with one is refused.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.interruption import checkpoint
 
 SAME, NEAR = 1e-8, 1e-5
-"""Sizes of the cells of a grid whose vertices are merged: always, and where the surface is not closed otherwise.
-Relative to the largest side of the bounding box."""
+"""Sizes of the cells in which vertices are merged, always and where the surface would not be closed otherwise, relative
+to the largest side of the bounding box."""
 MAX_FILLED = 0.02
-"""Largest part of the closed surface that may be made of filled holes."""
+"""Largest share of filled holes in the closed surface."""
 MAX_OPEN_EDGES = 10_000
 """Largest number of edges around holes."""
 SMALLEST_VOLUME = 1e-6
 """Smallest part of its bounding box that a solid fills."""
 MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-"""Odd numbers without pattern: sums of their multiples, modulo 2⁶⁴, are hardly ever the same."""
+"""Odd multipliers of a hash of cells: sums modulo 2⁶⁴ hardly ever coincide."""
 REMEDY = (
     "close it in a mesh editor, or give its walls a thickness; if its hollows do not matter, load its convex hull "
     "(Blender, MeshLab and trimesh make one)"
@@ -44,9 +44,9 @@ class ClosedMesh:
     faces: Indices
     """(F, 3)."""
     volume: float
-    """Enclosed, m³."""
+    """Enclosed volume, m³."""
     notes: tuple[str, ...]
-    """What was mended, in words for the page."""
+    """Descriptions of what was mended, for the page."""
 
 
 def closed(vertices: Array, faces: Indices) -> ClosedMesh:
@@ -57,8 +57,7 @@ def closed(vertices: Array, faces: Indices) -> ClosedMesh:
         faces: (F, 3), indices of vertices.
 
     Raises:
-        FormatError: it has no area, edges that more than two triangles share, holes that are not small, or encloses
-            nothing.
+        FormatError: it has no area, edges of more than two triangles, or large holes, or encloses nothing.
     """
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
@@ -90,14 +89,14 @@ def closed(vertices: Array, faces: Indices) -> ClosedMesh:
 def _merged(
     vertices: Array, faces: Indices, cell: float, shift: tuple[float, ...] = (0.0, 0.0, 0.0)
 ) -> tuple[Array, Indices]:
-    """One vertex for all in the same cell of a grid; only used ones, and no triangles with two corners in one cell."""
+    """Merge used vertices in the same cell of a grid, and drop triangles with two corners in one cell."""
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     kept = np.flatnonzero(used)
     cells = np.round(vertices[kept] / max(cell, 1e-300) + shift).astype(np.int64)
     order = np.argsort(cells.astype(np.uint64) @ MIXERS, kind="stable")
     cells = cells[order]
-    new = np.concatenate([[True], (cells[1:] != cells[:-1]).any(axis=1)])  # if sums are the same by chance, too
+    new = np.concatenate([[True], (cells[1:] != cells[:-1]).any(axis=1)])  # also where hashes coincide
     number = np.empty(len(vertices), dtype=np.intp)
     number[kept[order]] = np.cumsum(new) - 1
     faces = number[faces]
@@ -106,10 +105,10 @@ def _merged(
 
 
 def _without_seams(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices, Indices]:
-    """The surface with near vertices merged, and its open edges (E, 2).
+    """Merge near vertices; return the surface and its open edges (E, 2).
 
-    The borders of the cells part some vertices that are near, so that the cells are shifted until nothing is open; not
-    if that changes nothing, as for triangles that have nothing to do with each other.
+    Borders of cells separate some near vertices, so the cells are shifted until nothing is open, or until a shift
+    changes nothing, as for unrelated triangles.
     """
     before, once = np.inf, np.empty((0, 2), dtype=np.intp)
     for shift in itertools.product((0.0, 0.5), repeat=3):
@@ -126,19 +125,19 @@ def _without_seams(vertices: Array, faces: Indices, cell: float) -> tuple[Array,
 
 
 def _sides(faces: Indices, num_vertices: int) -> Indices:
-    """(3F,) a number for each side of each triangle: twice that of its edge, one more in the other direction."""
+    """Number the sides of the triangles, (3F,): twice the number of the edge, plus one in its other direction."""
     a, b = np.concatenate(faces.T), np.concatenate(np.roll(faces, -1, axis=1).T)
     return 2 * (np.minimum(a, b) * num_vertices + np.maximum(a, b)) + (a > b)
 
 
 def _joins_pairs(sides: Indices) -> bool:
-    """Whether each edge is one of exactly two triangles, given their sides in order."""
+    """Return whether each edge has exactly two triangles, given their sides in order."""
     edges = sides // 2
     return bool(len(edges) % 2 == 0 and (edges[::2] == edges[1::2]).all() and (edges[1:-1:2] != edges[2::2]).all())
 
 
 def _different(faces: Indices, num_vertices: int) -> Indices:
-    """Each triangle once, however it is turned."""
+    """Return each triangle once, whatever its orientation."""
     a, b, c = np.sort(faces, axis=1).T
     order = np.lexsort((c, a * num_vertices + b))
     in_order = np.sort(faces, axis=1)[order]
@@ -147,7 +146,7 @@ def _different(faces: Indices, num_vertices: int) -> Indices:
 
 
 def _edges_of_one(faces: Indices, num_vertices: int) -> Indices:
-    """(E, 2) the edges of one triangle only, along it. Raises FormatError if some are of more than two."""
+    """Return the edges (E, 2) of one triangle only, along it. Raises FormatError if an edge has more than two."""
     _, first, count = np.unique(_sides(faces, num_vertices) // 2, return_index=True, return_counts=True)
     if (count > 2).any():
         found = f"{(count != 2).sum()} edges that do not join two triangles, {(count > 2).sum()} of them more than two"
@@ -157,7 +156,7 @@ def _edges_of_one(faces: Indices, num_vertices: int) -> Indices:
 
 
 def _filled(vertices: Array, faces: Indices, once: Indices) -> tuple[Array, Indices, str]:
-    """The surface with its holes filled, each by triangles around its middle; and what is to be said about it."""
+    """Fill each hole by triangles around its middle; return the surface and a note for the page."""
     loops = _loops(once) if len(once) <= MAX_OPEN_EDGES else None
     if loops is None:
         found = f"{len(once)} edges that do not join two triangles, and are not around holes that could be filled"
@@ -165,7 +164,7 @@ def _filled(vertices: Array, faces: Indices, once: Indices) -> tuple[Array, Indi
     along = set(map(tuple, once.tolist()))
     patches, middles = [], []
     for loop in loops:
-        if (loop[0], loop[1]) in along:  # a patch goes the other way round
+        if (loop[0], loop[1]) in along:  # a patch runs in the other direction
             loop.reverse()
         if len(loop) == 3:
             patches.append(loop)
@@ -196,7 +195,7 @@ def _area(vertices: Array, faces: Indices) -> float:
 
 
 def _loops(edges: Indices) -> list[list[int]] | None:
-    """Loops without a vertex twice that edges (E, 2) consist of, as lists of vertices; None if they are no loops."""
+    """Split edges (E, 2) into loops, lists of distinct vertices; None if they do not consist of loops."""
     neighbours: defaultdict[int, set[int]] = defaultdict(set)
     for a, b in edges.tolist():
         neighbours[a].add(b)
@@ -223,16 +222,16 @@ def _loops(edges: Indices) -> list[list[int]] | None:
 
 
 def _turned(faces: Indices, num_vertices: int) -> Mask:
-    """(F,) which triangles of a closed surface to turn round, the fewest, so that neighbours face the same way.
+    """Find the fewest triangles (F,) of a closed surface to turn so that neighbours face the same way.
 
-    Each triangle is two nodes of a graph, as it is and turned, and neighbours that agree are joined: then all of a
-    surface in one of its two ways is one component.
+    Each triangle is two nodes of a graph, as it is and turned, and neighbours that agree are joined: each orientation
+    of a connected surface is then one component.
 
     Raises:
-        FormatError: there is no such way, as for a Klein bottle.
+        FormatError: the surface has no orientation, as a Klein bottle.
     """
     sides, num = _sides(faces, num_vertices), len(faces)
-    order = np.argsort(sides, kind="stable").reshape(-1, 2)  # the two triangles of each edge
+    order = np.argsort(sides, kind="stable").reshape(-1, 2)  # the two triangles at each edge
     agree = sides[order[:, 0]] != sides[order[:, 1]]
     one, other = (order % num).T
     rows = np.concatenate([one, one + num])

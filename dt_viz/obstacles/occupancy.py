@@ -1,4 +1,4 @@
-"""Occupancy maps learned from labelled samples, and the vector fields that flow out of what they occupy (sec. 4.4)."""
+"""Occupancy maps learned from labelled samples, and vector fields that lead out of the occupied region (sec. 4.4)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from dt_viz.properties import cached_property
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")
 PAD = 0.5
-"""Margin of the inducing points around the occupied samples, in kernel widths. More of it lets the map tell apart free
-places far from the obstacle, which only makes the field reach where it is not wanted."""
+"""Margin of the inducing points around the occupied samples, in kernel widths. A larger one lets the map vary far from
+the obstacle, where no field is wanted."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class OccupancyMap:
     """b, the logit far away from every inducing point."""
 
     def logit(self, s: Array) -> Array:
-        """Log-odds log p/(1 − p) at the points `s` (N, d), as (N,)."""
+        """Compute the log-odds log p/(1 − p) at the points `s` (N, d), as (N,)."""
         return self.grid.contract(s, self.weights[:, None], ((0,) * self.grid.dim,))[0][:, 0] + self.bias
 
     def probability(self, s: Array) -> Array:
-        """p(o = 1 | s) at the points `s` (N, d), as (N,)."""
+        """Compute p(o = 1 | s) at the points `s` (N, d), as (N,)."""
         return expit(self.logit(s))
 
     def logit_gradient(self, s: Array) -> tuple[Array, Array]:
@@ -59,25 +59,20 @@ def _hessian_orders(dim: int) -> tuple[tuple[int, ...], ...]:
 
 
 def fit_occupancy(
-    samples: Array,
-    labels: Array,
-    kernel_width: float,
-    *,
-    regularisation: float = 0.1,
-    max_iterations: int = 50,
+    samples: Array, labels: Array, kernel_width: float, *, regularisation: float = 0.1, max_iterations: int = 50
 ) -> OccupancyMap:
     """Learn an occupancy map by penalised maximum likelihood (Newton's method on a convex objective).
 
     Args:
         samples: (K, d) points s_k.
         labels: (K,) o_k, 1 occupied and 0 free.
-        kernel_width: σ of a Gaussian, about half the size of the obstacle. A narrow kernel leaves false minima of the
-            map inside the obstacle, where points get stuck.
+        kernel_width: σ of a Gaussian, about half the size of the obstacle. A narrow kernel leaves local minima inside
+            the obstacle, where points get stuck.
         regularisation: weight of ½‖w‖².
-        max_iterations: of Newton's method.
+        max_iterations: largest number of Newton steps.
 
     Raises:
-        ValueError: if the labels are of one kind only, so that there is no boundary to learn.
+        ValueError: the labels are all of one kind, so that there is no boundary to learn.
     """
     occupied = labels > 0.5
     if occupied.all() or not occupied.any():
@@ -86,7 +81,7 @@ def fit_occupancy(
     grid = GaussianGrid.covering(samples[occupied], kernel_width, pad=PAD)
     features = np.concatenate([grid.features(samples), np.ones((len(samples), 1))], axis=1)
     penalty = np.full(features.shape[1], regularisation)
-    penalty[-1] = 1e-3  # the bias is data: the share of free space
+    penalty[-1] = 1e-3  # the bias follows from the data: the share of free space
     w = np.zeros(features.shape[1])
     for _ in range(max_iterations):
         p = expit(features @ w)
@@ -104,7 +99,7 @@ def fit_occupancy(
 def sample_labels(
     inside: Callable[[Array], Mask], lower: Array, upper: Array, num_samples: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Labelled samples {(s_k, o_k)} of a shape: uniform in its grown bounding box, half of them close to the shape.
+    """Draw labelled samples {(s_k, o_k)} of a shape, uniform in its grown bounding box, half of them close to it.
 
     Args:
         inside: tells for points (N, d) whether they are occupied, (N,) bool.
@@ -126,10 +121,10 @@ def sample_labels(
 class AvoidanceField:
     """Generator V whose reverse flow leaves the occupied region.
 
-    - "free-space" (default): V = ∇U with U'(logit) = σ(logit/T) − σ(b/T), not below 0, b the logit far away. Without
-      the second term and with T = 1 this is −∇log(1 − p). The temperature T widens the field, for a smooth warp needs
-      reach; the second term ends it where the map knows of nothing any more: what is far away stays where it is.
-    - "probability": V = ∇p, the paper's. Where p saturates the field is dead, so what is deep inside never leaves.
+    - "free-space" (default): V = ∇U with U'(logit) = max(σ(logit/T) − σ(b/T), 0), b the logit far away. Without the
+      second term and with T = 1 this is −∇log(1 − p). The temperature T widens the field, which makes the warp
+      smoother; the second term ends it away from the obstacle, so that far points do not move.
+    - "probability": V = ∇p, the paper's. It vanishes where p saturates, so points deep inside never leave.
 
     V is scaled by the squared kernel width, which makes the duration dimensionless and about 1.
     """
@@ -152,12 +147,12 @@ class AvoidanceField:
         return float(expit(self.occupancy.bias / self.temperature))
 
     def __call__(self, s: Array) -> Array:
-        """V at the points `s` (N, d), as (N, d)."""
+        """Compute V at the points `s` (N, d), as (N, d)."""
         logit, gradient = self.occupancy.logit_gradient(s)
         return self._weight(logit)[0][:, None] * gradient
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """V (N, d) and DV (N, d, d) at the points `s` (N, d). DV is symmetric: V is a gradient."""
+        """Compute V (N, d) and DV (N, d, d) at the points `s` (N, d). DV is symmetric: V is a gradient."""
         logit, gradient, hessian = self.occupancy.logit_hessian(s)
         weight, slope = self._weight(logit)
         weight, bend = weight[:, None], slope[:, None] * gradient
@@ -178,8 +173,8 @@ class AvoidanceField:
 class StretchedField:
     """A vector field under a linear map of space: V_out(s) = M·V(M⁻¹s).
 
-    Its flow is M γ(t, M⁻¹s): what leaves a shape there leaves the stretched shape here, in the same time. A flat
-    or long shape so gets a field that is as smooth, relative to each of its sizes, as that of a ball.
+    Its flow is M γ(t, M⁻¹s), which leaves the stretched shape in the time in which γ leaves the original one. A flat or
+    long shape thus gets a field that is as smooth, relative to each of its sizes, as that of a ball.
     """
 
     inner: VectorField
@@ -196,14 +191,14 @@ class StretchedField:
         return self.inner.dim
 
     def to_frame(self, s: Array) -> Array:
-        """Where the points `s` (N, d) lie in the frame of `inner`, M⁻¹s, (N, d)."""
+        """Transform the points `s` (N, d) to the frame of `inner`: M⁻¹s, (N, d)."""
         return s @ self._inverse.T
 
     def __call__(self, s: Array) -> Array:
-        """V_out at the points `s` (N, d), as (N, d)."""
+        """Compute V_out at the points `s` (N, d), as (N, d)."""
         return self.inner(self.to_frame(s)) @ self.axes.T
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """V_out (N, d) and its derivative (N, d, d) at the points `s` (N, d)."""
+        """Compute V_out (N, d) and its derivative (N, d, d) at the points `s` (N, d)."""
         v, DV = self.inner.with_jacobian(self.to_frame(s))
         return v @ self.axes.T, self.axes @ DV @ self._inverse

@@ -1,9 +1,9 @@
-"""Obstacles: their true shape, and the field learned from samples of it that motions are led around with (sec. 4.4)."""
+"""Obstacles: their true shapes, and the avoidance fields learned from samples of them (sec. 4.4)."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -29,37 +29,32 @@ Quaternion = tuple[float, float, float, float]
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 NUM_SAMPLES = 4000
 KERNEL_WIDTH = 0.9
-"""Of the occupancy map, in radii of the obstacle; in half sizes where it has three of them."""
-REGULARISATION = 10.0
-SOLID_REGULARISATION = 1.0
-"""The same for shapes that may be hollow: their map must rise more steeply for the flow to be as quick."""
+"""Kernel width of the occupancy map, in radii of the obstacle, or along each axis in half sizes."""
+REGULARISATION, SOLID_REGULARISATION = 10.0, 1.0
+"""Regularisation of the occupancy map, and that for shapes that may be hollow, whose map must rise more steeply."""
 FLATTEST = 0.3
-"""Smallest half size, relative to the largest, that the kernel adapts to: a field around something flatter is as thick
-as around this, or it would turn motions sharply."""
-MAX_BALLS = 12
-"""Of a cover."""
-NUM_BALLS = 10
-"""Of the cover of a mesh."""
+"""Smallest half size, relative to the largest, that the kernel adapts to: a thinner field turns motions sharply."""
+MAX_BALLS, NUM_BALLS = 12, 10
+"""Largest number of balls of a cover, and the number for a mesh."""
 NUM_STEPS = 10
-"""Of Newton's method to a surface."""
+"""Number of Newton steps to a surface."""
 THINNEST = 0.3
-"""Depth, relative to the largest half size, up to which walls are thickened before they are learned: the kernel is too
-wide for thinner ones."""
+"""Depth, relative to the largest half size, to which thinner shapes are thickened before they are learned."""
 TURNED = 0.8
-"""Volume of the box along a shape's principal axes, relative to that along the axes of its frame, from which the field
-takes the principal ones."""
+"""Volume of the box along a shape's principal axes, relative to that along its frame's, below which the field follows
+the principal axes."""
 
 T = TypeVar("T", bound="Obstacle")
 
 
 def as_point(v: Array) -> Point:
-    """An array (3,) as a value."""
+    """Convert an array (3,) to a tuple."""
     x, y, z = (float(c) for c in v)
     return x, y, z
 
 
 class Obstacle(Protocol):
-    """A solid somewhere in the world: a value, cheap to move, compared and hashed by what it is."""
+    """A solid somewhere in the world: an immutable value, cheap to move."""
 
     @property
     def position(self) -> Point:
@@ -73,16 +68,16 @@ class Obstacle(Protocol):
 
     @property
     def radius(self) -> float:
-        """Of the ball around `position` that holds it, metres."""
+        """Radius of the ball around `position` that holds it, metres."""
         ...
 
     @property
     def depth(self) -> float:
-        """How far inside its deepest point is, metres."""
+        """Distance of its deepest point from the surface, metres."""
         ...
 
     def moved(self: T, position: Point, wxyz: Quaternion = UPRIGHT) -> T:
-        """The same shape somewhere else."""
+        """Return the same shape somewhere else."""
         ...
 
     def signed_distance(self, s: Array) -> Array:
@@ -94,24 +89,24 @@ class Obstacle(Protocol):
         ...
 
     def nearest_free(self, s: Array) -> Array:
-        """The points `s` (*B, 3), those inside moved to the nearest point of the surface, (*B, 3), metres."""
+        """Return the points `s` (*B, 3), those inside moved to the nearest point of the surface, (*B, 3), metres."""
         ...
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
-        """The generator whose reverse flow leaves the shape, learned once for all places of it."""
+        """Return the generator whose reverse flow leaves the shape, learned once for all its places."""
         ...
 
     def cover(self) -> tuple[Array, Array]:
-        """Balls that together hold the shape: centres (K, 3) in the world and radii (K,), metres, K ≤ `MAX_BALLS`."""
+        """Cover the shape by balls: centres (K, 3) in the world and radii (K,), metres, K ≤ `MAX_BALLS`."""
         ...
 
     def surface(self) -> tuple[Array, Indices]:
-        """What to draw: vertices (V, 3), metres, in its own frame, and faces (F, 3), outward."""
+        """Return the drawn mesh: vertices (V, 3), metres, in its own frame, and faces (F, 3), outward."""
         ...
 
 
 class _Turned:
-    """What is common to shapes that are given in a frame of their own."""
+    """Base of shapes that are given in a frame of their own."""
 
     position: Point
     wxyz: Quaternion
@@ -135,9 +130,9 @@ class _Turned:
         centre: Array | float = 0.0,
         scale: float = 1.0,
     ) -> PlacedField:
-        """The field of a map in the frame u, where a point of this shape's own frame is axes·u + centre.
+        """Return the field of a map in a frame u; u ↦ axes·u + centre gives this shape's own frame.
 
-        World metres are `scale` times the units of the own frame.
+        Metres of the world are `scale` times the units of the own frame.
         """
         local = StretchedField(AvoidanceField(occupancy, generator, temperature), axes)
         return PlacedField(local, self._to_world(np.zeros(3) + centre), rotation(self.wxyz), scale)
@@ -145,7 +140,7 @@ class _Turned:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball in the world, with the true shape that clearances are measured against."""
+    """A ball."""
 
     position: Point
     """Centre, metres."""
@@ -154,7 +149,7 @@ class Sphere:
 
     @property
     def wxyz(self) -> Quaternion:
-        """A ball is turned by nothing."""
+        """Identity: a ball looks the same in any orientation."""
         return UPRIGHT
 
     @property
@@ -177,14 +172,14 @@ class Sphere:
         return np.sqrt((offset * offset).sum(axis=-1)) - self.radius
 
     def nearest_free(self, s: Array) -> Array:
-        """The points `s` (*B, 3), those inside moved to the nearest point of the surface, (*B, 3), metres."""
+        """See `Obstacle`."""
         offset = s - np.asarray(self.position)
         distance = np.linalg.norm(offset, axis=-1, keepdims=True)
         outward = np.where(distance > 0, offset / np.maximum(distance, 1e-300), np.array([0.0, 0.0, 1.0]))
         return np.where(distance < self.radius, np.asarray(self.position) + self.radius * outward, s)
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
-        """The generator whose reverse flow leaves the sphere, from an occupancy map learned once for all spheres."""
+        """See `Obstacle`: from one occupancy map for all spheres."""
         local = AvoidanceField(unit_sphere_map(), generator, temperature)
         return PlacedField(local, np.asarray(self.position), np.eye(3), self.radius)
 
@@ -194,8 +189,8 @@ class Sphere:
 
     def surface(self) -> tuple[Array, Indices]:
         """See `Obstacle`."""
-        heights = -np.cos(np.linspace(0, np.pi, 25))
-        vertices, faces = _lathe(np.sqrt(1 - heights**2)[1:-1], heights[1:-1], -1.0, 1.0)
+        turn = np.linspace(0, np.pi, 25)
+        vertices, faces = lathe(list(zip(np.sin(turn), -np.cos(turn), strict=True)))
         return self.radius * vertices, faces
 
 
@@ -206,7 +201,7 @@ class Box(_Turned):
     position: Point
     """Centre, metres."""
     sizes: tuple[float, float, float] = (0.15, 0.15, 0.15)
-    """Of the whole box along its own axes, metres."""
+    """Side lengths along its own axes, metres."""
     wxyz: Quaternion = UPRIGHT
 
     @cached_property
@@ -272,7 +267,7 @@ class Cylinder(_Turned):
 
     @property
     def radius(self) -> float:
-        """Of the ball that holds it, metres."""
+        """Half the diagonal, metres."""
         return float(np.hypot(self.diameter, self.height) / 2)
 
     @property
@@ -303,10 +298,10 @@ class Cylinder(_Turned):
         return self._placed(_cylinder_map(unit), generator, temperature, np.diag(self._half / unit))
 
     def cover(self) -> tuple[Array, Array]:
-        """See `Obstacle`: slices one above the other, or seven balls side by side, whatever is tighter."""
+        """See `Obstacle`: balls of slices one above the other, or seven balls side by side, whichever is tighter."""
         (R, _, half), slices = self._half, np.arange(1, MAX_BALLS + 1)
         stacked = np.hypot(R, half / slices)
-        num = int(slices[stacked <= 1.02 * stacked[-1]][0])  # more would gain nothing
+        num = int(slices[stacked <= 1.02 * stacked[-1]][0])  # the fewest that are nearly as tight
         centres = np.zeros((num, 3))
         centres[:, 2] = half * ((2 * np.arange(num) + 1) / num - 1)
         radius = stacked[num - 1]
@@ -318,18 +313,18 @@ class Cylinder(_Turned):
 
     def surface(self) -> tuple[Array, Indices]:
         """See `Obstacle`."""
-        vertices, faces = _lathe(np.ones(2), np.array([-1.0, 1.0]), -1.0, 1.0)
-        return vertices * self._half, faces
+        radius, _, half = self._half
+        return lathe([(0, -half), (radius, -half), (radius, half), (0, half)])
 
 
 class _Triangles(_Turned):
-    """What is common to shapes that triangles bound: larger or smaller ones share what was computed for one."""
+    """Base of shapes bounded by triangles; shapes that differ in scale only share what was computed for one."""
 
     scale: float
 
     @property
     def solid(self) -> Solid:
-        """What they enclose, in its own frame, before it is scaled."""
+        """Enclosed solid in its own frame, before scaling."""
         raise NotImplementedError
 
     @property
@@ -338,7 +333,7 @@ class _Triangles(_Turned):
         return self.scale * float(np.ptp(self.solid.bounds, axis=0).max())
 
     def resized(self: T, size: float) -> T:
-        """The same shape with the largest side of its bounding box of this size, metres."""
+        """Return the same shape scaled so that the largest side of its bounding box is `size`, metres."""
         shape: Any = self
         return replace(shape, scale=size / shape.size * shape.scale)
 
@@ -362,7 +357,7 @@ class _Triangles(_Turned):
         distance = self.solid.distances
         inside = np.flatnonzero(distance(own) < 0)
         moved = self.solid.nearest(own[inside])
-        for _ in range(NUM_STEPS):  # to where the interpolated distance is 0, too
+        for _ in range(NUM_STEPS):  # so that the interpolated distance is 0, too
             depth, slope = distance.with_slope(moved)
             moved -= (depth / np.maximum((slope * slope).sum(axis=1), 0.25))[:, None] * slope
         found = np.array(s, dtype=float)
@@ -392,14 +387,14 @@ class _Triangles(_Turned):
 
 @dataclass(frozen=True)
 class MeshObstacle(_Triangles):
-    """What a closed mesh encloses."""
+    """An obstacle enclosed by a mesh."""
 
     position: Point
-    """Of the mesh's origin, metres."""
+    """Position of the mesh's origin, metres."""
     mesh: Solid
     wxyz: Quaternion = UPRIGHT
     scale: float = 1.0
-    """Of the mesh."""
+    """Metres for one unit of the mesh."""
 
     @property
     def solid(self) -> Solid:
@@ -409,14 +404,14 @@ class MeshObstacle(_Triangles):
 
 @dataclass(frozen=True)
 class CloudObstacle(_Triangles):
-    """What a point cloud occupies."""
+    """An obstacle that a point cloud occupies."""
 
     position: Point
-    """Of the cloud's origin, metres."""
+    """Position of the cloud's origin, metres."""
     cloud: Cloud
     wxyz: Quaternion = UPRIGHT
     scale: float = 1.0
-    """Of the cloud."""
+    """Metres for one unit of the cloud."""
 
     @property
     def solid(self) -> Solid:
@@ -424,14 +419,14 @@ class CloudObstacle(_Triangles):
         return self.cloud.solid
 
     def labelled(self) -> tuple[Array, Mask]:
-        """Its points in the world (K, 3), metres, and whether each is occupied (K,)."""
+        """Return its points in the world (K, 3), metres, and whether each is occupied (K,)."""
         points, labels = self._to_world(self.cloud.points), self.cloud.labels
         return points, np.ones(len(points), dtype=bool) if labels is None else labels > 0.5
 
 
 @lru_cache(maxsize=256)
 def rotation(wxyz: Quaternion) -> Array:
-    """(3, 3) matrix of a quaternion, whose length does not count; columns are the turned axes."""
+    """Return the matrix (3, 3) of a quaternion of any length; its columns are the turned axes."""
     w, x, y, z = np.asarray(wxyz, dtype=float) / np.linalg.norm(wxyz)
     matrix = np.array(
         [
@@ -446,18 +441,18 @@ def rotation(wxyz: Quaternion) -> Array:
 
 @lru_cache(maxsize=1)
 def unit_sphere_map() -> OccupancyMap:
-    """Occupancy of the unit ball, learned from labelled samples."""
+    """Learn the occupancy of the unit ball from labelled samples."""
     return learned(lambda s: np.linalg.norm(s, axis=1) < 1)
 
 
 def learned(inside: Callable[[Array], Mask], regularisation: float = REGULARISATION) -> OccupancyMap:
-    """Occupancy of a shape whose largest half sizes are 1, learned from labelled samples around it."""
+    """Learn the occupancy of a shape whose largest half sizes are 1 from labelled samples around it."""
     samples, labels = sample_labels(inside, -np.ones(3), np.ones(3), NUM_SAMPLES, np.random.default_rng(0))
     return fit_occupancy(samples, labels, KERNEL_WIDTH, regularisation=regularisation)
 
 
 def _unit_sizes(half: Array) -> tuple[float, float, float]:
-    """Half sizes where space is stretched until they are alike: 1, or less for what is flatter than `FLATTEST`."""
+    """Return half sizes after space is stretched to make them equal: 1, or less for a shape flatter than `FLATTEST`."""
     x, y, z = (round(float(min(1.0, size / (FLATTEST * half.max()))), 3) for size in half)
     return x, y, z
 
@@ -474,13 +469,13 @@ def _cylinder_map(half: tuple[float, float, float]) -> OccupancyMap:
 
 @lru_cache(maxsize=16)
 def _solid_map(solid: Solid) -> tuple[OccupancyMap, Array, Array]:
-    """The map of a solid, the stretched axes (3, 3) of its frame, as columns, and its origin (3,), metres."""
+    """Return the map of a solid, the stretched axes (3, 3) of its frame as columns, and its origin (3,), metres."""
     grid = solid.distances
     interior = grid.interior if len(grid.interior) else solid.vertices
     turn = np.eye(3)
     spread = np.linalg.eigh(np.cov(interior.T))[1]
     if np.prod(np.ptp(solid.vertices @ spread, axis=0)) < TURNED * np.prod(np.ptp(solid.vertices, axis=0)):
-        turn = spread  # it stands askew in its own frame
+        turn = spread  # it is askew in its own frame
     along = solid.vertices @ turn
     lower, upper = along.min(axis=0), along.max(axis=0)
     half = (upper - lower) / 2
@@ -494,7 +489,7 @@ def _magnitude(x: Array) -> Array:
 
 
 def _beyond_faces(*excess: Array) -> Array:
-    """Signed distance from a box in the coordinates whose excesses over the half sizes these are."""
+    """Return the signed distance from a box, given the excesses of coordinates over its half sizes."""
     inside, squared = excess[0], np.zeros(())
     for x in excess[1:]:
         inside: Array = np.where(x.real > inside.real, x, inside)
@@ -505,7 +500,7 @@ def _beyond_faces(*excess: Array) -> Array:
 
 
 def _blocks(half: Array) -> tuple[Array, float]:
-    """Centres (K, 3) of the equal parts that a box is best cut into, and half the diagonal of a part."""
+    """Cut a box into equal parts; return their centres (K, 3) and half the diagonal of a part."""
     limit = range(1, MAX_BALLS + 1)
     cuts = np.array([cut for cut in itertools.product(limit, repeat=3) if np.prod(cut) <= MAX_BALLS])
     radius = np.linalg.norm(half / cuts, axis=1)
@@ -515,25 +510,35 @@ def _blocks(half: Array) -> tuple[Array, float]:
     return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3), float(radius[best])
 
 
-def _lathe(radii: Array, heights: Array, bottom: float, top: float, num: int = 48) -> tuple[Array, Indices]:
-    """A closed surface of revolution around z through rings (K,), with an apex below and above."""
-    turn = 2 * np.pi * np.arange(num) / num
-    rings = np.stack(
-        [
-            np.outer(radii, np.cos(turn)),
-            np.outer(radii, np.sin(turn)),
-            np.repeat(heights[:, None], num, axis=1),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    vertices = np.concatenate([rings, [[0, 0, bottom], [0, 0, top]]])
-    here = np.arange(num)
-    there = (here + 1) % num
-    below = len(rings)
-    parts = [np.stack([np.full(num, below), there, here], axis=1)]
-    for k in range(len(radii) - 1):
-        a, b, c, d = here + k * num, there + k * num, there + (k + 1) * num, here + (k + 1) * num
-        parts += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
-    last = (len(radii) - 1) * num
-    parts.append(np.stack([np.full(num, below + 1), here + last, there + last], axis=1))
-    return vertices, np.concatenate(parts)
+def lathe(profile: Sequence[tuple[float, float]], num: int = 48) -> tuple[Array, Indices]:
+    """Return the closed surface of revolution of a profile around z.
+
+    Args:
+        profile: distances from the axis and heights, metres, from the axis up along the outside and back to it.
+        num: number of sides.
+
+    Returns:
+        Vertices (V, 3), metres, and faces (F, 3), outward.
+    """
+    (_, bottom), *rings, (_, top) = profile
+    turn, here = 2 * np.pi * np.arange(num) / num, np.arange(num)
+    circle, there = np.stack([np.cos(turn), np.sin(turn)], axis=1), (here + 1) % num
+    vertices = [np.column_stack([radius * circle, np.full(num, height)]) for radius, height in rings]
+    last, below = (len(rings) - 1) * num, len(rings) * num
+    faces = [np.stack([np.full(num, below), there, here], axis=1)]
+    for first in range(0, last, num):
+        a, b, c, d = here + first, there + first, there + first + num, here + first + num
+        faces += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    faces.append(np.stack([np.full(num, below + 1), here + last, there + last], axis=1))
+    return np.concatenate([*vertices, [[0, 0, bottom], [0, 0, top]]]), np.concatenate(faces)
+
+
+@lru_cache(maxsize=4)
+def golden_spiral(num: int, offset: float = 0.0) -> Array:
+    """Return evenly spread unit vectors (num, 3): a spiral in golden angles, turned by `offset` of them."""
+    k = np.arange(num)
+    z, turn = 1 - (2 * k + 1) / num, np.pi * (1 + np.sqrt(5)) * (k + offset)
+    r = np.sqrt(1 - z * z)
+    vectors = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+    vectors.flags.writeable = False
+    return vectors

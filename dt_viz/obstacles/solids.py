@@ -1,8 +1,8 @@
-"""Solids bounded by triangles: their signed distance as a smooth function that is quick to evaluate anywhere.
+"""Solids bounded by triangles, with a signed distance that is smooth and quick to evaluate anywhere.
 
-The distance is computed once, on a grid: that of each node from the nearest triangle, with the sign of the winding
-number. Between the nodes it is a quadratic B-spline with the nodes' values as coefficients, so it has a continuous
-slope and is, like a distance, nowhere steeper than 1 but for the discretisation: a weighted mean of distances.
+The distance is computed once on a grid: of each node from the nearest triangle, with the sign of the winding number.
+Between the nodes it is a quadratic B-spline with the nodes' values as coefficients, that is, a weighted mean of
+distances: its slope is continuous and, up to the discretisation, at most 1.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from dt_viz.obstacles.triangles import closest_on_triangles, grid_nodes, inside_
 from dt_viz.properties import cached_property
 
 NUM_NODES = 64**3
-"""Of a grid, about."""
+"""Approximate number of nodes of a distance grid."""
 MARGIN = 0.2
-"""Of the grid around the shape, relative to the largest side of its bounding box."""
+"""Margin of the grid around the shape, relative to the largest side of its bounding box."""
 NUM_SAMPLES = 60_000
-"""Of the surface, about, and one at least on each triangle."""
+"""Approximate number of samples on a surface; each triangle has at least one."""
 LONGEST_ROWS = 8
-"""Bound of the number of samples in a row along all triangles, in `NUM_SAMPLES`."""
+"""Largest number of samples in rows along the sides of all triangles, in units of `NUM_SAMPLES`."""
 NUM_NEAREST = 6
-"""Samples whose triangles are measured exactly for each point."""
+"""Number of nearest samples of a point whose triangles are measured exactly."""
 NUM_ROUNDS, NUM_SWEEPS = 2, 3
-"""In which the nodes of a grid tell each other which point of the surface is near."""
+"""Numbers of rounds, and of sweeps in each, in which nodes of a grid hand on near points of the surface."""
 WALK = 0.6
 """Part of the way along a surface to the place that would be nearest if it were flat."""
 WALK_CELLS = 1.0
 """Longest such step, in cells of the grid."""
 NUM_PROBES = 100_000
-"""Points at which the slope is looked at."""
+"""Number of points at which the slope of a distance is checked."""
 BLOCK = 2048
-"""Points that a grid is evaluated at at once: of more, what is worked out on the way leaves the cache."""
+"""Number of points for which a grid is evaluated in one step, so that intermediate results stay in the cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """What closed triangles enclose, in metres; compared and hashed by its vertices and faces."""
+    """The solid enclosed by triangles; compared and hashed by its vertices and faces."""
 
     vertices: Array
     """(V, 3) metres, in the solid's own frame."""
@@ -59,7 +59,7 @@ class Solid:
 
     @cached_property
     def digest(self) -> bytes:
-        """Of vertices and faces."""
+        """Hash of vertices and faces."""
         return hashlib.blake2b(self.vertices.tobytes() + self.faces.tobytes(), digest_size=16).digest()
 
     def __eq__(self, other: object) -> bool:
@@ -70,12 +70,12 @@ class Solid:
 
     @property
     def distances(self) -> DistanceGrid:
-        """Its signed distance; computed once for all equal solids."""
+        """Signed distance; computed once for all equal solids."""
         return _distances(self)
 
     @cached_property
     def radius(self) -> float:
-        """Of the ball around the origin that holds it, metres."""
+        """Radius of the ball around the origin that holds it, metres."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
     @cached_property
@@ -85,17 +85,17 @@ class Solid:
 
     @property
     def used(self) -> Array:
-        """The vertices of its faces, metres."""
+        """Vertices of its faces, metres."""
         used = np.zeros(len(self.vertices), dtype=bool)
         used[self.faces] = True
         return self.vertices[used]
 
     def nearest(self, s: Array) -> Array:
-        """The points of the surface nearest to the points `s` (N, 3), (N, 3), metres."""
+        """Find the points of the surface, (N, 3), nearest to the points `s` (N, 3), metres."""
         return _surface(self).nearest(s)
 
     def balls(self, num: int) -> tuple[Array, Array]:
-        """Centres (K, 3) and radii (K,) of at most `num` balls that together hold it, metres."""
+        """Cover it by at most `num` balls: centres (K, 3) and radii (K,), metres."""
         centres, radii = _balls(self, num)
         return centres.copy(), radii.copy()
 
@@ -104,35 +104,35 @@ class Solid:
 class DistanceGrid:
     """A signed distance sampled on a grid; analytic between and beyond its nodes.
 
-    For an object of 15 cm it is off by up to 2 mm beside edges, 0.3 mm elsewhere near the surface, and 2 % far from it.
+    For an object of 15 cm its error is up to 2 mm beside edges, 0.3 mm elsewhere near the surface, and 2 % far from it.
     """
 
     origin: Array
-    """(3,) the first node, metres."""
+    """(3,) first node, metres."""
     cell: float
     """Distance between neighbouring nodes, metres."""
     values: Array
     """(n_x, n_y, n_z) signed distances of the nodes, metres."""
     margin: float
-    """At least as far is the shape from the border of the grid, metres."""
+    """Smallest distance of the shape from the border of the grid, metres."""
     centre: Array
-    """(3,) of the bounding box."""
+    """(3,) centre of the bounding box, metres."""
     radius: float
-    """Of the ball around it that holds the shape."""
+    """Radius of the ball around that centre that holds the shape, metres."""
 
     @cached_property
     def nodes(self) -> Array:
-        """(n_x·n_y·n_z, 3) metres, last axis fastest."""
+        """Nodes (n_x·n_y·n_z, 3), metres, last axis fastest."""
         return grid_nodes(self.origin, self.cell, self.values.shape)
 
     @cached_property
     def depth(self) -> float:
-        """How far inside the deepest point is, metres."""
+        """Distance of the deepest point from the surface, metres."""
         return max(0.0, -float(self.values.min()))
 
     @cached_property
     def interior(self) -> Array:
-        """(N, 3) the nodes inside, metres."""
+        """Nodes (N, 3) inside, metres."""
         return self.nodes[self.values.ravel() < 0]
 
     def __call__(self, s: Array) -> Array:
@@ -216,24 +216,24 @@ class DistanceGrid:
 
 
 class _Surface:
-    """Triangles, with samples on them that tell which ones are near."""
+    """Triangles with samples on them, by which near ones are found."""
 
     def __init__(self, triangles: Array) -> None:
         self._triangles = triangles
         a, b, c = triangles.swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-        # triangles that are long and thin would have one sample after the other along them
+        # long and thin triangles would otherwise have rows of very many samples
         length = sum(float(np.linalg.norm(side, axis=1).sum()) for side in (b - a, c - b, a - c)) / 2
         spacing = max(np.sqrt(area / NUM_SAMPLES), length / (LONGEST_ROWS * NUM_SAMPLES))
         self.samples, self._owner = surface_samples(triangles, spacing)
         self._tree = KDTree(self.samples)
 
     def nearest(self, s: Array) -> Array:
-        """The points of the surface nearest to the points `s` (N, 3), (N, 3)."""
+        """Find the points of the surface, (N, 3), nearest to the points `s` (N, 3)."""
         return self._nearest(s)[1] if len(s) else s.copy()
 
     def _nearest(self, s: Array) -> tuple[Indices, Array]:
-        """The triangles (N,) nearest to points `s` (N, 3), and the points (N, 3) on them."""
+        """Find the triangles (N,) nearest to points `s` (N, 3), and the points (N, 3) on them."""
         _, found = self._tree.query(s, k=min(NUM_NEAREST, self._tree.n))
         owners = self._owner[np.reshape(found, (len(s), -1))]  # (N, K)
         points = np.stack([closest_on_triangles(s, self._triangles[owner]) for owner in owners.T], axis=1)
@@ -241,10 +241,10 @@ class _Surface:
         return owners[best], points[best]
 
     def distances(self, nodes: Array, origin: Array, cell: float, shape: tuple[int, int, int]) -> Array:
-        """Distances (n_x, n_y, n_z) of a grid's nodes (N, 3) from the surface.
+        """Compute the distances (n_x, n_y, n_z) of a grid's nodes (N, 3) from the surface.
 
-        A node beside the surface asks the tree. From there the nearest samples are handed on from node to node: far
-        away from the surface too many are about as near for a tree to be quick.
+        Nodes beside the surface search the tree, and hand on what they find from node to node: far away from the
+        surface so many samples are about equally near that a tree is slow.
         """
         beside = np.zeros(shape, dtype=bool)
         corner = ((self.samples - origin) / cell).astype(np.intp)
@@ -262,10 +262,10 @@ class _Surface:
         return np.linalg.norm(points - nodes.reshape(*shape, 3), axis=-1)
 
     def _walk(self, owner: Indices, points: Array, nodes: Array, longest: float) -> None:
-        """Moves points of the surface, in place, along it to where they are nearer to the nodes.
+        """Move points of the surface, in place, along it to where they are nearer to the nodes.
 
-        Where the surface bends like a ball of radius R around a node at distance d, the step is WALK·(1 + d/R) of the
-        way.
+        Where the surface has radius of curvature R and the node is at distance d, the step covers the part
+        WALK·(1 + d/R) of the way.
         """
         offset = nodes - points
         a, b, c = self._triangles[owner].swapaxes(0, 1)
@@ -282,7 +282,7 @@ class _Surface:
 
 
 def _flatten(signed: Array, cell: float) -> None:
-    """Lowers distances on a grid, in place, that are too large to be that far from their neighbours' ones."""
+    """Limit, in place, the slopes between neighbouring distances on a grid to 1."""
     outside = signed > 0
     for step in itertools.product(range(-2, 3), repeat=3):
         if any(step):
@@ -294,7 +294,7 @@ def _flatten(signed: Array, cell: float) -> None:
 
 
 def _hand_on(owner: Indices, points: Array, nodes: Array) -> None:
-    """Lets each node of a grid take over, in place, its neighbour's point of the surface where that is nearer."""
+    """Replace, in place, each node's point of the surface by its neighbour's where that is nearer."""
     squared = ((points - nodes) ** 2).sum(axis=-1)
     for _, axis, back in itertools.product(range(NUM_SWEEPS), range(3), (False, True)):
         ends = slice(1, None), slice(None, -1)
@@ -322,7 +322,9 @@ def _distances(solid: Solid) -> DistanceGrid:
     origin = centre - cell * (counts - 1) / 2
     shape = (int(counts[0]), int(counts[1]), int(counts[2]))
     nodes = grid_nodes(origin, cell, shape)
-    inside = inside_of_grid(solid.vertices[solid.faces], origin, cell, shape)  # first: it refuses what takes too long
+    inside = inside_of_grid(
+        solid.vertices[solid.faces], origin, cell, shape
+    )  # first, since it refuses meshes that take too long
     distance = _surface(solid).distances(nodes, origin, cell, shape)
     radius = float(np.linalg.norm(solid.used - centre, axis=1).max())
     signed = np.where(inside, -distance, distance)
@@ -336,14 +338,14 @@ def _distances(solid: Solid) -> DistanceGrid:
 
 @lru_cache(maxsize=64)
 def _balls(solid: Solid, num: int) -> tuple[Array, Array]:
-    """Clusters of the grid's cells that the solid has a part in, grown by half a cell's diagonal."""
+    """Cluster the grid's cells that the solid reaches into; the balls are grown by half a cell's diagonal."""
     grid = solid.distances
     half_diagonal = grid.cell * np.sqrt(3) / 2
     nodes = grid.nodes[grid.values.ravel() < half_diagonal]
     some = nodes[:: max(1, len(nodes) // 4000)]
     centres = [some[np.linalg.norm(some - some.mean(axis=0), axis=1).argmax()]]
     apart = np.linalg.norm(some - centres[0], axis=1)
-    while len(centres) < num:  # the farthest point first
+    while len(centres) < num:  # farthest-point initialisation
         centres.append(some[apart.argmax()])
         apart = np.minimum(apart, np.linalg.norm(some - centres[-1], axis=1))
     centres = np.array(centres)
@@ -358,7 +360,7 @@ def _balls(solid: Solid, num: int) -> tuple[Array, Array]:
 
 
 def _middle(points: Array) -> Array:
-    """Centre (3,) of a small ball around points (N, 3), by steps towards the farthest one (Bădoiu and Clarkson)."""
+    """Find the centre (3,) of a small ball around points (N, 3) by steps to the farthest (Bădoiu and Clarkson)."""
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     for k in range(1, 20):
         farthest = points[((points - centre) ** 2).sum(axis=1).argmax()]

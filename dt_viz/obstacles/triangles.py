@@ -1,4 +1,4 @@
-"""Triangles in space: nearest points, samples on them, and which nodes of a grid they enclose."""
+"""Triangles in space: nearest points, samples on them, and the nodes of a grid that they enclose."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices, Mask
 
 CHUNK = 1_000_000
-"""Triangles times lines that are looked at at once."""
+"""Number of pairs of a triangle and a line that are tested in one step."""
 MAX_CROSSINGS = 3_000_000
-"""Largest number of lines in one direction times triangles near them; 500,000 even triangles have some 10,000."""
+"""Largest number of pairs of a triangle and a line near it; 500,000 even triangles have some 10,000."""
 
 
 def closest_on_triangles(s: Array, triangles: Array) -> Array:
-    """The point (N, 3) of each triangle (N, 3, 3) that is nearest to the point `s` (N, 3) (Ericson, 2005, 5.1.5)."""
+    """Find the point (N, 3) of each triangle (N, 3, 3) nearest to its point `s` (N, 3) (Ericson, 2005, 5.1.5)."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     ab, ac = b - a, c - a
     pa, pb, pc = s - a, s - b, s - c
@@ -45,7 +45,7 @@ def closest_on_triangles(s: Array, triangles: Array) -> Array:
 
 
 def surface_samples(triangles: Array, spacing: float) -> tuple[Array, Indices]:
-    """Points on triangles (F, 3, 3), about that far apart, one at least on each; to which triangle each belongs."""
+    """Spread points over triangles (F, 3, 3), about `spacing` apart, at least one on each; also return their owners."""
     longest = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).argmax(axis=1)
     turned = (longest[:, None] + np.arange(3)) % 3  # its longest side first
     a, b, c = np.take_along_axis(triangles, turned[..., None], axis=1).swapaxes(0, 1)
@@ -61,17 +61,17 @@ def surface_samples(triangles: Array, spacing: float) -> tuple[Array, Indices]:
 
 
 def grid_nodes(origin: Array, cell: float, shape: tuple[int, ...]) -> Array:
-    """Nodes (N, 3) of a grid, the last axis fastest."""
+    """Return the nodes (N, 3) of a grid, the last axis fastest."""
     return origin + cell * np.indices(shape).reshape(3, -1).T
 
 
 def inside_of_grid(triangles: Array, origin: Array, cell: float, shape: tuple[int, ...]) -> Mask:
-    """Which nodes of a grid closed triangles (F, 3, 3) enclose: the winding number along lines in all three directions.
+    """Find the nodes of a grid that closed triangles (F, 3, 3) enclose, by winding numbers along lines.
 
-    Two of the three must say so, for a line that leaves through a small hole counts wrongly.
+    The lines of two of the three directions must agree, since a line through a small hole counts wrongly.
 
     Raises:
-        FormatError: there are very many triangles that are long, or one over the other.
+        FormatError: very many triangles are long or overlap.
     """
     votes = np.zeros(shape, dtype=np.int8)
     for axis in range(3):
@@ -82,9 +82,9 @@ def inside_of_grid(triangles: Array, origin: Array, cell: float, shape: tuple[in
 
 
 def _winding(triangles: Array, origin: Array, cell: float, shape: tuple[int, ...]) -> Array:
-    """Winding numbers of nodes, counted along the last axis."""
+    """Count the winding numbers of the nodes along the last axis."""
     nx, ny, nz = shape
-    # the lines run a little beside the nodes: not through the edges of shapes with round numbers
+    # the lines pass a little beside the nodes, so as not to hit the edges of shapes with round coordinates
     shift = cell * np.array([0.00137, 0.00219])
     t = (triangles - origin) / cell
     flat = t[..., :2] - shift / cell

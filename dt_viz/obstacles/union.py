@@ -1,27 +1,26 @@
-"""Union obstacles as one."""
+"""Unions of obstacles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from dt_viz.flows.fields import Array, Repeated, Sum, VectorField
 from dt_viz.obstacles.occupancy import Generator
-from dt_viz.obstacles.shapes import Obstacle, Sphere
+from dt_viz.obstacles.shapes import Obstacle, Sphere, golden_spiral
 
 NUM_DIRECTIONS, NUM_STEPS = 500, 200
-"""In which a way out of overlapping obstacles is looked for, and largest number of steps on it."""
+"""Number of rays along which a way out of overlapping obstacles is searched, and largest number of steps on a ray."""
 SHORTEST = 1e-4
-"""Metres of such a step: by so much a way may lead farther than to the surface."""
+"""Smallest ray-marching step, metres; bounds the overshoot."""
 ROUNDING = 1e-6
-"""Metres inside that do not count on a surface."""
+"""Largest depth, metres, that counts as lying on a surface."""
 
 
 @dataclass(frozen=True)
 class Union:
-    """The union of any number of obstacles, also none: what is inside one of them is inside."""
+    """The union of any number of obstacles, possibly none."""
 
     parts: tuple[Obstacle, ...] = ()
 
@@ -37,19 +36,19 @@ class Union:
         return nearest
 
     def nearest_free(self, s: Array) -> Array:
-        """The points `s` (*B, 3), those inside moved to the nearest place outside, or nearly so, (*B, 3), metres."""
+        """Return the points `s` (*B, 3), those inside moved about to the nearest free place, (*B, 3), metres."""
         free = np.array(s, dtype=float).reshape(-1, 3)
         for row in np.flatnonzero(self.signed_distance(free) < 0):
             free[row] = self._way_out(free[row])
         return free.reshape(s.shape)
 
     def _way_out(self, s: Array) -> Array:
-        """The same for one point (3,) that is inside."""
+        """Find the free place for one point (3,) inside."""
         deepest = min(self.parts, key=lambda part: float(part.signed_distance(s)))
         free = deepest.nearest_free(s)
-        if self.signed_distance(free) >= -ROUNDING:  # nothing outside is nearer
+        if self.signed_distance(free) >= -ROUNDING:  # no free place is nearer
             return free
-        directions, length = _directions(), np.zeros(NUM_DIRECTIONS)
+        directions, length = golden_spiral(NUM_DIRECTIONS) * [1, -1, -1], np.zeros(NUM_DIRECTIONS)
         for _ in range(NUM_STEPS):
             depth = -self.signed_distance(s + length[:, None] * directions)
             if depth[length.argmin()] <= 0:
@@ -59,16 +58,7 @@ class Union:
         return s + length[nearest] * directions[nearest]
 
     def field(self, generator: Generator, temperature: float) -> VectorField:
-        """The generators of the parts, added up (sec. 4.4)."""
+        """Return the sum of the parts' generators (sec. 4.4)."""
         spheres = tuple(part.field(generator, temperature) for part in self.parts if isinstance(part, Sphere))
         others = tuple(part.field(generator, temperature) for part in self.parts if not isinstance(part, Sphere))
         return Sum((*((Repeated(spheres),) if spheres else ()), *others))
-
-
-@lru_cache(maxsize=1)
-def _directions() -> Array:
-    """Unit vectors (NUM_DIRECTIONS, 3), evenly spread: a spiral from pole to pole in golden angles."""
-    k = np.arange(NUM_DIRECTIONS)
-    z, turn = (2 * k + 1) / NUM_DIRECTIONS - 1, k * np.pi * (3 - np.sqrt(5))
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)

@@ -1,1 +1,1 @@
-"""What is drawn on the slice and of ψ itself."""
+"""Pictures on the slice, and of ψ itself, as data."""

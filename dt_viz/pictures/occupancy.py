@@ -1,4 +1,4 @@
-"""What the occupancy maps believe of the obstacles, on a slice, beside their true outline (sec. 4.4)."""
+"""Learned occupancy of the obstacles on a slice, with their true outline (sec. 4.4)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from dt_viz.obstacles.union import Union
 from dt_viz.scenario.slices import Slice, level_line
 
 SPACING, COARSE_SPACING = 0.004, 0.010
-"""Metres between neighbouring samples."""
+"""Distances between neighbouring samples, metres."""
 NEAR = 0.006
-"""Metres from the slice, within which labelled points are shown on it."""
+"""Largest distance from the slice of the labelled points that are shown on it, metres."""
 MAX_POINTS = 300
-"""That are shown."""
+"""Approximate largest number of these points."""
 
 
 @dataclass(frozen=True)
@@ -27,30 +27,30 @@ class OccupancyPicture:
 
     area: Slice
     probability: Array
-    """(n, m) p(o = 1 | s), along the first and the second axis of the slice, from corner to corner."""
+    """(n, m) p(o = 1 | s) along the first and second axes of the slice, from corner to corner."""
     level: Array
     """(K, 2, 3) segments of the line p = 1/2, metres."""
     outline: Array
     """(L, 2, 3) segments of the obstacles' true outline, metres."""
     points: Array
-    """(K, 3) what is known of obstacles from point clouds: points beside the slice, moved into it, metres."""
+    """(K, 3) points of clouds near the slice, projected onto it, metres."""
     occupied: Mask
-    """(K,) their labels."""
+    """(K,) whether each of them is occupied."""
 
 
 def occupancy_picture(area: Slice, obstacles: Sequence[Obstacle], *, coarse: bool) -> OccupancyPicture:
-    """The learned occupancy of all obstacles: what one of them is believed to occupy is occupied.
+    """Compute the learned occupancy of all obstacles together.
 
     Args:
-        area: where to look.
-        obstacles: any number.
-        coarse: with fewer samples, for a picture that is replaced at once.
+        area: the slice.
+        obstacles: any number of obstacles.
+        coarse: whether to use fewer samples, for a picture that is soon replaced.
     """
     world = area.grid(COARSE_SPACING if coarse else SPACING)
     points, shape = world.reshape(-1, 3), world.shape[:2]
     free = np.ones(len(points))
     for obstacle in obstacles:
-        free *= 1 - believed(obstacle, points)
+        free *= 1 - learned_occupancy(obstacle, points)
     probability = 1 - free.reshape(shape)
     distance = Union(tuple(obstacles)).signed_distance(points).reshape(shape)
     return OccupancyPicture(
@@ -63,7 +63,7 @@ def occupancy_picture(area: Slice, obstacles: Sequence[Obstacle], *, coarse: boo
 
 
 def _known(area: Slice, obstacles: Sequence[Obstacle]) -> tuple[Array, Mask]:
-    """Points (K, 3) of point clouds on the slice, and whether they are occupied (K,)."""
+    """Return points (K, 3) of clouds on the slice, and whether they are occupied (K,)."""
     clouds = [obstacle.labelled() for obstacle in obstacles if isinstance(obstacle, CloudObstacle)]
     points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in clouds)])
     occupied = np.concatenate([np.zeros(0, dtype=bool), *(labels for _, labels in clouds)])
@@ -73,8 +73,8 @@ def _known(area: Slice, obstacles: Sequence[Obstacle]) -> tuple[Array, Mask]:
     return area.at(across[near]), occupied[near]
 
 
-def believed(obstacle: Obstacle, s: Array) -> Array:
-    """p(o = 1 | s) of the map learned from samples of the obstacle, at the world points `s` (N, 3), (N,)."""
+def learned_occupancy(obstacle: Obstacle, s: Array) -> Array:
+    """Compute p(o = 1 | s), (N,), of the map learned from an obstacle, at world points `s` (N, 3)."""
     placed = obstacle.field("free-space", 1.0)
     own, inner = placed.to_frame(s), placed.inner
     if isinstance(inner, StretchedField):

@@ -1,4 +1,4 @@
-"""Pictures of ψ itself: the generator that was learned, the grid that ψ⁻¹ warps, and the base attractor beside it."""
+"""Pictures of ψ: the learned generator, the grid warped by ψ⁻¹, and the base attractor beside it."""
 
 from __future__ import annotations
 
@@ -19,53 +19,53 @@ from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 
 ARROW_SPACING = 0.027
-"""Of the generator's arrows, metres."""
+"""Spacing of the generator's arrows, metres."""
 NEGLIGIBLE = 0.03
-"""Part of the largest arrow below which there is none to see."""
+"""Length of an arrow, relative to the largest, below which it is left out."""
 LINE_SPACING = 0.035
-"""Between neighbouring lines of the grid in base space, metres."""
+"""Spacing of the grid's lines in base space, metres."""
 TRIAL_STEP, COARSE_TRIAL_STEP = 0.004, 0.012
-"""Along a line of the grid, metres of base space: where it lies in the motion's space is looked at so closely."""
+"""Step along a line of the grid in base space with which its place on the slice is found, metres."""
 SAMPLE_SPACING = 0.010
-"""Along a line of the grid, metres in the motion's space, before the behaviours bend it."""
+"""Spacing of samples along a line of the grid in the motion's space, before the transforms bend it, metres."""
 STEEPEST = 4.0
-"""Path along a line of the grid in base space, relative to that along the slice, beyond which it is torn."""
+"""Length of a step in base space, relative to that along the slice, beyond which a line is torn."""
 FINE_SPACING, COARSE_SPACING = 0.006, 0.030
-"""Metres between neighbouring samples of the drawn grid."""
+"""Distances between neighbouring samples of the drawn grid, metres."""
 TOLERANCE = 1e-6
-"""Of the behaviours' flows where they bend the grid, metres: coarser is not faster, and lines would seem to cross."""
+"""Tolerance of the transforms' flows for the grid, metres: a coarser one is no faster, and lines would cross."""
 MAX_NEWTON, MAX_STEP, MIN_SLOPE, ON_SLICE = 6, 0.05, 0.1, 1e-6
-"""Steps to where the grid lies on the slice, the longest of them, metres, the least rise of the preimage for a rise of
-1 that is believed, and how near counts as on it, metres."""
+"""Largest number of Newton steps of the grid to the slice, their largest length, metres, the smallest slope of the
+preimage that they use, and the distance, metres, that counts as on the slice."""
 INSET_GAP = 0.06
-"""Between the slice and the inset, metres."""
+"""Distance between the slice and the inset, metres."""
 INSET_HALF_WIDTH = 0.21
-"""At most, metres: all of it is seen from where the task puts the camera."""
+"""Largest half width of the inset, metres, which is all visible from the task's camera."""
 INSET_MARGIN = 0.18
-"""Around the rays in the inset, relative to their extent."""
+"""Margin around the rays in the inset, relative to their extent."""
 INSET_ARROWS = 13
-"""Along the longer side of the inset."""
+"""Number of arrows along the longer side of the inset."""
 
 
 @dataclass(frozen=True)
 class GeneratorPicture:
-    """A generator V of ψ, ψ(s) = γ(t, s), on the slice: it straightens the motion."""
+    """A generator V of ψ, ψ(s) = γ(t, s), on the slice; its flow straightens the motion."""
 
     points: Array
     """(N, 3), metres."""
     displacements: Array
-    """(N, 3) t·V, metres: about how far the flow carries a point."""
+    """(N, 3) t·V, metres: approximate displacements by the flow."""
     motions: tuple[Array, ...]
     """The demonstrations on the manifold that this flow acts on, (T_i, 3), metres; empty for the mean of all flows."""
     num_flows: int
-    """That ψ is composed of."""
+    """Number of flows that ψ is composed of."""
 
 
 @dataclass(frozen=True)
 class GridPicture:
-    """Regular planes of base space where they meet what the imitation's ψ makes of the slice, through ψ⁻¹ of the stack.
+    """The warped grid: ψ⁻¹ of regular planes in base space, cut with the image of the slice under the imitation.
 
-    In a drawing's plane they are the images of a lattice of straight lines.
+    In a drawing's plane these are the images of a lattice of straight lines.
     """
 
     lines: tuple[Array, ...]
@@ -74,25 +74,25 @@ class GridPicture:
 
 @dataclass(frozen=True)
 class BasePicture:
-    """The base system in an inset beside the slice, smaller if need be."""
+    """The base system in an inset beside the slice, scaled down if necessary; metres in the world unless stated."""
 
     rays: tuple[Array, ...]
-    """(2, 3), from ψ(start) to ψ(goal), metres in the world, as all that follows."""
+    """(2, 3) from ψ(start) to ψ(goal)."""
     points: Array
-    """(N, 3) of the vector field's arrows."""
+    """(N, 3) places of the vector field's arrows."""
     velocities: Array
     """(N, 3) m/s in base space."""
     grid: tuple[Array, ...]
     """(2, 3) lines of the lattice whose image is the warped grid."""
     border: Array
-    """(5, 3) the inset's closed outline."""
+    """(5, 3) closed outline of the inset."""
     labels: tuple[Array, Array]
-    """(3,) above the inset and above the learned system."""
+    """(3,) places of the labels of the inset and of the learned system."""
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """Those that the view asks for; None is what it does not, or what is not worked out yet."""
+    """The pictures of a view; None for those that are not shown, or not computed yet."""
 
     field: FieldPicture | None = None
     streamlines: tuple[Array, ...] | None = None
@@ -109,18 +109,18 @@ NO_PICTURES = Pictures()
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The warped grid on a slice of the manifold of the imitation, before behaviours bend it."""
+    """The warped grid on a slice of the imitation's manifold, before the transforms bend it."""
 
     area: Slice
     index: Indices
-    """(N,) which piece a sample belongs to."""
+    """(N,) index of each sample's piece."""
     images: Array
-    """(N, 3) of the samples in base space."""
+    """(N, 3) images of the samples in base space."""
     positions: Array
-    """(N, 3) of the samples on the slice, metres."""
+    """(N, 3) positions of the samples on the slice, metres."""
 
     def images_at(self, place: Array) -> Array:
-        """Points of base space (M, 3) at places (M,) counted in samples, between them on straight lines."""
+        """Interpolate points of base space (M, 3) linearly at places (M,), counted in samples."""
         before = np.minimum(place.astype(int), len(self.images) - 2)
         start, end = self.images[before], self.images[before + 1]
         return start + (place - before)[:, None] * (end - start)
@@ -134,34 +134,31 @@ class _Inset:
     centre: Array
     scale: float
     half: Array
-    """(2,) of the rectangle, metres in base space."""
+    """(2,) half the sides of the rectangle, metres in base space."""
 
     def __call__(self, z: Array) -> Array:
         return self.centre + self.scale * (z - self.middle)
 
 
 class Sketchbook:
-    """Makes pictures of one learned motion.
-
-    What does not depend on the obstacle is worked out when it is first shown.
-    """
+    """Makes pictures of one learned motion; parts that do not depend on the obstacle are computed once."""
 
     def __init__(self, task: Task, flows: Chain | None, system: DiffeomorphicSystem, rays: Rays) -> None:
         """Begin with no picture.
 
         Args:
-            task: where the motion is.
-            flows: that ψ is composed of, in the demonstrations' own units; None where it is not in the stack.
-            system: the motion without any behaviour, in the world.
-            rays: from ψ(starts) to ψ(goal).
+            task: task of the motion.
+            flows: flows that ψ is composed of, in the demonstrations' own units; None without an imitation.
+            system: system of the motion without further transforms, in the world.
+            rays: rays from ψ(starts) to ψ(goal).
         """
         self._task, self._flows, self._system, self._rays = task, flows, system, rays
         self._generators: dict[int, tuple[Slice, GeneratorPicture]] = {}
         self._pieces: dict[bool, _Pieces] = {}
-        """Coarse and fine ones."""
+        """Coarse (True) and fine pieces."""
 
     def generator(self, area: Slice, number: int) -> GeneratorPicture | None:
-        """The generator of one of the flows: 1 is what ψ applies first, 0 stands for the mean over time of all."""
+        """Return the generator of a flow; ψ applies number 1 first, and 0 stands for the mean over all flows."""
         if self._flows is None:
             return None
         number = min(number, len(self._flows.parts))
@@ -199,12 +196,12 @@ class Sketchbook:
         return GeneratorPicture(points[seen], displacements[seen], tuple(motions), len(flows))
 
     def grid(self, area: Slice, behaviours: Sequence[Diffeomorphism], *, coarse: bool) -> GridPicture:
-        """The warped grid.
+        """Return the warped grid.
 
         Args:
-            area: where to look.
-            behaviours: what is stacked on the imitation, from the inside out.
-            coarse: with fewer points, for a picture that is replaced at once.
+            area: the slice.
+            behaviours: transforms stacked on the imitation, from the inside out.
+            coarse: whether to use fewer points, for a picture that is soon replaced.
         """
         pieces = self._pieces.get(coarse)
         if pieces is None or not pieces.area.lies_like(area):
@@ -224,23 +221,23 @@ class Sketchbook:
         bundle = Bundle(pieces.index, np.arange(float(len(pieces.index))), lifted(pieces.positions)[:, None])
         if not coarse:
             bundle = refined(bundle, evaluate, FINE_SPACING, max_rounds=3)
-        # where ψ⁻¹ tears neighbours far apart a straight stroke would be a lie
+        # no line between neighbours that ψ⁻¹ moves far apart
         limit = 3 * (COARSE_SPACING if coarse else FINE_SPACING)
         return GridPicture(_runs(bundle.positions, bundle.index, limit))
 
     def _lines(self, area: Slice) -> tuple[Array, Array]:
-        """Ends (M, 2), along the slice, of the lattice's lines over all that ψ makes of it; two cross over ψ(goal)."""
+        """Return the ends (M, 2), along the slice, of the lattice's lines over its image; two cross at ψ(goal)."""
         across, middle = area.across(self._images(area)), area.across(self._system.base.goal)
         lower = middle + LINE_SPACING * np.floor((across.min(axis=0) - middle) / LINE_SPACING)
         upper = middle + LINE_SPACING * np.ceil((across.max(axis=0) - middle) / LINE_SPACING)
         return _lattice_lines(lower, upper, LINE_SPACING)
 
     def _images(self, area: Slice) -> Array:
-        """Of a lattice on the slice in base space, (N, 3)."""
+        """Return the images (N, 3) in base space of a lattice on the slice."""
         return self._system.transform.forward(area.lattice(0.02))
 
     def _cut(self, area: Slice, *, coarse: bool) -> _Pieces:
-        """The pieces of the lattice's lines, raised to what ψ makes of the slice, that lie on the slice."""
+        """Project the lattice's lines onto the image of the slice, and return the pieces whose preimages are on it."""
         start, end = self._lines(area)
         step = COARSE_TRIAL_STEP if coarse else TRIAL_STEP
         counts = 2 + (np.linalg.norm(end - start, axis=1) / step).astype(int)
@@ -248,7 +245,7 @@ class Sketchbook:
         u = np.concatenate([np.linspace(0, 1, n) for n in counts])[:, None]
         x, z, there = self._raised(area, start[line] + u * (end - start)[line])
         inside = there & (np.abs(area.across(x)) <= area.half_size).all(axis=1)
-        # another line begins, or this one goes on in another fold of what ψ makes of the slice
+        # another line begins, or this one continues in another fold of the slice's image
         apart = (np.diff(line) > 0) | (np.linalg.norm(np.diff(z, axis=0), axis=1) > STEEPEST * step)
         samples = []
         for run in _true_runs(inside):
@@ -263,9 +260,9 @@ class Sketchbook:
         return _Pieces(area, index, z[chosen], x[chosen])
 
     def _raised(self, area: Slice, across: Array) -> tuple[Array, Array, Mask]:
-        """Points of base space over the places `across` (N, 2) along the slice whose preimages lie on it.
+        """Find points of base space over places `across` (N, 2) along the slice whose preimages lie on it.
 
-        By Newton's steps along the normal, from how high the nearest image of a lattice on the slice is.
+        Newton's method moves them along the normal, from the height of the nearest image of a lattice on the slice.
 
         Returns:
             The preimages (N, 3), the points (N, 3), metres, and whether they were found (N,).
@@ -289,7 +286,7 @@ class Sketchbook:
         return x, z, found
 
     def base(self, rays: Rays) -> BasePicture:
-        """The base system; `rays` are those of the whole stack."""
+        """Return the base system; `rays` are those of the whole stack."""
         task, inset = self._task, self._inset
         goal = rays.base.goal
         spacing = 2 * inset.half.max() / INSET_ARROWS
@@ -320,7 +317,7 @@ class Sketchbook:
 
     @cached_property
     def _inset(self) -> _Inset:
-        """Beside the slice, on the left of who looks from where the task puts the camera; no larger than the slice."""
+        """Inset beside the slice, on the left as seen from the task's camera, no larger than the slice."""
         task = self._task
         plane = task.slice.axes
         ends = np.concatenate([self._rays.z0, [self._rays.base.goal]])
@@ -329,7 +326,7 @@ class Sketchbook:
         half = (upper - lower) / 2
         half = half + INSET_MARGIN * half.max()
         half = np.maximum(half, 0.45 * half.max())
-        # the plane of the picture goes through the goal, where all rays meet
+        # the plane of the inset contains the goal, where all rays meet
         normal = task.slice.normal
         offset = (self._rays.base.goal - task.slice.centre) @ normal
         middle = task.slice.at((lower + upper) / 2) + offset * normal
@@ -342,18 +339,18 @@ class Sketchbook:
 
 
 def in_frame(transform: Diffeomorphism) -> Chain | None:
-    """The chain of flows inside a placed imitation; None of the identity."""
+    """Return the chain of flows inside a placed imitation; None for the identity."""
     return transform.inner if isinstance(transform, Placed) and isinstance(transform.inner, Chain) else None
 
 
 def _lattice(lower: Array, upper: Array, spacing: float) -> Array:
-    """Points (N, 2) over a rectangle at about this spacing."""
+    """Return points (N, 2) over a rectangle at about this spacing."""
     axes = [np.linspace(a, b, max(2, round((b - a) / spacing) + 1)) for a, b in zip(lower, upper, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _lattice_lines(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
-    """Ends (M, 2) of the lines of a lattice over a rectangle, whose sides are multiples of the spacing."""
+    """Return the ends (M, 2) of a lattice's lines over a rectangle, whose sides are multiples of the spacing."""
     starts, ends = [], []
     for axis in range(2):
         for c in np.linspace(lower[axis], upper[axis], round((upper[axis] - lower[axis]) / spacing) + 1):
@@ -365,12 +362,12 @@ def _lattice_lines(lower: Array, upper: Array, spacing: float) -> tuple[Array, A
 
 
 def _true_runs(mask: Mask) -> list[Indices]:
-    """Indices of each run of neighbours that are true."""
+    """Return the indices of each run of true values."""
     return [run for run in np.split(np.arange(len(mask)), np.flatnonzero(np.diff(mask)) + 1) if mask[run[0]]]
 
 
 def _runs(positions: Array, index: Indices, limit: float) -> tuple[Array, ...]:
-    """Polylines (T_i, 3) of samples of the same piece that lie within `limit` of their neighbours."""
+    """Return polylines (T_i, 3) of samples of the same piece that lie within `limit` of their neighbours."""
     far = np.linalg.norm(np.diff(positions, axis=0), axis=1) > limit
     pieces = np.split(positions, np.flatnonzero(far | (np.diff(index) > 0)) + 1)
     return tuple(piece for piece in pieces if len(piece) > 1)

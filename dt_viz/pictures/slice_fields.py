@@ -1,4 +1,4 @@
-"""What a system does on a slice: its velocity, its streamlines, and det J or its Lyapunov value as a function."""
+"""Fields of a system on a slice: velocity, streamlines, and det J or the Lyapunov value."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from dt_viz.scenario.scenario import SliceColour
 from dt_viz.scenario.slices import Slice, level_line
 
 ARROW_SPACING = 0.030
-"""Metres."""
+"""Spacing of the arrows, metres."""
 SEPARATION = 0.032
-"""Of streamlines, metres: one begins so far from all others, and ends where it comes half as close to one."""
+"""Distance from all other streamlines at which one may begin, metres; it ends at half that distance."""
 SEED_SPACINGS = (2.0, 1.0, 0.5)
-"""Of the lattices whose points streamlines begin at, one after the other, in separations."""
+"""Spacings of the successive lattices of streamlines' seeds, in separations."""
 NUM_TRIALS = 64
-"""Samples of a streamline for which it is decided where it ends."""
+"""Number of samples of a streamline from which its end is found."""
 MIN_LENGTH = 1.0
-"""Of a streamline, in separations."""
+"""Smallest length of a streamline, in separations."""
 MAX_OFFSET = 0.10
-"""Metres from the slice at which a streamline ends."""
+"""Distance from the slice at which a streamline ends, metres."""
 FINE_LINE, COARSE_LINE = 0.006, 0.014
-"""Metres between neighbouring samples of a drawn streamline."""
+"""Distances between neighbouring samples of a drawn streamline, metres."""
 FINE_COLOUR = 0.008
-"""Metres between neighbouring samples of a function; while a hand moves it is sampled as the arrows are."""
+"""Distance between neighbouring samples of a function, metres; a coarse picture has the arrows' spacing."""
 LEVEL_SPACING = 0.04
-"""Between the base attractor's circles that level lines of the Lyapunov value are images of, metres."""
+"""Spacing of the base attractor's circles whose images are the level lines of the Lyapunov value, metres."""
 
 Clearance = Callable[[Array], Array]
-"""Distance (N,) of points (N, 3) from what no motion comes into, negative inside, metres."""
+"""Function from points (N, 3) to their distances (N,) from the blocked region, metres, negative inside."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +53,16 @@ class ColourPicture:
     what: SliceColour
     area: Slice
     values: Array
-    """(n, m) along the first and the second axis of the slice, from corner to corner; NaN where no motion comes. det J,
-    or the Lyapunov value in m²/s."""
+    """(n, m) det J, or Lyapunov values in m²/s, along the first and second axes of the slice, from corner to corner;
+    NaN in the blocked region."""
     clearance: Array
-    """(n, m) distance from where no motion comes, negative there, metres."""
+    """(n, m) distance from the blocked region, negative inside, metres."""
     lines: Array
     """(K, 2, 3) segments of level lines, metres."""
 
 
 class Samples:
-    """A system at the lattice points of a slice that motions come to: what several pictures need is worked out once."""
+    """A system at the free lattice points of a slice, evaluated once for several pictures."""
 
     def __init__(
         self, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, spacing: float, *, jacobian: bool
@@ -70,11 +70,11 @@ class Samples:
         """Evaluate ψ.
 
         Args:
-            system: whose ψ.
+            system: the system of ψ.
             area: the slice.
-            clearance: from where no motion comes.
-            spacing: of the lattice, metres.
-            jacobian: whether to work out J, too; velocities are then had from it.
+            clearance: distance from the blocked region.
+            spacing: spacing of the lattice, metres.
+            jacobian: whether to compute J, too, which then also gives the velocities.
         """
         self.system, self.area = system, area
         self.grid = area.grid(spacing)
@@ -83,7 +83,7 @@ class Samples:
         """(n, m), metres."""
         self.free = self.clearance > 0
         self.points = self.grid[self.free]
-        """(N, 3) where motions come, metres."""
+        """(N, 3) free points, metres."""
         transform, self.jacobians = system.transform, None
         if jacobian:
             self.images, self.jacobians = transform.jacobian(self.points)
@@ -99,7 +99,7 @@ class Samples:
         return self.system.transform.inverse_tangents(self.images, f)[1][..., 0]
 
     def spread(self, values: Array) -> Array:
-        """Values (N,) on the whole lattice (n, m), NaN where no motion comes."""
+        """Return values (N,) on the whole lattice (n, m), NaN in the blocked region."""
         spread = np.full(self.free.shape, np.nan)
         spread[self.free] = values
         return spread
@@ -108,9 +108,9 @@ class Samples:
 def arrows_and_colour(
     system: DiffeomorphicSystem, area: Slice, clearance: Clearance, colour: SliceColour, *, arrows: bool, coarse: bool
 ) -> tuple[FieldPicture | None, ColourPicture | None]:
-    """Velocities on the slice, if `arrows` are wanted, and a function of it, if the `colour` is one.
+    """Compute velocities on the slice, if `arrows` are wanted, and the function that the `colour` shows, if any.
 
-    Both are worked out on one lattice for a `coarse` picture, which is replaced at once.
+    A `coarse` picture, which is soon replaced, uses one lattice for both.
     """
     function, det = colour in {"det", "lyapunov"}, colour == "det"
     field, samples = None, None
@@ -125,18 +125,18 @@ def arrows_and_colour(
 
 
 def det_jacobian(samples: Samples) -> ColourPicture:
-    """The determinant of ψ's Jacobian: how much larger a small volume is in base space. Not above 0 where ψ folds."""
+    """Compute det J of ψ: the ratio of a small volume in base space to the original; ≤ 0 where ψ folds."""
     assert samples.jacobians is not None
     values = samples.spread(np.linalg.det(samples.jacobians))
     return ColourPicture("det", samples.area, values, samples.clearance, np.empty((0, 2, 3)))
 
 
 def lyapunov_value(samples: Samples) -> ColourPicture:
-    """Φ(ψ(y)), which falls along every motion; its level lines are images of evenly spaced circles around the goal."""
+    """Compute Φ(ψ(y)), which falls along every motion, and level lines: images of evenly spaced circles."""
     base = samples.system.base
     values = samples.spread(base.potential(samples.images))
     radius, levels = LEVEL_SPACING, []
-    # where there would be more than one line for a cell of the lattice there is none
+    # no lines where a cell of the lattice would have more than one
     sparse = np.where(_steps(values) < base.speed * LEVEL_SPACING, values, np.nan)
     while (level := _potential(samples.system, radius)) < np.nanmax(values, initial=0.0):
         levels.append(level_line(samples.grid, sparse - level))
@@ -146,18 +146,18 @@ def lyapunov_value(samples: Samples) -> ColourPicture:
 
 
 def streamlines(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool) -> tuple[Array, ...]:
-    """Evenly spaced motions from places on the slice, each (T_i, 3), metres, as far as they stay over the slice.
+    """Compute evenly spaced motions from places on the slice, each (T_i, 3), metres, as far as they stay over it.
 
-    Exact: by conjugacy a streamline through y is ψ⁻¹ of the ray through ψ(y). Each ends where it comes too close to one
-    before it, and what room is left is filled, after Jobard and Lefer, "Creating Evenly-Spaced Streamlines of Arbitrary
-    Density" (1997).
+    They are exact: by conjugacy a streamline through y is ψ⁻¹ of the ray through ψ(y). Each ends where it comes too
+    close to an earlier one, and the remaining gaps are filled, after Jobard and Lefer, "Creating Evenly-Spaced
+    Streamlines of Arbitrary Density" (1997).
     """
     marks, starts, trials, lengths = _Marks(area), [], [], []
     u = np.linspace(0, 1, NUM_TRIALS)
     for spacing in SEED_SPACINGS:
         seeds = area.lattice(spacing * SEPARATION)
         seeds = seeds[~marks.crowded(seeds) & (clearance(seeds) > 0)]
-        # from the rim inwards: those are long, and their order stays while the motion changes
+        # from the rim inwards: those are long, and their order does not change with the motion
         seeds = seeds[np.argsort(-np.abs(area.across(seeds) / area.half_size).max(axis=1).round(6), kind="stable")]
         rays = Rays(system.transform.forward(seeds), system.base)
         index = np.repeat(np.arange(len(seeds)), NUM_TRIALS)
@@ -179,7 +179,7 @@ def streamlines(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, 
 
 
 class _Marks:
-    """Where streamlines are, on a lattice of small cubes over the slice."""
+    """Cells near streamlines, on a lattice of small cubes over the slice."""
 
     def __init__(self, area: Slice) -> None:
         self._area, self._cell, border = area, SEPARATION / 3, 4
@@ -190,25 +190,25 @@ class _Marks:
         self._around, self._close = (self._ball(radius) for radius in (3.0, 1.5))
 
     def _ball(self, radius: float) -> Indices:
-        """Which cubes, relative to one, have their middle within so many cubes of its middle."""
+        """Return the offsets of the cubes whose middles are within `radius` cubes of a cube's middle."""
         reach = np.arange(-int(radius), int(radius) + 1)
         offsets = np.stack(np.meshgrid(reach, reach, reach), axis=-1).reshape(-1, 3)
         return offsets[np.linalg.norm(offsets, axis=1) <= radius] @ self._stride
 
     def _cells(self, points: Array) -> tuple[Mask, Indices]:
-        """Whether points (N, 3) are over the slice, and the cubes that those are in."""
+        """Return whether points (N, 3) are over the slice, and the cubes of those that are."""
         own = np.column_stack([self._area.across(points), (points - self._area.centre) @ self._area.normal])
         over = np.asarray((np.abs(own) <= self._half + 1e-9).all(axis=1))
         return over, (np.round((own[over] + self._half) / self._cell).astype(int) + self._border) @ self._stride
 
     def crowded(self, points: Array) -> Mask:
-        """Whether points (N, 3) over the slice are too near to a streamline to begin another one."""
+        """Return whether points (N, 3) over the slice are too near to a streamline to begin another one."""
         return self._near[self._cells(points)[1]]
 
     def take(self, line: Array) -> int:
-        """How many of a line's first points are to be shown; they are marked. 0 if it has too little room."""
+        """Mark the first points of a line that have room; return their number, 0 if the line would be too short."""
         along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-        closely = np.arange(0, along[-1], self._cell)  # nothing slips through between samples
+        closely = np.arange(0, along[-1], self._cell)  # so densely that no cube is skipped
         over, cells = self._cells(np.stack([np.interp(closely, along, c) for c in line.T], axis=1))
         cells = cells[: _num_leading(over)]
         if not len(cells) or self._near[cells[0]]:
@@ -223,12 +223,12 @@ class _Marks:
 
 
 def _num_leading(mask: Mask) -> int:
-    """How many are true before the first that is not."""
+    """Return the number of leading true values."""
     return len(mask) if mask.all() else int(mask.argmin())
 
 
 def _steps(values: Array) -> Array:
-    """(n, m) the largest difference of each value from its neighbours; infinite where one has none."""
+    """Return the largest difference of each value (n, m) from its neighbours; infinite beside NaN."""
     steps = np.zeros_like(values)
     for axis in range(2):
         step = np.nan_to_num(np.abs(np.diff(values, axis=axis)), nan=np.inf)
@@ -238,5 +238,5 @@ def _steps(values: Array) -> Array:
 
 
 def _potential(system: DiffeomorphicSystem, radius: float) -> float:
-    """Of the base attractor at this distance from its goal."""
+    """Return the base attractor's potential at a distance from its goal."""
     return float(system.base.potential(system.base.goal + radius * np.eye(system.base.dim)[0]))

@@ -14,9 +14,10 @@ from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Point, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario, View
-from dt_viz.scenario.stack import aware, plane_of
+from dt_viz.scenario.stack import plane_of, with_added
 from dt_viz.scenario.tasks import Pot, Task
-from dt_viz.transforms.bias import Biasing, BiasPoint
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.bias import BiasPoint
 
 BOTTLE = (0.07, 0.24)
 """Diameter and height, metres."""
@@ -69,15 +70,26 @@ class PaperScene:
         return not scenario.moves_like(replace(own, warp=scenario.warp, **followed))
 
 
+def _avoiding(task: Task, avoidance: Avoidance) -> Scenario:
+    return Scenario(task.name, (Layer(avoidance, name=avoidance.title),))
+
+
+def _biased(task: Task, *points: BiasPoint) -> Scenario:
+    scenario = Scenario(task.name)
+    for point in points:
+        scenario = replace(scenario, stack=with_added(scenario, point)[0])
+    return scenario
+
+
 def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
     (x, y, _), (diameter, height) = task.obstacle_position, BOTTLE
-    return Scenario(task.name, (Cylinder((x, y, height / 2), diameter, height),), space="cspace")
+    return _avoiding(task, Avoidance(Cylinder((x, y, height / 2), diameter, height), space="cspace"))
 
 
 def _cube_in_the_letter(task: Task) -> Scenario:
     """Fig. 3 (a)."""
-    return Scenario(task.name, (Box(task.obstacle_position, (CUBE, CUBE, CUBE)),), space="task")
+    return _avoiding(task, Avoidance(Box(task.obstacle_position, (CUBE, CUBE, CUBE))))
 
 
 def in_clover(s: Array) -> Mask:
@@ -96,22 +108,22 @@ def clover() -> Cloud:
 
 def _cloud_in_the_letter(task: Task) -> Scenario:
     """Fig. 3 (b)."""
-    return Scenario(task.name, (CloudObstacle(task.obstacle_position, clover()),), space="task")
+    return _avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, clover())))
 
 
 def _sphere_in_the_stroke(task: Task) -> Scenario:
     """Fig. 5."""
     u = STROKE_PLACES.get(task.name)
     place = task.obstacle_position if u is None else as_point(task.mean_path[round(100 * u)])
-    return Scenario(task.name, (Sphere(place, STROKE_SPHERE),), space="both", temperature=STROKE_TEMPERATURE)
+    sphere = Sphere(place, STROKE_SPHERE)
+    return _avoiding(task, Avoidance(sphere, space="both", temperature=STROKE_TEMPERATURE))
 
 
 def _two_points(task: Task) -> Scenario:
     """Fig. 4."""
     mean, plane = task.mean_path, plane_of(task)
     places = [mean[round(100 * u)] + task.slice.axes @ offset for u, offset in J_OFFSETS]
-    layers = [Layer(Biasing(BiasPoint(as_point(p), plane=plane)), name=f"Bias {k}") for k, p in enumerate(places, 1)]
-    return Scenario(task.name, (), layers=aware(layers))
+    return _biased(task, *(BiasPoint(as_point(place), plane=plane) for place in places))
 
 
 def release(pot: Pot) -> Point:
@@ -124,8 +136,7 @@ def _into_pot(index: int) -> Callable[[Task], Scenario]:
     """Fig. 8."""
 
     def scenario(task: Task) -> Scenario:
-        point = BiasPoint(release(task.pots[index]), moves_goal=True)
-        return Scenario(task.name, (), layers=(Layer(Biasing(point), name="Bias 1"),))
+        return _biased(task, BiasPoint(release(task.pots[index]), moves_goal=True))
 
     return scenario
 

@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from dt_viz.flows.diffeomorphisms import AUTO, Integration
-from dt_viz.obstacles.occupancy import Generator
+from dt_viz.learning.imitation import Objective
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.slices import SlicePose
-
-if TYPE_CHECKING:
-    from dt_viz.learning.imitation import Objective
-    from dt_viz.transforms.base import Behaviour
-
-Space = Literal["task", "cspace", "both"]
-"""What avoids the obstacle: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""
-SPACES: tuple[Space, ...] = ("task", "cspace", "both")
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.base import ArmAvoidance, Transform
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
 """What is shown as colour on the slice: det J of the stack, its Lyapunov value, or what the occupancy maps believe."""
@@ -31,8 +24,6 @@ MAX_STARTS = 36
 """Added ones, in the page."""
 MAX_MARGIN = 0.05
 """Metres."""
-MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
-MAX_MANUAL_DURATION = 2.0
 
 
 COMPUTED_VIEWS = ("field", "streamlines", "generator", "grid", "base", "health_plots")
@@ -60,7 +51,7 @@ class View:
     ghost_arm: bool = False
     """The arm where it would be without avoidance."""
     onion: bool = False
-    """Union arms along the motion, fading."""
+    """Several arms along the motion, fading."""
     body_points: bool = False
     """The spheres that cover the arm, and how far avoidance has moved each."""
     joint_plots: bool = False
@@ -95,13 +86,16 @@ class View:
 
 @dataclass(frozen=True)
 class Layer:
-    """A behaviour in the stack."""
+    """A transform in the stack."""
 
-    behaviour: Behaviour
-    """A value: compared by what it is made of."""
+    transform: Transform
     on: bool = True
     name: str = ""
-    """As the page calls it."""
+    """Name on the page, which no other layer of the stack has."""
+
+
+AVOIDING = (Layer(Avoidance(), name=Avoidance.title),)
+"""The stack that a scenario begins with."""
 
 
 @dataclass(frozen=True)
@@ -109,37 +103,53 @@ class Scenario:
     """All that a picture depends on: the same scenario always gives the same frame."""
 
     task: str
-    obstacles: tuple[Obstacle, ...]
-    """All are avoided together; there may be none."""
+    stack: tuple[Layer, ...] = AVOIDING
+    """The transforms on the imitation, from the inside out."""
     imitation: bool = True
     """Whether the learned transform is in the stack; without it motions are straight."""
     objective: Objective = "trajectory"
-    avoidance: bool = True
-    """Whether the obstacle's transforms are in the stack."""
-    space: Space = "task"
-    """Which of them."""
-    generator: Generator = "free-space"
-    temperature: float = 6.0
-    """T of the occupancy potential: higher reaches farther and bends more gently."""
-    margin: float = 0.01
-    """Clearance that `auto` keeps, metres."""
-    duration: float | None = None
-    """t of the avoidance flow; None is `auto`, the shortest that clears the obstacle by the margin."""
-    integration: Integration = AUTO
-    """Of the avoidance flow."""
     warp: float = 1.0
     """s, from 0 to 1: every flow of the stack, the imitation's too, runs for this fraction of its duration."""
-    layers: tuple[Layer, ...] = ()
-    """What else the end effector's motion is to do, from the inside out."""
-    avoidance_level: int | None = None
-    """How many of these layers the end effector's avoidance is stacked on; None is all of them."""
     starts: tuple[Point, ...] = ()
-    """Where motions begin besides the task's starts, metres."""
+    """Places where motions begin besides the task's starts, metres."""
     arm_rollout: int = 0
-    """Which rollout the arm follows: those from the task's starts come first, then those from `starts`."""
+    """Number of the rollout that the arm follows: those from the task's starts come first, then those from `starts`."""
     scene: str = ""
     """Name of the scene of the paper that it began as, if any."""
     view: View = field(default_factory=View)
+
+    @property
+    def active(self) -> tuple[tuple[int, Layer], ...]:
+        """The layers that change the end effector's motion, from the inside out, each with its place in the stack."""
+        return tuple((k, layer) for k, layer in enumerate(self.stack) if layer.on and layer.transform.acts)
+
+    @property
+    def avoidance(self) -> Avoidance:
+        """The transform that the page's obstacles belong to; one without obstacles if the stack has none."""
+        return next((layer.transform for layer in self.stack if isinstance(layer.transform, Avoidance)), Avoidance())
+
+    @property
+    def arm_avoidance(self) -> ArmAvoidance | None:
+        """What the whole arm avoids in configuration space; None where only the end effector gives way.
+
+        Where several layers ask for it, all their obstacles are avoided, in the way of the outermost.
+        """
+        asked = [layer.transform.arm_avoidance for layer in self.stack if layer.on]
+        avoidances = [avoidance for avoidance in asked if avoidance is not None]
+        if not avoidances:
+            return None
+        parts = [part for avoidance in avoidances for part in avoidance.obstacle.parts]
+        return replace(avoidances[-1], obstacle=Union(tuple(parts)))
+
+    @property
+    def avoids(self) -> bool:
+        """Whether some layer that is on leads motions around its obstacles."""
+        return any(layer.on and bool(layer.transform.avoided.parts) for layer in self.stack)
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """The obstacles of all layers, also of those that are off."""
+        return tuple(part for layer in self.stack for part in layer.transform.avoided.parts)
 
     @property
     def obstacle(self) -> Union:
@@ -148,7 +158,7 @@ class Scenario:
 
     @property
     def selected(self) -> int | None:
-        """Which obstacle has handles; None if there is no obstacle."""
+        """Number of the obstacle that has handles; None if there is no obstacle."""
         return min(self.view.selected, len(self.obstacles) - 1) if self.obstacles else None
 
     def moves_like(self, other: Scenario) -> bool:

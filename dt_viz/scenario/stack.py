@@ -1,10 +1,9 @@
-"""Edits of the stack of transforms: pure functions that give the fields of a scenario that change."""
+"""Edits of the stack of transforms: pure functions from one stack to another."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -12,106 +11,129 @@ from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.bias import Biasing, BiasPoint
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.base import Surroundings, Transform
 
-MAX_BIAS_POINTS = 4
-BESIDE = 0.08
-"""Metres from the mean path at which a new bias point is placed."""
-APART = 0.25
-"""Metres that it keeps from other bias points, where that is possible: regions are about that large."""
-ROOM = 0.04
-"""Metres that it keeps from obstacles."""
-PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
-"""Along the mean path, beside which new bias points are placed, as fractions of its length."""
-IMITATION, AVOIDANCE, WHOLE_ARM = "Imitation", "Avoidance", "Whole arm"
-"""Names of the transforms that are no layers."""
+IMITATION, WHOLE_ARM = "Imitation", "Whole arm"
+"""Names of the transforms below and above the stack: what was learned, and the avoidance in configuration space."""
+
+Stack = tuple[Layer, ...]
 
 
-class Stacked(TypedDict):
-    """The fields of a scenario that say what is stacked in which order."""
-
-    layers: tuple[Layer, ...]
-    avoidance_level: int | None
-
-
-def bias_points(layers: Sequence[Layer]) -> dict[str, BiasPoint]:
-    """The bias points, also those that are off, by the name of their layer."""
-    return {layer.name: layer.behaviour.point for layer in layers if isinstance(layer.behaviour, Biasing)}
+def place_of(scenario: Scenario, name: str) -> int | None:
+    """Place in the stack of the layer of this name, and of the one whose obstacles the whole arm avoids."""
+    if name == WHOLE_ARM:
+        name = avoidance_layer(scenario).name
+    return next((k for k, layer in enumerate(scenario.stack) if layer.name == name), None)
 
 
-def aware(layers: Sequence[Layer]) -> tuple[Layer, ...]:
-    """The layers, each bias point told which targets below it are not to be pulled away again."""
-    below, told = [], []
-    for layer in layers:
-        behaviour = layer.behaviour
-        if isinstance(behaviour, Biasing):
-            layer = replace(layer, behaviour=replace(behaviour, below=tuple(below)))  # noqa: PLW2901
-            if layer.on:
-                below.append(behaviour.point.position)
-        told.append(layer)
-    return tuple(told)
+def avoidance_layer(scenario: Scenario) -> Layer:
+    """The layer that the page's obstacles belong to; one that is off and has none if the stack has no such layer."""
+    none = Layer(scenario.avoidance, on=False, name=Avoidance.title)
+    return next((layer for layer in scenario.stack if layer.transform is scenario.avoidance), none)
 
 
-def with_bias_point(layers: Sequence[Layer], point: BiasPoint) -> tuple[Layer, ...]:
-    """One bias point more, outermost, under the first name that is free."""
-    taken = {layer.name for layer in layers}
-    name = next(name for k in range(1, len(layers) + 2) if (name := f"Bias {k}") not in taken)
-    return aware((*layers, Layer(Biasing(point), name=name)))
+def transform_of(scenario: Scenario, name: str) -> Transform | None:
+    """The transform of the layer of this name, see `place_of`; None if there is none."""
+    place = place_of(scenario, name)
+    return None if place is None else scenario.stack[place].transform
 
 
-def with_changed_point(layers: Sequence[Layer], name: str, point: BiasPoint) -> tuple[Layer, ...]:
-    """The bias point of this name replaced."""
-    return aware([replace(layer, behaviour=Biasing(point)) if layer.name == name else layer for layer in layers])
+def with_transform(scenario: Scenario, name: str, transform: Transform) -> Stack:
+    """The stack with the transform of the layer of this name replaced; unchanged if there is none."""
+    return _changed(scenario, name, transform=transform)
 
 
-def switched(layers: Sequence[Layer], name: str) -> tuple[Layer, ...]:
-    """The layer of this name switched off, or on."""
-    return aware([replace(layer, on=not layer.on) if layer.name == name else layer for layer in layers])
+def with_avoidance(scenario: Scenario, **changes: Any) -> Stack:  # noqa: ANN401 - the fields of Avoidance
+    """The stack with fields of the avoidance replaced that the page's obstacles belong to; added if there is none."""
+    layer = avoidance_layer(scenario)
+    after = replace(scenario.avoidance, **changes)
+    if place_of(scenario, layer.name) is None:
+        return (*scenario.stack, Layer(after, name=layer.name))
+    return _changed(scenario, layer.name, transform=after)
 
 
-def names(scenario: Scenario) -> tuple[str, ...]:
-    """What is stacked on the imitation, also what is off, from the inside out; the end effector's avoidance is one."""
-    stacked = [layer.name for layer in scenario.layers]
-    stacked.insert(len(stacked) if scenario.avoidance_level is None else scenario.avoidance_level, AVOIDANCE)
-    return tuple(stacked)
+def _changed(scenario: Scenario, name: str, **changes: Any) -> Stack:  # noqa: ANN401 - the fields of Layer
+    place = place_of(scenario, name)
+    return tuple(replace(layer, **changes) if k == place else layer for k, layer in enumerate(scenario.stack))
 
 
-def visible_names(scenario: Scenario) -> tuple[str, ...]:
-    """The same without the end effector's avoidance where there is nothing for it to do."""
-    return tuple(name for name in names(scenario) if name != AVOIDANCE or _hand_avoids(scenario))
+def with_added(scenario: Scenario, transform: Transform) -> tuple[Stack, str]:
+    """The stack with one transform more, outermost but for those that stay so, and the name that it got."""
+    taken, title = {layer.name for layer in scenario.stack}, transform.title
+    names = (title if transform.most == 1 else f"{title} {k}" for k in range(1, len(taken) + 2))
+    name = next(name for name in names if name not in taken)
+    place = len(scenario.stack)
+    while place and scenario.stack[place - 1].transform.stays_outermost:
+        place -= 1
+    return (*scenario.stack[:place], Layer(transform, name=name), *scenario.stack[place:]), name
 
 
-def _hand_avoids(scenario: Scenario) -> bool:
-    """Whether the end effector's avoidance belongs to the stack, on or off."""
-    return scenario.space != "cspace" and bool(scenario.obstacles)
+def without(scenario: Scenario, name: str) -> Stack:
+    """The stack without the layer of this name."""
+    return tuple(layer for layer in scenario.stack if layer.name != name)
 
 
-def without(scenario: Scenario, name: str) -> Stacked:
-    """The layer of this name taken out."""
-    return _in_order(scenario, [other for other in names(scenario) if other != name])
+def switched(scenario: Scenario, name: str) -> Stack:
+    """The stack with the layer of this name switched off, or on; unchanged if there is none."""
+    place = place_of(scenario, name)
+    return scenario.stack if place is None else _changed(scenario, name, on=not scenario.stack[place].on)
 
 
-def shifted(scenario: Scenario, name: str, steps: int) -> Stacked:
-    """The layer of this name, or the avoidance of the end effector, moved outwards by so many places, or inwards."""
-    order = list(visible_names(scenario))
+def shifted(scenario: Scenario, name: str, steps: int) -> Stack:
+    """The stack with the layer of this name moved outwards by so many places of those that are listed, or inwards."""
+    order = list(listed(scenario))
     k = order.index(name)
     order.insert(min(max(k + steps, 0), len(order) - 1), order.pop(k))
-    return _in_order(scenario, order)
+    by_name, rest = {layer.name: layer for layer in scenario.stack}, iter(order)
+    return tuple(by_name[next(rest)] if layer.transform.acts else layer for layer in scenario.stack)
 
 
-def _in_order(scenario: Scenario, order: Sequence[str]) -> Stacked:
-    by_name = {layer.name: layer for layer in scenario.layers}
-    layers = aware([by_name[name] for name in order if name != AVOIDANCE])
-    level = order.index(AVOIDANCE) if AVOIDANCE in order else scenario.avoidance_level
-    return {"layers": layers, "avoidance_level": None if level == len(layers) else level}
+def as_fresh(scenario: Scenario, fresh: Scenario) -> Stack:
+    """The stack of a fresh scenario of another task, its obstacles and their avoidance as they are in this one."""
+    kept = zip(fresh.obstacles, scenario.obstacles, strict=False)
+    moved = tuple(had.moved(there.position, had.wxyz) for there, had in kept)
+    avoidance, own = avoidance_layer(fresh), avoidance_layer(scenario)
+    changes = {"transform": replace(scenario.avoidance, obstacles=moved), "on": own.on}
+    return _changed(fresh, avoidance.name, **changes)
+
+
+def listed(scenario: Scenario) -> tuple[str, ...]:
+    """Names of the layers that change the end effector's motion, also of those that are off, from the inside out."""
+    return tuple(layer.name for layer in scenario.stack if layer.transform.acts)
 
 
 def levels(scenario: Scenario) -> tuple[str, ...]:
     """Names of the levels of the end effector's stack that are on, as `Frame.levels` has them."""
-    off = {layer.name for layer in scenario.layers if not layer.on}
-    if not scenario.avoidance:
-        off.add(AVOIDANCE)
-    return (IMITATION, *(name for name in visible_names(scenario) if name not in off))
+    return (IMITATION, *(layer.name for _, layer in scenario.active))
+
+
+def tunable(scenario: Scenario) -> tuple[str, ...]:
+    """Names of all transforms, also of those that are off, from the outermost to the imitation."""
+    arm = (WHOLE_ARM,) if scenario.avoidance.arm_avoidance is not None and scenario.obstacles else ()
+    return (*arm, *reversed(listed(scenario)), IMITATION)
+
+
+def tuned(scenario: Scenario) -> str:
+    """Name of the transform whose settings the page shows: the one chosen, or else the outermost."""
+    names = tunable(scenario)
+    return scenario.view.tuned if scenario.view.tuned in names else names[0]
+
+
+def anchored(scenario: Scenario) -> dict[str, Transform]:
+    """The transforms that have a place of their own, also those that are off, by the name of their layer."""
+    return {layer.name: layer.transform for layer in scenario.stack if layer.transform.anchor is not None}
+
+
+def added(scenario: Scenario) -> dict[str, Transform]:
+    """The transforms of which there may be several, also those that are off, by the name of their layer."""
+    return {layer.name: layer.transform for layer in scenario.stack if layer.transform.most > 1}
+
+
+def selected(scenario: Scenario) -> str | None:
+    """Name of the added transform that has the handles: the chosen one, or else the newest."""
+    names = added(scenario)
+    return scenario.view.bias if scenario.view.bias in names else next(reversed(names), None)
 
 
 def plane_of(task: Task) -> tuple[Point, Point] | None:
@@ -122,25 +144,8 @@ def plane_of(task: Task) -> tuple[Point, Point] | None:
     return as_point(u), as_point(v)
 
 
-def place_beside(task: Task, scenario: Scenario) -> BiasPoint:
-    """A bias point beside the mean demonstration, in the middle or where bias points and obstacles leave room."""
+def surroundings(task: Task, scenario: Scenario) -> Surroundings:
+    """What a transform that is added finds."""
     mean = np.mean([resample_by_arc_length(path, 201) for path in task.paths], axis=0)
-    plane = plane_of(task)
-    normal = np.array([0.0, 0.0, 1.0]) if plane is None else np.cross(*plane)
-    places = []
-    for u in PLACES:
-        k = round(200 * u)
-        tangent = mean[k + 5] - mean[k - 5]
-        aside = np.cross(tangent, normal)
-        if np.linalg.norm(aside) < 0.1 * np.linalg.norm(tangent):  # straight up or down
-            aside = np.array([1.0, 0.0, 0.0])
-        sides = [mean[k] + sign * BESIDE * aside / np.linalg.norm(aside) for sign in (-1, 1)]
-        # first the side that is farther from the rest of the motion
-        places += sorted(sides, key=lambda place: -np.linalg.norm(mean - place, axis=1).min())
-    taken = [np.asarray(other.position) for other in bias_points(scenario.layers).values()]
-    free = [place for place in places if np.linalg.norm(mean - place, axis=1).min() > BESIDE / 2]  # of other strokes
-    room = [place for place in free if scenario.obstacle.signed_distance(place) > ROOM] or free or places
-    # two whose regions overlap pull against each other: first where no other one is near, then as far as there is
-    apart = [min((float(np.linalg.norm(place - other)) for other in taken), default=np.inf) for place in room]
-    far = [place for place, distance in zip(room, apart, strict=True) if distance > APART]
-    return BiasPoint(as_point(far[0] if far else room[int(np.argmax(apart))]), plane=plane)
+    anchors = tuple(transform.anchor for transform in anchored(scenario).values() if transform.anchor is not None)
+    return Surroundings(mean, plane_of(task), scenario.obstacle, anchors)

@@ -11,7 +11,6 @@ from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.scenario import MAX_STARTS, Scenario
 from dt_viz.scenario.slices import Slice
-from dt_viz.transforms.bias import REACH, SHOULDER
 
 GRID = (4, 4)
 """Starts of a grid along the slice's first and second axis."""
@@ -20,7 +19,11 @@ INNER = 0.8
 APART = 0.02
 """Metres: a place nearer than this to another start is taken."""
 MIN_HEIGHT = 0.02
-"""Metres above the table."""
+"""Height of a start above the table, metres."""
+SHOULDER = (0.0, 0.0, 0.28)
+"""Place of the arm's shoulder, metres."""
+REACH = 0.95
+"""Distance from the shoulder beyond which the hand gets nowhere, metres."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +81,10 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
     starts, blocked, far = scenario.starts, 0, 0
     places = area.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
     rooms = scenario.obstacle.signed_distance(places)
-    if scenario.avoidance and scenario.space != "task":
+    if scenario.arm_avoidance is not None:
         rooms = np.minimum(rooms, arm_room(places))
     for place, room in zip(places, rooms, strict=True):
-        if room < scenario.margin:
+        if room < scenario.avoidance.margin:
             blocked += 1
         elif place[2] < MIN_HEIGHT or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
             far += 1

@@ -16,8 +16,7 @@ from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, la
 from dt_viz.learning.imitation import Imitation
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.scenario.slices import Slice
-
-ASSETS = Path(__file__).resolve().parents[2] / "assets"
+from dt_viz.shipped import ASSETS
 
 DRAWING_CENTRE = np.array([0.0, -0.50, 0.42])
 """Middle of the vertical drawing plane before the robot, metres. Whoever faces the robot sees it as a blackboard."""

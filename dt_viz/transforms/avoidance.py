@@ -1,18 +1,45 @@
-"""Avoiding an obstacle: the reverse flow out of what it occupies, for as long as it takes to be clear (sec. 4.4)."""
+"""Avoiding obstacles: the reverse flow out of what they occupy, for as long as it takes to be clear (sec. 4.4)."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow
-from dt_viz.flows.fields import Array, Mask, VectorField
+from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Integration
+from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
 from dt_viz.flows.integrators import integrate_adaptive, rk4
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.occupancy import Generator
+from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.base import Built, Motion, named_starts
+from dt_viz.transforms.base import (
+    ArmAvoidance,
+    Built,
+    Choice,
+    FlowIntegration,
+    MotionBelow,
+    Number,
+    Setting,
+    Transform,
+    axes_of,
+    start_warnings,
+)
+from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
+Space = Literal["task", "cspace", "both"]
+"""What avoids the obstacles: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""
+SPACE_NAMES: Mapping[Space, str] = {"task": "End effector", "cspace": "Whole arm", "both": "Both"}
+"""Names of these."""
+GENERATOR_NAMES: Mapping[Generator, str] = {
+    "free-space": "Free space (−∇log(1−p))",
+    "probability": "Probability (∇p, the paper's)",
+}
+"""Names of the generators."""
+MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
+MAX_MANUAL_DURATION = 2.0
+"""Longest flow time that can be chosen by hand."""
 MAX_DURATION = 2.5
 """Longest flow that is tried to clear an obstacle: a motion that still collides runs through the flow's centre."""
 SNAPSHOT = 0.05
@@ -31,108 +58,264 @@ ACCEPTED_MARGIN = 0.9
 BESIDE = 1e-3
 """Metres inside that still are beside the obstacle where its surface is only nearly known, and by which a motion may go
 deeper than its covered start before that counts."""
+NUM_DIRECTIONS, MAX_STEPS_OUT = 360, 200
+"""Number of directions of a plane in which a way out of obstacles is looked for, and of steps on it."""
+SHORTEST = 1e-4
+"""Length of the shortest of these steps, metres: by so much a way may lead farther than to the surface."""
 TAIL = 2.0
 """Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
 place: such a path arrives at up to 60° from the straight way out."""
-GOAL_INSIDE, STAYS_INSIDE = "the goal is inside the obstacle", "a motion does not leave the obstacle"
-"""Words of the doubts that name a cause; what follows from it is not said again."""
 
 
-class ObstacleAvoidance:
-    """The end effector avoids the obstacle."""
+@dataclass(frozen=True, init=False)
+class Avoidance(Transform):
+    """Motions are led around obstacles: those of the end effector, those of the whole arm, or both."""
 
-    def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
-        """See `Behaviour`. With `auto` the duration is the shortest that clears all that can be cleared.
+    obstacles: tuple[Obstacle, ...]
+    """All are avoided together; there may be none."""
+    space: Space
+    """What gives way."""
+    generator: Generator
+    temperature: float
+    """T of the occupancy potential: higher reaches farther and bends more gently."""
+    margin: float
+    """Clearance that the automatic flow time keeps, metres."""
+    duration: float | None
+    """t of the flow; None is the shortest that clears the obstacles by the margin."""
+    integration: Integration
+    """Integration of the flow."""
+    plane: tuple[Point, Point] | None
+    """Two orthonormal vectors: the flow acts along these only; None is in space."""
 
-        That is, of this motion. The ends of the next one are moved by this flow, and its duration only grows from one
+    title: ClassVar[str] = "Avoidance"
+    hint: ClassVar[str] = "leads motions around the obstacles"
+    most: ClassVar[int] = 1
+    stays_outermost: ClassVar[bool] = True
+    yields_goal: ClassVar[bool] = True
+    settings: ClassVar[tuple[Setting, ...]] = (
+        Choice("space", "Avoid with", SPACE_NAMES, "what gives way: the hand's path, or the arm by its joint angles"),
+        Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
+        Number(
+            "temperature",
+            "Reach",
+            "T",
+            MIN_TEMPERATURE,
+            MAX_TEMPERATURE,
+            0.5,
+            6.0,
+            hint="temperature: higher bends more gently, from farther away",
+        ),
+        Number(
+            "duration",
+            "Flow time",
+            "t",
+            0.0,
+            MAX_MANUAL_DURATION,
+            0.01,
+            0.5,
+            automatic=True,
+            of_flow=True,
+            hint="the shortest flow that does what the transform is for",
+        ),
+        FlowIntegration(),
+    )
+
+    def __init__(
+        self,
+        obstacles: Obstacle | Iterable[Obstacle] = (),
+        *,
+        space: Space = "task",
+        generator: Generator = "free-space",
+        temperature: float = 6.0,
+        margin: float = 0.01,
+        duration: float | None = None,
+        integration: Integration = AUTO,
+        plane: tuple[Point, Point] | None = None,
+    ) -> None:
+        values = {
+            "obstacles": tuple(obstacles) if isinstance(obstacles, Iterable) else (obstacles,),
+            "space": space,
+            "generator": generator,
+            "temperature": temperature,
+            "margin": margin,
+            "duration": duration,
+            "integration": integration,
+            "plane": plane,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def acts(self) -> bool:
+        """See `Transform`."""
+        return self.space != "cspace" and bool(self.obstacles)
+
+    @property
+    def arm_avoidance(self) -> ArmAvoidance | None:
+        """See `Transform`."""
+        if self.space == "task":
+            return None
+        flow = self.generator, self.temperature, self.margin, self.duration, self.integration
+        return ArmAvoidance(self.avoided, *flow)
+
+    @property
+    def avoided(self) -> Union:
+        """See `Transform`."""
+        return Union(self.obstacles)
+
+    def in_plane(self, plane: tuple[Point, Point]) -> Avoidance:
+        """See `Transform`."""
+        return replace(self, plane=plane)
+
+    def _field(self) -> VectorField:
+        field = self.avoided.field(self.generator, self.temperature)
+        return field if self.plane is None else InPlane(field, axes_of(self.plane)[:, :2])
+
+    def _nearest_free(self, goal: Array) -> Array:
+        """The place (3,) where motions end whose goal (3,) is covered, metres; in the plane, if the flow acts there."""
+        obstacle = self.avoided
+        if self.plane is None or obstacle.signed_distance(goal) >= 0:
+            return obstacle.nearest_free(goal)
+        turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
+        directions = np.column_stack([np.cos(turn), np.sin(turn)]) @ axes_of(self.plane)[:, :2].T
+        length = np.zeros(NUM_DIRECTIONS)
+        for _ in range(MAX_STEPS_OUT):
+            depth = -obstacle.signed_distance(goal + length[:, None] * directions)
+            if depth[length.argmin()] <= 0:
+                break
+            length += np.where(depth > 0, np.maximum(depth, SHORTEST), 0)
+        return goal + length.min() * directions[length.argmin()]
+
+    def build(self, motion: MotionBelow) -> Built:
+        """See `Transform`. The automatic flow time is the shortest that clears all that can be cleared.
+
+        That is, of this motion. The ends of the next one are moved by this flow, and its flow time only grows from one
         attempt to the next: where a start or goal is close to the obstacle it may end up longer than needed.
         """
-        scenario = motion.scenario
-        if not scenario.avoidance or scenario.space == "cspace" or not scenario.obstacle.parts:
-            return None
-        obstacle = scenario.obstacle
-        field = obstacle.field(scenario.generator, scenario.temperature)
+        obstacle = self.avoided
+        field = self._field()
         num_demonstrated = len(motion.demonstrated.starts)
-        doubts = named_starts(np.flatnonzero(_blocked(motion)), num_demonstrated, "inside the obstacle")
-        duration, hopeless = scenario.duration, False
+        covered = np.flatnonzero(_blocked(obstacle, motion))
+        warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
+        duration, hopeless = self.duration, False
         if duration is None:
             # the deepest samples leave last, or nearly so; where they did not tell the whole story, take all
-            depth = np.where(_avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
-            if at_least:
+            depth = np.where(self._avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
+            if motion.at_least:
                 points = motion.positions[np.isfinite(depth)]
             else:
-                points = np.concatenate([_deepest(motion, depth), _crests(motion, depth, field)])
-            duration = clearing_duration(field, obstacle, points, _margin(motion), at_least=at_least)
+                crests = _crests(motion, depth, field, self._kept_margin(motion))
+                points = np.concatenate([_deepest(motion, depth), crests])
+            margin = self._kept_margin(motion)
+            duration = clearing_duration(field, obstacle, points, margin, at_least=motion.at_least)
             # where the exact flow is clear for longer already, more time is not what a coarse one lacks
-            hopeless = duration is None or (scenario.integration.by_hand and 0 < duration <= at_least)
+            hopeless = duration is None or (self.integration.by_hand and 0 < duration <= motion.at_least)
             if duration is None:
                 duration = MAX_DURATION
                 carried, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
                 if obstacle.signed_distance(carried).min() < 0:
-                    flat = scenario.generator == "probability"
+                    flat = self.generator == "probability"
                     why = "∇p is flat inside it" if flat else "it runs through its dead centre"
-                    doubts.append(f"{STAYS_INSIDE}: {why}")
-        flow = scenario.integration.of(AdaptiveFlow(field, duration, tolerance))
-        goal = _goal(motion) if motion.keeps_goal else flow.inverse(motion.goal)
+                    text = f"a motion does not leave the obstacle: {why}"
+                    warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
+        flow = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
+        goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
             end = "end beside it" if inside < BESIDE else f"end {1e3 * inside:.0f} mm deep in it"
-            doubts.append(f"{GOAL_INSIDE}: motions {end}")
-        return Built(flow, duration, goal, hopeless, tuple(doubts), scenario.integration)
+            warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, {"duration": duration})
 
-    def satisfied(self, motion: Motion) -> bool:
+    def satisfied(self, motion: MotionBelow) -> bool:
         """Whether all that can be cleared keeps (almost) the margin, where that is to be seen to."""
-        if motion.scenario.duration is not None:
+        if self.duration is not None:
             return True
-        distance = motion.scenario.obstacle.signed_distance(motion.positions[_avoidable(motion)])
-        return bool((distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING).all())
+        distance = self.avoided.signed_distance(motion.positions[self._avoidable(motion)])
+        return bool((distance >= ACCEPTED_MARGIN * self._kept_margin(motion) - ROUNDING).all())
+
+    def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
+        """Warnings about how near the end effector comes to the obstacle; see `Transform`."""
+        if satisfied and float(self.avoided.signed_distance(motion.positions).min()) >= 0:
+            return ()
+        kept = self.smallest_kept(motion)
+        covered = any(warning.kind is Kind.GOAL_COVERED for warning in made.warnings)
+        # where a goal is covered, what ends nearly on the surface is beside it
+        if kept < (-BESIDE if covered else -ROUNDING):
+            return (motion.warning(Kind.ENTERS, f"a motion enters the obstacle by {in_millimetres(-kept)}"),)
+        if satisfied or np.isinf(kept):
+            return ()
+        far = made.hopeless and not made.integration.by_hand
+        why = ": the field does not reach farther; a higher T or a smaller margin helps" if far else ""
+        text = f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle{why}"
+        return (motion.warning(Kind.TOO_NEAR, text),)
+
+    def smallest_kept(self, motion: MotionBelow) -> float:
+        """Smallest distance from the obstacle of what the stack could keep out of it, metres, negative inside.
+
+        Of a motion that starts inside, what is deeper than its start counts, too; of one that was to end beside a
+        covered goal, all up to its end. Infinite if nothing counts.
+        """
+        obstacle, motion = self.avoided, replace(motion, keeps_goal=False)
+        distance, at_start = obstacle.signed_distance(motion.positions), obstacle.signed_distance(motion.starts)
+        deeper = (at_start < 0)[motion.index] & (distance < at_start[motion.index] - BESIDE)
+        return float(distance[self._avoidable(motion) | deeper].min(initial=np.inf))
+
+    def _kept_margin(self, motion: MotionBelow) -> float:
+        """The clearance to keep, metres: the margin, or what start and goal leave of it."""
+        obstacle = self.avoided
+        ends = motion.starts[~_blocked(obstacle, motion)]
+        if motion.keeps_goal:
+            ends = np.concatenate([ends, self._nearest_free(motion.goal)[None]])
+        room = obstacle.signed_distance(ends).min(initial=self.margin)
+        return max(0.0, float(room))
+
+    def _avoidable(self, motion: MotionBelow) -> Mask:
+        """(N,) bool: samples that a transform can keep out of the obstacle.
+
+        Not the first ones of a motion that starts inside it, until it keeps the margin. If it covers the goal, not the
+        last ones either, as near to the end as the way to where motions end instead is short.
+        """
+        obstacle = self.avoided
+        distance = obstacle.signed_distance(motion.positions)
+        free, clear = distance >= -ROUNDING, distance >= ACCEPTED_MARGIN * self._kept_margin(motion) - ROUNDING
+        goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
+        instead = self._nearest_free(motion.goal) if goal_covered else motion.goal
+        avoidable = np.ones(len(free), dtype=bool)
+        for rollout, blocked in enumerate(_blocked(obstacle, motion)):
+            if not (blocked or goal_covered):
+                continue
+            rows = np.flatnonzero(motion.index == rollout)
+            outside = np.flatnonzero((clear if clear[rows].any() else free)[rows])
+            if blocked:
+                avoidable[rows[: outside[0] if len(outside) else None]] = False
+            if goal_covered:
+                path = motion.positions[rows]
+                to_end = np.append(np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)[::-1])[::-1], 0)
+                tail = to_end <= TAIL * np.linalg.norm(path[-1] - instead) + BESIDE
+                tail[: outside[-1] + 1 if len(outside) else 0] = False
+                avoidable[rows[tail]] = False
+        return avoidable
 
 
-def smallest_kept(motion: Motion) -> float:
-    """Smallest distance from the obstacle of what the stack could keep out of it, metres, negative inside.
-
-    Of a motion that starts inside, what is deeper than its start counts, too; of one that was to end beside a covered
-    goal, all up to its end. Infinite if nothing counts.
-    """
-    obstacle, motion = motion.scenario.obstacle, replace(motion, keeps_goal=False)
-    distance, at_start = obstacle.signed_distance(motion.positions), obstacle.signed_distance(motion.starts)
-    deeper = (at_start < 0)[motion.index] & (distance < at_start[motion.index] - BESIDE)
-    return float(distance[_avoidable(motion) | deeper].min(initial=np.inf))
-
-
-def _goal(motion: Motion) -> Array:
-    """Where motions around the obstacle end: at the goal, or beside the obstacle if that covers it."""
-    return motion.scenario.obstacle.nearest_free(motion.goal)
-
-
-def _blocked(motion: Motion) -> Mask:
+def _blocked(obstacle: Union, motion: MotionBelow) -> Mask:
     """(R,) bool: which rollouts start inside the obstacle."""
-    return motion.scenario.obstacle.signed_distance(motion.starts) < 0
+    return obstacle.signed_distance(motion.starts) < 0
 
 
-def _margin(motion: Motion) -> float:
-    """The clearance to keep, metres: the wanted one, or what start and goal leave of it."""
-    ends = motion.starts[~_blocked(motion)]
-    if motion.keeps_goal:
-        ends = np.concatenate([ends, _goal(motion)[None]])
-    room = motion.scenario.obstacle.signed_distance(ends).min(initial=motion.scenario.margin)
-    return max(0.0, float(room))
-
-
-def _deepest(motion: Motion, depth: Array) -> Array:
+def _deepest(motion: MotionBelow, depth: Array) -> Array:
     """(M, 3) the deepest few samples of each rollout; `depth` (N,), metres, is infinite for those that do not count."""
     order = np.lexsort([depth, motion.index])
     rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
     return motion.positions[order[(rank < NUM_DEEPEST) & np.isfinite(depth[order])]]
 
 
-def _crests(motion: Motion, depth: Array, field: VectorField) -> Array:
+def _crests(motion: MotionBelow, depth: Array, field: VectorField, margin: float) -> Array:
     """(M, 3) places between the samples of the rollouts where the field stops leading onwards and starts leading back.
 
     The field is a gradient, or nearly so: its potential is largest there, and what is there leaves last.
     """
     s, step = motion.positions, np.diff(motion.positions, axis=0)
-    near, same = depth < _margin(motion), np.diff(motion.index) == 0
+    near, same = depth < margin, np.diff(motion.index) == 0
     k = np.flatnonzero(same & near[:-1] & near[1:])
     here, there = (field(np.concatenate([s[k], s[k + 1]])) * np.tile(step[k], (2, 1))).sum(axis=1).reshape(2, -1)
     turns = (here > 0) & (there < 0)
@@ -142,34 +325,6 @@ def _crests(motion: Motion, depth: Array, field: VectorField) -> Array:
     bend, inner = np.zeros_like(s), (same[:-1] & same[1:])[:, None]
     bend[1:-1] = np.diff(step / length, axis=0) / (length[:-1] + length[1:]) * inner
     return s[k] + part * step[k] - part * (1 - part) * length[k] ** 2 * (bend[k] + bend[k + 1]) / 2
-
-
-def _avoidable(motion: Motion) -> Mask:
-    """(N,) bool: samples that a transform can keep out of the obstacle.
-
-    Not the first ones of a motion that starts inside it, until it keeps the margin. If it covers the goal, not the last
-    ones either, as near to the end as the way to where motions end instead is short.
-    """
-    obstacle = motion.scenario.obstacle
-    distance = obstacle.signed_distance(motion.positions)
-    free, clear = distance >= -ROUNDING, distance >= ACCEPTED_MARGIN * _margin(motion) - ROUNDING
-    goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
-    instead = _goal(motion) if goal_covered else motion.goal
-    avoidable = np.ones(len(free), dtype=bool)
-    for rollout, blocked in enumerate(_blocked(motion)):
-        if not (blocked or goal_covered):
-            continue
-        rows = np.flatnonzero(motion.index == rollout)
-        outside = np.flatnonzero((clear if clear[rows].any() else free)[rows])
-        if blocked:
-            avoidable[rows[: outside[0] if len(outside) else None]] = False
-        if goal_covered:
-            path = motion.positions[rows]
-            to_end = np.append(np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)[::-1])[::-1], 0)
-            tail = to_end <= TAIL * np.linalg.norm(path[-1] - instead) + BESIDE
-            tail[: outside[-1] + 1 if len(outside) else 0] = False
-            avoidable[rows[tail]] = False
-    return avoidable
 
 
 def clearing_duration(

@@ -1,22 +1,29 @@
-"""What every behaviour that is stacked on the imitation has in common: each is one diffeomorphism (sec. 4.1)."""
+"""What every transform has in common: a value that is built into one diffeomorphism (sec. 4.1).
+
+A new kind of transform is one file with a subclass of `Transform`, and one line in `dt_viz.transforms.registry`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from dt_viz.flows.diffeomorphisms import AUTO, Diffeomorphism, Integration
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.obstacles.occupancy import Generator
+from dt_viz.obstacles.shapes import Point
+from dt_viz.obstacles.union import Union
+from dt_viz.warning import Kind, MotionWarning
 
 
 @dataclass(frozen=True)
-class Motion:
-    """The motion one level down, that a behaviour is to change."""
+class MotionBelow:
+    """The motion one level down, which a transform is to change."""
 
-    scenario: Scenario
     starts: Array
     """(R, 3) where the robot starts, metres."""
     goal: Array
@@ -25,17 +32,25 @@ class Motion:
     """(N,) which rollout a sample belongs to."""
     positions: Array
     """(N, 3) samples of the rollouts, metres."""
+    name: str = ""
+    """Name of the transform, for its warnings."""
+    tolerance: float = 2e-9
+    """Tolerance of a step of the transform's flow, metres."""
+    at_least: float = 0.0
+    """Flow time to start from where it is chosen automatically: what an earlier attempt needed."""
     above: Diffeomorphism | None = None
-    """ψ from the top of the stack to the manifold of the behaviour, as far as it has been built."""
+    """ψ from the top of the stack to the manifold of the transform, as far as it has been built."""
     top: Array | None = None
     """(N, 3) the same samples at the top of the stack, where the robot moves, metres; None before it is built."""
     keeps_goal: bool = True
-    """Whether behaviours that do not mean to move the goal leave it where it is, or may move it after all."""
+    """Whether transforms that do not mean to move the goal leave it where it is, or may move it after all."""
     num_demonstrated: int | None = None
-    """How many of the rollouts, the first ones, have a demonstration; None is all. The others begin anywhere."""
+    """Number of rollouts, the first ones, that have a demonstration; None is all. The others begin anywhere."""
+    targets: tuple[Point, ...] = ()
+    """Places that transforms further down lead the motions to, metres."""
 
     @property
-    def demonstrated(self) -> Motion:
+    def demonstrated(self) -> MotionBelow:
         """The rollouts that have a demonstration, only."""
         num = self.num_demonstrated
         if num is None or num == len(self.starts):
@@ -45,49 +60,227 @@ class Motion:
         samples = {"index": self.index[rows], "positions": self.positions[rows], "top": top}
         return replace(self, starts=self.starts[:num], **samples)
 
+    def warning(self, kind: Kind, text: str) -> MotionWarning:
+        """A warning about the transform that this motion is changed by."""
+        return MotionWarning(kind, text, self.name)
+
 
 @dataclass(frozen=True)
 class Built:
-    """A behaviour made for a motion."""
+    """A transform made for a motion."""
 
     transform: Diffeomorphism
-    """ψ, from the manifold with the behaviour to the one without."""
+    """ψ, from the manifold with the transform to the one without."""
     duration: float
     """t of its flow."""
     goal: Array
-    """(3,) where motions with the behaviour are to end, metres: `Motion.goal` if the behaviour respects it, else its
-    image under ψ⁻¹."""
+    """(3,) where motions with the transform are to end, metres: `MotionBelow.goal` if it is to stay, else its image
+    under ψ⁻¹."""
     hopeless: bool = False
-    """Whether no duration does what is wanted, so that trying again is of no use."""
-    doubts: tuple[str, ...] = ()
-    """Why its result is not to be trusted, in words."""
+    """Whether no flow time does what is wanted, so that trying again is of no use."""
+    warnings: tuple[MotionWarning, ...] = ()
     integration: Integration = AUTO
-    """Of its flow; one by hand is checked for what it costs."""
+    """Integration of its flow; one chosen by hand is checked for what it costs."""
+    chosen: Mapping[str, float] = field(default_factory=dict, compare=False)
+    """Values that were chosen automatically, by the transform's fields."""
 
 
-class Behaviour(Protocol):
-    """A kind of transform that the engine stacks. A new one is a file with such a class, and a layer of a scenario."""
+@dataclass(frozen=True)
+class Number:
+    """A setting that is a slider on the page."""
 
-    def build(self, motion: Motion, tolerance: float, at_least: float) -> Built | None:
-        """The transform for this motion; None where the scenario has it switched off.
+    field: str
+    """Name of the transform's field."""
+    label: str
+    unit: str
+    low: float
+    high: float
+    step: float
+    initial: float
+    """Value of the slider before there is one."""
+    scale: float = 1.0
+    """Units of the slider for one of the field's."""
+    automatic: bool = False
+    """Whether a switch beside the slider sets the field to None, which leaves the choice to the transform."""
+    of_flow: bool = False
+    """Whether it is t of the transform's flow."""
+    hint: str = ""
+
+
+@dataclass(frozen=True)
+class Switch:
+    """A setting that is on or off."""
+
+    field: str
+    label: str
+    hint: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A setting that is one of a few values."""
+
+    field: str
+    label: str
+    options: Mapping[Any, str]
+    """Names of the values."""
+    hint: str = ""
+
+
+@dataclass(frozen=True)
+class FlowIntegration:
+    """The setting of a field of type `Integration`."""
+
+    field: str = "integration"
+
+
+Setting = Number | Switch | Choice | FlowIntegration
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is known where a transform is added."""
+
+    mean_path: Array
+    """(T, 3) the mean demonstration, evenly sampled, metres."""
+    plane: tuple[Point, Point] | None
+    """Two orthonormal vectors of a drawing's plane; None of a task in space."""
+    obstacle: Union
+    anchors: tuple[Point, ...]
+    """Places of other transforms, metres."""
+
+
+@dataclass(frozen=True)
+class ArmAvoidance:
+    """What the whole arm is to avoid in configuration space, and how (sec. 4.5)."""
+
+    obstacle: Union
+    generator: Generator = "free-space"
+    temperature: float = 6.0
+    """T of the occupancy potential."""
+    margin: float = 0.01
+    """Clearance that the automatic flow time keeps, metres."""
+    duration: float | None = None
+    """t of the flow; None is the shortest that clears the obstacle by the margin."""
+    integration: Integration = AUTO
+
+
+def axes_of(plane: tuple[Point, Point] | None) -> Array:
+    """Orthonormal columns (3, 3), those of a plane first, if there is one."""
+    if plane is None:
+        return np.eye(3)
+    u, v = np.asarray(plane)
+    return np.stack([u, v, np.cross(u, v)], axis=1)
+
+
+_Transform = TypeVar("_Transform", bound="Transform")
+
+
+class Transform(ABC):
+    """A kind of transform that can be stacked; subclasses are frozen dataclasses, compared by what they are made of."""
+
+    title: ClassVar[str] = ""
+    """Name on the page; numbered where there may be more than one."""
+    hint: ClassVar[str] = ""
+    """What the button that adds one is explained by."""
+    most: ClassVar[int] = 4
+    """Largest number in a stack of the page."""
+    settings: ClassVar[tuple[Setting, ...]] = ()
+    """Settings that the page offers."""
+    flow_time: ClassVar[str] = "t"
+    """Name of t in the list of the stack."""
+    stays_outermost: ClassVar[bool] = False
+    """Whether transforms that are added go below it."""
+    yields_goal: ClassVar[bool] = False
+    """Whether motions may end elsewhere where it finds no way with the goal kept."""
+
+    @abstractmethod
+    def build(self, motion: MotionBelow) -> Built:
+        """The diffeomorphism for this motion."""
+
+    def satisfied(self, motion: MotionBelow) -> bool:
+        """Whether the samples of `motion`, taken after the transform, behave as wanted."""
+        return True
+
+    @property
+    def acts(self) -> bool:
+        """Whether it changes the end effector's motion at all; else it is left out of the stack."""
+        return True
+
+    @property
+    def arm_avoidance(self) -> ArmAvoidance | None:
+        """What the whole arm is to avoid in configuration space, if anything."""
+        return None
+
+    @property
+    def avoided(self) -> Union:
+        """The obstacles that it leads motions around."""
+        return Union()
+
+    @property
+    def anchor(self) -> Point | None:
+        """The place that it leads motions to and by which it is dragged, metres."""
+        return None
+
+    @property
+    def anchor_plane(self) -> tuple[Point, Point] | None:
+        """Two orthonormal vectors of the plane that it is dragged in; None of space."""
+        return None
+
+    @property
+    def region(self) -> float | None:
+        """Radius of the region around its anchor in which it acts, metres; None where that is chosen automatically."""
+        return None
+
+    def anchored(self: _Transform, place: Point) -> _Transform:
+        """The same transform with its anchor elsewhere."""
+        return self
+
+    @property
+    def ends_motions(self) -> bool:
+        """Whether motions are to end at its anchor."""
+        return False
+
+    def in_plane(self: _Transform, plane: tuple[Point, Point]) -> _Transform:
+        """The same transform, acting along a plane only, given by two orthonormal vectors."""
+        return self
+
+    def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
+        """Warnings about what it wants and does not get.
 
         Args:
-            motion: one level down.
-            tolerance: of the flow's integration, metres.
-            at_least: duration to start from where it is chosen automatically.
+            motion: the samples at the top of the stack.
+            made: what it was built into.
+            satisfied: whether `satisfied` says so.
         """
-        ...
+        if satisfied or (made.hopeless and made.warnings):
+            return ()
+        return (motion.warning(Kind.UNREACHED, f"{motion.name}: not every motion does what it asks for"),)
 
-    def satisfied(self, motion: Motion) -> bool:
-        """Whether the samples of `motion`, taken after the transform, behave as wanted."""
-        ...
+    def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
+        """Warnings about what the avoidance of obstacles takes from it again.
+
+        Args:
+            motion: the motions that are shown, of the end effector.
+            made: what it was built into; it was satisfied then.
+            who: moves, in words.
+        """
+        return ()
+
+    @classmethod
+    def beside(cls: type[_Transform], surroundings: Surroundings) -> _Transform:
+        """The transform that the page adds."""
+        return cls()
 
 
-def named_starts(which: Indices, num_demonstrated: int, how: str) -> list[str]:
-    """What there is to say of starts, counted from 0, the task's first: they are all `how`; empty if it is of none."""
+def start_warnings(
+    which: Indices, num_demonstrated: int, kind: Kind, how: str, source: str = ""
+) -> list[MotionWarning]:
+    """Warnings about starts, counted from 0, the task's first, that are all `how`; empty if it is none."""
     said = []
-    for numbers, kind in ((which[which < num_demonstrated], ""), (which[which >= num_demonstrated], "added ")):
-        counted = ", ".join(str(k + 1 - (num_demonstrated if kind else 0)) for k in numbers)
+    for numbers, of in ((which[which < num_demonstrated], ""), (which[which >= num_demonstrated], "added ")):
+        counted = ", ".join(str(k + 1 - (num_demonstrated if of else 0)) for k in numbers)
         if len(numbers):
-            said.append(f"{kind}start {counted} is {how}" if len(numbers) == 1 else f"{kind}starts {counted} are {how}")
+            which_are = f"{of}start {counted} is" if len(numbers) == 1 else f"{of}starts {counted} are"
+            said.append(MotionWarning(kind, f"{which_are} {how}", source))
     return said

@@ -6,6 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -13,8 +14,19 @@ from scipy.linalg import cho_factor, cho_solve
 from dt_viz.flows.diffeomorphisms import AUTO, Flow, Integration
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, Selection, VectorField
 from dt_viz.flows.integrators import integrate, rk4
-from dt_viz.obstacles.shapes import Point
-from dt_viz.transforms.base import Built, Motion
+from dt_viz.obstacles.shapes import Point, as_point
+from dt_viz.transforms.base import (
+    Built,
+    FlowIntegration,
+    MotionBelow,
+    Number,
+    Setting,
+    Surroundings,
+    Switch,
+    Transform,
+    axes_of,
+)
+from dt_viz.warning import Kind, MotionWarning
 
 NUM_SAMPLES = 400
 """Unit vectors sampled in one octant of the region, or quadrant of the disc; the others are its mirror images."""
@@ -48,38 +60,96 @@ OVERSHOOT = 2.0
 STEP = 2.2
 """Flow time of a step of the flow, for each fourth root of a metre of tolerance. The field is mild everywhere, so RK4
 with equal steps is quicker here than steps of each point's own length, and there and back it errs less."""
-OFF_PLANE = "before or behind the plane"
-"""Words of the doubt that a point of a drawing lies there; that motions miss it by so much is not said again."""
-SHOULDER = (0.0, 0.0, 0.28)
-"""Of the arm, metres."""
-REACH = 0.95
-"""Metres from the shoulder, beyond which the hand gets nowhere."""
+MAX_TARGET_MISS = 0.013
+"""Metres by which motions that avoid may miss the target before it is said: a centimetre, and what the arm's joints,
+interpolated between samples, are off by while a hand moves."""
+PLACED_BESIDE = 0.08
+"""Metres from the mean path at which a new bias point is placed."""
+APART = 0.25
+"""Metres that it keeps from other bias points, where that is possible: regions are about that large."""
+ROOM = 0.04
+"""Metres that it keeps from obstacles."""
+PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
+"""Places along the mean path, as fractions of its length, beside which new bias points are placed."""
+SMALLEST_REGION, LARGEST_REGION = 0.04, 0.40
+"""Radius of a region that can be chosen on the page, metres."""
 
 
 @dataclass(frozen=True)
-class BiasPoint:
-    """A place that motions are pulled towards, and how."""
+class BiasPoint(Transform):
+    """Motions are pulled towards a place.
+
+    With the goal where it is, every motion passes the place on its way. If the goal moves, it does so to the place.
+    It is made for the motions that have a demonstration: one that was started elsewhere changes nothing about it.
+    """
 
     position: Point
     """The target, metres."""
     radius: float | None = None
-    """Of the region S around it in which the field acts, metres; None is `auto`, by the distance of the motion."""
+    """Radius of the region S around it in which the field acts, metres; None chooses it by the distance of the motion.
+    """
     strength: float | None = None
-    """t of the flow, in which a point far from target and border moves by t radii; None is `auto`, the shortest after
-    which every motion passes within a centimetre."""
+    """t of the flow, in which a point far from target and border moves by t radii; None is the shortest after which
+    every motion passes within a centimetre."""
     plane: tuple[Point, Point] | None = None
     """Two orthonormal vectors: the field acts along these only, and alike at every depth. None is in space."""
     moves_goal: bool = False
     """Whether the goal is pulled along, or stays where it is."""
     integration: Integration = AUTO
-    """Of its flow."""
+    """Integration of the flow."""
+
+    title: ClassVar[str] = "Bias"
+    hint: ClassVar[str] = "a point that every motion passes, or ends at"
+    flow_time: ClassVar[str] = "strength"
+    settings: ClassVar[tuple[Setting, ...]] = (
+        Number(
+            "radius",
+            "Radius",
+            "[cm]",
+            100 * SMALLEST_REGION,
+            100 * LARGEST_REGION,
+            0.5,
+            15.0,
+            scale=100.0,
+            automatic=True,
+            hint="of the region that it acts in; auto: by how far the motion is away",
+        ),
+        Switch("moves_goal", "Moves the goal", "motions end here instead of at the goal"),
+        Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True, of_flow=True),
+        FlowIntegration(),
+    )
+
+    @property
+    def anchor(self) -> Point:
+        """See `Transform`."""
+        return self.position
+
+    @property
+    def anchor_plane(self) -> tuple[Point, Point] | None:
+        """See `Transform`."""
+        return self.plane
+
+    def in_plane(self, plane: tuple[Point, Point]) -> BiasPoint:
+        """See `Transform`."""
+        return replace(self, plane=plane)
+
+    @property
+    def region(self) -> float | None:
+        """See `Transform`."""
+        return self.radius
+
+    @property
+    def ends_motions(self) -> bool:
+        """See `Transform`."""
+        return self.moves_goal
+
+    def anchored(self, place: Point) -> BiasPoint:
+        """See `Transform`."""
+        return replace(self, position=place)
 
     def axes(self) -> Array:
         """(3, 3) orthonormal columns, those of the plane first."""
-        if self.plane is None:
-            return np.eye(3)
-        u, v = np.asarray(self.plane)
-        return np.stack([u, v, np.cross(u, v)], axis=1)
+        return axes_of(self.plane)
 
     def field(self, radius: float) -> PlacedField:
         """The generator whose reverse flow leads to the target, from a regression done once for all targets."""
@@ -89,6 +159,123 @@ class BiasPoint:
     def offsets(self, s: Array) -> Array:
         """Offsets (*B, 2 or 3) from the target of the points `s` (*B, 3), metres, along the axes it acts on."""
         return (s - np.asarray(self.position)) @ self.axes()[:, : 3 if self.plane is None else 2]
+
+    def build(self, motion: MotionBelow) -> Built:
+        """See `Transform`. The automatic strength is the smallest that brings every motion to the target."""
+        point, motion, at_least = self, motion.demonstrated, motion.at_least
+        if motion.above is not None:  # what is above must not lead the motion past the target again
+            point = replace(point, position=as_point(motion.above.forward(np.asarray(point.position))))
+        nearest, at_end = closest_points(point, motion)
+        if point.moves_goal:
+            nearest = motion.goal[None]
+        distance = float(np.linalg.norm(point.offsets(nearest), axis=1).max())
+        radius = point.radius or self._auto_radius(motion, (SMALL if at_least == 0 else SMALLER) * distance, distance)
+        field, duration = point.field(radius), point.strength
+        warnings = self._misplaced(motion, nearest, radius)
+        if duration is None:
+            duration = pulling_duration(field, point, nearest, at_least=at_least)
+            if duration is not None and at_least > 0:
+                # starts and goal in the region move the motion below the farther, the longer the flow: converge sooner
+                duration = min(at_least + OVERSHOOT * (duration - at_least), MAX_DURATION)
+        hopeless = duration is None
+        if duration is None:
+            duration = MAX_DURATION
+            warnings.append(_warning(motion, Kind.UNREACHED, _too_small(radius, distance)))
+        elif point.strength is None and at_least > LONG and at_end.any() and not point.moves_goal:
+            hopeless = True  # its ends stay where they are, and no other place of it will be nearer
+            text = "a motion has its start or goal nearer to the point than its way: it is not led there"
+            warnings.append(_warning(motion, Kind.UNREACHED, text))
+        steps = max(1, math.ceil(duration / (STEP * motion.tolerance**0.25)))
+        flow = Flow(field, duration, steps, sparse=True, tolerance=motion.tolerance)
+        flow = point.integration.of(flow)
+        goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
+        chosen = {"strength": duration, "radius": radius}
+        return Built(flow, duration, goal, hopeless, tuple(warnings), point.integration, chosen)
+
+    def satisfied(self, motion: MotionBelow) -> bool:
+        """Whether every motion passes close to the target, where that is to be seen to."""
+        if self.strength is not None:
+            return True
+        return bool((self.distances(motion) <= ACCEPTED).all())
+
+    def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
+        """Warnings about motions that pass beside the target to avoid an obstacle; see `Transform`.
+
+        In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
+        """
+        if self.strength is not None:
+            return ()
+        off_plane = any(warning.kind is Kind.OFF_PLANE for warning in made.warnings)
+        point = self if off_plane else replace(self, plane=None)
+        missed = float(point.distances(motion).max())
+        if missed <= MAX_TARGET_MISS:
+            return ()
+        does = "ends" if self.moves_goal else "passes"
+        text = f"{who} gives way to the obstacle and {does} {1e3 * missed:.0f} mm from it"
+        return (_warning(motion, Kind.TARGET_MISSED, text),)
+
+    @classmethod
+    def beside(cls, surroundings: Surroundings) -> BiasPoint:
+        """A bias point beside the mean demonstration, in the middle or where other places and obstacles leave room."""
+        mean, plane = surroundings.mean_path, surroundings.plane
+        normal = np.array([0.0, 0.0, 1.0]) if plane is None else np.cross(*plane)
+        places = []
+        for u in PLACES:
+            k = round((len(mean) - 1) * u)
+            tangent = mean[k + 5] - mean[k - 5]
+            aside = np.cross(tangent, normal)
+            if np.linalg.norm(aside) < 0.1 * np.linalg.norm(tangent):  # straight up or down
+                aside = np.array([1.0, 0.0, 0.0])
+            sides = [mean[k] + sign * PLACED_BESIDE * aside / np.linalg.norm(aside) for sign in (-1, 1)]
+            # first the side that is farther from the rest of the motion
+            places += sorted(sides, key=lambda place: -np.linalg.norm(mean - place, axis=1).min())
+        # off other strokes, and where obstacles leave room
+        free = [place for place in places if np.linalg.norm(mean - place, axis=1).min() > PLACED_BESIDE / 2]
+        room = [place for place in free if surroundings.obstacle.signed_distance(place) > ROOM] or free or places
+        # two whose regions overlap pull against each other: first where no other one is near, then as far as there is
+        taken = np.asarray(surroundings.anchors).reshape(-1, 3)
+        apart = [float(np.linalg.norm(place - taken, axis=1).min(initial=np.inf)) for place in room]
+        far = [place for place, distance in zip(room, apart, strict=True) if distance > APART]
+        return cls(as_point(far[0] if far else room[int(np.argmax(apart))]), plane=plane)
+
+    def distances(self, motion: MotionBelow) -> Array:
+        """(R,) metres from the target: of the motions that have a demonstration, or of their ends if the goal moves."""
+        motion = motion.demonstrated
+        if motion.top is not None:
+            motion = replace(motion, positions=motion.top)
+        if self.moves_goal:
+            last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
+            return np.linalg.norm(self.offsets(motion.positions[last]), axis=1)
+        return closest_distances(self, motion)
+
+    def _auto_radius(self, motion: MotionBelow, least: float, distance: float) -> float:
+        """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""
+        kept = [motion.starts, np.asarray(motion.targets).reshape(-1, 3)]
+        if not self.moves_goal:
+            kept.append(motion.goal[None])
+        room = float(np.linalg.norm(self.offsets(np.concatenate(kept)), axis=1).min())
+        return max(MIN_RADIUS, min(LARGE * distance, max(least, room)))
+
+    def _misplaced(self, motion: MotionBelow, nearest: Array, radius: float) -> list[MotionWarning]:
+        """Warnings about the place of the bias point."""
+        texts = []
+        if np.linalg.norm(self.offsets(motion.goal)) < ACCEPTED:
+            texts.append("the point is on the goal, where the motions end anyway")
+        if (np.linalg.norm(self.offsets(motion.starts), axis=1) < ACCEPTED).any():
+            texts.append("the point is on a start, where the motion is anyway")
+        if any(np.linalg.norm(self.offsets(np.asarray(other))) < 0.9 * radius for other in motion.targets):
+            texts.append("the region covers a bias point below it in the stack: motions are pulled away from that")
+        warnings = [_warning(motion, Kind.MISPLACED, text) for text in texts]
+        depth = float(np.abs((nearest - self.position) @ self.axes()[:, 2]).max()) if self.plane else 0.0
+        if depth > ACCEPTED:
+            text = f"the point lies {100 * depth:.0f} cm before or behind the plane: motions are not led to it"
+            warnings.append(_warning(motion, Kind.OFF_PLANE, text))
+        return warnings
+
+
+def _warning(motion: MotionBelow, kind: Kind, text: str) -> MotionWarning:
+    """A warning that begins with the name of the bias point, as there may be several."""
+    return motion.warning(kind, f"{motion.name}: {text}")
 
 
 @dataclass(frozen=True)
@@ -172,101 +359,13 @@ def unit_field(dim: int) -> RegionField:
     return RegionField(GridRBF(grid, cho_solve(cho_factor(gram), features.T @ away / len(samples))))
 
 
-@dataclass(frozen=True)
-class Biasing:
-    """Motions are pulled towards a bias point.
-
-    With the goal where it is, every motion passes the target on its way. If the goal moves, it does so to the target.
-    It is made for the motions that have a demonstration: one that was started elsewhere changes nothing about it.
-    """
-
-    point: BiasPoint
-    below: tuple[Point, ...] = ()
-    """Targets of the bias points below this one in the stack: what passes them is not to be pulled away again."""
-
-    def build(self, motion: Motion, tolerance: float, at_least: float) -> Built:
-        """See `Behaviour`. With `auto` the duration is the shortest that brings every motion to the target."""
-        point, motion = self.point, motion.demonstrated
-        if motion.above is not None:  # what is above must not lead the motion past the target again
-            x, y, z = motion.above.forward(np.asarray(point.position))
-            point = replace(point, position=(float(x), float(y), float(z)))
-        nearest, at_end = closest_points(point, motion)
-        if point.moves_goal:
-            nearest = motion.goal[None]
-        distance = float(np.linalg.norm(point.offsets(nearest), axis=1).max())
-        radius = point.radius or self._auto_radius(motion, (SMALL if at_least == 0 else SMALLER) * distance, distance)
-        field, duration = point.field(radius), point.strength
-        doubts = self._misplaced(motion, nearest, radius)
-        if duration is None:
-            duration = pulling_duration(field, point, nearest, at_least=at_least)
-            if duration is not None and at_least > 0:
-                # starts and goal in the region move the motion below the farther, the longer the flow: converge sooner
-                duration = min(at_least + OVERSHOOT * (duration - at_least), MAX_DURATION)
-        hopeless = duration is None
-        if duration is None:
-            duration = MAX_DURATION
-            doubts.append(_too_small(radius, distance))
-        elif point.strength is None and at_least > LONG and at_end.any() and not point.moves_goal:
-            hopeless = True  # its ends stay where they are, and no other place of it will be nearer
-            doubts.append("a motion has its start or goal nearer to the point than its way: it is not led there")
-        steps = max(1, math.ceil(duration / (STEP * tolerance**0.25)))
-        flow = Flow(field, duration, steps, sparse=True, tolerance=tolerance)
-        flow = point.integration.of(flow)
-        goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
-        return Built(flow, duration, goal, hopeless, tuple(doubts), point.integration)
-
-    def satisfied(self, motion: Motion) -> bool:
-        """Whether every motion passes close to the target, where that is to be seen to."""
-        if self.point.strength is not None:
-            return True
-        return bool((self.distances(motion) <= ACCEPTED).all())
-
-    def distances(self, motion: Motion) -> Array:
-        """(R,) metres from the target: of the motions that have a demonstration, or of their ends if the goal moves."""
-        motion = motion.demonstrated
-        if motion.top is not None:
-            motion = replace(motion, positions=motion.top)
-        if self.point.moves_goal:
-            last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
-            return np.linalg.norm(self.point.offsets(motion.positions[last]), axis=1)
-        return closest_distances(self.point, motion)
-
-    def _auto_radius(self, motion: Motion, least: float, distance: float) -> float:
-        """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""
-        kept = [motion.starts, np.asarray(self.below).reshape(-1, 3)]
-        if not self.point.moves_goal:
-            kept.append(motion.goal[None])
-        room = float(np.linalg.norm(self.point.offsets(np.concatenate(kept)), axis=1).min())
-        return max(MIN_RADIUS, min(LARGE * distance, max(least, room)))
-
-    def _misplaced(self, motion: Motion, nearest: Array, radius: float) -> list[str]:
-        """What there is to say of the place of the bias point."""
-        point, doubts = self.point, []
-        position = np.asarray(point.position)
-        if np.linalg.norm(point.offsets(motion.goal)) < ACCEPTED:
-            doubts.append("the point is on the goal, where the motions end anyway")
-        if (np.linalg.norm(point.offsets(motion.starts), axis=1) < ACCEPTED).any():
-            doubts.append("the point is on a start, where the motion is anyway")
-        if position[2] < 0:
-            doubts.append("the point is below the table")
-        away = float(np.linalg.norm(position - SHOULDER))
-        if away > REACH:
-            doubts.append(f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m")
-        depth = float(np.abs((nearest - position) @ point.axes()[:, 2]).max()) if point.plane else 0.0
-        if depth > ACCEPTED:
-            doubts.append(f"the point lies {100 * depth:.0f} cm {OFF_PLANE}: motions are not led to it")
-        if any(np.linalg.norm(point.offsets(np.asarray(other))) < 0.9 * radius for other in self.below):
-            doubts.append("the region covers a bias point below it in the stack: motions are pulled away from that")
-        return doubts
-
-
 def _too_small(radius: float, distance: float) -> str:
     """What there is to say of a region from which not all motions arrive."""
     sizes = f"the region of {100 * radius:.0f} cm is too small: a motion is {100 * distance:.0f} cm from the target"
     return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
 
 
-def closest_points(point: BiasPoint, motion: Motion) -> tuple[Array, Mask]:
+def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Mask]:
     """Where each rollout, as a polyline, comes closest to the target.
 
     Returns:
@@ -286,7 +385,7 @@ def closest_points(point: BiasPoint, motion: Motion) -> tuple[Array, Mask]:
     return nearest, ((k == first) & (along[k] == 0)) | ((k + 1 == last) & (along[k] == 1))
 
 
-def closest_distances(point: BiasPoint, motion: Motion) -> Array:
+def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
     """(R,) metres: how close each rollout comes to the target, in the plane if the bias acts in one."""
     return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)
 

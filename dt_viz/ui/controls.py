@@ -1,8 +1,7 @@
-"""The only way from a control of the page to the session: what a browser sends is checked here before anything acts.
+"""Checks of what a browser sends for the page's controls, before anything acts on it.
 
-viser takes over whatever arrives, without a look at limits, choices or types, also for controls that are disabled or
-hidden, and calls back afterwards. So `handle.value` is what a browser claims; `Control.value` is what was shown to it,
-or accepted from it.
+viser accepts any value, whatever the limits, choices and types, also for controls that are disabled or hidden, and
+calls back afterwards. So `handle.value` is a browser's claim; `Control.value` was shown to it, or accepted from it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ class Control:
     """An input of the panel.
 
     A number beyond the control's limits is moved to them. Anything else that the control cannot have sent is refused,
-    and the browser is shown the value from before.
+    and the browser is shown the previous value.
     """
 
     def __init__(self, handle: Any, act: Callable[[Any], None] | None = None) -> None:  # noqa: ANN401
@@ -26,7 +25,7 @@ class Control:
 
         Args:
             handle: a slider, a dropdown, a checkbox, a button or a group of buttons.
-            act: given each value that the browser sends and the control allows. It must only submit.
+            act: called with each allowed value from the browser. It must only submit.
         """
         self.handle = handle
         self._value, self._act = handle.value, act
@@ -35,14 +34,12 @@ class Control:
 
     @property
     def value(self) -> Any:  # noqa: ANN401 - as the kind of control
-        """The value shown last, or accepted from the browser since. Assigning shows another one."""
+        """Value shown last, or accepted from the browser since; assigning shows another one."""
         return self._value
 
     @value.setter
     def value(self, value: Any) -> None:  # noqa: ANN401
-        self._value = value
-        if self.handle.value != value:
-            self.handle.value = value
+        self._value = self.handle.value = value
 
     async def _changed(self, event: viser.GuiEvent) -> None:
         if event.client is None:  # assigned here, not in a browser
@@ -56,19 +53,19 @@ class Control:
             self._act(value)
 
     def _put_back(self) -> None:
-        # not by viser's setter, which casts to the type of what it has: that is the claim's
+        # not by viser's setter, which casts to the type of the claim
         self.handle._impl.value = self._value
         if not _is_button(self.handle):
             self.handle._queue_update("value", self._value)
 
 
 def on_press(button: viser.GuiButtonHandle, act: Callable[[], None]) -> None:
-    """Call `act`, which must only submit, when the button is pressed while that is possible."""
+    """Call `act`, which must only submit, when the button is pressed while it is enabled."""
     Control(button, lambda _pressed: act())
 
 
 def allowed(handle: Any, claimed: Any) -> Any | None:  # noqa: ANN401 - handles and values of all kinds
-    """The value that a control takes for what a browser claims; None if the control cannot have sent it."""
+    """Return the value that a control accepts for a browser's claim; None if the control cannot have sent it."""
     if handle.disabled or not handle.visible:
         return None
     match handle:
@@ -80,7 +77,7 @@ def allowed(handle: Any, claimed: Any) -> Any | None:  # noqa: ANN401 - handles 
             return claimed if claimed in handle.options else None
         case viser.GuiCheckboxHandle() | viser.GuiButtonHandle():
             return claimed if isinstance(claimed, bool) else None
-    raise TypeError(f"nobody has said what a {type(handle).__name__} may send")
+    raise TypeError(f"no rule for the values of a {type(handle).__name__}")
 
 
 def _is_button(handle: Any) -> bool:  # noqa: ANN401

@@ -1,18 +1,18 @@
-"""Who gets in, and what gets in: the only place that reaches into viser's server.
+"""Gate of the server: checks connections and messages; the only module that relies on viser's internals.
 
-viser answers whoever connects, hands each message that it can decode to whatever handles it, and has no limits. It
-starts a server of the package websockets; the gate is put into that, from where it sees each request before viser
-answers it and each message before viser decodes it:
+viser answers every client, handles every message that it can decode, and has no limits. It starts a server of the
+package websockets; the gate is inserted there, so that it sees each request before viser answers it and each message
+before viser decodes it:
 
-- Requests are answered if they are meant for this server, and connections are accepted from its own and allowed pages;
-  see `Origins`. There are only so many connections.
-- Messages of the kinds that this page uses are passed on, if they are exactly as viser declares them. Of the others
-  some are kept and sent to everybody for ever (a form that changes), and some ask for what no visitor may decide (a
-  tunnel to the internet); they are dropped. A message that no page sends ends its connection.
-- Files are counted before they are held; see `Upload`.
-- What fails goes to the log, once in a while, without what was sent; see `Terse`.
+- Requests must be meant for this server, and connections come from its own or allowed pages; see `Origins`. The number
+  of connections is limited.
+- Messages of the kinds that this page uses are passed on, if they are exactly as viser declares them. Other kinds are
+  dropped: some would be stored and sent to everybody (a form that changes), and some request what no visitor may decide
+  (a tunnel to the internet). A malformed message ends its connection.
+- The size of files is checked before they are stored; see `Upload`.
+- Failures are logged at a limited rate and without the received content; see `Terse`.
 
-What is used of viser beyond its documentation is looked for when the server starts.
+The undocumented parts of viser that are used are checked when the server starts.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from dt_viz.ui.uploads import MalformedError, Upload
 logger = logging.getLogger(__name__)
 
 SMALL, PART, IMAGE = 64 * 1024, 2**20, 16 * 2**20
-"""Bytes that a message may have: of most kinds, with a part of a file, and with a rendered image."""
+"""Largest sizes of messages, bytes: of most kinds, with a part of a file, and with a rendered image."""
 MAX_SIZES: Mapping[str, int] = {
     "ViewerCameraMessage": SMALL,
     "GuiUpdateMessage": SMALL,
@@ -58,11 +58,11 @@ MAX_SIZES: Mapping[str, int] = {
     "FileTransferStartUpload": SMALL,
     "FileTransferPart": PART,
 }
-"""Messages that this page uses, by viser's name, and the bytes that each may have."""
+"""Largest sizes, bytes, of the messages that this page uses, by viser's name."""
 MAX_RATE = 400
-"""Messages of one connection in a second; a page sends at most 20 of a kind. What is beyond waits."""
+"""Largest rate of messages of a connection, 1/s, beyond which they wait; a page sends at most 20 of a kind."""
 MAX_SOCKETS = 256
-"""Open sockets, also of those who have not asked for anything yet."""
+"""Largest number of open sockets, with or without a request."""
 MISDIRECTED = (
     "This server is not known by that name. To use it, start it with --allow-origin and the address of the page."
 )
@@ -70,20 +70,20 @@ FOREIGN = "Pages of other servers may not connect. To let one, start this server
 FULL = "All places are taken, and those to wait, too."
 
 Answer = Callable[[ServerConnection, Request], Response | None]
-"""Answers a request, or lets it go on to become a connection."""
+"""Callback that answers a request, or returns None to let it become a connection."""
 Refused = Callable[[viser.ClientHandle, str], None]
-"""Tells a visitor why a file is not accepted."""
+"""Callback that tells a visitor why a file is not accepted."""
 
 
 class GateError(RuntimeError):
-    """viser's server is not as it is expected to be."""
+    """A version of viser whose internals differ from what the gate relies on."""
 
     def __init__(self, what: str) -> None:
         super().__init__(f"viser {viser.__version__} has changed ({what}); accepted: viser 1.1")
 
 
 class _Value(msgspec.Struct, forbid_unknown_fields=True):
-    """What a control's update may change: viser would set whatever else is named."""
+    """Permitted changes of a control; viser would set any property that is named."""
 
     value: bool | int | float | str
 
@@ -93,7 +93,7 @@ class _Kind(msgspec.Struct):
 
 
 class _Connection(ServerConnection):
-    """A connection that passes on what the gate lets through."""
+    """A connection that passes on the messages that the gate accepts."""
 
     def __init__(self, gate: Gate, *arguments: Any, **options: Any) -> None:  # noqa: ANN401 - of websockets
         super().__init__(*arguments, **options)
@@ -111,7 +111,7 @@ class _Connection(ServerConnection):
         self._gate.leave(self)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ANN401 - as in websockets
-        """The next message that is let through; raises ConnectionClosed as there."""
+        """Return the next accepted message; raises ConnectionClosed as the base class."""
         while True:
             raw = await super().recv(decode)
             await self._keep_pace()
@@ -132,19 +132,19 @@ class _Connection(ServerConnection):
 
 
 class Gate:
-    """Starts viser's server and stands in front of it."""
+    """Starts viser's server behind its checks."""
 
     def __init__(self, origins: Origins, *, max_connections: int, max_upload: int, refused: Refused) -> None:
-        """Let nobody in yet.
+        """Prepare the checks.
 
         Args:
-            origins: says whose pages may connect.
-            max_connections: at a time.
-            max_upload: bytes of a file.
-            refused: tells a visitor of a file that is not accepted.
+            origins: pages that may connect.
+            max_connections: largest number of simultaneous connections.
+            max_upload: largest size of a file, bytes.
+            refused: called with a visitor and the reason when a file is not accepted.
 
         Raises:
-            GateError: viser has other messages than expected.
+            GateError: viser's messages differ from the expected ones.
         """
         self.max_upload = max_upload
         self._origins, self._max_connections, self._refused = origins, max_connections, refused
@@ -157,10 +157,10 @@ class Gate:
             raise GateError(str(error)) from error
 
     def open(self, host: str, port: int, label: str) -> viser.ViserServer:
-        """Start viser's server behind the gate; see there for the arguments.
+        """Start viser's server behind the gate; the arguments are those of `viser.ViserServer`.
 
         Raises:
-            GateError: viser does not start its server in the way that is expected.
+            GateError: viser does not start its server as expected.
         """
         _report_to_the_log()
         with self._put_into_websockets() as used:
@@ -174,7 +174,7 @@ class Gate:
 
     @contextmanager
     def _put_into_websockets(self) -> Iterator[list[bool]]:
-        """Have servers of websockets start with this gate; the list that is given is not empty once one did."""
+        """Make servers of websockets start with this gate; the yielded list is not empty once one did."""
         module: Any = websockets.asyncio.server
         original = module.serve
         used: list[bool] = []
@@ -218,11 +218,11 @@ class Gate:
             await connection.close(1002, f"Version mismatch. Server: {viser.__version__}. Reload the page.")
 
     def leave(self, connection: ServerConnection) -> None:
-        """The connection is lost."""
+        """Forget a lost connection."""
         self._connections.discard(connection)
 
     def passes(self, connection: _Connection, raw: Any) -> bool:  # noqa: ANN401 - bytes, or what no page sends
-        """Whether viser may have this message.
+        """Return whether a message is passed on to viser.
 
         Raises:
             MalformedError: no page sends such a message.
@@ -245,15 +245,15 @@ class Gate:
         return _is_finite(message)
 
     def _begins(self, connection: _Connection, message: Any) -> bool:  # noqa: ANN401 - FileTransferStartUpload
-        """Whether a file may be sent; the visitor is told if not."""
+        """Return whether a file is accepted; tell the visitor if not."""
         client = self._client_of(connection)
         if client is None:
-            return False  # there is no page yet that could offer it
+            return False  # there is no page yet that could send it
         client.gui._drop_uploads_from_client(client._websock_connection.client_id)  # pyright: ignore[reportArgumentType]
         try:
             connection.upload.start(message.transfer_uuid, message.filename, message.size_bytes, message.part_count)
         except DataError as error:
-            # the page takes a file for under way until all of it is acknowledged
+            # the page shows an upload in progress until all of it is acknowledged
             for told in (
                 viser._messages.FileTransferPartAck(
                     message.source_component_uuid, message.transfer_uuid, message.size_bytes, message.size_bytes
@@ -266,7 +266,7 @@ class Gate:
         return True
 
     def _client_of(self, connection: ServerConnection) -> viser.ClientHandle | None:
-        """Whose connection it is; None before the page has said where its camera is."""
+        """Return the client of a connection; None before its page has reported a camera."""
         if self._server is None:
             return None
         live = self._server._websock_server._live_connections
@@ -275,7 +275,7 @@ class Gate:
 
 
 def _strict(name: str) -> type[msgspec.Struct]:
-    """What a message of viser must be: all that it declares, of these types, and nothing else."""
+    """Return the strict type of one of viser's messages: all declared fields, of their types, and no others."""
     declared = getattr(viser._messages, name)
     hints = get_type_hints(declared)
     if name == "GuiUpdateMessage":
@@ -288,7 +288,7 @@ def _strict(name: str) -> type[msgspec.Struct]:
 
 
 def _is_finite(value: Any) -> bool:  # noqa: ANN401 - a message, or what it holds
-    """Whether all its numbers are finite."""
+    """Return whether all its numbers are finite."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.astuple(value)
     if isinstance(value, tuple):
@@ -297,7 +297,7 @@ def _is_finite(value: Any) -> bool:  # noqa: ANN401 - a message, or what it hold
 
 
 def _report_to_the_log() -> None:
-    """Have viser report to the log what its callbacks raise; it prints all of it, as often as it happens."""
+    """Make viser log what its callbacks raise, which it would print, however often."""
     reports = {
         "print_threadpool_errors": _report_task,
         "print_task_error": _report_task,

@@ -1,6 +1,6 @@
-"""The only way from the scene of the page to the session: what a browser says of places is checked before it is used.
+"""Checks of what a browser sends about places in the scene, before it is used.
 
-viser passes on whatever numbers arrive; a node that is hidden can be clicked and dragged by a forged message, too.
+viser passes on any numbers; a forged message can also click and drag a hidden node.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import viser
 from dt_viz.flows.fields import Array
 
 MAX_DISTANCE = 5.0
-"""Distance from the robot's base, along each axis, beyond which nothing can be put, metres."""
+"""Largest coordinate of a place, metres."""
 MAX_SIGHT = 1e4
-"""Largest coordinate of a camera and of what it points at, metres."""
+"""Largest coordinate of a camera and of the point it looks at, metres."""
 MIN_TURN, MAX_TURN = 0.5, 2.0
-"""Lengths of a quaternion that is taken for a rotation: browsers send unit ones, with rounding."""
+"""Smallest and largest norm of a quaternion; browsers send unit ones, with rounding."""
 PHASES = ("start", "update", "end")
 
 
 def vector(values: Any, size: int, limit: float) -> Array | None:  # noqa: ANN401 - whatever a browser sends
-    """The numbers (size,) that were sent; None if they are none, not finite, or beyond ±limit."""
+    """Return the numbers (size,) that were sent; None if they are none, not finite, or beyond ±limit."""
     try:
         numbers = np.array(values, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -33,31 +33,31 @@ def vector(values: Any, size: int, limit: float) -> Array | None:  # noqa: ANN40
 
 
 def place(values: Any) -> Array | None:  # noqa: ANN401
-    """The place (3,), metres, that was sent; None if nothing can be put there."""
+    """Return the place (3,), metres, that was sent; None if nothing can be put there."""
     return vector(values, 3, MAX_DISTANCE)
 
 
 def turn(values: Any) -> Array | None:  # noqa: ANN401
-    """The quaternion (4,) w, x, y, z that was sent; None if it is no rotation."""
+    """Return the quaternion (4,) w, x, y, z that was sent; None if it is no rotation."""
     wxyz = vector(values, 4, MAX_TURN)
     return wxyz if wxyz is not None and MIN_TURN <= np.linalg.norm(wxyz) <= MAX_TURN else None
 
 
 @dataclass(frozen=True)
 class Drag:
-    """An event of a drag at something in the scene; places (3,) in metres."""
+    """An event of dragging something in the scene; places (3,) in metres."""
 
     phase: str
     """One of `PHASES`."""
     camera: Array
     grabbed: Array
-    """Where the thing was grabbed, moved with it."""
+    """Grabbed point, which moves with the thing."""
     pointer: Array
-    """The pointer, on a plane through the grabbed point that faces the camera."""
+    """Pointer, on the plane through the grabbed point that faces the camera."""
 
 
 def on_drag(node: Any, act: Callable[[Drag], None]) -> None:  # noqa: ANN401 - viser's nodes of all kinds
-    """Call `act`, which must only submit, with each event of a drag at a node that is shown."""
+    """Call `act`, which must only submit, with each event of dragging a visible node."""
 
     @node.on_drag
     async def _(event: viser.SceneNodeDragEvent) -> None:
@@ -68,7 +68,7 @@ def on_drag(node: Any, act: Callable[[Drag], None]) -> None:  # noqa: ANN401 - v
 
 
 def on_click(node: Any, act: Callable[[], None]) -> None:  # noqa: ANN401
-    """Call `act`, which must only submit, when a node that is shown is clicked."""
+    """Call `act`, which must only submit, when a visible node is clicked."""
 
     @node.on_click
     async def _(_event: viser.SceneNodePointerEvent) -> None:
@@ -77,18 +77,18 @@ def on_click(node: Any, act: Callable[[], None]) -> None:  # noqa: ANN401
 
 
 class Clicks:
-    """Clicks anywhere in the scene, while they are listened to."""
+    """Clicks anywhere in the scene, while listening."""
 
     def __init__(self, scene: viser.SceneApi, act: Callable[[Array, Array], None]) -> None:
-        """Wait for `listen`; `act`, which must only submit, is given origin and direction (3,) of the ray, metres."""
+        """Wait for `listen`; `act`, which must only submit, is called with a ray's origin and direction (3,), m."""
         self._scene, self._act = scene, act
         self._listens = False
 
     def listen(self, wanted: bool) -> None:
-        """Listen from now on, or no more."""
+        """Start or stop listening."""
         if wanted != self._listens:
             self._listens = wanted
-            listener: Any = self._clicked  # viser takes coroutines, too, and does not say so
+            listener: Any = self._clicked  # viser takes coroutines, too, against its type hints
             if wanted:
                 self._scene.on_click()(listener)
             else:

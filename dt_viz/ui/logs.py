@@ -1,4 +1,4 @@
-"""A log that nobody outside can fill, and that holds nothing of what visitors send."""
+"""A log that visitors cannot flood, and that contains nothing they send."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ import traceback
 from collections.abc import Callable
 
 MAX_RECORDS = 5
-"""Records of one kind in a `PERIOD`."""
+"""Largest number of records of one kind in a `PERIOD`."""
 PERIOD = 60.0
-"""Seconds after which records of a kind are let through again."""
+"""Time after which records of a kind are logged again, seconds."""
 
 _Kind = tuple[str, int, str | None]
 
 
 class Terse(logging.Filter):
-    """Lets a few records of each kind through, and of an exception its type and its places, not its text.
+    """Filter that passes a few records of each kind, with the type and traceback of exceptions but not their text.
 
-    A kind is a place in the program, so there are only so many. The first record after a `PERIOD` says how many were
+    A kind is a place in the program, so their number is limited. The first record after a `PERIOD` says how many were
     left out.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Count by this clock, seconds."""
+        """Count by a clock, seconds."""
         super().__init__()
         self._clock = clock
         self._lock = threading.Lock()
         self._counts: dict[_Kind, tuple[float, int]] = {}
-        """When the period began, and how many records there were since."""
+        """Start of the current period, and number of records since, by kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether to write the record; what is not to be written of it is taken out."""
+        """Return whether to write the record, after removing its confidential parts."""
         place = None
         if record.exc_info and record.exc_info[0] is not None:
             kind, _, trace = record.exc_info
@@ -48,7 +48,7 @@ class Terse(logging.Filter):
         return True
 
     def _num_left_out(self, kind: _Kind) -> int | None:
-        """How many of its kind were left out in the period before; None if this one is to be left out, too."""
+        """Return how many of its kind were left out in the last period; None if this one is left out, too."""
         now = self._clock()
         with self._lock:
             began, count = self._counts.get(kind, (now, 0))

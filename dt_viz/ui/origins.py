@@ -1,17 +1,17 @@
-"""Which web pages may talk to the server: those that it served itself, and those of other names that are allowed.
+"""Web pages that may connect to the server: its own pages, and those of allowed origins.
 
-A page that is open in the same browser can reach every server that the user can reach, so the server asks where a page
-is from. The browser says so in two headers that a page cannot change:
+A page in the user's browser can reach every server that the user can reach, so the server checks the origin of a page.
+The browser reports it in two headers that a page cannot change:
 
 ``Host``
     The name in the address that the browser connects to. A page can have a name of its own resolve to this server
-    (DNS rebinding), and then counts as served by it; so a name must be known. Addresses and ``localhost`` cannot be
-    made to resolve elsewhere.
+    (DNS rebinding), and then counts as served by it; so only known names are accepted. Addresses and ``localhost``
+    cannot be made to resolve elsewhere.
 ``Origin``
-    Where the page is from. It must be the very host and port that it connects to, or an allowed one.
+    The origin of the page. It must be the host and port that it connects to, or an allowed one.
 
-A program that is no browser sends no ``Origin``. It has no rights but its own, and needs no page to misuse; it is let
-in. Who may reach the port at all is the matter of ``--host`` and of a firewall.
+A program that is no browser sends no ``Origin``. It acts with its own rights only, so it is accepted. ``--host`` and a
+firewall decide who can reach the port at all.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from dataclasses import dataclass
 from urllib.parse import SplitResult, urlsplit
 
 DEFAULT_PORTS = {"http": 80, "https": 443}
-"""Port of an address that names none, by scheme."""
+"""Default port of each scheme."""
 LOOPBACK = "localhost"
-"""Name that stands for all names and addresses of the machine itself."""
+"""Canonical name of the loopback addresses."""
 
 
 class OriginError(ValueError):
-    """A text is no origin; the message says what was found and what would be accepted."""
+    """A text that is no origin; the message says what was found and what would be accepted."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Origin:
 
     @classmethod
     def parse(cls, text: str) -> Origin:
-        """The origin that a text such as ``https://demo.example.org:8443`` names.
+        """Parse the origin from a text such as ``https://demo.example.org:8443``.
 
         Raises:
-            OriginError: it names none, or more than that.
+            OriginError: it is no origin, or has further parts.
         """
         parts = _split(text)
         if parts is None or parts.scheme not in DEFAULT_PORTS:
@@ -58,33 +58,33 @@ class Origin:
 
 
 class Origins:
-    """Says whom to answer."""
+    """Rules for the requests and pages that are accepted."""
 
     def __init__(self, host: str, allowed: Iterable[Origin] = ()) -> None:
-        """Answer pages of the server itself, and allowed ones.
+        """Accept the server's own pages and those of allowed origins.
 
         Args:
             host: name or address that the server listens on.
-            allowed: further pages; their names may be those of this server, too.
+            allowed: further origins; their names count as names of this server, too.
         """
         self._allowed = frozenset(allowed)
         self._names = {LOOPBACK, host.lower(), *(origin.host for origin in self._allowed)}
 
     def knows(self, host: str) -> bool:
-        """Whether a request to this host, the value of the header ``Host``, is meant for this server."""
+        """Return whether a request to this host, the value of the header ``Host``, is meant for this server."""
         parts = _split(f"//{host}")
         return parts is not None and (parts.hostname in self._names or _address(parts.hostname) is not None)
 
     def admits(self, origin: str, host: str) -> bool:
-        """Whether a page may connect.
+        """Return whether a page may connect.
 
         Args:
             origin: value of its header ``Origin``.
-            host: value of the header ``Host``, which is known.
+            host: value of the header ``Host``, a known one.
         """
         try:
             page = Origin.parse(origin)
-        except OriginError:  # also "null", of pages that come from nowhere
+        except OriginError:  # also "null", the origin of local pages
             return False
         if page in self._allowed:
             return True
@@ -96,7 +96,7 @@ class Origins:
 
 
 def _split(text: str) -> SplitResult | None:
-    """The parts of a URL, or None where there is no host or no valid port, and where there is more than both."""
+    """Split a URL; return None if it has no host, an invalid port, or further parts."""
     try:
         parts = urlsplit(text)
         if not parts.hostname or parts.port == 0:
@@ -115,7 +115,7 @@ def _address(host: str | None) -> ipaddress.IPv4Address | ipaddress.IPv6Address 
 
 
 def _canonical(host: str) -> str:
-    """The host by the one name that it has here."""
+    """Return the canonical name of a host."""
     address = _address(host)
     if address is None:
         return host

@@ -1,4 +1,4 @@
-"""The arm's motion in a loop, on a clock of its own."""
+"""Playback of the arm's motion in a loop, on a thread of its own."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from dt_viz.flows.fields import Array
 
 PICTURES_PER_SECOND = 25
 REST = 0.8
-"""Seconds at the goal before the motion begins again."""
+"""Time at the goal before the motion begins again, seconds."""
 CATCH_UP = 0.3
-"""Seconds in which the arm gets onto a detour: it has moved on while the detour was computed."""
+"""Time in which the arm joins a detour, seconds, since it has moved on while the detour was computed."""
 
 
 def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
-    """Joint angles (6,), rad, so many seconds after the start, with and without avoidance."""
+    """Return the joint angles (6,), rad, with and without avoidance at a moment, seconds after the start."""
     place = float(np.interp(moment, motion.times, np.arange(len(motion.times))))
     before = min(int(place), len(motion.times) - 2)
     weight = place - before
@@ -30,14 +30,14 @@ def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
 
 @dataclass(eq=False)
 class _Detour:
-    """A motion that is followed once, beginning from where the arm is."""
+    """A motion that is followed once, from the current posture of the arm."""
 
     motion: ArmMotion
     ended: Callable[[], None]
     offsets: tuple[Array, Array] | None
-    """(6,) each: from the motion's first postures to those of the arms when it began, rad."""
+    """Offsets (6,) of the arms' postures from the first ones of the motion when it began, rad."""
     held: bool = False
-    """Whether the arm stays at its beginning."""
+    """Whether the arm stays at the beginning of the motion."""
     clock: float = 0.0
 
     @property
@@ -46,7 +46,7 @@ class _Detour:
         return self.clock > self.motion.times[-1] + REST
 
     def postures(self) -> tuple[Array, Array]:
-        """As `at_moment`, now."""
+        """Return the current joint angles, as `at_moment`."""
         q, without = at_moment(self.motion, min(self.clock, self.motion.times[-1]))
         left = max(0.0, 1 - self.clock / CATCH_UP)
         if self.offsets is not None and left > 0:
@@ -55,7 +55,7 @@ class _Detour:
 
 
 class Playback:
-    """Poses the arms along the newest motion. A new motion takes over at the same moment of the loop."""
+    """Poses the arms along the newest motion; a new motion takes over at the same moment of the loop."""
 
     def __init__(self, pose: Callable[[Array, Array], None]) -> None:
         self._pose = pose
@@ -64,7 +64,7 @@ class Playback:
         self._changing = threading.Lock()
         self._posed: tuple[Array, Array] | None = None
         self._shown: ArmMotion | _Detour | None = None
-        """What the arms were posed along last."""
+        """Motion or detour of the last pose."""
         self._playing = True
         self._speed = 1.0
         self._clock = 0.0
@@ -75,22 +75,22 @@ class Playback:
 
     @property
     def q(self) -> Array | None:
-        """Joint angles (6,) of the arm now, rad; None before there is a motion."""
+        """Current joint angles (6,) of the arm, rad; None before there is a motion."""
         return None if self._posed is None else self._posed[0]
 
     @property
     def resting(self) -> float:
-        """Seconds for which the arm has been at the goal; 0 on its way."""
+        """Time that the arm has been at the goal, seconds; 0 before."""
         return self._resting
 
     def follow(self, motion: ArmMotion | None) -> None:
-        """Go on along this motion; None keeps the arm where it is."""
+        """Continue along this motion; None stops the arm."""
         self._motion = motion
 
     def take_detour(self, motion: ArmMotion, ended: Callable[[], None]) -> None:
-        """Leave the loop for this motion, once, to its end; then call `ended` and begin the loop again.
+        """Follow this motion once to its end; then call `ended` and begin the loop again.
 
-        A detour that is under way is left for it, and its `ended` is not called.
+        It replaces a current detour, whose `ended` is not called.
         """
         posed = self._posed
         offsets = None if posed is None else (posed[0] - motion.q[0], posed[1] - motion.without[0])
@@ -98,9 +98,9 @@ class Playback:
             self._detour = _Detour(motion, ended, offsets)
 
     def hold(self, motion: ArmMotion | None, ended: Callable[[], None]) -> None:
-        """Keep the arm at the beginning of a motion, or where it is if that is None, until a detour begins or ends.
+        """Hold the arm at the beginning of a motion, or in its posture if that is None, until a detour begins or ends.
 
-        `ended` is called when it ends, not when another detour begins.
+        `ended` is called when the hold ends, not when another detour begins.
         """
         if motion is None:
             if self._posed is None:
@@ -111,23 +111,23 @@ class Playback:
             self._detour = _Detour(motion, ended, None, held=True)
 
     def end_detour(self) -> None:
-        """Go on with the loop now."""
+        """End the detour and continue the loop."""
         detour = self._detour
         if detour is not None:
             self._leave(detour)
 
     def let_go(self) -> None:
-        """Go on with the loop if the arm is held; a detour that is under way goes on."""
+        """Continue the loop if the arm is held; a moving detour continues."""
         detour = self._detour
         if detour is not None and detour.held:
             self._leave(detour)
 
     def set_pace(self, playing: bool, speed: float) -> None:
-        """Play or pause, and how many times faster than real time."""
+        """Play or pause, at a multiple of real time."""
         self._playing, self._speed = playing, speed
 
     def close(self) -> None:
-        """Stop, and wait for the picture that is being sent."""
+        """Stop the thread, and wait for the current picture."""
         self._closed.set()
         self._thread.join(timeout=1)
 
@@ -146,7 +146,7 @@ class Playback:
             before = now
 
     def advance(self, seconds: float) -> None:
-        """Move the clock on by so much real time and pose the arms; called by the thread of the playback only."""
+        """Advance the clock by real time, in seconds, and pose the arms; called by the playback's thread only."""
         step = self._speed * seconds if self._playing else 0.0
         motion, detour = self._motion, self._detour
         if detour is not None:

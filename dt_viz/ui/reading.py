@@ -1,4 +1,4 @@
-"""Files of visitors, read one at a time over all visitors, each for as long as its visitor stays."""
+"""Reading of uploaded files, one at a time over all visitors, while their visitors stay."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from dt_viz.interruption import UnwantedError, interruptible
 logger = logging.getLogger(__name__)
 
 LOOK = 0.1
-"""Time between two looks whether a visitor who waits is still there, seconds."""
+"""Interval of the checks whether a waiting visitor is still there, seconds."""
 LONGEST_PAUSE = 0.1
-"""Longest pause of reading at a checkpoint, for others who drag, seconds."""
+"""Longest pause of reading at a checkpoint, in favour of drags, seconds."""
 
 _one_file = threading.Lock()
-"""Held by who reads: a file takes up to some hundred megabytes on its way to an obstacle."""
+"""Lock of the reader: a file takes up to some hundred megabytes on its way to an obstacle."""
 
 
 class Reader:
     """Reads the files of one visitor, on a thread of its own."""
 
     def __init__(self, waits: Callable[[], None]) -> None:
-        """Read nothing yet.
+        """Prepare for the files of a visitor.
 
         Args:
-            waits: called when another visitor's file is being read, so that this visitor's has to wait.
+            waits: called when a file has to wait for another visitor's.
         """
         self._waits = waits
         self._left = threading.Event()
         self._busy = threading.Lock()
 
     def begin(self, read: Callable[[], None]) -> bool:
-        """Have a file read soon, and shown; False if another one of this visitor is under way.
+        """Start to read a file; return False if another one of this visitor is being read.
 
-        What `read` raises is logged: it is expected to say itself what is wrong with the file.
+        What `read` raises is logged; it should report bad files itself.
         """
         if not self._busy.acquire(blocking=False):
             return False
@@ -45,12 +45,12 @@ class Reader:
         return True
 
     def close(self) -> None:
-        """The visitor has left: stop reading at the next checkpoint, and waiting."""
+        """Stop waiting, and reading at the next checkpoint: the visitor has left."""
         self._left.set()
 
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Wait until no other file is read, then read within this block; others who drag go first at checkpoints.
+        """Wait until no other file is being read; within the block, drags go first at checkpoints.
 
         Raises:
             UnwantedError: the visitor has left.
@@ -70,7 +70,7 @@ class Reader:
             read()
         except UnwantedError:
             pass
-        except Exception:  # of a thread nobody else would hear of it
+        except Exception:  # nobody else handles a thread's errors
             logger.exception("a file could not be read")
         finally:
             self._busy.release()

@@ -24,18 +24,18 @@ from dt_viz.ui.visitor import NOTICE_SECONDS, Visitor
 logger = logging.getLogger(__name__)
 
 MAX_WAITING = 8
-"""Connections beyond the visitors, which are shown that all places are taken; any more are refused."""
+"""Number of connections beyond the visitors that are told that all places are taken; any more are refused."""
 
 MAX_SLEEP = 0.5
-"""Longest sleep of the main thread, seconds. Only there handlers of signals run, and one that arrives just before a
-sleep, or on another thread, is looked at after it."""
+"""Longest sleep of the main thread, seconds. Only this thread runs signal handlers, and a signal that arrives just
+before a sleep, or on another thread, is handled after it."""
 
-# a visitor may leave between two pictures of the arm; what is then sent to nobody is no news
+# a visitor may leave between two pictures of the arm; a picture without a receiver is no problem
 warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
 
 
 class AddressError(OSError):
-    """The server cannot listen where it was told to; the message says why and what to do."""
+    """An address on which the server cannot listen; the message says why and what to do."""
 
 
 class Server:
@@ -55,16 +55,16 @@ class Server:
         """Listen and wait for visitors.
 
         Args:
-            tasks: by name.
-            fits: shared by all visitors.
-            task: that each visitor begins with.
+            tasks: tasks by name.
+            fits: store shared by all visitors.
+            task: first task of each visitor.
             host: address to listen on.
-            port: to listen on; 0 takes any free one.
-            max_sessions: visitors at a time; further ones are told to wait.
-            allowed: pages of other addresses that may connect; see `Origins`.
+            port: port to listen on; 0 takes any free one.
+            max_sessions: largest number of visitors; further ones are told to wait.
+            allowed: origins of other pages that may connect; see `Origins`.
 
         Raises:
-            AddressError: the address is not to be had.
+            AddressError: the address is not available.
             GateError: this version of viser is not supported.
         """
         port = _checked_port(host, port)
@@ -78,7 +78,7 @@ class Server:
             Origins(host, allowed), max_connections=max_sessions + MAX_WAITING, max_upload=MAX_BYTES, refused=_refuse
         )
         self._server = gate.open(host, port, "DT-Viz")
-        if self._server.get_port() != port:  # somebody was faster than the check
+        if self._server.get_port() != port:  # another program was faster than the check
             self._server.stop()
             raise AddressError(f"port {port} on {host} was taken a moment ago; choose another with --port")
         self.host, self.port = host, port
@@ -87,22 +87,17 @@ class Server:
         self._server.on_client_disconnect(self._farewell)
 
     @property
-    def num_sessions(self) -> int:
-        """Visitors with a page of their own."""
-        return sum(visitor is not None for visitor in self._visitors.values())
-
-    @property
     def visitors(self) -> tuple[Visitor, ...]:
-        """Who is there."""
+        """Visitors with a page of their own."""
         return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
 
     def wait(self) -> NoReturn:
-        """Serve until a signal's handler raises an exception."""
+        """Serve until a signal handler raises an exception."""
         while True:
             time.sleep(MAX_SLEEP)
 
     def close(self) -> None:
-        """Send everybody away and stop listening."""
+        """Close all pages and stop listening."""
         for visitor in self.visitors:
             visitor.close()
         self._server.stop()
@@ -147,7 +142,7 @@ def _refuse(client: viser.ClientHandle, text: str) -> None:
 
 
 def _checked_port(host: str, port: int) -> int:
-    """The port to listen on, if it is free: viser itself would silently take the next one."""
+    """Return the port to listen on, if it is free; viser itself would silently take the next one."""
     with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

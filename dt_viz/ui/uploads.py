@@ -1,13 +1,14 @@
-"""What a visitor may send as a file: one at a time, no larger than announced, and announced no larger than allowed."""
+"""Limits of uploads: one file at a time, no larger than announced, and announced no larger than allowed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dt_viz.errors import DataError
+from dt_viz.errors import DataError, naming
+from dt_viz.files.checks import check_size
 
 MAX_PARTS = 1024
-"""Most parts of a file; the page sends parts of half a megabyte."""
+"""Largest number of parts of a file; the page sends parts of half a megabyte."""
 
 
 class MalformedError(ValueError):
@@ -32,25 +33,25 @@ class Upload:
         self._transfer: _Transfer | None = None
 
     def start(self, uuid: str, name: str, num_bytes: int, num_parts: int) -> None:
-        """A file is announced. It takes the place of one that is not complete: that has been given up.
+        """Begin a file that is announced; an incomplete one before it has been given up.
 
         Raises:
             DataError: it is too large; the message is for the user.
-            MalformedError: no file has so many parts.
+            MalformedError: no file of that size has so many parts.
         """
         self._transfer = None
-        if num_bytes > self._max_bytes:
-            raise DataError(name, "file", f"{num_bytes / 1e6:.1f} MB", f"at most {self._max_bytes / 1e6:.0f} MB")
+        with naming(DataError, name):
+            check_size(num_bytes, self._max_bytes)
         if num_bytes < 0 or not min(num_bytes, 1) <= num_parts <= min(num_bytes, MAX_PARTS):
             raise MalformedError(f"{num_parts} parts for {num_bytes} bytes")
         if num_parts:
             self._transfer = _Transfer(uuid, num_bytes, num_parts)
 
     def part(self, uuid: str, index: int, num_bytes: int) -> bool:
-        """A part arrives; whether it is wanted: parts of other files than the announced one are not.
+        """Count a part that arrives; return whether it belongs to the announced file.
 
         Raises:
-            MalformedError: it is there already, or the parts do not add up to what was announced.
+            MalformedError: it has arrived before, or the parts do not add up to the announced size.
         """
         transfer = self._transfer
         if transfer is None or transfer.uuid != uuid:

@@ -9,14 +9,15 @@ from functools import partial
 import viser
 
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Engine, Frame, Stage
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.motion.pushing import Pushed
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import SlicePose
-from dt_viz.scenario.stack import bias_points, with_changed_point
+from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.panel.panel import Panel
@@ -40,7 +41,9 @@ NOTICE_SECONDS = 12.0
 
 def initial_scenario(engine: Engine, task: str) -> Scenario:
     """The scenario that a task begins with. Raises what `Engine.task` raises."""
-    return Scenario(task, (Sphere(engine.task(task).obstacle_position),))
+    scenario = Scenario(task)
+    sphere = Sphere(engine.task(task).obstacle_position)
+    return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
 
 
 class Visitor:
@@ -69,8 +72,8 @@ class Visitor:
                 robot,
                 self._obstacle_moved,
                 self._obstacle_selected,
-                self._bias_moved,
-                self._bias_selected,
+                self._anchor_moved,
+                self._anchor_selected,
                 self._slice_moved,
                 Starts(client.scene, self._start_moved, self._start_chosen, self._start_clicked),
             )
@@ -157,22 +160,22 @@ class Visitor:
         obstacles = list(self.session.scenario.obstacles)
         if index < len(obstacles):  # or it was deleted a moment ago
             obstacles[index] = obstacles[index].moved((x, y, z), (w, i, j, k))
-            self.session.edit(f"obstacle {index}", obstacles=tuple(obstacles))
+            stack = with_avoidance(self.session.scenario, obstacles=tuple(obstacles))
+            self.session.edit(f"obstacle {index}", stack=stack)
         if phase == "end":
             self.session.end_gesture()
 
     def _obstacle_selected(self, index: int) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, selected=index))
 
-    def _bias_moved(self, name: str, position: Array, phase: str) -> None:
+    def _anchor_moved(self, name: str, position: Array, phase: str) -> None:
         if phase == "start":
             self.session.begin_gesture()
-        layers = self.session.scenario.layers
-        point = bias_points(layers).get(name)
-        if point is not None:  # or it was deleted a moment ago
-            x, y, z = (float(c) for c in position)
-            moved = with_changed_point(layers, name, replace(point, position=(x, y, z)))
-            self.session.edit(name, layers=moved)
+        scenario = self.session.scenario
+        transform = transform_of(scenario, name)
+        if transform is not None:  # or it was deleted a moment ago
+            moved = with_transform(scenario, name, transform.anchored(as_point(position)))
+            self.session.edit(name, stack=moved)
         if phase == "end":
             self.session.end_gesture()
 
@@ -193,7 +196,7 @@ class Visitor:
         self.session.edit("add start", starts=with_start(scenario, place), arm_rollout=arm_rollout)
         self.session.end_gesture()
 
-    def _bias_selected(self, name: str) -> None:
+    def _anchor_selected(self, name: str) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
 
     def _slice_moved(self, position: Array, wxyz: Array, phase: str) -> None:
@@ -239,7 +242,7 @@ class Visitor:
             return
         with self.client.atomic():
             self.pushed_path.show(pushed)
-            self.grip.say(pushed.doubt)
+            self.grip.say(pushed.warning)
         if last:
             self._playback.take_detour(pushed.motion, self._detour_ended)
         else:

@@ -20,7 +20,9 @@ from dt_viz.obstacles.files import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeEr
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
+from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import Task
+from dt_viz.ui.chores import Later
 from dt_viz.ui.controls import Control
 from dt_viz.ui.reading import Reader
 
@@ -48,13 +50,14 @@ Shape = type[Obstacle] | UnionType
 class ObstaclePanel:
     """The folder "Obstacles" of one visitor's panel."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str, bool], None]) -> None:
+    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str, bool], None], later: Later) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
         Args:
             gui: of the visitor.
             bind: ties a control to the scenario.
             say: shows a text for a while, and whether it is about an error.
+            later: does work beside the server's event loop.
         """
         self._bind, self._say = bind, say
         self._session: Session | None = None
@@ -103,8 +106,8 @@ class ObstaclePanel:
             )
             bind(
                 gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
-                lambda s: round(100 * s.margin, 3),
-                lambda _s, value: {"margin": value / 100},
+                lambda s: round(100 * s.avoidance.margin, 3),
+                lambda s, value: {"stack": with_avoidance(s, margin=value / 100)},
             )
             with gui.add_folder("From a file", expand_by_default=False):
                 self._unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
@@ -118,8 +121,8 @@ class ObstaclePanel:
             self._begin(partial(self.load, file.content, file.name, UNITS[self._unit.value]))
 
         Control(self._again, lambda _clicked: self._begin(self.load_again))
-        Control(self._add, lambda name: self.add(SHAPES[name]))
-        Control(self._change, lambda name: {"Duplicate": self.duplicate, "Delete": self.delete}[name]())
+        Control(self._add, lambda name: later(partial(self.add, SHAPES[name])))
+        Control(self._change, lambda name: later({"Duplicate": self.duplicate, "Delete": self.delete}[name]))
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -224,7 +227,7 @@ class ObstaclePanel:
         session = self._session
         if session is not None:
             view = replace(session.scenario.view, selected=selected)
-            session.edit("obstacles", obstacles=tuple(obstacles), view=view)
+            session.edit("obstacles", stack=with_avoidance(session.scenario, obstacles=tuple(obstacles)), view=view)
             session.end_gesture()
 
     def _size(
@@ -245,7 +248,8 @@ class ObstaclePanel:
             if not isinstance(chosen, shape):
                 return {}
             index, before = scenario.selected or 0, scenario.obstacles
-            return {"obstacles": (*before[:index], change(chosen, value / 100), *before[index + 1 :])}
+            changed = (*before[:index], change(chosen, value / 100), *before[index + 1 :])
+            return {"stack": with_avoidance(scenario, obstacles=changed)}
 
         handle.visible = False
         control = self._bind(handle, shown, changed)

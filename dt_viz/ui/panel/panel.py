@@ -12,17 +12,16 @@ import viser
 
 from dt_viz.arm.collision import SELF_REACH, CollisionReport
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Frame, Stage
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.engine.worker import LatestWorker
 from dt_viz.errors import DataError
 from dt_viz.learning.imitation import ImitationError
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import bias_points
 from dt_viz.scenario.tasks import Task
+from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
-from dt_viz.ui.panel.bias import BiasPanel
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
 from dt_viz.ui.panel.plots import JointPlots
@@ -30,11 +29,13 @@ from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
 from dt_viz.ui.panel.starts import StartsPanel
+from dt_viz.ui.panel.transforms import TransformsPanel
 from dt_viz.ui.scene.arm_layers import NUM_ARMS
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.palette import css
 from dt_viz.ui.scene.picture import Colour
+from dt_viz.warning import ARM, Kind
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -121,12 +122,14 @@ class Panel:
         on_press(self._cancel, self._cancel_learning)
         self._build_task()
         tabs = gui.add_tab_group()
+        self._chores = Chores(self.fail)
+        later = self._chores.later
         with tabs.add_tab("World"):
             self._obstacles = ObstaclePanel(
-                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER))
+                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER)), later
             )
-            self._biases = BiasPanel(gui, self._bind)
-            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER))
+            self._transforms = TransformsPanel(gui, self._bind, later)
+            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER), later)
         with tabs.add_tab("Stack"):
             self._stack = StackPanel(gui, self._bind)
         with tabs.add_tab("Show"):
@@ -142,7 +145,7 @@ class Panel:
         """Let the controls edit this session."""
         self._session = session
         self._obstacles.connect(session)
-        self._biases.connect(session)
+        self._transforms.connect(session)
         self._starts.connect(session)
         self._stack.connect(session)
         self._slice.connect(session)
@@ -153,6 +156,7 @@ class Panel:
         self._stack.close()
         self._saver.close()
         self._beginnings.close()
+        self._chores.close()
 
     @property
     def legend(self) -> Legend | None:
@@ -163,7 +167,7 @@ class Panel:
         """Show the scenario's choices."""
         self._adopted = scenario
         self._obstacles.adopt(scenario)
-        self._biases.adopt(scenario)
+        self._transforms.adopt(scenario)
         self._stack.adopt(scenario)
         self._slice.adopt(scenario)
         self.push.adopt(scenario)
@@ -187,7 +191,7 @@ class Panel:
         if self._noticed is not None and frame.scenario != self._noticed:
             self._notice.visible, self._noticed = False, None
         self._give_hint(hint(frame))
-        self._biases.report(frame)
+        self._transforms.report(frame)
         self._stack.report(frame)
         self._slice.report(frame)
         self.joints.draw(frame.arm)
@@ -413,6 +417,8 @@ COMPUTING = "Computing the motion…"
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
 HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
+OF_MESHES = frozenset({Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE})
+"""Kinds of warnings about what the arm's meshes come near to."""
 _BLUE = ((29, 79, 124), (232, 241, 250))
 _GREEN = ((0, 92, 66), (230, 245, 239))
 _AMBER = ((138, 75, 0), (255, 244, 224))
@@ -431,48 +437,36 @@ def hint(frame: Frame) -> str:
 
 
 def status_html(frame: Frame, pace: Pace) -> str:
-    """The status line: speed, clearance, certificates, and every reason for doubt."""
-    health, scenario = frame.health, frame.scenario
+    """The status line: speed, clearance, certificates, and every warning."""
+    known, scenario = frame.certificates, frame.scenario
     hides_arm = not (scenario.view.arm or scenario.view.onion)
     # what is not known after the last stage never will be
     unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
     off = "–" if frame.blocked else "off"
-    of = "body points" if scenario.avoidance and scenario.space != "task" else "end effector"
-    durations = {"": health.duration, " arm": health.arm_duration}
-    if None not in durations.values():
-        durations = {" hand": health.duration, " arm": health.arm_duration}
-    flow_time = " · ".join(f"{t:.2f}{whose}" for whose, t in durations.items() if t is not None)
-    biases, layer_times = bias_points(scenario.layers), zip(scenario.layers, health.layer_durations, strict=False)
-    strength = " · ".join(f"{t:.2f} {layer.name}" for layer, t in layer_times if layer.name in biases and t is not None)
+    whole_arm = scenario.arm_avoidance is not None
     rows = (
         ("Rebuild", _rebuild(pace)),
-        ("Clearance", off if frame.blocked else _clearance(health.clearance, of)),
-        *(_collision_rows(None, "arm hidden") if hides_arm else _collision_rows(health.collision, unknown)),
-        *((("Flow time t", flow_time or off),) if flow_time or not strength else ()),
-        *((("Strength", strength),) if strength else ()),
-        ("Smallest det J", unknown if health.min_det_jacobian is None else f"{health.min_det_jacobian:.2g}"),
-        ("There and back", unknown if health.round_trip_error is None else _tiny(health.round_trip_error)),
-        ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[health.lyapunov_falls]),
+        ("Clearance", off if frame.blocked else _clearance(known.clearance, whole_arm=whole_arm)),
+        *(_collision_rows(None, "arm hidden") if hides_arm else _collision_rows(known.collision, unknown)),
+        *_duration_rows(frame, off),
+        ("Smallest det J", unknown if known.min_det_jacobian is None else f"{known.min_det_jacobian:.2g}"),
+        ("There and back", unknown if known.round_trip_error is None else _tiny(known.round_trip_error)),
+        ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[known.lyapunov_falls]),
     )
     cells = "".join(
         f"<tr style='vertical-align:top'><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
         f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
         for name, value in rows
     )
-    warnings = [doubt for doubt in health.doubts if not (hides_arm and doubt in health.arm_doubts)]
-    if health.clearance < 0 and scenario.avoidance and scenario.warp == 1 and not (warnings or frame.blocked):
-        warnings.append("the motions go through the obstacle at this flow time")
-    if health.collision is not None and not hides_arm:
-        own = health.collision.problems_of_its_own
-        entered = [problem for problem in health.collision.problems if problem not in own]
-        told = {problem: problem for problem in own}
-        if scenario.warp == 1:
-            advice = HAND_ONLY if scenario.avoidance and scenario.space == "task" else ""
-            told = {**{problem: problem + advice for problem in entered}, **told}
-        warnings += [text for problem, text in told.items() if not any(problem in w for w in warnings)]
+    seen = [warning for warning in known.warnings if not (hides_arm and warning.source == ARM)]
+    hand_only = scenario.avoids and not whole_arm
+    warnings = [f"{w}{HAND_ONLY}" if hand_only and w.kind is Kind.ARM_ENTERS else str(w) for w in seen]
+    of_motion = any(warning.kind not in OF_MESHES for warning in seen)
+    if known.clearance < 0 and scenario.avoids and scenario.warp == 1 and not (of_motion or frame.blocked):
+        warnings.insert(0, "the motions go through the obstacle at this flow time")
     blocked = ""
     if frame.blocked:
-        blocked = _alarm(f"no motion: {'; '.join(frame.blocked)}. What is shown is the last good one.", *_RED)
+        blocked = _alarm(f"no motion: {'; '.join(map(str, frame.blocked))}. What is shown is the last good one.", *_RED)
     warp = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
     said = warp + "".join(_alarm(warning, *_AMBER) for warning in warnings)
     if not (said or blocked) and frame.stage is Stage.CERTIFIED:
@@ -492,8 +486,26 @@ def _tiny(length: float) -> str:
     return f"{1e3 * length:.0e} mm" if 0 < length < 1e-4 else f"{1e3 * length:.1f} mm"
 
 
-def _clearance(clearance: float, whose: str) -> str:
+def _clearance(clearance: float, *, whole_arm: bool) -> str:
+    whose = "body points" if whole_arm else "end effector"
     return "no obstacle" if clearance == float("inf") else f"{1e3 * clearance:.1f} mm, {whose}"
+
+
+def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
+    """T of the flows: of the avoidance, and of the transforms that call it otherwise."""
+    hand, strengths = None, []
+    for layer, duration in zip(frame.scenario.stack, frame.durations, strict=False):
+        if duration is None:
+            continue
+        if layer.transform.most == 1:
+            hand = duration
+        else:
+            strengths.append(f"{duration:.2f} {layer.name}")
+    both = hand is not None and frame.arm_duration is not None
+    parts = ((hand, " hand" if both else ""), (frame.arm_duration, " arm"))
+    flow_time = " · ".join(f"{t:.2f}{whose}" for t, whose in parts if t is not None)
+    times = (("Flow time t", flow_time or off),) if flow_time or not strengths else ()
+    return (*times, *((("Strength", " · ".join(strengths)),) if strengths else ()))
 
 
 def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.motion.pushing import Pushed
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.ui.controls import on_press

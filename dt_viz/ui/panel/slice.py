@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario
 from dt_viz.ui.controls import on_press
@@ -70,7 +70,7 @@ class SlicePanel:
         self._colour = view.colour
         self.back.visible = view.slice is not None
         shown = view.colour != "none" or view.field or view.streamlines or view.grid
-        self.note.visible = shown and scenario.avoidance and scenario.space != "task" and bool(scenario.obstacles)
+        self.note.visible = shown and scenario.arm_avoidance is not None and bool(scenario.obstacles)
         if view.colour in {"none", "occupancy"}:
             self._explain(OCCUPANCY if view.colour == "occupancy" else None)
 

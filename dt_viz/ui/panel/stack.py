@@ -9,13 +9,13 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import AVOIDANCE, IMITATION, WHOLE_ARM, bias_points, levels, shifted, switched, visible_names
-from dt_viz.scenario.tuning import avoids, transforms
+from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, levels, listed, place_of, shifted, switched, tunable
 from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.transform_settings import Bind, TransformSettings, durations
+from dt_viz.ui.panel.settings import Bind
+from dt_viz.ui.panel.transform_settings import TransformSettings, durations, flow_time_of
 from dt_viz.ui.panel.warp import WarpControls
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.levels import manifold
@@ -115,21 +115,20 @@ class StackPanel:
 
 def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row, ...]:
     """The list from the top down, with the durations that the last frame had."""
-    on = {layer.name for layer in scenario.layers if layer.on} | ({AVOIDANCE} if scenario.avoidance else set())
-    seen = levels(scenario)
-    listed = []
-    order, biases = visible_names(scenario), bias_points(scenario.layers)
+    on = {layer.name for layer in scenario.stack if layer.on}
+    seen, order, rows = levels(scenario), listed(scenario), []
     for k, name in enumerate(order):
         moves = (UP,) * (k < len(order) - 1) + (DOWN,) * (k > 0)
         look = (_look(scenario, name),) * (name in seen)
-        label = _label(name, durations.get(name), "strength" if name in biases else "t")
-        listed.append(Row(name, label, (ON if name in on else OFF, *moves, *look)))
-    if WHOLE_ARM in transforms(scenario):
+        label = _label(name, durations.get(name), flow_time_of(scenario, name))
+        rows.append(Row(name, label, (ON if name in on else OFF, *moves, *look)))
+    place = place_of(scenario, WHOLE_ARM)
+    if WHOLE_ARM in tunable(scenario) and place is not None:
         label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
-        listed.append(Row(WHOLE_ARM, label, (ON if scenario.avoidance else OFF,)))
+        rows.append(Row(WHOLE_ARM, label, (ON if scenario.stack[place].on else OFF,)))
     imitation = Row(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
     base = Row(BASE, BASE, (SEEN if scenario.view.base else SEE,))
-    return (*reversed(listed), imitation, base)
+    return (*reversed(rows), imitation, base)
 
 
 def legend_html(scenario: Scenario) -> str:
@@ -156,11 +155,7 @@ def _look(scenario: Scenario, name: str) -> str:
 
 
 def _switch(scenario: Scenario, name: str) -> dict[str, Any]:
-    if name == IMITATION:
-        return {"imitation": not scenario.imitation}
-    if avoids(name):
-        return {"avoidance": not scenario.avoidance}
-    return {"layers": switched(scenario.layers, name)}
+    return {"imitation": not scenario.imitation} if name == IMITATION else {"stack": switched(scenario, name)}
 
 
 def _select(scenario: Scenario, name: str) -> dict[str, Any]:
@@ -173,8 +168,8 @@ def _select(scenario: Scenario, name: str) -> dict[str, Any]:
 _ACTIONS: dict[str, Callable[[Scenario, str], dict[str, Any]]] = {
     ON: _switch,
     OFF: _switch,
-    UP: lambda scenario, name: dict(shifted(scenario, name, 1)),
-    DOWN: lambda scenario, name: dict(shifted(scenario, name, -1)),
+    UP: lambda scenario, name: {"stack": shifted(scenario, name, 1)},
+    DOWN: lambda scenario, name: {"stack": shifted(scenario, name, -1)},
     SEE: _select,
     SEEN: _select,
 }

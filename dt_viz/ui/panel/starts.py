@@ -14,6 +14,7 @@ from dt_viz.engine.session import Session
 from dt_viz.motion.following import room_at_rest
 from dt_viz.scenario.scenario import MAX_STARTS, Scenario
 from dt_viz.scenario.starts import followed, with_grid
+from dt_viz.ui.chores import Later
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.transform_settings import Bind
 
@@ -21,7 +22,7 @@ from dt_viz.ui.panel.transform_settings import Bind
 class StartsPanel:
     """Adds starts by clicks and in a grid, and removes them."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str], None]) -> None:
+    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str], None], later: Later) -> None:
         """Build the controls; they act once `connect` has given them a session. `say` shows a message."""
         self._session: Session | None = None
         self._say = say
@@ -38,7 +39,7 @@ class StartsPanel:
             )
 
         acts = {"Grid": self.add_grid, "Remove": self.remove, "Clear": self.clear}
-        Control(self._buttons, lambda name: acts[name]())
+        Control(self._buttons, lambda name: later(acts[name]))
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""

@@ -1,1 +1,1 @@
-"""What is drawn in the scene and taken hold of."""
+"""The scene of the page: what is drawn, and what is dragged."""

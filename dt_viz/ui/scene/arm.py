@@ -1,4 +1,4 @@
-"""The JACO arm in the browser: its meshes once, then six rotations a picture."""
+"""The JACO arm in the browser: its meshes are sent once, then six rotations for each posture."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from dt_viz.arm.robot import Robot
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.links import bodies, light_shells
+from dt_viz.ui.scene.picture import Shown
 
 PEDESTAL = 2
-"""Bodies that no motion carries away from anything: the base, and link 1, which only turns on the spot."""
+"""Number of bodies that no motion moves away: the base, and link 1, which only spins."""
 STALE_OPACITY = 0.4
-"""Of the arm while it shows a motion that is not the scenario's."""
+"""Opacity of the arm while its motion is not the scenario's."""
 GHOST_OPACITY = 0.5
 MIN_APART = 0.006
-"""Metres that avoidance must move a link for its ghost to be shown: two surfaces in one place flicker."""
+"""Smallest distance of a link from its ghost at which the ghost is shown, metres: coinciding surfaces flicker."""
 
 
 class ArmFrames:
@@ -35,13 +36,13 @@ class ArmFrames:
             )
 
     def pose(self, q: Array) -> None:
-        """Turn to the joint angles `q` (6,), rad."""
+        """Take the joint angles `q` (6,), rad."""
         for frame, wxyz in zip(self.frames[1:], self._robot.joint_frames(q), strict=True):
             frame.wxyz = wxyz
 
 
 class ArmPicture:
-    """The arm."""
+    """The arm with its meshes."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._tree = ArmFrames(scene, robot, "/arm")
@@ -67,7 +68,7 @@ class ArmPicture:
         self._tree.pose(q)
 
     def show(self, *, whole: bool, pedestal: bool) -> None:
-        """Show the whole arm, or only what stands under other pictures of it, or nothing."""
+        """Show the whole arm, or only the pedestal under other pictures of it, or nothing."""
         self.frames[0].visible = whole or pedestal
         self.frames[PEDESTAL].visible = whole
 
@@ -78,24 +79,24 @@ class ArmPicture:
 
     @property
     def stale(self) -> bool:
-        """Whether what it shows is not the scenario's motion: then it is translucent and says so."""
+        """Whether its motion is not the scenario's; then it is translucent and labelled."""
         return self._note.visible
 
     @stale.setter
     def stale(self, stale: bool) -> None:
-        if stale != self._note.visible:
-            self._note.visible = stale
-            for mesh in self.meshes:
-                mesh.opacity = STALE_OPACITY if stale else None
+        self._note.visible = stale
+        for mesh in self.meshes:
+            mesh.opacity = STALE_OPACITY if stale else None
 
 
-class GhostArm:
-    """The arm where it would be without avoidance, translucent; links that coincide with the arm's are left out."""
+class GhostArm(Shown):
+    """The translucent arm without avoidance; links that coincide with the arm's are hidden."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._robot = robot
         self._tree = ArmFrames(scene, robot, "/ghost_arm")
-        self._tree.frames[0].visible = False
+        super().__init__(self._tree.frames[0])
+        self.visible = False
         shells = light_shells(robot.joint_names)[PEDESTAL:]
         self._corners = np.stack([trimesh.bounds.corners(shell.bounds) for shell in shells])  # (5, 8, 3)
         self.links = tuple(
@@ -120,12 +121,3 @@ class GhostArm:
         moved = np.linalg.norm(corners[1] - corners[0], axis=-1).max(axis=-1)
         for link, distance in zip(self.links, moved, strict=True):
             link.visible = bool(distance > MIN_APART)
-
-    @property
-    def visible(self) -> bool:
-        """Whether it is shown."""
-        return self._tree.frames[0].visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self._tree.frames[0].visible = visible

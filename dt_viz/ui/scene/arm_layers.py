@@ -1,4 +1,4 @@
-"""What avoidance does to the whole arm: its body points, its ghost without avoidance, and arms along the motion."""
+"""Pictures of whole-arm avoidance: the body points, the ghost without avoidance, and arms along the motion."""
 
 from __future__ import annotations
 
@@ -11,39 +11,40 @@ from viser import transforms
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import ArmMotion, Frame
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import View
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import PEDESTAL, ArmPicture, GhostArm
 from dt_viz.ui.scene.links import light_shells
-from dt_viz.ui.scene.picture import Picture, rgb
+from dt_viz.ui.scene.picture import Picture, Shown, rgb
 
 NUM_ARMS = 6
-"""Along the motion, start and goal included."""
+"""Number of arms along the motion, start and goal included."""
 FAINTEST, STRONGEST = 0.12, 0.5
-"""Opacities of the first and the last of them."""
+"""Opacities of the first and the last arm."""
 FAR = 0.1
-"""Metres by which a body point is moved that gets the full colour."""
+"""Distance by which a body point with the full colour is moved, metres."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 def evenly_along(path: Array, num: int) -> Array:
-    """Where, in samples from its start, `num` places lie evenly along a path (T, d), its ends included."""
+    """Return `num` places, in samples from the start, evenly along a path (T, d), its ends included."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    length = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])  # strictly rising, also where the path rests
+    length = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])  # strictly increasing, also where the path rests
     return np.interp(np.linspace(0, length[-1], num), length, np.arange(len(path)))
 
 
 def arms_along(robot: Robot, motion: ArmMotion, num: int = NUM_ARMS) -> Array:
-    """Joint angles (num, 6), rad, at places evenly along the path of the hand."""
+    """Return joint angles (num, 6), rad, at places evenly along the path of the hand."""
     places = evenly_along(robot.end_effector(motion.q), num)
     samples = np.arange(len(motion.q))
     return np.stack([np.interp(places, samples, angle) for angle in motion.q.T], axis=1)
 
 
 class Onion(Picture):
-    """Union arms along the motion, from faint at its start to strong at its end. A drag sends their poses only."""
+    """Several arms along the motion, from faint at its start to strong at its end; a drag sends only their poses."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         super().__init__(scene.add_frame("/onion", show_axes=False, visible=False))
@@ -66,7 +67,7 @@ class Onion(Picture):
         )
         self._motion: ArmMotion | None = None
         self._drawn: ArmMotion | None = None
-        self._drawing = threading.Lock()  # whoever switches it on is not who computes
+        self._drawing = threading.Lock()  # it is switched on by another thread than the one that computes
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
@@ -85,18 +86,18 @@ class Onion(Picture):
         rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
         wxyzs = transforms.SO3.from_matrix(rotations).wxyz
         for joint, link in enumerate(self.links, start=PEDESTAL - 1):
-            # the browser blends from far to near by the node's own position
+            # the browser blends nodes from far to near by their own positions
             link.position = middle = origins[:, joint].mean(axis=0)
             link.batched_positions = (origins[:, joint] - middle).astype(np.float32)
             link.batched_wxyzs = wxyzs[:, joint].astype(np.float32)
 
 
-class BodySpheres:
-    """The spheres that cover the arm, and from where avoidance has moved each: the farther, the stronger its colour."""
+class BodySpheres(Shown):
+    """The spheres that cover the arm, with their displacements by avoidance: the larger, the stronger the colour."""
 
     def __init__(self, scene: viser.SceneApi, radius: Array) -> None:
         """Make spheres of these radii (P,), metres."""
-        self._node = scene.add_frame("/body_points", show_axes=False, visible=False)
+        super().__init__(scene.add_frame("/body_points", show_axes=False, visible=False))
         num = len(radius)
         ball = trimesh.creation.icosphere(subdivisions=2)
         self.spheres = scene.add_batched_meshes_simple(
@@ -120,7 +121,7 @@ class BodySpheres:
         )
 
     def pose(self, positions: Array, without: Array) -> None:
-        """Show the spheres at `positions` (P, 3), with lines from where they would be `without` (P, 3), metres."""
+        """Show the spheres at `positions` (P, 3), with lines from those `without` avoidance (P, 3), metres."""
         moved = np.linalg.norm(positions - without, axis=1, keepdims=True)
         still, far = (np.array(palette.linear(c)) for c in (palette.BODY_POINT, palette.BODY_POINT_MOVED))
         self.spheres.position = middle = positions.mean(axis=0)
@@ -128,18 +129,9 @@ class BodySpheres:
         self.spheres.batched_colors = (still + np.minimum(moved / FAR, 1) * (far - still)).astype(np.uint8)
         self.paths.points = np.stack([without, positions], axis=1).astype(np.float32)
 
-    @property
-    def visible(self) -> bool:
-        """Whether they are shown."""
-        return self._node.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self._node.visible = visible
-
 
 class Arms:
-    """All that moves with the playback: the arm, its ghost without avoidance, and its body points."""
+    """The arm, its ghost without avoidance, and its body points, which move with the playback."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
         self._robot = robot
@@ -148,24 +140,24 @@ class Arms:
         self.ghost = GhostArm(scene, robot)
         self.body = BodySpheres(scene, self._points.radius)
         self._now = (robot.home, robot.home)
-        self._posing = threading.Lock()  # the playback poses, whoever clicks shows and hides
+        self._posing = threading.Lock()  # the playback poses, another thread shows and hides
 
     def pose(self, q: Array, without: Array) -> None:
-        """Show the joint angles `q` (6,), rad, and where the arm would be `without` avoidance (6,), rad."""
+        """Show the joint angles `q` (6,), rad, and those `without` avoidance (6,), rad."""
         with self._posing:
             self._now = (q, without)
             self.arm.pose(q)
             self._pose_beside()
 
     def show(self, view: View) -> None:
-        """Show and hide what the view says."""
+        """Show and hide the parts as the view says."""
         with self._posing:
             self.arm.show(whole=view.arm, pedestal=view.ghost_arm or view.onion)
             self.ghost.visible, self.body.visible = view.ghost_arm, view.body_points
             self._pose_beside()
 
     def _pose_beside(self) -> None:
-        """Pose what is shown beside the arm; what is hidden waits until it is shown."""
+        """Pose the visible parts beside the arm; hidden ones are posed when they are shown."""
         q, without = self._now
         if self.ghost.visible:
             self.ghost.pose(q, without)

@@ -1,4 +1,4 @@
-"""The ball that the hand carries to the pots, and lets go of at the goal (fig. 8)."""
+"""The ball that the hand carries to the pots and drops at the goal (fig. 8)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.pots import WALL
 
 RADIUS = 0.022
-"""Of the ball, metres."""
+"""Radius of the ball, metres."""
 GRAVITY = 9.81
-"""Metres per second squared."""
+"""Acceleration of gravity, m/s²."""
 
 
 def fallen(place: Array, pots: tuple[Pot, ...], seconds: float) -> Array:
-    """Middle (3,) of a ball that was let go at `place` (3,), metres, so many seconds ago.
+    """Return the middle (3,) of a ball that was dropped at `place` (3,), metres, some `seconds` ago.
 
     It comes to rest on the bottom of the pot that catches it, or on the table.
     """
@@ -27,7 +27,7 @@ def fallen(place: Array, pots: tuple[Pot, ...], seconds: float) -> Array:
 
 
 class Carried:
-    """A ball in the hand, in a task with pots, as long as the arm is shown."""
+    """A ball in the hand, shown with the arm in tasks with pots."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self.ball = scene.add_icosphere("/carried", radius=RADIUS, color=palette.CARRIED, visible=False)
@@ -36,23 +36,21 @@ class Carried:
         self._posed = False
 
     def stand(self, pots: tuple[Pot, ...]) -> None:
-        """Be what is carried to these pots, if there are any."""
+        """Show the ball for these pots, if there are any."""
         self._pots = pots
         self._show()
 
     def show(self, *, arm: bool) -> None:
-        """Show it with the arm only."""
+        """Show the ball only with the arm."""
         self._arm = arm
         self._show()
 
     def pose(self, hand: Array, resting: float) -> None:
-        """Be in the hand at `hand` (3,), metres, or on its way down once that has rested at the goal for seconds."""
+        """Put the ball in the hand at `hand` (3,), metres, or below it, after `resting` seconds at the goal."""
         if self._pots:
             self.ball.position = fallen(hand, self._pots, resting)
             self._posed = True
             self._show()
 
     def _show(self) -> None:
-        shown = bool(self._pots) and self._arm and self._posed
-        if self.ball.visible != shown:
-            self.ball.visible = shown
+        self.ball.visible = bool(self._pots) and self._arm and self._posed

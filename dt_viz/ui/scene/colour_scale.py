@@ -1,4 +1,4 @@
-"""Scales of colours on which equal steps look equally large."""
+"""Perceptually uniform colour scales."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ _TO_LAB = np.array(
 
 
 def oklab(colours: Array) -> Array:
-    """OKLab coordinates (*B, 3) of sRGB colours (*B, 3) from 0 to 255: distances are differences that are seen."""
+    """Convert sRGB colours (*B, 3) from 0 to 255 to OKLab (*B, 3), whose distances are perceived differences."""
     c = np.asarray(colours) / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return np.cbrt(linear @ _TO_CONES.T) @ _TO_LAB.T
 
 
 def from_oklab(lab: Array) -> Array:
-    """Colours (*B, 3) in sRGB from 0 to 255, cut where no screen has them."""
+    """Convert OKLab (*B, 3) to sRGB colours (*B, 3) from 0 to 255, clipped to the gamut."""
     linear = (lab @ np.linalg.inv(_TO_LAB).T) ** 3 @ np.linalg.inv(_TO_CONES).T
     linear = np.clip(linear, 0, 1)
     return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def ramp(anchors: Sequence[Colour]) -> NDArray[np.uint8]:
-    """(NUM_SHADES, 3) sRGB colours through the anchors, in steps that look equally large."""
-    # finely along straight lines in OKLab, then evenly along the whole
+    """Return sRGB colours (NUM_SHADES, 3) through the anchors, in perceptually equal steps."""
+    # finely along straight lines in OKLab, then evenly along the whole path
     lab, u = oklab(np.array(anchors, float)), np.linspace(0, len(anchors) - 1, 4 * NUM_SHADES)
     path = np.stack([np.interp(u, np.arange(len(anchors)), c) for c in lab.T], axis=1)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -57,7 +57,7 @@ def ramp(anchors: Sequence[Colour]) -> NDArray[np.uint8]:
 
 
 def diverging(anchors: Sequence[Colour]) -> NDArray[np.uint8]:
-    """(NUM_SHADES, 3) sRGB colours with the middle anchor in the middle; the same to either side of it."""
+    """Return sRGB colours (NUM_SHADES, 3) with the middle anchor in the middle and as many on either side."""
     middle = len(anchors) // 2
     low, high = ramp(anchors[: middle + 1]), ramp(anchors[middle:])
     return np.concatenate([low[::2], high[1::2]])
@@ -65,17 +65,17 @@ def diverging(anchors: Sequence[Colour]) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Scale:
-    """Numbers from `low` to `high`, and beyond, as colours."""
+    """Map from numbers to colours; those beyond `low` and `high` get the end colours."""
 
     shades: NDArray[np.uint8]
-    """(NUM_SHADES, 3)."""
+    """(NUM_SHADES, 3) sRGB colours."""
     low: float
     high: float
 
     def colours(self, values: Array) -> NDArray[np.uint8]:
-        """(*B, 3) colours of values (*B,)."""
+        """Return the colours (*B, 3) of values (*B,)."""
         return self.shades[np.round((NUM_SHADES - 1) * np.clip(self.relative(values), 0, 1)).astype(int)]
 
     def relative(self, value: Number) -> Number:
-        """How far along the scale a value lies: 0 at `low`, 1 at `high`."""
+        """Return the place of a value on the scale: 0 at `low`, 1 at `high`."""
         return (value - self.low) / (self.high - self.low)

@@ -1,4 +1,4 @@
-"""Pictures to take home."""
+"""Export of the page as PNG files."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ RESOLUTIONS = {
 }
 """Width and height in pixels, by name."""
 TIMEOUT = 60.0
-"""Seconds to wait for the browser."""
+"""Longest time to wait for the browser, seconds."""
 
 
 class PictureSaver:
     """Saves pictures for one visitor, one at a time.
 
-    A browser may take a minute to render, or never answer. The visitor's own thread waits for it: viser's pool, in
-    which new visitors are welcomed, is everybody's.
+    A browser may take a minute to render, or never answer. A thread of the visitor's own waits for it, since viser's
+    pool also serves new visitors.
     """
 
     def __init__(
@@ -39,31 +39,31 @@ class PictureSaver:
         """Wait for requests.
 
         Args:
-            save: makes a picture, given the resolution's name and whether it is transparent. It ends by an error when
-                the visitor leaves.
-            show: told when a picture is begun, and when it is done.
-            fail: told of what `save` raises while the visitor is there.
+            save: makes a picture, given the resolution's name and whether it is transparent; raises when the visitor
+                leaves.
+            show: called with True when a picture is begun, and with False when it is done.
+            fail: called with what `save` raises while the visitor is there.
         """
         self._save, self._show, self._fail = save, show, fail
         self._thread: threading.Thread | None = None
         self._closed = False
 
     def request(self, resolution: str, transparent: bool) -> None:
-        """Begin a picture, unless one is under way. Never blocks; called by one thread only."""
+        """Begin a picture unless one is under way, without blocking; called by one thread only."""
         if self._closed or (self._thread is not None and self._thread.is_alive()):
             return
         self._thread = threading.Thread(target=self._run, args=(resolution, transparent), name="picture", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """The visitor has left: report nothing more."""
+        """Report nothing more: the visitor has left."""
         self._closed = True
 
     def _run(self, resolution: str, transparent: bool) -> None:
         self._show(True)
         try:
             self._save(resolution, transparent)
-        except Exception as error:  # whatever a browser sends for a picture: the page goes on
+        except Exception as error:  # the browser may send anything for a picture
             if not self._closed:
                 logger.exception("a picture could not be saved")
                 self._fail(error)
@@ -72,12 +72,12 @@ class PictureSaver:
 
 
 def render_png(client: viser.ClientHandle, size: tuple[int, int], legend: Legend | None, *, transparent: bool) -> bytes:
-    """What the visitor sees, as a PNG file.
+    """Render the visitor's view as a PNG file.
 
     Args:
-        client: the visitor; must not be called on the server's event loop.
+        client: the visitor; the server's event loop must not call this.
         size: width and height, pixels.
-        legend: of the colours in it, is drawn onto it.
+        legend: legend of its colours, drawn onto it.
         transparent: keep the background transparent, else make it white.
 
     Raises:
@@ -89,7 +89,7 @@ def render_png(client: viser.ClientHandle, size: tuple[int, int], legend: Legend
 
 
 def as_png(image: Image.Image, legend: Legend | None, *, transparent: bool) -> bytes:
-    """A PNG file of the RGBA image with its legend; see `render_png`."""
+    """Encode the RGBA image with its legend as PNG; see `render_png`."""
     if legend is not None:
         image = legend.drawn_onto(image)
     if not transparent:

@@ -1,4 +1,4 @@
-"""The ball at the arm's hand by which the user holds it."""
+"""The ball by which the user holds the arm's hand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.slices import Slice
 from dt_viz.ui import gestures
@@ -18,26 +18,26 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.handles import in_slice
 
 RADIUS = 0.016
-"""Metres: easy to hit, hardly wider than the fingers."""
+"""Radius of the ball, metres: easy to hit, hardly wider than the fingers."""
 
 Held = Callable[[Array, str], None]
-"""Told where the hand should be, (3,), metres, and the phase of the drag: "start", "update" or "end"."""
+"""Callback with the desired place of the hand, (3,), metres, and the phase of the drag: "start", "update" or "end"."""
 
 
 class Grip:
-    """Moves with the hand, and is dragged parallel to the slice."""
+    """A ball that moves with the hand, and is dragged parallel to the slice."""
 
     def __init__(
         self, scene: viser.SceneApi, robot: Robot, hand: str, where: Callable[[], Array | None], held: Held
     ) -> None:
-        """Hang the ball on the hand.
+        """Attach the ball to the hand.
 
         Args:
-            scene: of the visitor.
-            robot: whose hand it is.
+            scene: scene of the visitor.
+            robot: the arm.
             hand: node of its last joint.
-            where: the hand is now, (3,), metres; None before it moves.
-            held: told what the user does.
+            where: returns the current place of the hand, (3,), metres; None before it moves.
+            held: called with each event of a drag.
         """
         self.ball = scene.add_icosphere(
             f"{hand}/grip",
@@ -73,22 +73,18 @@ class Grip:
         gestures.on_drag(self.ball, dragged)
 
     def draw(self, frame: Frame) -> None:
-        """Show the ball where there is a motion to go on with, and remember the slice to be dragged in."""
+        """Show the ball if there is a motion to follow, and remember the slice that it is dragged in."""
         self._slice = frame.slice
-        shown = frame.arm is not None and not frame.blocked
-        if self.ball.visible != shown:
-            self.ball.visible = shown
+        self.ball.visible = frame.arm is not None and not frame.blocked
 
-    def say(self, doubt: str) -> None:
-        """Say beside the hand what is wrong; nothing if it is empty."""
-        if doubt and self._note.text != doubt:
-            self._note.text = doubt
-        if self._note.visible != bool(doubt):
-            self._note.visible = bool(doubt)
+    def say(self, warning: str) -> None:
+        """Show a warning beside the hand; none if it is empty."""
+        self._note.text = warning or self._note.text
+        self._note.visible = bool(warning)
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide the ball for as long as a picture takes."""
+        """Hide the ball while a picture is made."""
         shown, self.ball.visible = self.ball.visible, False
         try:
             yield

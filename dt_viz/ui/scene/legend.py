@@ -1,4 +1,4 @@
-"""What the colours on the slice mean: in the panel, and on the pictures that visitors take home."""
+"""Legends of the colours on the slice, for the panel and for exported pictures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dt_viz.ui.scene.slice_layers import DET_DECADES, OCCUPANCY_SCALE, scale_of
 
 INK, PAPER = (52, 58, 68), (255, 255, 255, 225)
 HEIGHT = 0.022
-"""Of a line of text on a picture, of the picture's height."""
+"""Height of a line of text, relative to that of the picture."""
 
 
 @dataclass(frozen=True)
@@ -24,18 +24,18 @@ class Legend:
     """A scale of colours with numbers, from left to right. Texts are ASCII: Pillow's own font has hardly more."""
 
     title: str
-    """What is shown, with its unit."""
+    """Quantity with its unit."""
     scale: Scale
     ticks: tuple[tuple[float, str], ...]
-    """Values and how they are written."""
+    """Values and their labels."""
     note: str = ""
-    """Said below."""
+    """Text below the scale."""
     swatch: Colour | None = None
-    """A colour that the note names."""
+    """Colour that the note explains."""
 
     @property
     def html(self) -> str:
-        """For the panel."""
+        """HTML for the panel."""
         stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in self.scale.shades[:: NUM_SHADES // 16].tolist())
         numbers = "".join(
             f"<span style='position:absolute;left:{at:.1f}%;transform:translateX(-{at:.1f}%)'>"
@@ -53,7 +53,7 @@ class Legend:
         )
 
     def drawn_onto(self, image: Image.Image) -> Image.Image:
-        """The RGBA image with the legend in its lower left corner, as tall as suits its height."""
+        """Draw the legend onto a copy of the RGBA image, in its lower left corner, scaled to its height."""
         em = round(HEIGHT * image.height)
         line, left, width = round(1.45 * em), round(1.6 * em), 24 * em
         font = ImageFont.load_default(em)
@@ -86,7 +86,7 @@ OCCUPANCY = Legend(
 
 
 def legend_of(picture: ColourPicture) -> Legend:
-    """What the colours of a picture mean."""
+    """Return the legend of a picture."""
     scale = scale_of(picture)
     if picture.what == "det":
         decades = range(-DET_DECADES, DET_DECADES + 1)

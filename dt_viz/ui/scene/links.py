@@ -1,4 +1,4 @@
-"""Meshes of the arm's links for the browser: in full for the arm itself, light for arms that are shown beside it."""
+"""Meshes of the arm's links for the browser: full ones for the arm, light ones for further arms."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dt_viz.arm.robot import package_folder, urdf_path
 from dt_viz.flows.fields import Array
 
 CELL = 0.005
-"""Edge of the cells in which a light mesh keeps one vertex, metres."""
+"""Edge length of the cells in which a light mesh keeps one vertex, metres."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """What moves with one joint."""
+    """The meshes that move with one joint."""
 
     placement: Array
     """(4, 4) pose in the parent link, that of the base in the world; all joint angles zero, metres."""
@@ -28,7 +28,7 @@ class Body:
 
 @lru_cache(maxsize=1)
 def bodies(joint_names: tuple[str, ...]) -> tuple[Body, ...]:
-    """The base and the six links with all that is fixed to them, read once for all visitors."""
+    """Load the base and the six links with everything fixed to them, once for all visitors."""
     urdf = yourdfpy.URDF.load(
         str(urdf_path()), filename_handler=lambda fname: str(fname).replace("package://", f"{package_folder()}/")
     )
@@ -55,12 +55,12 @@ def bodies(joint_names: tuple[str, ...]) -> tuple[Body, ...]:
 
 @lru_cache(maxsize=1)
 def light_shells(joint_names: tuple[str, ...]) -> tuple[trimesh.Trimesh, ...]:
-    """One mesh for the base and each link, with a third of the triangles or less, and without the rings."""
+    """Return a mesh for the base and each link with at most a third of the triangles and without rings."""
     return tuple(simplified(body.shell, CELL) for body in bodies(joint_names))
 
 
 def simplified(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
-    """The mesh with one vertex, their mean, for all vertices in a cell of a grid of that edge length, metres."""
+    """Replace all vertices in a cell of a grid, of edge length `cell`, metres, by their mean."""
     _, cluster = np.unique(np.floor(mesh.vertices / cell).astype(int), axis=0, return_inverse=True)
     cluster = cluster.ravel()
     sums = np.zeros((cluster.max() + 1, 3))

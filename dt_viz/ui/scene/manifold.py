@@ -1,23 +1,23 @@
-"""ψ itself in the scene: its generator, the grid that it warps, and the base attractor beside the learned system."""
+"""Pictures of ψ: its generator, the warped grid, and the base attractor beside the learned system."""
 
 from __future__ import annotations
 
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Arrows, Lines, Picture
 
 GENERATOR_LENGTH = 0.030
-"""Of the largest arrow, metres."""
+"""Length of the largest arrow, metres."""
 THICK, THIN = 0.0011, 0.0007
-"""Of the warped grid, metres: by itself, and beside the rollouts of a level."""
+"""Thickness of the warped grid's lines, metres: by itself, and beside the rollouts of a level."""
 INSET_LENGTH = 0.026
-"""Of the fastest arrow in the inset, metres."""
+"""Length of the fastest arrow in the inset, metres."""
 
 
 class Generator(Picture):
-    """The learned generator as arrows, with the demonstrations on the manifold where it acts."""
+    """The learned generator as arrows, with the demonstrations on the manifold that it acts on."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/generator", show_axes=False))
@@ -42,7 +42,7 @@ class Generator(Picture):
 
 
 class WarpedGrid(Picture):
-    """The grid of base space as ψ⁻¹ of the stack bends it; thinner and paler beside the rollouts of a level."""
+    """Image of a grid of base space under ψ⁻¹ of the stack; thinner and paler beside the rollouts of a level."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self.lines = Lines(scene, "/grid", palette.GRID, THICK)
@@ -53,13 +53,11 @@ class WarpedGrid(Picture):
         if frame.pictures.grid is not None:
             beside = frame.level is not None
             self.lines.show(frame.pictures.grid.lines, colour=palette.GRID_BESIDE if beside else palette.GRID)
-            thickness = THIN if beside else THICK
-            if self.lines.node.thickness != thickness:
-                self.lines.node.thickness = thickness
+            self.lines.node.thickness = THIN if beside else THICK
 
 
 class BaseInset(Picture):
-    """The base attractor beside the learned system: what is straight here is bent there."""
+    """The base attractor, with straight motions, beside the learned system."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/base", show_axes=False))

@@ -144,7 +144,7 @@ class Obstacles(Dragged):
             item.adopt(
                 obstacle,
                 selected=index == scenario.selected and not scenario.view.move_slice,
-                avoided=scenario.avoidance,
+                avoided=scenario.avoids,
                 opened=scenario.view.colour == "occupancy",
             )
 

@@ -1,4 +1,4 @@
-"""What pictures are made of: lines and arrows of one look, under one node of the scene tree."""
+"""Elements of pictures: lines and arrows of one look, and what is shown and hidden under one node of the scene tree."""
 
 from __future__ import annotations
 
@@ -10,22 +10,18 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
 
 Colour = tuple[int, int, int]
 
 
-class Picture(ABC):
-    """Something that is drawn from frames, under one node of the scene tree."""
+class Shown:
+    """A part of the scene under one node, which can be hidden."""
 
     def __init__(self, node: viser.SceneNodeHandle) -> None:
         self._node = node
-
-    @abstractmethod
-    def draw(self, frame: Frame) -> None:
-        """Show what the frame says."""
 
     @property
     def visible(self) -> bool:
@@ -35,12 +31,20 @@ class Picture(ABC):
     @visible.setter
     def visible(self, visible: bool) -> None:
         if visible != self._node.visible:
-            self._node.visible = visible  # first: a frame drawn meanwhile is then drawn by one of the two
+            self._node.visible = visible  # first, so that a frame that comes meanwhile is drawn
             if visible:
                 self._catch_up()
 
-    def _catch_up(self) -> None:  # noqa: B027 - most pictures need none
-        """Draw what was left out while it was hidden."""
+    def _catch_up(self) -> None:
+        """Draw what was left out while it was hidden; most parts need nothing."""
+
+
+class Picture(Shown, ABC):
+    """A part of the scene that is drawn from frames."""
+
+    @abstractmethod
+    def draw(self, frame: Frame) -> None:
+        """Show the frame."""
 
 
 class Lines:
@@ -50,9 +54,9 @@ class Lines:
         """Make an empty set.
 
         Args:
-            scene: of the visitor.
-            name: in the scene tree.
-            colour: of all lines.
+            scene: scene of the visitor.
+            name: name in the scene tree.
+            colour: colour of all lines.
             thickness: metres.
             dash: length of a dash and of the gap after it, metres; 0 draws through.
         """
@@ -69,7 +73,7 @@ class Lines:
         mark: Colour = palette.CHOSEN_ROLLOUT,
         colour: Colour | None = None,
     ) -> None:
-        """Show these polylines (T_i, 3), metres, the one with index `marked` in the colour `mark`, in this `colour`."""
+        """Show polylines (T_i, 3), metres, in a `colour`, the one with index `marked` in the colour `mark`."""
         segments: list[Array] = [np.zeros((0, 2, 3))]
         colours: list[NDArray[np.uint8]] = [np.zeros((0, 2, 3), np.uint8)]
         for index, path in enumerate(paths):
@@ -82,26 +86,26 @@ class Lines:
         assign(self.node, np.concatenate(segments), np.concatenate(colours))
 
     def show_segments(self, segments: Array) -> None:
-        """Show these segments (K, 2, 3), metres."""
+        """Show segments (K, 2, 3), metres."""
         assign(self.node, segments, rgb(self._colour, segments.shape))
 
 
 def assign(node: Any, points: Array, colours: NDArray[np.uint8]) -> None:  # noqa: ANN401 - lines, arrows and clouds
-    """Give a node points (N, …), metres, and as many colours: two messages, for the browser to apply as one.
+    """Give a node points (N, …), metres, and as many colours: two messages, so the caller must hold an atomic block.
 
-    So it must be done in an atomic block. Of no points there are no colours; the one that is sent instead means all.
+    Without points a single colour is sent, which stands for all.
     """
     node.points = points.astype(np.float32)
     node.colors = colours if len(colours) else np.zeros(3, np.uint8)
 
 
 def rgb(colour: Colour, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """One colour for an array of points of lines of that shape."""
+    """Return one colour, as linear light, for an array of points of this shape."""
     return np.broadcast_to(np.array(palette.linear(colour), dtype=np.uint8), shape)
 
 
 class Arrows:
-    """Vectors at points: longer and darker is more."""
+    """Vectors at points, the larger the longer and darker."""
 
     def __init__(
         self, scene: viser.SceneApi, name: str, little: Colour, much: Colour, length: float, thickness: float = 1.0
@@ -109,12 +113,12 @@ class Arrows:
         """Make an empty set.
 
         Args:
-            scene: of the visitor.
-            name: in the scene tree.
+            scene: scene of the visitor.
+            name: name in the scene tree.
             little: colour of the shortest.
             much: colour of the longest.
-            length: of the longest, metres.
-            thickness: relative to that of the vector field.
+            length: length of the longest, metres.
+            thickness: thickness relative to the vector field's.
         """
         self._little, self._much, self._length = np.array(little), np.array(much), length
         self.node = scene.add_arrows(
@@ -127,9 +131,9 @@ class Arrows:
         )
 
     def show(self, points: Array, vectors: Array) -> None:
-        """Show these vectors (N, 3), of any unit, in the middle of which the points (N, 3), metres, lie."""
+        """Show vectors (N, 3), of any unit, with their middles at points (N, 3), metres."""
         size = np.linalg.norm(vectors, axis=1, keepdims=True)
-        # the largest lie where ψ⁻¹ stretches most; a high quantile keeps the others readable
+        # the largest lie where ψ⁻¹ stretches most; a high quantile as the unit keeps the others readable
         relative = np.minimum(size / np.quantile(size, 0.9), 1) if len(size) else size
         arrows = vectors / np.maximum(size, 1e-12) * self._length * (0.45 + 0.55 * relative)
         ends = np.stack([points - arrows / 2, points + arrows / 2], axis=1)

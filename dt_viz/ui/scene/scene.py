@@ -11,15 +11,15 @@ import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import bias_points
+from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.anchors import BALL_RADIUS, Anchors
+from dt_viz.ui.scene.anchors import Moved as AnchorMoved
 from dt_viz.ui.scene.arm_layers import Onion
-from dt_viz.ui.scene.bias import BALL_RADIUS, Biases
-from dt_viz.ui.scene.bias import Moved as BiasMoved
 from dt_viz.ui.scene.handles import Moved as SliceMoved
 from dt_viz.ui.scene.levels import LevelRollouts
 from dt_viz.ui.scene.manifold import BaseInset, Generator, WarpedGrid
@@ -126,9 +126,9 @@ class Goal(Picture):
         text = OLD_GOAL if elsewhere else GOAL
         if self.label.text != text:
             self.label.text = text
-        # a bias point that moves the goal says so itself
-        biases = [point for point in bias_points(frame.scenario.layers).values() if point.moves_goal]
-        marked = any(np.linalg.norm(frame.reached - point.position) < BALL_RADIUS for point in biases)
+        # a transform that moves the goal says so itself
+        goals = [to.anchor for to in anchored(frame.scenario).values() if to.anchor is not None and to.ends_motions]
+        marked = any(np.linalg.norm(frame.reached - goal) < BALL_RADIUS for goal in goals)
         if self._end.visible != (elsewhere and not marked):
             self._end.visible = elsewhere and not marked
 
@@ -169,20 +169,20 @@ class ScenePictures:
         robot: Robot,
         moved: Moved,
         selected: Callable[[int], None],
-        bias_moved: BiasMoved,
-        bias_selected: Callable[[str], None],
+        anchor_moved: AnchorMoved,
+        anchor_selected: Callable[[str], None],
         slice_moved: SliceMoved,
         starts: Starts,
     ) -> None:
         """Build the scene of this robot; the others are told what the user does, see their pictures."""
         set_lights(scene)
         self.obstacles = Obstacles(scene, moved, selected)
-        self.biases = Biases(scene, bias_moved, bias_selected)
+        self.anchors = Anchors(scene, anchor_moved, anchor_selected)
         self.slice = MovableSlice(scene, slice_moved)
         self.starts = starts
         self._always: tuple[Picture, ...] = (
             self.obstacles,
-            self.biases,
+            self.anchors,
             self.slice,
             self.starts,
             LevelRollouts(scene),
@@ -246,7 +246,7 @@ class ScenePictures:
         """Show and hide what the scenario's view says, and move the obstacles to where they stand."""
         self._adopted = scenario
         self.obstacles.adopt(scenario)
-        self.biases.adopt(scenario)
+        self.anchors.adopt(scenario)
         self.slice.adopt(scenario)
         self.starts.adopt(scenario)
         with self._showing:
@@ -269,5 +269,5 @@ class ScenePictures:
     @contextmanager
     def without_handles(self) -> Iterator[None]:
         """Hide all handles for as long as a picture takes."""
-        with self.obstacles.without_handles(), self.biases.without_handles(), self.slice.without_handles():
+        with self.obstacles.without_handles(), self.anchors.without_handles(), self.slice.without_handles():
             yield

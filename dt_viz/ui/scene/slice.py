@@ -1,4 +1,4 @@
-"""The slice in the scene: handles that move and tilt it, and a thin frame where the task does not have it."""
+"""The slice in the scene: handles that move and tilt it, and a thin frame once it is moved."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.ui.scene import palette
@@ -15,14 +15,14 @@ from dt_viz.ui.scene.handles import Handles, Moved
 from dt_viz.ui.scene.picture import Lines, Picture
 
 HANDLE_SCALE = 0.24
-"""Metres that the handles stick out, about."""
+"""Approximate size of the handles, metres."""
 
 
 class MovableSlice(Picture):
-    """The frame of the slice, hung on a gizmo: the browser moves both together, without asking the server."""
+    """The frame of the slice as a child of a gizmo; the browser moves both, without the server."""
 
     def __init__(self, scene: viser.SceneApi, moved: Moved) -> None:
-        """Hidden until `adopt` shows it; `moved` is told of each new pose, the position being the slice's centre."""
+        """Begin hidden; `moved` is called with each new pose, the position being the slice's centre."""
         self.gizmo = scene.add_transform_controls("/slice", line_width=3.0, depth_test=False, visible=False)
         super().__init__(self.gizmo)
         self.border = Lines(scene, "/slice/border", palette.SLICE, 0.0022)
@@ -32,7 +32,7 @@ class MovableSlice(Picture):
         self._scenario: Scenario | None = None
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers where the task has it."""
+        """See `Picture`: remembers the slice of the task."""
         home = frame.task.slice
         if home is not self._home:
             self._home = home
@@ -42,7 +42,7 @@ class MovableSlice(Picture):
                 self.adopt(self._scenario)
 
     def adopt(self, scenario: Scenario) -> None:
-        """Lie where the scenario's slice does, unless that is where the browser has put it already."""
+        """Move to the scenario's slice, unless the browser has moved there already."""
         self._scenario, view = scenario, scenario.view
         if self._home is None:
             return
@@ -52,5 +52,5 @@ class MovableSlice(Picture):
         self.visible = view.move_slice or view.slice is not None
 
     def without_handles(self) -> AbstractContextManager[None]:
-        """Hide the handles, not the frame, for as long as a picture takes."""
+        """Hide the handles, not the frame, while a picture is made."""
         return self._handles.hidden()

@@ -1,4 +1,4 @@
-"""What lies on the slice: arrows, streamlines, and det J, the Lyapunov value or the learned occupancy as colour."""
+"""Pictures on the slice: arrows, streamlines, and det J, the Lyapunov value or the learned occupancy as colour."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from viser import transforms
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.slices import Slice
@@ -17,30 +17,28 @@ from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale, diverging, ramp
 from dt_viz.ui.scene.picture import Arrows, Lines, Picture, assign
 
 ARROW_LENGTH = 0.024
-"""Of the fastest arrow, metres."""
+"""Length of the fastest arrow, metres."""
 HEAD_LENGTH = 0.012
-"""Of the arrow heads on streamlines, metres."""
+"""Length of the arrow heads on streamlines, metres."""
 PIXEL = 0.004
-"""Of the colours, metres."""
-OPACITY = 0.5
-"""Of the colours: arm and rollouts behind them are seen through."""
-MOST_OPAQUE = 0.85
-"""Opacity where the map is sure that something is there."""
+"""Size of a pixel of the colours, metres."""
+OPACITY, MOST_OPAQUE = 0.5, 0.85
+"""Opacity of det J and the Lyapunov value, and of occupancy where it is certain."""
 POINT_SIZE = 0.0016
-"""Of a cloud's points, metres."""
+"""Size of a cloud's points, metres."""
 DET_DECADES = 2
-"""Of det J to either side of 1; what is beyond has the last colour."""
+"""Number of decades of det J on either side of 1; values beyond have the last colour."""
 CM2 = 1e4
 """Square centimetres in a square metre."""
 
 VOLUME, LYAPUNOV = diverging(palette.VOLUME), ramp(palette.LYAPUNOV)
 _LIKELY = np.linspace(0, MOST_OPAQUE, NUM_SHADES)[:, None]
 OCCUPANCY_SCALE = Scale(np.round(255 + _LIKELY * (np.array(palette.OCCUPANCY) - 255)).astype(np.uint8), 0.0, 1.0)
-"""As it looks on white."""
+"""Colours of the occupancy on white."""
 
 
 class FieldArrows(Picture):
-    """The vector field on the slice: longer and darker is faster."""
+    """The vector field on the slice; faster arrows are longer and darker."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._arrows = Arrows(scene, "/field", palette.ARROW_SLOW, palette.ARROW_FAST, ARROW_LENGTH)
@@ -54,7 +52,7 @@ class FieldArrows(Picture):
 
 
 class Streamlines(Picture):
-    """Motions from all over the slice, thin, with a head in the middle of each."""
+    """Motions from all over the slice as thin lines with an arrow head in the middle of each."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/streamlines", show_axes=False))
@@ -74,7 +72,7 @@ class Streamlines(Picture):
 
 
 class _Image:
-    """Pixels on a slice."""
+    """An image on a slice."""
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene, self._name = scene, name
@@ -85,13 +83,10 @@ class _Image:
         """Show pixels (n, m, 4) along the first and the second axis of the slice."""
         pixels = pixels.swapaxes(0, 1)[::-1]  # the first row is the upper one
         right, up = area.axes.T
-        turn = transforms.SO3.from_matrix(np.stack([right, -up, np.cross(right, -up)], axis=1))
+        turn = transforms.SO3.from_matrix(np.stack([right, -up, -area.normal], axis=1))
         if self.handle is not None and self._size == area.half_size:
             self.handle.image = pixels
-            if not np.allclose(self.handle.wxyz, turn.wxyz, rtol=0, atol=1e-12):
-                self.handle.wxyz = turn.wxyz
-            if not np.array_equal(self.handle.position, area.centre):
-                self.handle.position = area.centre
+            self.handle.wxyz, self.handle.position = turn.wxyz, area.centre
             return
         self._size = area.half_size
         width, height = (2 * half for half in area.half_size)
@@ -109,7 +104,7 @@ class _Image:
 
 
 class ColourSlice(Picture):
-    """det J or the Lyapunov value as colour, the latter with level lines."""
+    """det J, or the Lyapunov value with level lines, as colour."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/colour", show_axes=False))
@@ -127,22 +122,22 @@ class ColourSlice(Picture):
 
 
 def scale_of(picture: ColourPicture) -> Scale:
-    """Of det J its decimal logarithm, the same for all; of the Lyapunov value cm²/s from zero to the largest."""
+    """Return the scale of a picture: for log₁₀ det J a fixed one, for the Lyapunov value cm²/s up to the largest."""
     if picture.what == "det":
         return Scale(VOLUME, -DET_DECADES, DET_DECADES)
     return Scale(LYAPUNOV, 0.0, _rounded_up(CM2 * float(np.nanmax(picture.values, initial=1e-9))))
 
 
 def painted(picture: ColourPicture) -> NDArray[np.uint8]:
-    """Pixels (n, m, 4) along the axes of the slice: smooth between samples, nothing where no motion comes."""
+    """Return pixels (n, m, 4) along the axes of the slice, interpolated, and transparent where no motion comes."""
     values, unknown = picture.values, np.isnan(picture.values)
     shape = tuple(max(2, round(2 * half / PIXEL)) for half in picture.area.half_size)
     if unknown.all():
         return np.zeros((*shape, 4), np.uint8)
-    if unknown.any():  # what is next to it goes on, for the sake of the border
+    if unknown.any():  # extrapolate the nearest values, for the border
         nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
         values = values[tuple(np.asarray(nearest))]
-    # samples lie on the corners of the slice, pixels half a pixel inside
+    # the outermost samples lie on the border of the slice, pixels half a pixel inside
     axes = [(np.arange(p) + 0.5) / p * (n - 1) for p, n in zip(shape, values.shape, strict=True)]
     at = np.meshgrid(*axes, indexing="ij")
     shown = np.log10(np.maximum(values, 10.0 ** (-2 * DET_DECADES))) if picture.what == "det" else CM2 * values
@@ -156,13 +151,13 @@ def painted(picture: ColourPicture) -> NDArray[np.uint8]:
 
 
 def _rounded_up(value: float) -> float:
-    """The next number that is easily read: 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten."""
+    """Round up to 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * next(step for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * power >= value * (1 - 1e-9)))
 
 
 class OccupancySlice(Picture):
-    """What the map believes, as colour on the slice: the more opaque the more likely."""
+    """The learned occupancy as colour on the slice, the more opaque the more likely."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/occupancy", show_axes=False))

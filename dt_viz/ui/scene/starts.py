@@ -1,4 +1,4 @@
-"""Added starts in the scene: small balls that are dragged, and places on the slice that are clicked to add one."""
+"""Added starts in the scene: small balls that are dragged, and clicks on the slice that add one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import viser
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
@@ -20,14 +20,14 @@ from dt_viz.ui.scene.handles import in_slice
 from dt_viz.ui.scene.picture import Picture
 
 RADIUS = 0.010
-"""Of a ball, metres."""
+"""Radius of a ball, metres."""
 
 Moved = Callable[[int, Array, str], None]
-"""Told which start was moved, its position (3,), metres, and the phase of the drag."""
+"""Callback with the index of a start, its new position (3,), metres, and the phase of the drag."""
 
 
 class StartBall:
-    """One added start, with its number as doubts name it."""
+    """One added start, with its number as in warnings."""
 
     def __init__(
         self,
@@ -37,14 +37,14 @@ class StartBall:
         chosen: Callable[[int], None],
         area: Callable[[], Slice | None],
     ) -> None:
-        """Stand nowhere yet.
+        """Make the ball, without a place.
 
         Args:
-            scene: of the visitor.
-            index: in the scenario.
-            moved: told of each new position.
-            chosen: told that it was clicked.
-            area: what it is dragged parallel to.
+            scene: scene of the visitor.
+            index: index of the start in the scenario.
+            moved: called with each new position.
+            chosen: called when it is clicked.
+            area: returns the slice that it is dragged parallel to.
         """
         self.ball = scene.add_icosphere(
             f"/starts/{index}", radius=RADIUS, color=palette.START, subdivisions=2, cast_shadow=False
@@ -77,10 +77,10 @@ class Starts(Picture):
         """Begin with none.
 
         Args:
-            scene: of the visitor.
-            moved: told of a new position of one of them.
-            chosen: told which one was clicked.
-            clicked: told of a place (3,), metres, on the slice that was clicked to add one.
+            scene: scene of the visitor.
+            moved: called with each new position of a start.
+            chosen: called with the index of a clicked start.
+            clicked: called with a place (3,), metres, on the slice that was clicked to add a start.
         """
         super().__init__(scene.add_frame("/starts", show_axes=False))
         self._scene, self._moved, self._chosen, self._clicked = scene, moved, chosen, clicked
@@ -90,27 +90,25 @@ class Starts(Picture):
         """In the order of the scenario."""
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers the slice; grey are starts from which nothing moves."""
+        """See `Picture`: remembers the slice; starts without a motion are grey."""
         self._slice = frame.slice
         colour = palette.STALE if frame.blocked else palette.START
         for item in self.items:
-            if item.ball.color != colour:
-                item.ball.color = colour
+            item.ball.color = colour
 
     def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's starts, and listen to clicks on the slice while it says so."""
+        """Show the scenario's starts, and listen to clicks on the slice if the view says so."""
         while len(self.items) > len(scenario.starts):
             self.items.pop().ball.remove()
         while len(self.items) < len(scenario.starts):
             ball = StartBall(self._scene, len(self.items), self._moved, self._chosen, lambda: self._slice)
             self.items.append(ball)
         for item, start in zip(self.items, scenario.starts, strict=True):
-            if np.abs(np.asarray(item.ball.position) - start).max() > 1e-9:
-                item.ball.position = start
+            item.ball.position = start
         self._clicks.listen(scenario.view.click_to_start)
 
     def click(self, origin: Array, direction: Array) -> None:
-        """Add a start where this ray, both (3,), metres, meets the slice, unless one that is there was clicked."""
+        """Add a start where a ray, given by `origin` and `direction` (3,), meets the slice, unless it hits a start."""
         place = None if self._slice is None else struck(self._slice, origin, direction)
         if place is not None and not any(self._hits(item, origin, direction) for item in self.items):
             self._clicked(place)

@@ -1,6 +1,6 @@
-"""Bias points in the scene: each is dragged itself, the selected one also by handles; a ring is around its region.
+"""Transforms that have a place, in the scene: each is dragged itself, the selected one also by handles.
 
-In a drawing the handles move it in the drawing's plane.
+A ring is around the region that it acts in. In a drawing the handles move it in the drawing's plane.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import numpy as np
 import viser
 import viser.transforms
 
-from dt_viz.engine.engine import Frame
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import MAX_BIAS_POINTS, bias_points
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.scenario.stack import anchored, selected
+from dt_viz.transforms.base import Transform, axes_of
+from dt_viz.transforms.registry import KINDS
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene import palette
@@ -27,15 +28,17 @@ HANDLE_SCALE = 0.11
 """Metres that the handles stick out, about."""
 RING_WIDTH = 1.6
 """Pixels."""
+MAX_ANCHORS = sum(kind.most for kind in KINDS if kind.most > 1)
+"""Largest number of transforms that may have a place."""
 NUM_SEGMENTS = 96
 """Of a ring."""
 
 Moved = Callable[[str, Array, str], None]
-"""Told which bias point was moved, by name, its position (3,), metres, and the phase of the drag."""
+"""Told which transform was moved, by name, its position (3,), metres, and the phase of the drag."""
 
 
-class BiasPicture:
-    """One bias point, hung on a gizmo: the browser moves both together, without asking the server."""
+class AnchorPicture:
+    """One transform's place, hung on a gizmo: the browser moves both together, without asking the server."""
 
     def __init__(
         self,
@@ -45,7 +48,7 @@ class BiasPicture:
         selected: Callable[[str], None],
         along: Callable[[Drag], Array],
     ) -> None:
-        """Hidden until `adopt` gives it a bias point.
+        """Hidden until `adopt` gives it a transform.
 
         Args:
             scene: of the visitor.
@@ -55,7 +58,7 @@ class BiasPicture:
             along: how far (3,) an event drags what it has grabbed, metres.
         """
         self.name = ""
-        """Of the bias point."""
+        """Of the transform."""
         node = f"/bias/{number}"
         self.gizmo = scene.add_transform_controls(
             node, line_width=3.0, disable_rotations=True, depth_test=False, visible=False
@@ -92,16 +95,18 @@ class BiasPicture:
         gestures.on_drag(self.ball, dragged)
         gestures.on_click(self.ball, lambda: selected(self.name))
 
-    def adopt(self, name: str, point: BiasPoint, *, on: bool, selected: bool) -> None:
-        """Stand where the bias point does, unless that is where the browser has put it already."""
-        self.handles.stand(point.position, viser.transforms.SO3.from_matrix(point.axes()).wxyz)
-        flat = point.plane is not None
+    def adopt(self, name: str, transform: Transform, *, on: bool, selected: bool) -> None:
+        """Stand where the transform does, unless that is where the browser has put it already."""
+        assert transform.anchor is not None
+        plane = transform.anchor_plane
+        self.handles.stand(transform.anchor, viser.transforms.SO3.from_matrix(axes_of(plane)).wxyz)
+        flat = plane is not None
         if self.gizmo.active_axes[2] == flat:
             self.gizmo.active_axes = (True, True, not flat)
         if self._flat != flat:
             self._flat, self.region.points = flat, _rings(flat=flat)
         self.name = name
-        label = f"{name.lower()}: goal" if point.moves_goal else name.lower()
+        label = f"{name.lower()}: goal" if transform.ends_motions else name.lower()
         if self._label.text != label:
             self._label.text = label
         colour = palette.BIAS if on else palette.STALE
@@ -112,9 +117,9 @@ class BiasPicture:
         if not self.gizmo.visible:
             self.gizmo.visible = True
 
-    def show_region(self, point: BiasPoint, used: float | None) -> None:
+    def show_region(self, transform: Transform, used: float | None) -> None:
         """Show how far it acts: the radius that was used, or the one asked for; nothing while neither is known."""
-        radius = used or point.radius
+        radius = used or transform.region
         shown = radius is not None
         if shown:
             scale = (radius, radius, radius)
@@ -124,7 +129,7 @@ class BiasPicture:
             self.region.visible = shown
 
     def hide(self) -> None:
-        """There is no such bias point."""
+        """There is no such transform."""
         self.name = ""
         if self.gizmo.visible:
             self.gizmo.visible = False
@@ -138,14 +143,14 @@ def _rings(*, flat: bool) -> Array:
     return np.concatenate([np.stack([c[:-1], c[1:]], axis=1) for c in circles]).astype(np.float32)
 
 
-class Biases(Dragged):
-    """All bias points of a scenario."""
+class Anchors(Dragged):
+    """All transforms of a scenario that have a place."""
 
     def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[str], None]) -> None:
-        """Begin with none; see `BiasPicture`."""
+        """Begin with none; see `AnchorPicture`."""
         super().__init__(scene.add_frame("/bias", show_axes=False))
-        self._points: Mapping[str, BiasPoint] = {}
-        self.items = tuple(BiasPicture(scene, k, moved, selected, self.along) for k in range(MAX_BIAS_POINTS))
+        self._transforms: Mapping[str, Transform] = {}
+        self.items = tuple(AnchorPicture(scene, k, moved, selected, self.along) for k in range(MAX_ANCHORS))
 
     @property
     def handles(self) -> Iterable[Handles]:
@@ -155,23 +160,17 @@ class Biases(Dragged):
     def draw(self, frame: Frame) -> None:
         """See `Picture`: the regions, and the slice to be dragged in."""
         super().draw(frame)
-        radii = dict(zip((layer.name for layer in frame.scenario.layers), frame.layer_radii, strict=False))
-        for item, (name, point) in zip(self.items, self._points.items(), strict=False):
-            item.show_region(point, radii.get(name))
+        layers = zip(frame.scenario.stack, frame.chosen_values, strict=False)
+        radii = {layer.name: chosen.get("radius") for layer, chosen in layers}
+        for item, (name, transform) in zip(self.items, self._transforms.items(), strict=False):
+            item.show_region(transform, radii.get(name))
 
     def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's bias points where they stand."""
-        points = bias_points(scenario.layers)
-        self._points = points
-        on = {layer.name for layer in scenario.layers if layer.on}
-        selected = None if scenario.view.move_slice else selected_point(scenario)
-        for item, (name, point) in zip(self.items, points.items(), strict=False):
-            item.adopt(name, point, on=name in on, selected=name == selected)
-        for item in self.items[len(points) :]:
+        """Show the scenario's transforms where they stand."""
+        self._transforms = anchored(scenario)
+        on = {layer.name for layer in scenario.stack if layer.on}
+        chosen = None if scenario.view.move_slice else selected(scenario)
+        for item, (name, transform) in zip(self.items, self._transforms.items(), strict=False):
+            item.adopt(name, transform, on=name in on, selected=name == chosen)
+        for item in self.items[len(self._transforms) :]:
             item.hide()
-
-
-def selected_point(scenario: Scenario) -> str | None:
-    """Name of the bias point that has the handles: the chosen one, or else the newest."""
-    points = bias_points(scenario.layers)
-    return scenario.view.bias if scenario.view.bias in points else next(reversed(points), None)

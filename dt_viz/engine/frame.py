@@ -1,0 +1,79 @@
+"""What an engine computes for a scenario, stage by stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+
+from dt_viz.flows.fields import Array
+from dt_viz.motion.certificates import Certificates
+from dt_viz.motion.following import ArmMotion
+from dt_viz.motion.profiles import Profiles
+from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.tasks import Task
+from dt_viz.warning import MotionWarning
+
+
+class Stage(IntEnum):
+    """How far a frame is worked out; each stage holds all that the one before it holds."""
+
+    ROLLOUTS = 0
+    """Rollouts and their clearance."""
+    LIVE = 1
+    """Also the arm and what lies on the slice: what follows a drag."""
+    FINE = 2
+    """All of it refined, for a scenario that rests."""
+    CERTIFIED = 3
+    """Also the certificates."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All that the page draws for a scenario. Read only."""
+
+    scenario: Scenario
+    task: Task
+    stage: Stage
+    ghost: tuple[Array, ...]
+    """Undeformed rollouts, (T_i, 3)."""
+    rollouts: tuple[Array, ...]
+    """(T_i, 3), metres: first those from the task's starts, then those from added ones."""
+    times: tuple[Array, ...]
+    """(T_i,) seconds of the samples of each rollout."""
+    levels: tuple[tuple[Array, ...], ...]
+    """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3)."""
+    goal: Array
+    """(3,) where the demonstrations end."""
+    reached: Array
+    """(3,) where the motions end: elsewhere where the obstacle covers the goal or leaves no way to it."""
+    blocked: tuple[MotionWarning, ...]
+    """Why there is no motion for this scenario; what is shown then is the last one that there was."""
+    certificates: Certificates
+    chosen: int | None = 0
+    """Which rollout the arm follows; None where it cannot begin the one that the scenario asks for."""
+    learned_steps: tuple[int, ...] = ()
+    """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
+    durations: tuple[float | None, ...] = ()
+    """t of the flow of each layer of `Scenario.stack`, under a warp that of the full one; None where it is off."""
+    chosen_values: tuple[Mapping[str, float], ...] = ()
+    """Values that each layer of `Scenario.stack` chose automatically, by its fields; none where it is off."""
+    arm_duration: float | None = None
+    """t of the flow by which the whole arm avoids, under a warp that of the full one; None where it does not."""
+    level: int | None = None
+    """Which of `levels` the view shows, with the pictures that are on that manifold; None is the whole stack."""
+    arm: ArmMotion | None = None
+    """None before stage LIVE, and where the arm cannot reach the start."""
+    pictures: Pictures = NO_PICTURES
+    """Of ψ itself and on the slice, as far as the view shows them; empty before stage LIVE."""
+    profiles: Profiles | None = None
+    """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
+    seconds: float = 0.0
+    """From the start of the rebuild until this frame."""
+
+    @property
+    def slice(self) -> Slice:
+        """Where the pictures lie."""
+        return self.task.slice.posed(self.scenario.view.slice)

@@ -1,0 +1,1 @@
+"""Small programs that use the library: read them, copy them, change them."""

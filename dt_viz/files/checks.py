@@ -1,0 +1,82 @@
+"""Checks that the readers of files share; what they refuse they describe by a FormatError."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dt_viz.errors import FormatError
+from dt_viz.flows.fields import Array
+
+
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """Read a whole file.
+
+    Raises:
+        FormatError: there is no such file, or it is larger than `max_bytes`.
+        OSError: it cannot be read.
+    """
+    if not path.is_file():
+        raise FormatError("path", "no such file", "a readable file")
+    check_size(path.stat().st_size, max_bytes)
+    return path.read_bytes()
+
+
+def checked_suffix(content: bytes, source: Path, accepted: Collection[str], max_bytes: int) -> str:
+    """Return the suffix of a file's name in lower case.
+
+    Raises:
+        FormatError: the suffix is none of the `accepted` ones, or the content is empty or larger than `max_bytes`.
+    """
+    suffix = source.suffix.lower()
+    if suffix not in accepted:
+        raise FormatError("suffix", repr(source.suffix) if suffix else "no suffix", ", ".join(accepted))
+    check_size(len(content), max_bytes)
+    if not content:
+        raise FormatError("file", "an empty file", f"a {suffix} file with content")
+    return suffix
+
+
+def check_size(num_bytes: int, max_bytes: int) -> None:
+    """Raise FormatError if a file is larger than `max_bytes`."""
+    if num_bytes > max_bytes:
+        raise FormatError("file", f"{num_bytes / 1e6:.1f} MB", f"at most {max_bytes / 1e6:.0f} MB")
+
+
+def check_at_most(field: str, num: int, limit: int, unit: str = "") -> None:
+    """Raise FormatError if there are more than `limit`."""
+    if num > limit:
+        raise FormatError(field, f"{num} {unit}".rstrip(), f"at most {limit} {unit}".rstrip())
+
+
+def too_many(field: str, limit: int, unit: str = "") -> FormatError:
+    """Return the error about a count that has passed its limit before all was counted."""
+    return FormatError(field, f"more than {limit} {unit}".rstrip(), f"at most {limit} {unit}".rstrip())
+
+
+def real_numbers(values: ArrayLike, field: str, kinds: str = "iuf") -> Array:
+    """Return an array as float64; values that overflow become infinite.
+
+    Args:
+        values: what should be an array of integers or real numbers.
+        field: its name, for messages.
+        kinds: the accepted kinds of types, in numpy's letters.
+
+    Raises:
+        FormatError: its values are of another type.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in kinds:
+        raise FormatError(field, f"values of type {array.dtype}", "integers or real numbers")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return array.astype(np.float64)
+
+
+def check_finite(values: Array, field: str, place: Callable[[int], str]) -> None:
+    """Raise FormatError if one of the values (N, k) is infinite or NaN; `place` describes the place of its row."""
+    if not np.isfinite(values).all():
+        row, column = np.argwhere(~np.isfinite(values))[0]
+        raise FormatError(field, f"{values[row, column]} {place(int(row))}", "finite numbers")

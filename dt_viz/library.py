@@ -1,0 +1,196 @@
+"""The library: from demonstrations to a stable motion, transforms stacked on it, its paths and its velocity field.
+
+    motion = dt.fit(dt.load_demonstrations("push_box.npz"))
+    around = motion.stack(dt.Avoidance(dt.Sphere((0.10, -0.53, 0.15), diameter=0.15)))
+    paths = around.rollouts(spacing=0.005)
+
+Everything is computed by what the page is computed by; `import dt_viz` offers these names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.arm.robot import Robot
+from dt_viz.arm.robot import load_jaco as load_robot
+from dt_viz.arm.tracking import inverse_kinematics, track
+from dt_viz.flows.fields import Array
+from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.imitation import ImitationSettings, Objective
+from dt_viz.learning.imitation import fit as fit_imitation
+from dt_viz.motion.certificates import Certificates, Shown, certified
+from dt_viz.motion.diagnostics import motion_warnings
+from dt_viz.motion.nominal import NUM_SAMPLES, Learned
+from dt_viz.motion.solve import FINE, Solution, Solved, solve
+from dt_viz.properties import cached_property
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.base import Transform
+
+TOLERANCE = 1e-6
+"""Largest error of a step of the flows that a velocity is computed with, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A motion, sampled."""
+
+    positions: Array
+    """(T, d), metres."""
+    times: Array
+    """(T,) seconds from the start."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointPath:
+    """A motion of the arm's joints."""
+
+    q: Array
+    """(T, 6) joint angles, rad; continuous joints unwrapped."""
+    times: Array
+    """(T,) seconds, later than the path's where the joints' velocity limits ask for it."""
+    error: Array
+    """(T,) distances of the hand from the path, metres."""
+
+
+class Motion:
+    """A stable motion: what was learned from demonstrations, and the transforms stacked on it. Not to be changed."""
+
+    def __init__(self, learned: Learned, layers: tuple[Layer, ...] = ()) -> None:
+        """Wrap what was learned; see `fit`."""
+        self._learned, self._layers = learned, layers
+        self.dimension = learned.imitation.base.dim
+        """d: 2 of drawings, 3 of motions in space."""
+
+    @property
+    def transforms(self) -> tuple[Transform, ...]:
+        """The transforms on the imitation, from the inside out."""
+        return tuple(layer.transform for layer in self._layers)
+
+    @property
+    def goal(self) -> Array:
+        """(d,) where the motions end, metres."""
+        return self._solution.bundle.positions[-1, : self.dimension]
+
+    def stack(self, *transforms: Transform) -> Motion:
+        """The motion with more transforms on it, the last one outermost.
+
+        A motion in the plane stays there: what is stacked acts along the plane only.
+        """
+        scenario = Scenario("", self._layers)
+        for transform in transforms:
+            flat = transform.in_plane(PLANE) if self.dimension == 2 else transform
+            names = {layer.name for layer in scenario.stack}
+            name = next(name for k in range(1, len(names) + 2) if (name := f"{flat.title} {k}") not in names)
+            scenario = replace(scenario, stack=(*scenario.stack, Layer(flat, name=name)))
+        return Motion(self._learned, scenario.stack)
+
+    def rollouts(self, starts: ArrayLike | None = None, *, spacing: float = 0.005) -> tuple[Path, ...]:
+        """Exact paths to the goal, sampled more closely where the stack stretches them.
+
+        Args:
+            starts: (R, d) where they begin, metres; None is where the demonstrations do.
+            spacing: largest distance between neighbouring samples, metres.
+        """
+        solution = self._solution
+        system = solution.system
+        if starts is None:
+            rays = solution.rays
+        else:
+            rays = Rays(system.transform.forward(self._in_space(np.atleast_2d(np.asarray(starts, float)))), system.base)
+        evaluate = lambda index, fraction: system.transform.inverse(rays.at(index, fraction))[:, None]  # noqa: E731
+        bundle = refined(evenly_sampled(evaluate, len(rays.z0), NUM_SAMPLES), evaluate, spacing)
+        times = bundle.split(rays.times(bundle.index, bundle.fraction))
+        return tuple(Path(path[:, : self.dimension], t) for path, t in zip(bundle.paths, times, strict=True))
+
+    def velocity(self, y: ArrayLike) -> Array:
+        """ẏ (*B, d), m/s, at the places `y` (*B, d), metres: what a controller follows."""
+        points = np.asarray(y, float)
+        velocity = self._controlled.velocity(self._in_space(points.reshape(-1, self.dimension)))
+        return velocity[:, : self.dimension].reshape(points.shape)
+
+    def certificates(self) -> Certificates:
+        """What is known about how far the paths from the demonstrations' starts are to be trusted."""
+        nominal, solution = self._learned.demonstrated, self._solution
+        scenario = Scenario("", self._layers)
+        solved = Solved(scenario, nominal, nominal, solution, None, None)
+        bundle, path = solution.bundle, solution.bundle.positions
+        missed = float(np.linalg.norm(path[-1] - nominal.goal))
+        known = Certificates(
+            float(scenario.obstacle.signed_distance(path).min()), found=motion_warnings(solved, missed)
+        )
+        times = solution.rays.times(bundle.index, bundle.fraction)
+        return certified(known, solution, solved.ends, Shown(bundle.index, bundle.fraction, times, path))
+
+    @cached_property
+    def _solution(self) -> Solution:
+        return solve(self._learned.demonstrated, Scenario("", self._layers).active, FINE)
+
+    @cached_property
+    def _controlled(self) -> DiffeomorphicSystem:
+        return self._solution.system.at_tolerance(TOLERANCE)
+
+    def _in_space(self, points: Array) -> Array:
+        """Points (N, 3) of points (N, d)."""
+        return np.pad(points, ((0, 0), (0, 3 - self.dimension)))
+
+
+PLANE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+"""The plane of motions with two coordinates."""
+
+
+class Arm:
+    """The JACO arm."""
+
+    def __init__(self, robot: Robot) -> None:
+        """Wrap a robot; see `load_jaco`."""
+        self.robot = robot
+
+    def follow(self, path: Path) -> JointPath:
+        """The joints along a path of the hand.
+
+        Args:
+            path: in space, in the frame of the arm's base.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the path starts.
+        """
+        start = inverse_kinematics(self.robot, path.positions[0])
+        tracked = track(self.robot, path.positions, start)
+        times = within_velocity_limits(path.times, tracked.q, self.robot.velocity_limits)
+        return JointPath(tracked.q, times, tracked.error)
+
+
+def load_jaco() -> Arm:
+    """The JACO arm, from its URDF."""
+    return Arm(load_robot())
+
+
+def fit(demonstrations: Sequence[Demonstration], objective: Objective = "trajectory") -> Motion:
+    """Learn a stable motion from demonstrations, all ending at (about) the same place.
+
+    Args:
+        demonstrations: of one motion, with 2 or 3 coordinates; see `load_demonstrations`.
+        objective: what is fitted: the motions, or their velocities as in eq. (3).
+
+    Raises:
+        ImitationError: no stable motion can be learned from them.
+    """
+    given = tuple(demonstrations)
+    imitation = fit_imitation(given, ImitationSettings(objective))
+    return Motion(Learned.of(_task(given), imitation, imitates=True))
+
+
+def _task(demonstrations: tuple[Demonstration, ...]) -> Task:
+    """The demonstrations in their own frame."""
+    flat = Slice(np.zeros(3), np.eye(3)[:, :2], (1.0, 1.0))
+    nowhere = (0.0, 0.0, 0.0)
+    return Task("", "", "", demonstrations, np.zeros(3), np.eye(3), 1.0, flat, (nowhere, nowhere), nowhere)

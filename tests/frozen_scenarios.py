@@ -1,0 +1,106 @@
+"""Rollouts of sixty random scenarios, kept to be compared with those of another version.
+
+Scenarios are described by plain data (`frozen/scenarios.json`), which no change of the classes touches. On one machine
+versions that compute the same agree to rounding:
+
+    PYTHONPATH=. python tests/frozen_scenarios.py write before.npz        # in a checkout of the version before
+    PYTHONPATH=. python tests/frozen_scenarios.py compare before.npz      # here: metres, largest difference first
+
+`test_frozen_scenarios.py` compares some of them with `frozen/rollouts.npz`, which another machine has written.
+"""
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Stage
+from dt_viz.flows.diffeomorphisms import Integration
+from dt_viz.learning.store import FitStore
+from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.stack import plane_of
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.bias import BiasPoint
+
+FOLDER = Path(__file__).parent / "frozen"
+DESCRIPTIONS = json.loads((FOLDER / "scenarios.json").read_text(encoding="utf-8"))
+
+
+def scenario_of(engine, description):
+    """The scenario that a description is about."""
+    return Scenario(
+        description["task"],
+        _stack(engine.task(description["task"]), description),
+        imitation=description["imitation"],
+        objective=description["objective"],
+        warp=description["warp"],
+        starts=tuple(map(tuple, description["starts"])),
+    )
+
+
+def _stack(task, description):
+    avoid, layers = description["avoid"], []
+    for bias in description["biases"]:
+        plane = plane_of(task) if bias["plane"] else None
+        size = bias["radius"], bias["strength"]
+        point = BiasPoint(tuple(bias["position"]), *size, plane, bias["moves_goal"])
+        layers.append(Layer(point, on=bias["on"], name=bias["name"]))
+    avoidance = Avoidance(
+        map(_obstacle, description["obstacles"]),
+        **{name: avoid[name] for name in ("space", "generator", "temperature", "margin", "duration")},
+        integration=Integration(avoid["method"], avoid["steps"]),
+    )
+    layers.insert(description["level"], Layer(avoidance, on=avoid["on"], name="Avoidance"))
+    return tuple(layers)
+
+
+def _obstacle(description):
+    position = tuple(description["position"])
+    match description["kind"]:
+        case "sphere":
+            return Sphere(position, description["diameter"])
+        case "box":
+            return Box(position, tuple(description["sizes"]), tuple(description["wxyz"]))
+        case _:
+            return Cylinder(position, description["diameter"], description["height"], tuple(description["wxyz"]))
+
+
+def rollouts_of(engine, description):
+    """Rollouts of the refined frame, and those of the arm's motion, by name."""
+    frames = engine.frames(scenario_of(engine, description))
+    frame = next(frame for frame in frames if frame.stage is Stage.FINE)
+    found = {f"rollout {k}": path for k, path in enumerate(frame.rollouts)}
+    found |= {f"times {k}": times for k, times in enumerate(frame.times)}
+    return found if frame.arm is None else {**found, "joints": frame.arm.q}
+
+
+def all_rollouts(fits, robot):
+    """The same of many scenarios, each by an engine that has computed nothing yet."""
+    found = {}
+    for number, description in enumerate(DESCRIPTIONS):
+        print(number, end=" ", flush=True)
+        paths = rollouts_of(Engine(TASKS, fits, robot), description)
+        found |= {f"{number}/{name}": path for name, path in paths.items()}
+    return found
+
+
+def main(command, file):
+    with tempfile.TemporaryDirectory() as folder:
+        found = all_rollouts(FitStore(Path(folder)), load_jaco())
+    if command == "write":
+        np.savez_compressed(file, **found)
+        return
+    with np.load(file) as before:
+        assert set(before.files) == set(found)
+        off = {name: float(np.abs(before[name] - path).max(initial=0)) for name, path in found.items()}
+    print(*(f"\n{name}: {by:.1e}" for name, by in sorted(off.items(), key=lambda item: -item[1])[:20]))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,144 @@
+"""The library, as `import dt_viz as dt` offers it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dt_viz as dt
+from dt_viz.examples import controller, plot
+from dt_viz.examples.viser_scene import Scene
+from dt_viz.library import Motion
+from dt_viz.shipped import ASSETS
+from dt_viz.warning import Kind
+
+
+@pytest.fixture(scope="module")
+def push() -> Motion:
+    return dt.fit(dt.load_demonstrations(ASSETS / "push_box.npz"))
+
+
+@pytest.fixture(scope="module")
+def letter() -> Motion:
+    return dt.fit(dt.load_demonstrations(ASSETS / "draw_s.npz"))
+
+
+BALL = dt.Sphere((0.10, -0.53, 0.15), diameter=0.15)
+
+
+def middle_of(motion):
+    """The middle of the first path."""
+    (path, *_) = motion.rollouts()
+    return path.positions[len(path.positions) // 2]
+
+
+def test_every_name_is_there_and_nothing_is_loaded_before_it_is_asked_for():
+    assert all(getattr(dt, name).__doc__ for name in dt.__all__)
+    with pytest.raises(AttributeError):
+        dt.no_such_name  # noqa: B018
+    loads = "import sys, dt_viz; print('numpy' in sys.modules)"
+    assert subprocess.check_output([sys.executable, "-c", loads], text=True).strip() == "False"
+
+
+def test_the_example_leads_motions_around_a_ball_and_the_arm_follows(push):
+    around = push.stack(dt.Avoidance(BALL, margin=0.01))
+    paths = around.rollouts(spacing=0.005)
+    assert min(BALL.signed_distance(path.positions).min() for path in push.rollouts()) < -0.05
+    assert min(BALL.signed_distance(path.positions).min() for path in paths) > 0.0085
+    for path in paths:
+        np.testing.assert_allclose(path.positions[-1], push.goal, atol=1e-6)
+        assert (np.diff(path.times) > 0).all() and path.times[0] == 0
+        assert np.linalg.norm(np.diff(path.positions, axis=0), axis=1).max() <= 0.0051
+    known = around.certificates()
+    assert known.lyapunov_falls and known.min_det_jacobian is not None and known.min_det_jacobian > 0
+    assert known.warnings == ()
+    joints = dt.load_jaco().follow(paths[0])
+    assert joints.q.shape == (len(paths[0].times), 6) and joints.error.max() < 1e-3
+
+
+def test_a_drawing_stays_in_its_plane_around_an_obstacle(letter):
+    x, y = middle_of(letter)
+    ball = dt.Sphere((float(x), float(y) + 0.02, 0.0), diameter=0.10)
+    around = letter.stack(dt.Avoidance(ball))
+    for path in around.rollouts():
+        assert path.positions.shape[1] == 2
+        flat = np.pad(path.positions, ((0, 0), (0, 1)))
+        assert ball.signed_distance(flat).min() > 0.0085
+        np.testing.assert_allclose(path.positions[-1], letter.goal, atol=1e-6)
+    assert around._solution.bundle.positions[:, 2] == pytest.approx(0.0, abs=1e-12)
+    assert around.certificates().warnings == ()
+
+
+def test_a_covered_goal_of_a_drawing_is_left_in_the_plane(letter):
+    x, y = letter.goal
+    box = dt.Box((float(x), float(y), 0.0), (0.12, 0.10, 0.02))  # the nearest way out would be across the plane
+    around = letter.stack(dt.Avoidance(box))
+    kinds = {warning.kind for warning in around.certificates().warnings}
+    assert Kind.GOAL_COVERED in kinds
+    end = np.append(around.goal, 0.0)
+    assert abs(box.signed_distance(end)) < 2e-3 and 0.04 < np.linalg.norm(around.goal - letter.goal) < 0.07
+
+
+def test_transforms_are_stacked_in_any_order(letter):
+    x, y = middle_of(letter)
+    target = (float(x) + 0.05, float(y) + 0.04, 0.0)
+    ball = dt.Sphere((float(x) - 0.06, float(y), 0.0), diameter=0.06)
+    for stacked in (
+        letter.stack(dt.BiasPoint(target), dt.Avoidance(ball)),
+        letter.stack(dt.Avoidance(ball)).stack(dt.BiasPoint(target)),
+    ):
+        paths = [path.positions for path in stacked.rollouts()]
+        assert max(np.linalg.norm(path - target[:2], axis=1).min() for path in paths) < 0.015
+        assert min(ball.signed_distance(np.pad(path, ((0, 0), (0, 1)))).min() for path in paths) > 0
+    assert len(letter.transforms) == 0  # stacking changes nothing of what it was called on
+
+
+def test_the_velocity_field_is_that_of_the_paths(push):
+    around = push.stack(dt.Avoidance(BALL))
+    rng = np.random.default_rng(0)
+    starts = push.rollouts()[0].positions[:1] + rng.normal(0, 0.02, (5, 3))
+    for path, start in zip(around.rollouts(starts, spacing=5e-4), starts, strict=True):
+        np.testing.assert_allclose(path.positions[0], start, atol=1e-7)
+        np.testing.assert_allclose(path.positions[-1], push.goal, atol=1e-6)
+        k = len(path.times) // 3
+        chord = (path.positions[k + 1] - path.positions[k - 1]) / (path.times[k + 1] - path.times[k - 1])
+        np.testing.assert_allclose(around.velocity(path.positions[k]), chord, rtol=0.05, atol=2e-3)
+    assert around.velocity(starts).shape == starts.shape
+
+
+def test_the_example_of_the_readme_runs(monkeypatch, capsys):
+    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    code = text.split("## As a library")[1].split("```python")[1].split("```")[0]
+    monkeypatch.chdir(ASSETS)
+    found = {}
+    exec(compile(code, "README.md", "exec"), found)
+    assert found["ball"] == BALL and found["joints"].error.max() < 1e-3
+    assert "Certificates(clearance=0.0" in capsys.readouterr().out
+
+
+def test_the_controller_arrives_also_when_it_is_pushed(push):
+    start = push.rollouts()[0].positions[0]
+    passed = controller.run(push.stack(dt.Avoidance(BALL, margin=0.02)), start)
+    assert np.linalg.norm(passed[-1] - push.goal) < controller.ARRIVED
+    steps = np.linalg.norm(np.diff(passed, axis=0), axis=1)
+    assert steps.argmax() == controller.PUSH_AT and steps.max() > 0.04
+    assert BALL.signed_distance(passed).min() > 0
+
+
+def test_the_plot_is_drawn(tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    plot.main(str(tmp_path / "plot.png"))
+    assert (tmp_path / "plot.png").stat().st_size > 20_000
+
+
+def test_the_scene_draws_its_paths_around_the_ball_where_it_stands(server):
+    motion = dt.fit(dt.load_demonstrations(ASSETS / "lift_box.npz"))
+    scene = Scene(server, motion)
+    drawn = server.scene._handle_from_node_name
+    before = drawn["/path/0"].points.copy()
+    scene.handle.position = np.add(scene.handle.position, (0.0, 0.05, 0.0))
+    scene.draw()
+    assert before.shape != drawn["/path/0"].points.shape or np.abs(before - drawn["/path/0"].points).max() > 0.01
+    server.scene.reset()
