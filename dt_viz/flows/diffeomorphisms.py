@@ -13,8 +13,9 @@ from typing import Literal, overload
 
 import numpy as np
 
+from dt_viz.flows.collocation import collocated, implicit_euler_path
 from dt_viz.flows.fields import Array, VectorField
-from dt_viz.flows.integrators import Step, euler, integrate, integrate_adaptive, rk4
+from dt_viz.flows.integrators import Step, euler, implicit_euler, integrate, integrate_adaptive, rk4
 
 
 class Diffeomorphism(ABC):
@@ -41,9 +42,9 @@ class Diffeomorphism(ABC):
         """
 
     def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        """ψ integrated to another tolerance (in the unit of the points); maps that have none stay as they are.
+        """ψ for a controller: integrated to another tolerance (in the unit of the points), at single points quickly.
 
-        For a controller, which needs velocities quickly and less exactly than a rollout.
+        Maps without a tolerance stay as they are.
         """
         return self
 
@@ -112,12 +113,18 @@ class Flow(Diffeomorphism):
         """See `Diffeomorphism`. The number of steps stays, so an exact inverse stays exact."""
         return replace(self, duration=fraction * self.duration)
 
-    def at_tolerance(self, tolerance: float) -> Flow:
+    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
         """See `Diffeomorphism`. The error of a step of length h is in proportion to h⁴."""
-        if self.tolerance is None:
-            return self
-        steps = math.ceil(self.steps * (self.tolerance / tolerance) ** 0.25)
-        return replace(self, steps=steps, tolerance=tolerance)
+        if self.tolerance is not None:
+            steps = math.ceil(self.steps * (self.tolerance / tolerance) ** 0.25)
+            return _AtOnce(replace(self, steps=steps, tolerance=tolerance), tolerance)
+        return _AtOnce(self, tolerance) if self.step is implicit_euler else self
+
+    def path(self, s: Array, tolerance: float) -> tuple[Array, Array] | None:
+        """ψ (d,) and its Jacobian (d, d) at the point `s` (d,) from a whole path at once; None where that fails."""
+        if self.step is implicit_euler:
+            return implicit_euler_path(self.field, s, self.duration, self.steps, tolerance)
+        return collocated(self.field, s, self.duration, tolerance)
 
     def min_step_determinant(self, s: Array, *, inverse: bool) -> float:
         """Smallest det of the derivative of a step of ψ from points `s` (N, d), or of ψ⁻¹.
@@ -168,12 +175,44 @@ class AdaptiveFlow(Diffeomorphism):
         """See `Diffeomorphism`."""
         return replace(self, duration=fraction * self.duration)
 
-    def at_tolerance(self, tolerance: float) -> AdaptiveFlow:
+    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
         """See `Diffeomorphism`."""
-        return replace(self, tolerance=tolerance)
+        return _AtOnce(replace(self, tolerance=tolerance), tolerance)
+
+    def path(self, s: Array, tolerance: float) -> tuple[Array, Array] | None:
+        """See `Flow.path`."""
+        return collocated(self.field, s, self.duration, tolerance)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return integrate_adaptive(self.field, s, U, -self.duration if inverse else self.duration, self.tolerance)
+
+
+@dataclass(frozen=True)
+class _AtOnce(Diffeomorphism):
+    """A flow whose ψ and Jacobian at a single point are found by its `path`, and all else as it is."""
+
+    flow: Flow | AdaptiveFlow
+    tolerance: float
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return self.flow.dim
+
+    def scaled(self, fraction: float) -> Diffeomorphism:
+        """See `Diffeomorphism`."""
+        return replace(self, flow=self.flow.scaled(fraction))
+
+    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
+        """See `Diffeomorphism`."""
+        return self.flow.at_tolerance(tolerance)
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        if U is not None and len(s) == 1 and not inverse:
+            found = self.flow.path(s[0], self.tolerance)
+            if found is not None:
+                return found[0][None], found[1] @ U
+        return self.flow._map(s, U, inverse=inverse)
 
 
 @dataclass(frozen=True, init=False)

@@ -18,8 +18,6 @@ Selection = slice | Indices
 
 BLOCK = 4096
 """Number of points that a sum over a grid takes at once; with more of them the intermediate results leave the cache."""
-FEW = 16
-"""Number of points up to which the calls cost more than the arithmetic, so that fewer and larger products pay."""
 
 
 class VectorField(Protocol):
@@ -91,18 +89,17 @@ class GaussianGrid:
 
     @cached_property
     def _flat_axes(self) -> tuple[NDArray[np.intp], Array, tuple[slice, ...]]:
-        """The axes one after the other: coordinate (Σn_j,) and value (Σn_j, 1) of each entry, and each axis' part."""
+        """The axes one after the other: to which coordinate each entry belongs, the entries, and each axis' part."""
         ends = np.cumsum(self.shape)
         parts = tuple(slice(int(end) - n, int(end)) for n, end in zip(self.shape, ends, strict=True))
-        return np.repeat(np.arange(self.dim), self.shape), np.concatenate(self.axes)[:, None], parts
+        return np.repeat(np.arange(self.dim), self.shape), np.concatenate(self.axes), parts
 
     def _gaussians(self, s: Array, max_order: int) -> Array:
         """1-D Gaussians of all axes and their derivatives, (K + 1, Σn_j, N): the batch last, for long inner loops."""
         coordinate, entries, _ = self._flat_axes
-        offset = s.T.take(coordinate, axis=0)
-        offset -= entries
+        offset = np.ascontiguousarray(s.T)[coordinate] - entries[:, None]
         values = np.empty((max_order + 1, *offset.shape))
-        np.exp(offset * offset * -self.ell, out=values[0])
+        np.exp(-self.ell * (offset * offset), out=values[0])
         # Hermite recursion: g⁽ⁿ⁺¹⁾ = −2ℓ (offset · g⁽ⁿ⁾ + n · g⁽ⁿ⁻¹⁾)
         offset *= -2.0 * self.ell
         for n in range(max_order):
@@ -141,8 +138,6 @@ class GaussianGrid:
         if num > BLOCK:
             blocks = [self.contract(s[i : i + BLOCK], weights, orders) for i in range(0, num, BLOCK)]
             return np.concatenate(blocks, axis=1)
-        if num <= FEW:
-            return self._contract_few(s, weights, orders)
         highest, levels, order = _plan(orders)
         values = self._gaussians(s, highest)
         first, *others = self._flat_axes[2]
@@ -156,18 +151,6 @@ class GaussianGrid:
                 np.einsum("parn,an->prn", partial[source], values[derivative, part], out=longer[target])
             partial = longer
         return partial[order].swapaxes(1, 2)
-
-    def _contract_few(self, s: Array, weights: Array, orders: tuple[tuple[int, ...], ...]) -> Array:
-        """`contract` by one product for each axis, which gives all multi-indices with entries up to the highest."""
-        highest, chosen = _combinations(orders)
-        values = np.ascontiguousarray(self._gaussians(s, highest).transpose(2, 0, 1))  # (N, K + 1, Σn_j)
-        first, *others = self._flat_axes[2]
-        num, count = len(s), highest + 1
-        table = values[:, :, first].reshape(num * count, -1) @ weights.reshape(self.shape[0], -1)
-        for n, part in zip(self.shape[1:], others, strict=True):
-            table = values[:, None, :, part] @ table.reshape(num, count, n, -1)
-            count *= highest + 1
-        return table.reshape(num, count, -1).swapaxes(0, 1)[chosen]
 
     def features(self, s: Array) -> Array:
         """The dense matrix k(s, ŝ), (N, m): for fitting, not for evaluating."""
@@ -212,14 +195,6 @@ def _plan(orders: tuple[tuple[int, ...], ...]) -> _Plan:
     return _Plan(max(map(max, orders)), tuple(levels), _selection([before.index(order) for order in orders]))
 
 
-@lru_cache(maxsize=256)
-def _combinations(orders: tuple[tuple[int, ...], ...]) -> tuple[int, Selection]:
-    """Highest derivative along an axis, and the places of multi-indices among all that reach up to it."""
-    highest = max(map(max, orders))
-    places = np.array(orders) @ (highest + 1) ** np.arange(len(orders[0]))[::-1]
-    return highest, _selection(places.tolist())
-
-
 def _selection(rows: list[int]) -> Selection:
     """Selection of rows of an array: a slice, which copies nothing, where they are consecutive."""
     consecutive = rows == list(range(rows[0], rows[-1] + 1))
@@ -230,12 +205,6 @@ def _selection(rows: list[int]) -> Selection:
 def unit_orders(dim: int) -> tuple[tuple[int, ...], ...]:
     """Multi-indices of the `dim` first derivatives."""
     return tuple(tuple(int(i == j) for i in range(dim)) for j in range(dim))
-
-
-@lru_cache
-def jacobian_orders(dim: int) -> tuple[tuple[int, ...], ...]:
-    """Multi-indices of the value and of the `dim` first derivatives."""
-    return ((0,) * dim, *unit_orders(dim))
 
 
 @lru_cache
@@ -271,8 +240,8 @@ class GridRBF:
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
-        partials = self.grid.contract(s, self.weights, jacobian_orders(self.dim))
-        return partials[0], np.ascontiguousarray(partials[1:].transpose(1, 2, 0))
+        value, *columns = self.grid.contract(s, self.weights, ((0,) * self.dim, *unit_orders(self.dim)))
+        return value, np.stack(columns, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -297,24 +266,16 @@ class PlacedField:
 
     def to_frame(self, s: Array) -> Array:
         """Where the world points `s` (N, d) lie in the frame of `inner`, Rᵀ(s − o)/c, (N, d)."""
-        return (s - self.origin) @ self._to_local
+        return (s - self.origin) @ (self.axes / self.scale)
 
     def __call__(self, s: Array) -> Array:
         """V at the world points `s` (N, d), as (N, d)."""
-        return self.inner(self.to_frame(s)) @ self._to_world
+        return self.inner(self.to_frame(s)) @ (self.scale * self.axes.T)
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the world points `s` (N, d)."""
         v, DV = self.inner.with_jacobian(self.to_frame(s))
-        return v @ self._to_world, self.axes @ DV @ self.axes.T
-
-    @cached_property
-    def _to_local(self) -> Array:
-        return self.axes / self.scale
-
-    @cached_property
-    def _to_world(self) -> Array:
-        return self.scale * self.axes.T
+        return v @ (self.scale * self.axes.T), self.axes @ DV @ self.axes.T
 
 
 @dataclass(frozen=True)

@@ -1,56 +1,28 @@
-"""Integrators, for points and, where asked for, for tangents carried along with them.
+"""One step of an integrator, for a state and, where asked for, for tangents carried along with it.
 
-A method takes (field, s, U, h, steps): points `s` (N, d), tangents `U` (N, d, k) or None, step length h of either sign,
-number of steps. It returns the new points and tangents. Tangents obey the variational equation U̇ = DV·U, integrated by
-the same method, so they are the exact derivative of the numerical step.
+A step takes (field, s, U, h): points `s` (N, d), tangents `U` (N, d, k) or None, step length h of either sign. It
+returns the new points and tangents. Tangents obey the variational equation U̇ = DV·U, integrated by the same method,
+so they are the exact derivative of the numerical step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
-from typing import Protocol
 
 import numpy as np
 
 from dt_viz.flows.fields import Array, Mask, VectorField
 from dt_viz.interruption import checkpoint
 
-TOGETHER, MOST_STEPS = 128, 8
-"""Number of points times steps, and number of steps, up to which implicit Euler finds several steps at once."""
+Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
 
 
-class Step(Protocol):
-    """A method: several steps of one length."""
-
-    def __call__(
-        self, field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1
-    ) -> tuple[Array, Array | None]:
-        """The points (N, d) and tangents (N, d, k) after `steps` steps."""
-        ...
-
-
-def _one_by_one(step: Callable[[VectorField, Array, Array | None, float], tuple[Array, Array | None]]) -> Step:
-    """The method that takes one `step` after the other."""
-
-    @wraps(step)
-    def method(field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1) -> tuple[Array, Array | None]:
-        for _ in range(steps):
-            checkpoint()
-            s, U = step(field, s, U, h)
-        return s, U
-
-    return method
-
-
-@_one_by_one
 def euler(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
     """Explicit Euler, the paper's: s + h·V(s). First order."""
     state, rate = _augment(field, s, U)
     return _split(state + h * rate(state), s, U)
 
 
-@_one_by_one
 def rk4(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
     """The classical Runge–Kutta step. Fourth order."""
     state, rate = _augment(field, s, U)
@@ -62,81 +34,48 @@ def rk4(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array,
 
 
 def implicit_euler(
-    field: VectorField, s: Array, U: Array | None, h: float, steps: int = 1, *, max_iterations: int = 200
+    field: VectorField, s: Array, U: Array | None, h: float, *, max_iterations: int = 200
 ) -> tuple[Array, Array | None]:
-    """Implicit Euler: the y_k with y_k − h·V(y_k) = y_{k−1}, y_0 = s. First order; `euler` with −h undoes it exactly.
+    """Implicit Euler: the y with y − h·V(y) = s. First order, and the exact inverse of `euler` with −h.
 
-    For few points Newton's method finds the y_k of several steps at once, because a field costs little more at many
-    points than at one. Where the residual of a point has grown, the method goes back half the way. While I − h·DV is
-    regular everywhere, which is also when a step is invertible, that leads to the one solution from everywhere.
+    Newton's method, point by point going back half the way where the residual has grown. While I − h·DV is regular
+    everywhere, which is also when the step is invertible, that leads to the one solution from everywhere.
     """
-    at_once = min(MOST_STEPS, max(1, TOGETHER // max(1, len(s))))
-    while steps > 0:
-        s, U = _implicit_steps(field, s, U, h, min(at_once, steps), max_iterations)
-        steps -= at_once
-    return s, U
-
-
-def _implicit_steps(
-    field: VectorField, s: Array, U: Array | None, h: float, steps: int, max_iterations: int
-) -> tuple[Array, Array | None]:
-    """`implicit_euler` with all K = `steps` steps at once; the unknowns are the path y_1, …, y_K of each point."""
-    num, d = s.shape
+    identity = np.eye(field.dim)
     scale = 1.0 + np.abs(s).max(initial=0.0)
-    path, end = np.empty((num, steps, d)), s
-    for k in range(steps):
-        path[:, k] = end = end + h * field(end)
-    linear = np.eye(steps * d) - np.eye(steps * d, k=-d)  # of the system: y_k − y_{k−1}
-    diagonal = np.arange(steps)
-
-    def system(path: Array) -> tuple[Array, Array]:
-        """Residual (N, K·d) of a path (N, K, d), and its derivative (N, K·d, K·d)."""
-        v, DV = field.with_jacobian(path.reshape(-1, d))
-        residual = path - h * v.reshape(path.shape)
-        residual[:, 0] -= s
-        residual[:, 1:] -= path[:, :-1]
-        matrix = np.empty((num, steps, d, steps, d))
-        matrix[...] = linear.reshape(matrix.shape[1:])
-        matrix[:, diagonal, :, diagonal] -= h * DV.reshape(num, steps, d, d).swapaxes(0, 1)
-        return residual.reshape(num, steps * d), matrix.reshape(num, steps * d, steps * d)
-
-    # Newton's step at `best`, the part of it that was taken, the residual there, and the last change of the path
-    best, direction, length, smallest, change = path, path, 1.0, np.inf, np.inf
-    residual, matrix = system(path)
+    y = best = s + h * field(s)
+    direction = np.zeros_like(s)
+    smallest = np.full(len(s), np.inf)  # residual at `best`
+    length = np.ones((len(s), 1))
     for _ in range(max_iterations):
-        checkpoint()
-        size = np.abs(residual).max(axis=1)[:, None, None]
+        v, DV = field.with_jacobian(y)
+        residual = y - h * v - s
+        size = np.abs(residual).max(axis=1)
         if size.max(initial=0.0) <= 1e-15 * scale:
-            change = 0.0
             break
-        update = np.linalg.solve(matrix, residual[..., None]).reshape(path.shape)
+        update = np.linalg.solve(identity - h * DV, residual[..., None])[..., 0]
         worse = (size > smallest) & (size > 1e-13 * scale)
-        if worse.any():
-            length = np.where(worse, 0.5 * length, 1.0)
-            best, direction = np.where(worse, best, path), np.where(worse, direction, update)
-            smallest = np.where(worse, smallest, size)
-            path = best - length * direction
-        else:
-            best, direction, length, smallest = path, update, 1.0, size
-            path = path - update
-            change = np.abs(update).max(initial=0.0)
-            if change <= 1e-8 * scale:
-                break  # quadratic convergence: the next correction would be far below rounding
-        residual, matrix = system(path)
+        length = np.where(worse[:, None], 0.5 * length, 1.0)
+        best = np.where(worse[:, None], best, y)
+        direction = np.where(worse[:, None], direction, update)
+        smallest = np.where(worse, smallest, size)
+        y = best - length * direction
+        if not worse.any() and np.abs(update).max(initial=0.0) <= 1e-8 * scale:
+            break  # quadratic convergence: the next correction would be far below rounding
     if U is None:
-        return path[:, -1], None
-    if change > 1e-12 * scale:
-        _, matrix = system(path)
-    tangents = np.zeros((num, steps * d, U.shape[2]))
-    tangents[:, :d] = U
-    return path[:, -1], np.linalg.solve(matrix, tangents)[:, -d:]
+        return y, None
+    return y, np.linalg.solve(identity - h * field.with_jacobian(y)[1], U)
 
 
 def integrate(
     step: Step, field: VectorField, s: Array, U: Array | None, duration: float, steps: int
 ) -> tuple[Array, Array | None]:
     """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` for `duration` in equal `steps`."""
-    return step(field, s, U, duration / steps, steps)
+    h = duration / steps
+    for _ in range(steps):
+        checkpoint()
+        s, U = step(field, s, U, h)
+    return s, U
 
 
 def integrate_adaptive(

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
-from dt_viz.flows.fields import Array, GaussianGrid, Mask, VectorField, jacobian_orders, second_orders
+from dt_viz.flows.fields import Array, GaussianGrid, Mask, VectorField, second_orders, unit_orders
 from dt_viz.properties import cached_property
 
 Generator = Literal["free-space", "probability"]
@@ -41,21 +40,20 @@ class OccupancyMap:
 
     def logit_gradient(self, s: Array) -> tuple[Array, Array]:
         """The logit (N,) and its gradient (N, d) at the points `s` (N, d)."""
-        partials = self.grid.contract(s, self.weights[:, None], jacobian_orders(self.grid.dim))[..., 0]
+        d = self.grid.dim
+        partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d)))[..., 0]
         return partials[0] + self.bias, partials[1:].T
 
     def logit_hessian(self, s: Array) -> tuple[Array, Array, Array]:
         """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
         d = self.grid.dim
-        partials = self.grid.contract(s, self.weights[:, None], _hessian_orders(d))[..., 0]
-        return partials[0] + self.bias, partials[1 : 1 + d].T, partials[1 + d :].T.reshape(-1, d, d)
-
-
-@lru_cache
-def _hessian_orders(dim: int) -> tuple[tuple[int, ...], ...]:
-    """Multi-indices of the value, of the first derivatives, and of all entries of the Hessian, row by row."""
-    second = second_orders(dim)
-    return (*jacobian_orders(dim), *(second[min(i, j), max(i, j)] for i in range(dim) for j in range(dim)))
+        second = second_orders(d)
+        orders = ((0,) * d, *unit_orders(d), *second.values())
+        partials = self.grid.contract(s, self.weights[:, None], orders)[..., 0]
+        hessian = np.empty((len(s), d, d))
+        for (i, j), column in zip(second, partials[1 + d :], strict=True):
+            hessian[:, i, j] = hessian[:, j, i] = column
+        return partials[0] + self.bias, partials[1 : 1 + d].T, hessian
 
 
 def fit_occupancy(
@@ -149,24 +147,26 @@ class AvoidanceField:
     def __call__(self, s: Array) -> Array:
         """Compute V at the points `s` (N, d), as (N, d)."""
         logit, gradient = self.occupancy.logit_gradient(s)
-        return self._weight(logit)[0][:, None] * gradient
+        return (self._gain * self._weight(logit)[0])[:, None] * gradient
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """Compute V (N, d) and DV (N, d, d) at the points `s` (N, d). DV is symmetric: V is a gradient."""
         logit, gradient, hessian = self.occupancy.logit_hessian(s)
         weight, slope = self._weight(logit)
-        weight, bend = weight[:, None], slope[:, None] * gradient
-        return weight * gradient, weight[:, None] * hessian + bend[:, :, None] * gradient[:, None]
+        outer = gradient[:, :, None] * gradient[:, None, :]
+        return (self._gain * weight)[:, None] * gradient, self._gain * (
+            weight[:, None, None] * hessian + slope[:, None, None] * outer
+        )
 
     def _weight(self, logit: Array) -> tuple[Array, Array]:
-        """V's factor at the logit's gradient, which is dU/dlogit times the squared kernel width, and its derivative."""
+        """dU/dlogit and its derivative."""
         if self.generator == "probability":
             p = expit(logit)
-            weight = self._gain * p * (1 - p)
+            weight = p * (1 - p)
             return weight, weight * (1 - 2 * p)
         p = expit(logit / self.temperature)
         weight = np.maximum(p - self._far, 0)
-        return self._gain * weight, (weight > 0) * p * (1 - p) * (self._gain / self.temperature)
+        return weight, (weight > 0) * p * (1 - p) / self.temperature
 
 
 @dataclass(frozen=True)

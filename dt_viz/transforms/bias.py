@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from dt_viz.flows.diffeomorphisms import AUTO, Flow, Integration
-from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, Selection, VectorField
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.transforms.base import (
@@ -297,48 +297,34 @@ class RegionField:
 
     def __call__(self, s: Array) -> Array:
         """V at the points `s` (N, d), as (N, d)."""
-        value, (inside, u, r) = np.zeros_like(s), self._inside(s)
-        if len(u):
-            value[inside, : u.shape[1]] = _window(_ramp(r))[:, None] * self.directions(u)
+        value = np.zeros_like(s)
+        k = self.directions.dim
+        radius = np.sqrt((s[:, :k] ** 2).sum(axis=1))
+        inside = np.flatnonzero(radius < 1)
+        if len(inside):
+            value[inside, :k] = _window(radius[inside])[0][:, None] * self.directions(s[inside, :k])
         return value
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
         value, DV = np.zeros_like(s), np.zeros((*s.shape, s.shape[1]))
-        inside, u, r = self._inside(s)
-        if len(u):
-            k, x = u.shape[1], _ramp(r)
-            bump, window = x * (1 - x), _window(x)[:, None]
+        k = self.directions.dim
+        radius = np.sqrt((s[:, :k] ** 2).sum(axis=1))
+        inside = np.flatnonzero(radius < 1)
+        if len(inside):
+            u, r = s[inside, :k], radius[inside]
+            window, slope = _window(r)
             fit, D_fit = self.directions.with_jacobian(u)
-            gradient = (_STEEPNESS * bump * bump * bump / np.maximum(r, PLATEAU))[:, None] * u
-            value[inside, :k] = window * fit
-            DV[inside, :k, :k] = window[:, None] * D_fit + fit[:, :, None] * gradient[:, None]
+            gradient = (slope / np.maximum(r, PLATEAU))[:, None] * u
+            value[inside, :k] = window[:, None] * fit
+            DV[inside, :k, :k] = window[:, None, None] * D_fit + fit[:, :, None] * gradient[:, None, :]
         return value, DV
 
-    def _inside(self, s: Array) -> tuple[Selection, Array, Array]:
-        """Rows of the points `s` (N, d) inside the border, their first k coordinates (M, k) and norms (M,)."""
-        u = s[:, : self.directions.dim]
-        squared = (u * u).sum(axis=1)
-        within = squared < 1
-        if within.all():
-            return slice(None), u, np.sqrt(squared)
-        inside = np.flatnonzero(within)
-        return inside, u[inside], np.sqrt(squared[inside])
 
-
-_STEEPNESS = -140 / (1 - PLATEAU)
-"""Factor of w′ = factor·(x·(1 − x))³."""
-
-
-def _ramp(radius: Array) -> Array:
-    """Part x of the way from the plateau to the border, at the radii (N,) below 1."""
-    return np.maximum((radius - PLATEAU) / (1 - PLATEAU), 0)
-
-
-def _window(x: Array) -> Array:
-    """Values w (N,) at the parts `x` (N,) of the way from the plateau to the border."""
-    squared = x * x
-    return 1 - squared * squared * (35 + x * (-84 + x * (70 - 20 * x)))
+def _window(radius: Array) -> tuple[Array, Array]:
+    """W and its derivative at the radii (N,) below 1."""
+    x = np.maximum((radius - PLATEAU) / (1 - PLATEAU), 0)
+    return 1 - x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3), -140 * (x * (1 - x)) ** 3 / (1 - PLATEAU)
 
 
 @lru_cache(maxsize=2)
