@@ -17,88 +17,80 @@ from dt_viz.flows.fields import Array, VectorField
 
 STAGES = 12
 """Number of stages of the Radau method."""
-MAX_ITERATIONS = 6
+MAX_ITERATIONS = 8
 """Number of Newton's iterations after which a path counts as too long for one system."""
-CONTRACTION = 0.9
-"""Largest ratio of successive corrections; above it a path counts as too long, too."""
-LAST_CORRECTION = 10.0
-"""Largest final correction of Newton's method, in tolerances. Convergence is quadratic: the error is far smaller."""
-LAST_COEFFICIENTS = 100.0
-"""Factor on the tolerance for h·‖V‖·c², c the last Legendre coefficients of V along the path relative to ‖V‖. The order
-2m − 1 of the method makes its error about as small as c²; in stacks it is below a hundredth of that."""
-SHORTEST = 1e-3
-"""Shortest part of the duration that is tried."""
+SLOW, QUADRATIC = 0.9, 0.003
+"""Ratios of successive corrections of Newton's method. Above the first a path counts as too long, too. Below the second
+the next correction, and the relative error of the derivative, is about the ratio squared."""
+FIRST = 1e3
+"""Value, in tolerances, that takes the place of the correction before the first one."""
+UNRESOLVED = 100.0
+"""Upper bound, in tolerances, of h·‖V‖·c², c the last Legendre coefficients of V along the path relative to ‖V‖. The
+method's order 2m − 1 makes its error about as small as c²; in stacks it is below a hundredth of h·‖V‖·c²."""
+HALVINGS = 10
+"""Number of times that a path is halved before its field counts as too steep."""
+
+Mapped = tuple[Array, Array]
+"""The end (d,) of a path and its derivative (d, d) by the start."""
 
 
-class Path(NamedTuple):
-    """The end of a path, with its derivative."""
+class _Path(NamedTuple):
+    """A path from one system."""
 
-    end: Array
-    """(d,)."""
-    jacobian: Array
-    """(d, d) derivative of the end by the start."""
+    mapped: Mapped
     rates: Array
     """(m, d) values of V at the stages."""
-    iterations: int
 
 
-def collocated(field: VectorField, s: Array, duration: float, tolerance: float) -> tuple[Array, Array] | None:
-    """Carry the point `s` (d,) along the flow of `field` with the Radau IIA method.
-
-    The step length adapts: a step that is not resolved or does not converge is halved, quick convergence doubles the
-    next one.
+def collocated(
+    field: VectorField, s: Array, duration: float, tolerance: float, halvings: int = HALVINGS
+) -> Mapped | None:
+    """Carry the point `s` (d,) along the flow of `field` with the Radau IIA method, in one step if that is exact enough.
 
     Args:
-        field: V, of d dimensions.
+        field: V.
         s: start.
         duration: of the flow, of either sign.
         tolerance: largest error of a step, in the unit of `s`.
+        halvings: number of times that the step may be halved.
 
     Returns:
         The end (d,) and its derivative by `s` (d, d); None where the field is too steep.
     """
     table, last = _radau(STAGES)
-    jacobian, done, part = np.eye(len(s)), 0.0, 1.0
-    while done < 1:
-        part = min(part, 1 - done)
-        h = part * duration
-        path = _path(field, s, h * table, tolerance)
-        if path is None or not _resolved(path.rates, last, abs(h), tolerance):
-            part /= 2
-            if part < SHORTEST:
-                return None
-            continue
-        s, jacobian, done = path.end, path.jacobian @ jacobian, done + part
-        if 2 * path.iterations <= MAX_ITERATIONS:
-            part *= 2
-    return s, jacobian
+    path = _path(field, s, duration * table, tolerance)
+    if path is not None and _resolved(path.rates, last, abs(duration), tolerance):
+        return path.mapped
+    if not halvings or (first := collocated(field, s, duration / 2, tolerance, halvings - 1)) is None:
+        return None
+    second = collocated(field, first[0], duration / 2, tolerance, halvings - 1)
+    return None if second is None else (second[0], second[1] @ first[1])
 
 
-def implicit_euler_path(
-    field: VectorField, s: Array, duration: float, steps: int, tolerance: float
-) -> tuple[Array, Array] | None:
-    """Carry the point `s` (d,) along the flow of `field` with implicit Euler in `steps` equal steps; see `collocated`."""
+def implicit_euler_path(field: VectorField, s: Array, duration: float, steps: int, tolerance: float) -> Mapped | None:
+    """Carry the point `s` (d,) along the flow of `field` with implicit Euler in equal `steps`; see `collocated`."""
     path = _path(field, s, np.tri(steps) * (duration / steps), tolerance)
-    return None if path is None else (path.end, path.jacobian)
+    return None if path is None else path.mapped
 
 
-def _path(field: VectorField, s: Array, table: Array, tolerance: float) -> Path | None:
-    """Solve for the stages with the table h·A (m, m), whose last stage is the end; None without convergence."""
+def _path(field: VectorField, s: Array, table: Array, tolerance: float) -> _Path | None:
+    """Solve for the stages with the table h·A (m, m), the last of which is the end; None without convergence."""
     m, d = len(table), len(s)
-    stages, before = np.tile(s, (m, 1)), np.inf
+    stages, before = np.tile(s, (m, 1)), FIRST * tolerance
     right = np.empty((m * d, 1 + d))
     right[:, 1:] = np.tile(np.eye(d), (m, 1))
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    for iteration in range(MAX_ITERATIONS):
         rates, derivatives = field.with_jacobian(stages)
         right[:, 0] = (stages - s - table @ rates).reshape(-1)
         system = (-table[:, None, :, None] * derivatives.swapaxes(0, 1)).reshape(m * d, m * d)
         system.reshape(-1)[:: m * d + 1] += 1
         solved = np.linalg.solve(system, right)
         stages = stages - solved[:, 0].reshape(m, d)
-        correction = np.abs(solved[:, 0]).max()
-        if correction <= LAST_CORRECTION * tolerance:
-            return Path(stages[-1], solved[-d:, 1:], rates, iteration)
-        if correction > CONTRACTION * before:
+        correction = float(np.abs(solved[:, 0]).max())
+        ratio = correction / before
+        if ratio <= QUADRATIC and ratio**2 * correction <= tolerance:
+            return _Path((stages[-1], solved[-d:, 1:]), rates)
+        if iteration and ratio > SLOW:
             return None
         before = correction
     return None
@@ -107,7 +99,7 @@ def _path(field: VectorField, s: Array, table: Array, tolerance: float) -> Path 
 def _resolved(rates: Array, last: Array, h: float, tolerance: float) -> bool:
     """Whether a path with the velocities `rates` (m, d) at its stages has small last coefficients."""
     speed = np.abs(rates).max()
-    return bool(h * (np.abs(last @ rates).max(axis=1).sum()) ** 2 <= LAST_COEFFICIENTS * tolerance * speed)
+    return bool(h * np.abs(last @ rates).max(axis=1).sum() ** 2 <= UNRESOLVED * tolerance * speed)
 
 
 @lru_cache

@@ -240,8 +240,8 @@ class GridRBF:
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
-        value, *columns = self.grid.contract(s, self.weights, ((0,) * self.dim, *unit_orders(self.dim)))
-        return value, np.stack(columns, axis=-1)
+        partials = self.grid.contract(s, self.weights, ((0,) * self.dim, *unit_orders(self.dim)))
+        return partials[0], np.ascontiguousarray(partials[1:].transpose(1, 2, 0))
 
 
 @dataclass(frozen=True)
