@@ -27,7 +27,8 @@ from dt_viz.learning.imitation import fit as fit_imitation
 from dt_viz.motion.certificates import Certificates, Shown, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned
-from dt_viz.motion.solve import FINE, Solution, Solved, solve
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import FINE, Solution, build_stack
 from dt_viz.properties import cached_property
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.slices import Slice
@@ -128,7 +129,7 @@ class Motion:
 
     @cached_property
     def _solution(self) -> Solution:
-        return solve(self._learned.demonstrated, Scenario("", self._layers).active, FINE)
+        return build_stack(self._learned.demonstrated, Scenario("", self._layers).active, FINE)
 
     def _in_space(self, points: Array) -> Array:
         """Points (N, 3) of points (N, d)."""

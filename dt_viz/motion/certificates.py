@@ -19,7 +19,7 @@ from dt_viz.arm.robot import Robot
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
-from dt_viz.motion.solve import Solution
+from dt_viz.motion.stack import Solution
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres, told
 
 NUM_CHECKED, NUM_CHECKED_POSTURES = 400, 100

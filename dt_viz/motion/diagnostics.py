@@ -15,7 +15,8 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import MAX_SAMPLES
 from dt_viz.motion.certificates import MAX_ROUND_TRIP
 from dt_viz.motion.nominal import Nominal
-from dt_viz.motion.solve import Applied, Solution, Solved
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import Applied, Solution
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.scenario.starts import REACH, SHOULDER
