@@ -1,7 +1,13 @@
 """Results that are kept, by what they were computed from."""
 
-import pytest
+import threading
+from typing import Any, cast
 
+import numpy as np
+import pytest
+from scenes import changing
+
+from dt_viz.engine.session import Session
 from dt_viz.memo import Memo
 
 
@@ -31,3 +37,42 @@ def test_what_fails_is_tried_again_and_leaves_what_is_kept():
         memo("a", 2, fail, newest=1)
     assert memo("a", 2, lambda: "made", newest=2) == "made"
     assert memo("a", 1, fail, newest=2) == "kept"
+
+
+class Blank:
+    """A display that shows nothing."""
+
+    def __getattr__(self, name):
+        return lambda *_, **__: None
+
+
+def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatch):
+    """Its worker, whoever edits, pushes, holds or asks for the task."""
+    users, compute = set(), Memo.__call__
+
+    def recorded(self, *args, **kwargs):
+        users.add(threading.get_ident())
+        return compute(self, *args, **kwargs)
+
+    monkeypatch.setattr(Memo, "__call__", recorded)
+    session = Session(new_engine(), initial, "draw_s", cast(Any, Blank()))
+    try:
+        assert session.wait_idle(60)
+        q = np.zeros(6)
+
+        def edit(number):
+            session.edit("temperature", **changing(session.scenario, temperature=3.0 + number))
+            session.choose_task(("draw_s", "lift_box")[number])
+            assert len(session.task.starts) == 7
+            session.push(q, lambda _: None)
+            session.hold(q, np.array([0.0, -0.5, 0.4]), lambda _: None, last=True)
+
+        threads = [threading.Thread(target=edit, args=(number,)) for number in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+        assert session.wait_idle(60)
+    finally:
+        session.close()
+    assert len(users) == 1 and threading.get_ident() not in users
