@@ -63,7 +63,7 @@ def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatc
         def edit(number):
             session.edit("temperature", **changing(session.scenario, temperature=3.0 + number))
             session.choose_task(("draw_s", "lift_box")[number])
-            assert len(session.task.starts) == 7
+            assert session.task.name in {"draw_s", "lift_box"}
             session.push(q, lambda _: None)
             session.hold(q, np.array([0.0, -0.5, 0.4]), lambda _: None, last=True)
 
