@@ -115,7 +115,7 @@ class Motion:
         return velocity[:, : self.dimension].reshape(points.shape)
 
     def certificates(self) -> Certificates:
-        """What is known about how far the paths from the demonstrations' starts are to be trusted."""
+        """Checks of the paths from the demonstrations' starts, and warnings."""
         nominal, solution = self._learned.demonstrated, self._solution
         scenario = Scenario("", self._layers)
         solved = Solved(scenario, nominal, nominal, solution, None, None)

@@ -72,7 +72,7 @@ def _certified_arm(frame: Frame, fine: Solved, arm: ArmSolution, follower: Follo
 
 
 def with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates:
-    """What is known with what the meshes of the arm come near to: of the one that is shown, and of all that avoid."""
+    """Certificates with distances of the arm's meshes: on the motion that it shows, and on all that it avoids along."""
     assert frame.arm is not None
     model, scenario, avoidance = load_collision_model(), frame.scenario, frame.scenario.arm_avoidance
     report = model.report(frame.arm.q, scenario.obstacle)

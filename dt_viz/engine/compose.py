@@ -170,6 +170,6 @@ def _learned_steps(nominal: Nominal) -> tuple[int, ...]:
 
 
 def level_of(scenario: Scenario, stack: Solution) -> int | None:
-    """Which level the view names, if it is in the stack."""
+    """Index of the level that the view names; None if that is not in the stack."""
     names = levels(scenario)[: 1 + len(stack.built)]
     return names.index(scenario.view.level) if scenario.view.level in names else None

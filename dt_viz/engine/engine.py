@@ -62,13 +62,13 @@ def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class _Shown:
-    """What was shown last of a task."""
+    """The frame of a task that was computed last, and its motion."""
 
     frame: Frame
     newest: Solved
     """The motion of the frame."""
     live: Solved
-    """The same as it was at stage LIVE: quicker, and exact enough for a hand that moves."""
+    """The same motion at precision LIVE: quicker, and exact enough for a hand that moves."""
 
 
 class Engine:
@@ -248,7 +248,7 @@ class Engine:
         return replace(frame, scenario=scenario, level=compose.level_of(scenario, solved.stack))
 
     def _with_arm(self, scenario: Scenario, precision: Precision) -> Frame:
-        """The same with the arm."""
+        """The frame of stage ROLLOUTS, with the arm."""
         frame, solved = self._rollouts(scenario, precision), self.solved(scenario, precision)
         with_arm = self.memo(
             "arm",
@@ -309,5 +309,5 @@ def _avoids(transform: Transform) -> bool:
 
 
 def _sketchbook(learned: Learned) -> Sketchbook:
-    """What makes the pictures of ψ."""
+    """The maker of pictures of ψ."""
     return Sketchbook(learned.task, in_frame(learned.system.transform), learned.system, learned.demonstrated.rays)

@@ -209,7 +209,7 @@ class Follower:
         return nominal.only(np.flatnonzero(~(far | touches)), warnings)
 
     def _touching(self, pins: Array, obstacle: Obstacle) -> list[MotionWarning]:
-        """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6)."""
+        """Reasons why the arm cannot rest in the postures `pins` (R + 1, 6): the parts of it that an obstacle touches."""
         pedestal = self.body.on_pedestal
         distance = obstacle.signed_distance(pedestal.positions(self.robot, pins[0])) - pedestal.radius
         if (distance >= 0).all() and (self.whole_arm.clearance(pins, obstacle) >= 0).all():
@@ -282,7 +282,7 @@ def _touching_starts(which: Indices, num_demonstrated: int) -> list[MotionWarnin
 
 
 def arm_samples(num: int) -> Indices:
-    """Which of the `num` samples of a rollout of the end effector the arm follows, (`NUM_ARM_SAMPLES`,)."""
+    """Indices (`NUM_ARM_SAMPLES`,) of the samples that the arm follows, of the `num` of a rollout of the hand."""
     return np.linspace(0, num - 1, NUM_ARM_SAMPLES).round().astype(int)
 
 
@@ -299,4 +299,4 @@ def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Ar
 
 
 PEDESTAL = ("base", "link 1")
-"""What no joint carries away from an obstacle."""
+"""Links that no joint can carry away from an obstacle."""

@@ -18,7 +18,7 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
-"""Of each rollout before refinement: from the task's starts, and from added ones."""
+"""Samples of each rollout before refinement: from the task's starts, and from added ones."""
 MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
 """Steps towards the images of moved ends, and metres by which they may miss."""
 
@@ -41,7 +41,7 @@ class Strand:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What depends on the task and the imitation only, not on where motions start."""
+    """The learned motion of a task, wherever its rollouts start."""
 
     task: Task
     imitation: Imitation
@@ -93,11 +93,11 @@ class Learned:
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """What a scenario's behaviours are stacked on: what was learned, and the rollouts from some starts."""
+    """The motion that transforms are stacked on: the learned one, and its rollouts from some starts."""
 
     learned: Learned
     strands: tuple[Strand, ...]
-    """Those of the task's starts first."""
+    """The rollouts; those from the task's starts first."""
     left_out: tuple[int, ...] = ()
     """Numbers of the starts, the task's first, that have no rollout here."""
     warnings: tuple[MotionWarning, ...] = ()
@@ -110,7 +110,7 @@ class Nominal:
 
     @property
     def imitation(self) -> Imitation:
-        """What was learned from the demonstrations."""
+        """The imitation of the demonstrations."""
         return self.learned.imitation
 
     @property
@@ -135,12 +135,12 @@ class Nominal:
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
-        """Of the start of each rollout, among all of the scenario's, the task's first."""
+        """Number of each rollout's start among all of the scenario's, the task's first."""
         total = len(self.strands) + len(self.left_out)
         return tuple(number for number in range(total) if number not in self.left_out)
 
     def rollout(self, number: int) -> int | None:
-        """Which rollout begins at the start of this number; None if it has none."""
+        """Index of the rollout that begins at the start of this number; None if it has none."""
         return self.numbers.index(number) if number in self.numbers else None
 
     def only(self, rollouts: Sequence[int] | Indices, warnings: Sequence[MotionWarning] = ()) -> Nominal:
@@ -169,7 +169,7 @@ class Nominal:
 
     @cached_property
     def rays(self) -> Rays:
-        """In base space."""
+        """Rays of the rollouts in base space."""
         return Rays(np.stack([strand.image for strand in self.strands]), self.system.base)
 
     @cached_property

@@ -18,7 +18,7 @@ from dt_viz.transforms.base import Built, MotionBelow, Transform
 from dt_viz.warning import MotionWarning
 
 MAX_ATTEMPTS = 4
-"""At a duration that clears the samples that refinement finds, too."""
+"""Attempts at a flow time that also clears the samples that refinement adds."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Precision:
     """How exactly a motion is worked out, all in metres."""
 
     tolerance: float
-    """Of a step of the behaviours' flows."""
+    """Tolerance of a step of the transforms' flows."""
     spacing: float
     """Largest distance between neighbouring samples."""
     ends: float
-    """By which a rollout may miss its start and goal before the motion below is worked out again between others."""
+    """Distance by which a rollout may miss its start and goal before the motion below is made anew between moved ends."""
 
 
 LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
@@ -77,7 +77,7 @@ class Solution:
         return tuple(warning for applied in self.built for warning in applied.made.warnings)
 
     def at(self, place: int) -> Applied | None:
-        """What was made of the layer at this place in the whole stack; None where that is off."""
+        """The layer at this place in the whole stack, as it was made; None where it is off."""
         return next((applied for applied in self.built if applied.place == place), None)
 
     def positions_at(self, index: Indices, fraction: Array) -> Array:
