@@ -209,7 +209,7 @@ class Follower:
         return nominal.only(np.flatnonzero(~(far | touches)), warnings)
 
     def _touching(self, pins: Array, obstacle: Obstacle) -> list[MotionWarning]:
-        """Reasons why the arm cannot rest in the postures `pins` (R + 1, 6): the parts of it that an obstacle touches."""
+        """Reasons why the arm cannot rest in the postures `pins` (R + 1, 6): what an obstacle touches of it."""
         pedestal = self.body.on_pedestal
         distance = obstacle.signed_distance(pedestal.positions(self.robot, pins[0])) - pedestal.radius
         if (distance >= 0).all() and (self.whole_arm.clearance(pins, obstacle) >= 0).all():

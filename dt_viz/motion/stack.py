@@ -30,7 +30,7 @@ class Precision:
     spacing: float
     """Largest distance between neighbouring samples."""
     ends: float
-    """Distance by which a rollout may miss its start and goal before the motion below is made anew between moved ends."""
+    """Distance by which a rollout may miss its start and goal before the motion below is made anew."""
 
 
 LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
