@@ -28,7 +28,8 @@ from dt_viz.learning.imitation import fit as fit_imitation
 from dt_viz.motion.certificates import Certificates, Shown, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned
-from dt_viz.motion.solve import FINE, Solution, Solved, solve
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import FINE, Solution, build_stack
 from dt_viz.properties import cached_property
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.slices import Slice
@@ -118,7 +119,7 @@ class Motion:
         return velocity[:, : self.dimension].reshape(points.shape)
 
     def certificates(self) -> Certificates:
-        """What is known about how far the paths from the demonstrations' starts are to be trusted."""
+        """Checks of the paths from the demonstrations' starts, and warnings."""
         nominal, solution = self._learned.demonstrated, self._solution
         scenario = Scenario("", self._layers)
         solved = Solved(scenario, nominal, nominal, solution, None, None)
@@ -132,7 +133,7 @@ class Motion:
 
     @cached_property
     def _solution(self) -> Solution:
-        return solve(self._learned.demonstrated, Scenario("", self._layers).active, FINE)
+        return build_stack(self._learned.demonstrated, Scenario("", self._layers).active, FINE)
 
     @cached_property
     def _controlled(self) -> DiffeomorphicSystem:

@@ -12,7 +12,7 @@ import dt_viz
 
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-FOUNDATION = {"errors", "interruption", "metrics", "properties", "shipped", "warning"}
+FOUNDATION = {"errors", "interruption", "memo", "metrics", "properties", "shipped", "warning"}
 """Modules of no package, which import each other only."""
 BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "transforms"}
 BELOW_ENGINE = BELOW_SCENARIO | {"arm", "scenario", "motion", "pictures"}

@@ -12,7 +12,7 @@ from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow, Identit
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.following import Follower
-from dt_viz.motion.solve import LIVE
+from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere
 
 ARRIVED = 0.02
@@ -27,7 +27,7 @@ class Case:
         x, y, z = (float(c) for c in mean[50])
         scenario = changed(scenario, space="cspace", obstacles=Sphere((x, y, z), 0.15))
         follower = Follower(robot)
-        self.nominal = engine._nominal(scenario, None)
+        self.nominal = engine.nominal(scenario)
         self.lifted = follower.undisturbed(self.nominal)
         self.section = Section(robot, self.lifted.reference)
         # the learned pace is not smooth enough for RK4 to show its order: a plain attractor takes its place

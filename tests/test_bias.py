@@ -11,7 +11,8 @@ from scenes import avoiding, biases
 from dt_viz.flows.diffeomorphisms import Flow, round_trip_error
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
-from dt_viz.motion.solve import FINE, LIVE, Nominal, Solution, solve
+from dt_viz.motion.nominal import Nominal
+from dt_viz.motion.stack import FINE, LIVE, Solution, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import DRAWING_AXES, POTS
@@ -52,7 +53,7 @@ def nominal(fits, engine):
 
     def nominal(task) -> Nominal:
         if task not in made:
-            made[task] = engine._nominal(Scenario(task), None)
+            made[task] = engine.nominal(Scenario(task))
         return made[task]
 
     return nominal
@@ -60,7 +61,7 @@ def nominal(fits, engine):
 
 def biased(nominal, *points, precision=FINE, **changes) -> Solution:
     scenario = avoiding(nominal.task.name, layers=biases(*points), **changes)
-    return solve(nominal, scenario.active, precision)
+    return build_stack(nominal, scenario.active, precision)
 
 
 def satisfied(solution) -> bool:

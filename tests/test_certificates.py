@@ -8,6 +8,7 @@ from scenes import changed, kinds
 
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.engine.certify import certify
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
@@ -16,7 +17,8 @@ from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor
 from dt_viz.motion.certificates import MAX_OFF_POSTURE, Certificates, Shown, certified
-from dt_viz.motion.solve import Solution, Solved
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import FINE, Solution
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.warning import Kind, MotionWarning
 
@@ -35,7 +37,7 @@ def bundle_of(transform):
     return evenly_sampled(lambda i, u: transform.inverse(RAYS.at(i, u))[:, None], 2, 300)
 
 
-def certify(transform, bundle=None):
+def certificates_of(transform, bundle=None):
     """Certificates of a bundle, said to be a motion of the transform between the ends of its rays."""
     bundle = bundle or bundle_of(transform)
     stack = Solution(transform, RAYS, bundle, ())
@@ -54,7 +56,7 @@ def both(*fractions):
     "transform", [Identity(3), Flow(field(0.3), 0.5, 20), Flow(field(0.3), 0.5, 6, implicit_euler, euler)]
 )
 def test_a_healthy_stack_gets_its_certificates_and_no_warning(transform):
-    known = certify(transform)
+    known = certificates_of(transform)
     assert known.min_det_jacobian is not None and known.min_det_jacobian > 0
     assert known.round_trip_error is not None and known.round_trip_error < 1e-6
     assert known.lyapunov_falls is True
@@ -65,13 +67,13 @@ def test_the_smallest_determinant_is_that_of_the_forward_map():
     transform = Flow(field(0.5), 0.8, 6, implicit_euler, euler)
     bundle = bundle_of(transform)
     expected = np.linalg.det(transform.jacobian(bundle.positions)[1]).min()
-    assert certify(transform, bundle).min_det_jacobian == pytest.approx(expected, rel=1e-8)
+    assert certificates_of(transform, bundle).min_det_jacobian == pytest.approx(expected, rel=1e-8)
 
 
 def test_a_folding_euler_map_is_recognised():
     folding = Flow(field(6.0), 1.0, 1, euler)
     bundle = bundle_of(Identity(3))  # straight through where it folds
-    known = certify(folding, bundle)
+    known = certificates_of(folding, bundle)
     assert known.min_det_jacobian is not None and known.min_det_jacobian < 0
     assert Kind.NO_DIFFEOMORPHISM in kinds(known.warnings)
 
@@ -79,7 +81,7 @@ def test_a_folding_euler_map_is_recognised():
 def test_a_bad_round_trip_is_recognised_and_measured():
     coarse = Flow(field(0.4), 1.0, 10, euler)  # Euler back is not the inverse of Euler there
     bundle = bundle_of(coarse)
-    known = certify(coarse, bundle)
+    known = certificates_of(coarse, bundle)
     error = np.linalg.norm(coarse.inverse(coarse.forward(bundle.positions)) - bundle.positions, axis=1).max()
     assert known.round_trip_error is not None
     assert known.round_trip_error == pytest.approx(error, rel=0.05)
@@ -91,7 +93,7 @@ def test_a_bad_round_trip_is_recognised_and_measured():
 def test_a_motion_that_turns_back_is_recognised():
     there = np.linspace(0, 1, 100)
     bundle = both(there[:60], there[40:])
-    known = certify(Identity(3), bundle)
+    known = certificates_of(Identity(3), bundle)
     assert known.lyapunov_falls is False
     assert [warning.kind for warning in known.warnings] == [BEFORE.kind, Kind.NOT_FALLING]
 
@@ -103,21 +105,21 @@ def test_samples_nearer_than_rounding_need_not_fall(rise, falls):
     levels = np.insert(bundle.levels, 20, bundle.levels[20], axis=0)
     fraction[20] -= 1e-9
     levels[21, 0] += rise * (RAYS.z0[0] - BASE.goal) / np.linalg.norm(RAYS.z0[0] - BASE.goal)
-    assert certify(Identity(3), Bundle(index, fraction, levels)).lyapunov_falls is falls
+    assert certificates_of(Identity(3), Bundle(index, fraction, levels)).lyapunov_falls is falls
 
 
 def test_a_motion_that_stands_still_does_not_fall_strictly():
-    assert certify(Identity(3), both([0.0, 0.3, 0.3, 1.0])).lyapunov_falls is False
+    assert certificates_of(Identity(3), both([0.0, 0.3, 0.3, 1.0])).lyapunov_falls is False
 
 
 @pytest.mark.parametrize(("first", "last"), [(0.0, 0.9), (0.1, 1.0)])
 def test_a_motion_that_is_not_shown_as_a_whole_is_recognised(first, last):
-    warnings = certify(Identity(3), both(np.linspace(first, last, 50))).warnings[1:]
+    warnings = certificates_of(Identity(3), both(np.linspace(first, last, 50))).warnings[1:]
     assert warnings == (MotionWarning(Kind.OTHER_ENDS, "a motion is not shown from its start to its goal"),)
 
 
 def test_the_rise_from_the_end_of_one_rollout_to_the_start_of_the_next_is_none():
-    assert certify(Identity(3)).lyapunov_falls is True
+    assert certificates_of(Identity(3)).lyapunov_falls is True
     assert len(bundle_of(Identity(3)).paths) == 2
 
 
@@ -137,7 +139,7 @@ class Broken(Diffeomorphism):
 
 def test_no_number_is_no_certificate():
     with np.errstate(invalid="ignore"):
-        known = certify(Broken(), both(np.linspace(0, 1, 5)))
+        known = certificates_of(Broken(), both(np.linspace(0, 1, 5)))
     assert known.lyapunov_falls is False
     failed = {Kind.NO_DIFFEOMORPHISM, Kind.ROUND_TRIP, Kind.NOT_FALLING, Kind.OFF_MOTION, Kind.OTHER_ENDS}
     assert kinds(known.warnings) == {BEFORE.kind, *failed}
@@ -172,7 +174,7 @@ class Certified:
     def failed(self, frame: Frame | None = None, solved: Solved | None = None) -> set[Kind]:
         """The kinds of warnings that the certificates add to those of a frame."""
         frame = frame or self.frame
-        warnings = self.engine._certified(frame, solved or self.solved).warnings
+        warnings = certify(frame, solved or self.solved, self.engine.follower).warnings
         return kinds(warning for warning in warnings if warning not in frame.certificates.warnings)
 
     def with_hand(self, change) -> tuple[Frame, Solved]:
@@ -187,7 +189,7 @@ class Certified:
 
     def with_postures(self, change) -> tuple[Frame, Solved]:
         """The same with other postures, everywhere: `change` takes each (T, 6) and what it is without avoidance."""
-        arm, frame, robot = self.solved.arm, self.frame, self.engine._robot
+        arm, frame, robot = self.solved.arm, self.frame, self.engine.follower.robot
         assert arm is not None and frame.arm is not None and frame.chosen is not None
         rows = [arm.index == rollout for rollout in range(len(frame.rollouts))]
         p = arm.p.copy()
@@ -203,7 +205,7 @@ class Certified:
 def computed(engine, scenario):
     """A motion of the scenario, refined."""
     frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.FINE)
-    return Certified(engine, frame, engine._shown)
+    return Certified(engine, frame, engine.solved(scenario, FINE))
 
 
 @pytest.fixture(scope="module", name="hand")
@@ -318,7 +320,7 @@ def test_a_goal_other_than_the_one_of_the_base_system_is_recognised(request, who
     rays = motion.solved.stack.rays
     base = replace(rays.base, goal=rays.base.goal + 0.005 * np.eye(3)[0])
     shifted = replace(motion.solved, stack=replace(motion.solved.stack, rays=replace(rays, base=base)))
-    warnings = motion.engine._certified(motion.frame, shifted).warnings
+    warnings = certify(motion.frame, shifted, motion.engine.follower).warnings
     assert any(w.kind is Kind.OTHER_ENDS and "begin or end up to 5" in w.text for w in warnings)
 
 

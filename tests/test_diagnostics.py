@@ -9,6 +9,7 @@ from scenes import avoiding, biases, changed, says
 from dt_viz.arm.collision import Nearest, load_collision_model
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_warnings
+from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import plane_of
@@ -167,7 +168,7 @@ def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
 def test_the_last_frame_says_what_margin_the_meshes_keep(engine, initial, margin, kept):
     scenario = changed(initial("draw_s"), space="cspace", margin=margin)
     frame = stage(engine, scenario, Stage.CERTIFIED)
-    model, arm = load_collision_model(), engine._shown.arm
+    model, arm = load_collision_model(), engine.solved(scenario, FINE).arm
     clearance = [
         model.nearest_to_obstacle(arm.p[arm.index == k], scenario.obstacle).distance for k in range(len(frame.rollouts))
     ]
@@ -186,7 +187,7 @@ def test_the_arm_s_clearance_is_that_from_what_the_arm_avoids(engine):
     frame = stage(engine, scenario, Stage.CERTIFIED)
     assert Kind.ARM_ENTERS in kinds(frame)
     assert not kinds(frame) & {Kind.OTHER_CLEARANCE, Kind.ROLLOUT_ENTERS}
-    p = engine._shown.arm.p
-    clearance = engine._follower.whole_arm.clearance
+    p = engine.solved(scenario, FINE).arm.p
+    clearance = engine.follower.whole_arm.clearance
     assert clearance(p, of_hand.avoided).min() < 0 < frame.certificates.clearance
     assert frame.certificates.clearance == pytest.approx(clearance(p, of_arm.avoided).min())

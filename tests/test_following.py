@@ -11,7 +11,7 @@ from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
-from dt_viz.motion.solve import LIVE, solve
+from dt_viz.motion.stack import LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import TASKS
@@ -31,7 +31,7 @@ def placed(scenario, *obstacles, **changes):
 
 @pytest.fixture(scope="module", name="nominal")
 def _nominal(engine, initial):
-    return engine._nominal(initial("push_box"), None)
+    return engine.nominal(initial("push_box"))
 
 
 @pytest.fixture(scope="module", name="follower")
@@ -89,7 +89,7 @@ class TestObstructions:
         assert clear_of_meshes >= 1
 
     def test_demonstrations_out_of_reach_are_named(self, too_far, initial, robot):
-        nominal = too_far._nominal(initial("push_box"), None)
+        nominal = too_far.nominal(initial("push_box"))
         follower = Follower(robot)
         (reason,) = follower.obstructions(nominal, Union((FAR,)))
         assert reason.kind is Kind.OUT_OF_REACH
@@ -106,7 +106,7 @@ class TestFollowing:
 
     @pytest.mark.parametrize(("exact", "tolerance"), [(False, 1e-3), (True, 1e-8)])
     def test_behaviours_of_the_hand_are_followed(self, follower, nominal, initial, robot, exact, tolerance):
-        solution = solve(nominal, changed(initial("push_box"), space="both").active, LIVE)
+        solution = build_stack(nominal, changed(initial("push_box"), space="both").active, LIVE)
         lifted = follower.behaving(nominal, solution, exact=exact)
         assert lifted.fractions.shape == (7, NUM_CONFIGURATIONS)
         assert (np.diff(lifted.fractions, axis=1) > 0).all()
@@ -119,17 +119,17 @@ class TestFollowing:
     def test_what_was_followed_before_changes_nothing_that_is_seen(
         self, follower, nominal, initial, robot, exact, tolerance
     ):
-        wanted = solve(nominal, changed(initial("push_box"), space="both").active, LIVE)
+        wanted = build_stack(nominal, changed(initial("push_box"), space="both").active, LIVE)
         x, y, z = initial("push_box").obstacles[0].position
         other = changed(initial("push_box"), space="both", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
-        follower.behaving(nominal, solve(nominal, other.active, LIVE), exact=False)
-        again = follower.behaving(nominal, wanted, exact=exact).tracked.q
-        fresh = Follower(robot).behaving(nominal, wanted, exact=exact).tracked.q
+        before = follower.behaving(nominal, build_stack(nominal, other.active, LIVE), exact=False)
+        again = follower.behaving(nominal, wanted, exact=exact, before=before).tracked.q
+        fresh = follower.behaving(nominal, wanted, exact=exact).tracked.q
         np.testing.assert_allclose(again, fresh, rtol=0, atol=tolerance)
 
     def test_warnings_say_what_misses_its_path(self, follower, nominal):
         path = np.linspace([0.0, -0.5, 0.2], [0.0, -1.2, 0.2], NUM_ARM_SAMPLES)
-        joints = follower.along(nominal, 0, path, exact=False)
+        joints = follower.along(nominal, path)
         missed, damped = follower.warnings(joints, 4)
         assert missed.kind is Kind.PATH_MISSED and "misses the path of rollout 5" in missed.text
         assert damped.kind is Kind.DAMPED

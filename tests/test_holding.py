@@ -10,7 +10,7 @@ from scenes import changed
 from dt_viz.arm.arm_system import Section
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR
-from dt_viz.motion.solve import LIVE, solve
+from dt_viz.motion.stack import LIVE, build_stack
 
 STEPS = 6
 """Events of a drag, two centimetres apart."""
@@ -61,7 +61,7 @@ def test_the_hand_is_where_it_is_held_and_goes_on_to_the_goal(engine, initial, r
 
 def test_the_motion_from_there_is_one_of_the_system(engine, initial, robot, task):
     scenario = initial(task)
-    system = solve(engine._nominal(scenario, None), scenario.active, LIVE).system
+    system = build_stack(engine.nominal(scenario), scenario.active, LIVE).system
     for _, _, place, found in drags(engine, scenario, robot):
         np.testing.assert_allclose(found.path[0], place, atol=1e-3)
         z = system.transform.forward(found.path)
@@ -75,8 +75,8 @@ def test_the_arm_gives_way_by_its_transform_while_it_is_held(engine, initial, ro
     """Its postures are those of eq. (4): ψ_q leads each to the section that the undisturbed motion is lifted by."""
     scenario = changed(initial("push_box"), space="cspace")
     for _, _, _, found in drags(engine, scenario, robot):
-        solved = engine._live
-        section = Section(robot, engine._follower.reference(solved.nominal))
+        solved = engine.solved(scenario, LIVE)
+        section = Section(robot, engine.follower.reference(solved.nominal))
         q = solved.arm.transform.forward(found.motion.q[::30])
         np.testing.assert_allclose(section.postures(robot.end_effector(q)[:, None])[:, 0], q, atol=5e-3)
 

@@ -8,7 +8,7 @@ from scenes import changed
 from scipy.spatial.transform import Rotation
 
 from dt_viz.engine.frame import Stage
-from dt_viz.motion.solve import FINE, LIVE, solve
+from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.pictures.sketchbook import FINE_SPACING, LINE_SPACING
 from dt_viz.scenario.scenario import View
@@ -66,7 +66,7 @@ def test_the_warped_grid_is_made_of_images_of_points_of_planes(engine, scenario,
     """ψ by another way, the forward side of the whole stack, makes the lines straight again, seen along the normal."""
     scenario = changed(scenario, avoids=avoidance)
     frame, pictures = picture_at(engine, scenario, wanted)
-    stack = solve(engine._nominal(scenario, None), scenario.active, LIVE if wanted is Stage.LIVE else FINE)
+    stack = build_stack(engine.nominal(scenario), scenario.active, LIVE if wanted is Stage.LIVE else FINE)
     middle, obstacle = [], scenario.obstacle
     for line in pictures.grid.lines:
         outside = line[obstacle.signed_distance(line) > 0.005]  # nearer, ψ magnifies what the picture rounds
@@ -155,7 +155,7 @@ def turned(path):
 
 def test_the_mean_generator_is_the_mean_of_the_flows(engine, initial):
     scenario = initial("draw_s")
-    imitation = engine._nominal(scenario, None).imitation
+    imitation = engine.nominal(scenario).imitation
     _, pictures = picture_at(engine, replace(scenario, view=ALL), Stage.LIVE)
     task, mean = engine.task("draw_s"), pictures.generator
     u = ((mean.points - task.origin) @ task.axes / task.scale)[:, :2]

@@ -11,7 +11,7 @@ from scenes import changed
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.pushing import DISTANCES, MAX_TRACKING_ERROR, PUSH_SECONDS
-from dt_viz.motion.solve import FINE, solve
+from dt_viz.motion.stack import FINE, build_stack
 from dt_viz.ui import playback as playback_module
 from dt_viz.ui.playback import Playback
 
@@ -56,7 +56,7 @@ def test_the_hand_is_pushed_aside_and_still_reaches_the_goal(engine, initial, ro
 
 def test_after_the_push_it_is_a_motion_of_the_system(engine, initial, task):
     scenario = initial(task)
-    system = solve(engine._nominal(scenario, None), scenario.active, FINE).system
+    system = build_stack(engine.nominal(scenario), scenario.active, FINE).system
     for _, _, pushed in pushes(engine, scenario):
         after = pushed.path[pushed.begins :]
         assert (np.diff(system.lyapunov(after)) < 0).all()

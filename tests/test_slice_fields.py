@@ -8,7 +8,7 @@ from scenes import biases, changed
 from scipy.spatial.transform import Rotation
 
 from dt_viz.engine.frame import Stage
-from dt_viz.motion.solve import FINE, LIVE, cut_off, solve
+from dt_viz.motion.stack import FINE, LIVE, build_stack, cut_off
 from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
 from dt_viz.scenario.scenario import SLICE_COLOURS, View
 from dt_viz.scenario.slices import SlicePose
@@ -38,8 +38,8 @@ def shown(engine, scenario, wanted=Stage.FINE, **view):
 
 
 def solved(engine, scenario, precision=FINE):
-    nominal = engine._nominal(scenario, None)
-    return nominal, solve(nominal, scenario.active, precision)
+    nominal = engine.nominal(scenario)
+    return nominal, build_stack(nominal, scenario.active, precision)
 
 
 def with_bias(engine, scenario):
@@ -71,7 +71,7 @@ def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, s
     engine = new_engine()
     before = list(engine.frames(scenario))
     monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
-    monkeypatch.setattr("dt_viz.engine.engine.certified", lambda *_: pytest.fail("certified again"))
+    monkeypatch.setattr("dt_viz.engine.engine.certify", lambda *_: pytest.fail("certified again"))
     moved = replace(scenario, view=View(slice=tilted(engine.task(scenario.task)), level="Imitation"))
     for old, new in zip(before, engine.frames(moved), strict=True):
         assert new.scenario == moved and new.stage is old.stage and new.level == 0
@@ -81,6 +81,15 @@ def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, s
     x, y, z = scenario.obstacles[0].position
     with pytest.raises(BaseException, match="solved again"):
         next(engine.frames(changed(moved, obstacles=(scenario.obstacles[0].moved((x, y, z + 0.01)),))))
+
+
+def test_another_rollout_for_the_arm_solves_nothing_again(new_engine, scenario, monkeypatch):
+    engine = new_engine()
+    list(engine.frames(scenario))
+    monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
+    first, other = (list(engine.frames(replace(scenario, arm_rollout=number)))[-1] for number in (0, 3))
+    assert (first.chosen, other.chosen) == (0, 3)
+    assert not np.array_equal(first.arm.q[0], other.arm.q[0])
 
 
 def test_frames_of_a_changed_view_are_those_of_a_fresh_start(engine, new_engine, scenario):

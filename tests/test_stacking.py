@@ -8,7 +8,7 @@ from scenes import avoiding, beside, biases, changed
 
 from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Integration
-from dt_viz.motion.solve import LIVE, solve
+from dt_viz.motion.stack import LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import (
@@ -103,7 +103,7 @@ def test_each_transform_is_told_the_targets_below_it_that_are_on(engine, monkeyp
 
     def targets(scenario):
         told.clear()
-        solve(engine._nominal(scenario, None), scenario.active, LIVE)
+        build_stack(engine.nominal(scenario), scenario.active, LIVE)
         return {name: motion.targets for name, motion in told.items()}
 
     first = (0.5, 0.0, 0.0)

@@ -13,7 +13,7 @@ from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import PlacedField
 from dt_viz.motion.nominal import Nominal
-from dt_viz.motion.solve import FINE, LIVE, solve
+from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.starts import with_grid
@@ -48,7 +48,7 @@ def test_added_rollouts_are_motions_of_the_system_and_end_at_the_goal(engine, in
     scenario = initial(task)
     scenario = replace(scenario, starts=random_starts(engine, scenario))
     frame, num = frame_of(engine, scenario), len(engine.task(task).demonstrations)
-    system = solve(engine._nominal(scenario, None), scenario.active, FINE).system
+    system = build_stack(engine.nominal(scenario), scenario.active, FINE).system
     assert len(frame.rollouts) == num + NUM
     for start, path, times in zip(scenario.starts, frame.rollouts[num:], frame.times[num:], strict=True):
         np.testing.assert_allclose(path[0], start, atol=1e-6)
@@ -76,7 +76,7 @@ def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(eng
     layers = biases(BiasPoint((x, y, z), plane=plane_of(engine.task(task))))
     before = changed(initial(task), obstacles=(), layers=layers)
     after = replace(before, starts=random_starts(engine, before, seed=2))
-    solutions = [solve(engine._nominal(scenario, None), scenario.active, FINE) for scenario in (before, after)]
+    solutions = [build_stack(engine.nominal(scenario), scenario.active, FINE) for scenario in (before, after)]
     (a,), (b,) = ([applied.made for applied in solution.built] for solution in solutions)
     assert a.duration == b.duration and a.warnings == b.warnings == ()
     assert isinstance(a.transform, Flow) and isinstance(b.transform, Flow)
@@ -109,14 +109,15 @@ def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it
         assert max(np.linalg.norm(other - point, axis=1).min() for point in path) < 5e-3
     assert not says(frame, "finds no way")
     named = " ".join(map(str, frame.certificates.warnings))
-    numbers, arm = engine._kept.nominal.numbers, engine._kept.solved[LIVE].arm
+    solved = engine.solved(replace(scenario, starts=grid.starts), LIVE)
+    numbers, arm = solved.nominal.numbers, solved.arm
     doubtful = np.union1d(arm.too_near, arm.moved)
     assert len(doubtful)
     for guest in doubtful:
         assert re.search(rf"added starts? [\d, ]*\b{numbers[guest] - 6}\b", named)
     for guest in np.setdiff1d(np.arange(7, len(frame.rollouts)), doubtful):
         np.testing.assert_allclose(frame.rollouts[guest][0], grid.starts[numbers[guest] - 7], atol=MOVED)
-        assert engine._follower.whole_arm.clearance(arm.p[arm.index == guest], scenario.obstacle).min() > 0
+        assert engine.follower.whole_arm.clearance(arm.p[arm.index == guest], scenario.obstacle).min() > 0
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
@@ -156,7 +157,7 @@ def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
 
 def test_an_added_start_at_the_goal_stays_there(engine, initial):
     scenario = changed(initial("draw_s"), obstacles=())
-    goal = engine._nominal(scenario, None).goal
+    goal = engine.nominal(scenario).goal
     frame = frame_of(engine, replace(scenario, starts=(tuple(float(c) for c in goal),), arm_rollout=7))
     np.testing.assert_allclose(frame.rollouts[-1], np.broadcast_to(goal, frame.rollouts[-1].shape), atol=1e-6)
     assert frame.arm is not None and np.isfinite(frame.arm.q).all()
@@ -166,10 +167,9 @@ def test_dragging_a_start_keeps_only_the_newest_rollouts(new_engine, initial):
     engine, scenario = new_engine(), initial("draw_s")
     for x in np.linspace(-0.1, 0.1, 200):
         moved = replace(scenario, starts=((float(x), -0.5, 0.45),))
-        assert isinstance(engine._nominal(moved, None), Nominal)
-    learned = engine._nominal(scenario, None).learned
-    assert learned._added.cache_info().currsize < 100
-    assert learned._nominals.cache_info().currsize < 10
+        assert isinstance(engine.nominal(moved), Nominal)
+    assert engine.memo.count("strand") < 100
+    assert engine.memo.count("nominal") < 10
 
 
 def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine, new_engine, initial):
@@ -184,15 +184,15 @@ def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine,
 
 
 def test_the_ground_keeps_what_it_has_of_the_demonstrations(engine, initial):
-    nominal = engine._nominal(initial("lift_box"), None)
-    more = nominal.learned.nominal(((0.1, -0.5, 0.3),))
+    nominal = engine.nominal(initial("lift_box"))
+    more = nominal.learned.nominal([nominal.learned.strand((0.1, -0.5, 0.3))])
     assert nominal.learned.nominal(()) is nominal
     np.testing.assert_array_equal(more.starts[:-1], nominal.starts)
     np.testing.assert_allclose(more.images(more.ends)[[0, -1]], nominal.images(nominal.ends)[[0, -1]], atol=1e-9)
     moved = more.ends + 0.01
     np.testing.assert_allclose(more.system.transform.inverse(more.images(moved)), moved, atol=1e-8)
     assert more.only([0, 7]).rollout(7) == 1 and more.only([0, 7]).rollout(3) is None
-    assert solve(more, initial("lift_box").active, LIVE).rays.z0.shape == (9, 3)
+    assert build_stack(more, initial("lift_box").active, LIVE).rays.z0.shape == (9, 3)
 
 
 def test_a_motion_that_begins_inside_the_obstacle_needs_no_longer_flow_than_the_others(engine, initial):
@@ -201,7 +201,7 @@ def test_a_motion_that_begins_inside_the_obstacle_needs_no_longer_flow_than_the_
     (obstacle,) = scenario.obstacles
     inside = tuple(c + d for c, d in zip(obstacle.position, (0.0, 0.0, 0.07), strict=True))
     before, after = (
-        solve(engine._nominal(s, None), s.active, LIVE) for s in (scenario, replace(scenario, starts=(inside,)))
+        build_stack(engine.nominal(s), s.active, LIVE) for s in (scenario, replace(scenario, starts=(inside,)))
     )
     assert all(applied.satisfied for applied in (*before.built, *after.built))
     assert after.built[0].made.duration < 1.5 * before.built[0].made.duration

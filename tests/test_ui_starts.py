@@ -44,10 +44,10 @@ def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_i
     grid = with_grid(scenario, task.slice, arm_room)
     hand_only = with_grid(changed(scenario, space="task"), task.slice, no_arm)
     assert set(grid.starts) < set(hand_only.starts) and grid.num_blocked > hand_only.num_blocked
-    nominal = engine._nominal(replace(scenario, starts=grid.starts), None)
-    assert not engine._follower.admitted(nominal, scenario.obstacle).left_out
-    postures = engine._follower.undisturbed(nominal).tracked.q[7:, 0]
-    room = engine._follower.whole_arm.clearance(postures, scenario.obstacle)
+    nominal = engine.nominal(replace(scenario, starts=grid.starts))
+    assert not engine.follower.admitted(nominal, scenario.obstacle).left_out
+    postures = engine.follower.undisturbed(nominal).tracked.q[7:, 0]
+    room = engine.follower.whole_arm.clearance(postures, scenario.obstacle)
     np.testing.assert_allclose(room, arm_room(np.array(grid.starts)), atol=1e-3)
 
 

@@ -13,7 +13,7 @@ from dt_viz.arm.whole_arm import MAX_DURATION, ROUNDING, ArmSolution, Lift, Whol
 from dt_viz.flows.diffeomorphisms import Identity, min_det_jacobian
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.following import Follower
-from dt_viz.motion.solve import FINE, LIVE
+from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Scenario
 
@@ -30,7 +30,7 @@ class Case:
         self.middle = Sphere((float(x), float(y), float(z)), 0.15)
         self.robot = robot
         self.scenario = changed(initial, space="cspace", obstacles=self.middle)
-        self.nominal = engine._nominal(self.scenario, None)
+        self.nominal = engine.nominal(self.scenario)
         self.follower = Follower(robot)
         self.arm: WholeArm = self.follower.whole_arm
         self.lifted: Lift = self.follower.undisturbed(self.nominal)

@@ -30,7 +30,7 @@ from dt_viz.properties import cached_property
 from dt_viz.transforms.base import ArmAvoidance
 
 NUM_CONFIGURATIONS = 100
-"""Of each rollout before refinement."""
+"""Samples of each rollout before refinement."""
 MAX_DURATION = 2.0
 """Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
 SNAPSHOT = 0.1
@@ -39,7 +39,7 @@ STRIDE = 3
 """Every which sample the duration is chosen for at first: the time that they take to leave changes slowly along a
 rollout, and the deepest are not the last."""
 MAX_ROUNDS = 4
-"""Of looking whether samples that refinement finds are clear, too, and going on if not."""
+"""Rounds of refinement and of a longer flow where the samples that it adds are not clear."""
 SLOPE = 0.1
 """Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
 OVERSHOOT = 7e-3
@@ -49,9 +49,9 @@ MOVED = 5e-3
 ROUNDING = 1e-3
 """Metres of clearance that do not count."""
 COARSE_STEP = 0.2
-"""Of flow time. An RK4 step of this length is off by a tenth of a millimetre at the hand, about."""
+"""Length of a coarse RK4 step, in flow time: off by a tenth of a millimetre at the hand, about."""
 TOLERANCE = 3e-9
-"""Of the fine flow's steps, rad."""
+"""Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
 BESIDE = 0.20
@@ -65,7 +65,7 @@ class Lift:
     fractions: Array
     """(R, T) increasing along each rollout."""
     tracked: JointPath
-    """At these fractions; its q has shape (R, T, 6)."""
+    """Joints at these fractions; its q has shape (R, T, 6)."""
     reference: Array
     """(6,) posture that the arm stays near to, rad."""
     exactly: Callable[[Array, Indices, Array], Array] | None = None

@@ -53,7 +53,7 @@ class Frame:
     """Why there is no motion for this scenario; what is shown then is the last one that there was."""
     certificates: Certificates
     chosen: int | None = 0
-    """Which rollout the arm follows; None where it cannot begin the one that the scenario asks for."""
+    """Number of the rollout that the arm follows; None where it cannot begin the one that the scenario asks for."""
     learned_steps: tuple[int, ...] = ()
     """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
     durations: tuple[float | None, ...] = ()
@@ -63,15 +63,15 @@ class Frame:
     arm_duration: float | None = None
     """t of the flow by which the whole arm avoids, under a warp that of the full one; None where it does not."""
     level: int | None = None
-    """Which of `levels` the view shows, with the pictures that are on that manifold; None is the whole stack."""
+    """Index in `levels` of the manifold that the view and the pictures show; None is the top of the stack."""
     arm: ArmMotion | None = None
     """None before stage LIVE, and where the arm cannot reach the start."""
     pictures: Pictures = NO_PICTURES
-    """Of ψ itself and on the slice, as far as the view shows them; empty before stage LIVE."""
+    """Pictures of ψ and on the slice, as far as the view shows them; empty before stage LIVE."""
     profiles: Profiles | None = None
     """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
     seconds: float = 0.0
-    """From the start of the rebuild until this frame."""
+    """Time from the start of the rebuild until this frame."""
 
     @property
     def slice(self) -> Slice:

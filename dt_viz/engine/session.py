@@ -34,7 +34,7 @@ MAX_UNDO = 200
 LIVE_PAUSE = 0.05
 """Seconds between two drawings of field and arm while edits come faster: rollouts are drawn for each that can be."""
 HABITS = ("playing", "speed", "joint_plots", "health_plots")
-"""What of the view is how a visitor works, and stays when a scene of the paper comes or goes."""
+"""Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
 """Seconds that a scenario must rest before it is refined: while a hand moves, edits come faster."""
 
@@ -63,7 +63,7 @@ class _Request:
 
 
 _Job = tuple[Scenario, float]
-"""What to compute, and when it was asked for."""
+"""A scenario to compute, and when it was asked for, seconds."""
 
 
 def _end_if(superseded: Callable[[], bool]) -> None:
@@ -85,7 +85,7 @@ def _is_step(after: Scenario, before: Scenario) -> bool:
 
 
 class Display(Protocol):
-    """What a session shows its results on: a page, or a measurement."""
+    """Receiver of a session's results: a page, or a measurement."""
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         """Show a frame. Called on the worker thread, in the order of the edits."""

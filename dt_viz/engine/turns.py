@@ -1,4 +1,4 @@
-"""One at a time: threads that share a processor take turns, and who is in a hurry goes first."""
+"""A queue with two priorities for threads that share a processor: one computes at a time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ LOOK = 0.02
 """Time in seconds between two calls of the checkpoint of a thread that waits."""
 
 _Place = tuple[bool, int]
-"""In the queue: whether it is patient, and a number that grows with each who comes."""
+"""Place in the queue: whether its priority is low, and a number that grows with each arrival; the smallest is next."""
 
 
 class Turns:
     """A lock whose holder can let others go first.
 
-    It is given to those in a hurry before those who are patient, and among them to who has waited longest.
+    Threads of high priority get it before those of low priority; among equals, the one that has waited longest.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Turns:
         self._holder: int | None = None
         """Identifier of the thread that has the turn."""
         self._patient = False
-        """Whether the holder is patient."""
+        """Whether the current holder has low priority."""
         self._ends = 0.0
         """End of the holder's time slice, seconds."""
 
@@ -41,7 +41,7 @@ class Turns:
         """Wait for the turn, and have it within this block. It is not reentrant.
 
         Args:
-            patient: whether those in a hurry go first.
+            patient: whether this thread has low priority.
             checkpoint: called every `LOOK` seconds of waiting; what it raises ends the waiting.
         """
         self._take(checkpoint, patient=patient)
@@ -53,10 +53,10 @@ class Turns:
     def give_way(self, checkpoint: Checkpoint = lambda: None) -> None:
         """Called by the holder: join the end of the queue, and go on from there when the turn comes again.
 
-        That is done only if somebody waits who is in more of a hurry, or after a `SLICE` in as much.
+        Nothing is done unless a thread of higher priority waits, or one of equal priority after a `SLICE`.
 
         Args:
-            checkpoint: as of `taken`. The turn is lost for good if it raises.
+            checkpoint: as in `taken`. If it raises, this thread has lost its turn for good.
         """
         if self._is_due():
             patient = self._patient
@@ -64,10 +64,10 @@ class Turns:
             self._take(checkpoint, patient=patient)
 
     def let_pass(self, longest: float) -> None:
-        """Called by who needs no turn, but takes the processor as well: wait while somebody in a hurry has or wants it.
+        """Wait while a thread of high priority has or wants the turn; for work that needs no turn but slows others.
 
         Args:
-            longest: seconds after which not to wait any more.
+            longest: seconds to wait at most.
         """
         with self._changed:
             self._changed.wait_for(lambda: not self._is_hurried(), longest)
@@ -96,7 +96,7 @@ class Turns:
             raise
 
     def _has_come(self, place: _Place) -> bool:
-        """Whether this thread has the turn now; waits for it `LOOK` seconds at most."""
+        """Wait for the turn, at most `LOOK` seconds; True if this thread has it now."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._holder is None and min(self._queue) == place, LOOK):
                 return False

@@ -19,7 +19,7 @@ from dt_viz.arm.robot import Robot
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
-from dt_viz.motion.solve import Solution
+from dt_viz.motion.stack import Solution
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres, told
 
 NUM_CHECKED, NUM_CHECKED_POSTURES = 400, 100
@@ -50,13 +50,13 @@ MAX_ROUND_TRIP = 1e-6
 
 @dataclass(frozen=True)
 class Certificates:
-    """What is known about how far a result is to be trusted; None is what has not been computed."""
+    """Checks of a motion, and the warnings that follow; None is what has not been computed."""
 
     clearance: float
     """Smallest distance from the obstacle of what avoids it, metres, negative inside: of the end effector, or of the
     spheres that cover the arm on the motions from the task's starts."""
     collision: CollisionReport | None = None
-    """What the arm's meshes come near to on the motion that it shows."""
+    """Nearest approaches of the arm's meshes on the motion that it shows."""
     min_det_jacobian: float | None = None
     """Smallest det J of the whole stack along the rollouts: positive where it is a diffeomorphism. Where ψ⁻¹,
     integrated by hand, folds what is drawn, its det is taken. It is as exact as tangents are: where space is squeezed
@@ -248,7 +248,7 @@ def _determinant(transform: Diffeomorphism, y: Array, drawn_from: Array | None) 
 
 
 def _with_map(known: Certificates, det: float, round_trip: float) -> Certificates:
-    """What is known with certificates of a map that may be worse than those before, and a warning for each failure."""
+    """The worse of the certificates known and of those of another map, and a warning for each failure."""
     warnings = []
     if not det > 0:
         text = f"det J falls to {det:.2g}: the map folds space, the stack is no diffeomorphism there"
@@ -264,7 +264,7 @@ def _with_map(known: Certificates, det: float, round_trip: float) -> Certificate
 
 
 def _evenly(rows: Indices, num: int) -> Indices:
-    """At most so many of the rows, evenly spread."""
+    """At most `num` of the rows, evenly spread."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, num).astype(int))]
 
 

@@ -15,7 +15,8 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import MAX_SAMPLES
 from dt_viz.motion.certificates import MAX_ROUND_TRIP
 from dt_viz.motion.nominal import Nominal
-from dt_viz.motion.solve import Applied, Solution, Solved
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import Applied, Solution
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.scenario.starts import REACH, SHOULDER
@@ -128,7 +129,7 @@ def target_warnings(solved: Solved, robot: Robot) -> tuple[MotionWarning, ...]:
 
 
 def margin_warnings(scenario: Scenario, nearest: Sequence[Nearest]) -> tuple[MotionWarning, ...]:
-    """What the arm's meshes keep of the margin that they are to avoid the obstacle by; empty if all of it.
+    """Warnings where the arm's meshes keep less than the margin that was asked for.
 
     Args:
         scenario: whose margin it is.
@@ -147,7 +148,7 @@ def margin_warnings(scenario: Scenario, nearest: Sequence[Nearest]) -> tuple[Mot
 
 
 def _of_integration(solved: Solved) -> tuple[MotionWarning, ...]:
-    """What the integrators cost that were chosen by hand."""
+    """Warnings about integrators that were chosen by hand."""
     stack, arm, avoidance = solved.stack, solved.arm, solved.scenario.arm_avoidance
     warnings, bundle = [], stack.bundle
     for level, applied in enumerate(stack.built, 1):
@@ -168,7 +169,7 @@ def _moves_goal(nominal: Nominal, stack: Solution) -> bool:
 def integration_warnings(
     name: str, flow: Diffeomorphism, integration: Integration, y: Array, x: Array, unit: Array | float = 1.0
 ) -> tuple[MotionWarning, ...]:
-    """What it costs that the integration of a transform's flow was chosen by hand; nothing if it was not.
+    """Warnings about the integration of a transform's flow, if it was chosen by hand.
 
     Quick enough for a drag. A flow in other coordinates, as the whole arm's, is too slow to be looked at for folds
     here: see `fold_warnings`.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -13,9 +12,10 @@ from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import JointPath, UnreachableError, drawn_onto, inverse_kinematics, track
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
 from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
 from dt_viz.motion.nominal import Learned, Nominal, Strand
-from dt_viz.motion.solve import Solution
+from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_STARTS
@@ -28,7 +28,9 @@ BY_FRACTION = 0.3
 MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
 NUM_ARM_SAMPLES = 200
-"""Of the motion that the arm shows where it follows a path of the end effector."""
+"""Samples of the motion that the arm shows where it follows a path of the end effector."""
+NEWEST = 2 * MAX_STARTS
+"""Number of added starts whose joints are kept."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +45,30 @@ class ArmMotion:
     """(T, 6) the same at the same moments of the motion without avoidance."""
 
 
-class Follower:
-    """Lifts the motions of one visitor to the joints, and keeps what a drag leaves unchanged."""
+@dataclass(frozen=True)
+class Admission:
+    """Whether and from where the whole arm can move."""
 
-    def __init__(self, robot: Robot) -> None:
+    nominal: Nominal
+    """The rollouts that it can begin."""
+    blocked: tuple[MotionWarning, ...] = ()
+    """Why it cannot move at all; empty where it can."""
+
+
+class Follower:
+    """Lifts motions of the end effector to the joints."""
+
+    def __init__(self, robot: Robot, memo: Memo | None = None) -> None:
+        """Take an arm.
+
+        Args:
+            robot: the arm.
+            memo: what keeps the joints along what a drag leaves unchanged.
+        """
         self.robot = robot
         self.body = load_body_points()
         self.whole_arm = WholeArm(robot, self.body)
-        self._lifts: dict[Learned, Lift | UnreachableError] = {}
-        self._before: dict[tuple[Learned, int | None], Array] = {}
-        newest = lru_cache(maxsize=2 * MAX_STARTS)  # a start that is dragged leaves nothing behind
-        self._added, self._reaches = newest(self._lift_added), newest(self._gets_to)
-        self._joined = lru_cache(maxsize=4)(self._join)
+        self._memo = Memo() if memo is None else memo
 
     def undisturbed(self, nominal: Nominal) -> Lift:
         """The joints along the motion without any behaviour.
@@ -62,18 +76,27 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        learned = nominal.learned
-        if learned not in self._lifts:
-            try:
-                self._lifts[learned] = self._lift_demonstrated(learned)
-            except UnreachableError as error:
-                self._lifts[learned] = error
-        lifted = self._lifts[learned]
-        if isinstance(lifted, UnreachableError):
-            raise lifted
-        if nominal is learned.demonstrated:
-            return lifted
-        return self._joined(nominal)
+        if nominal is nominal.learned.demonstrated:
+            return self._demonstrated(nominal.learned)
+        rollouts = range(len(nominal.strands))
+        return self._memo(
+            "joined",
+            nominal,
+            lambda: joined([self.undisturbed_along(nominal, rollout) for rollout in rollouts], nominal.num_added),
+            newest=4,
+        )
+
+    def undisturbed_along(self, nominal: Nominal, rollout: int) -> Lift:
+        """The joints along one of the rollouts without any behaviour.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the task's motions start.
+        """
+        number, strand, whole = nominal.numbers[rollout], nominal.strands[rollout], self._demonstrated(nominal.learned)
+        if number < nominal.num_demonstrated:
+            return whole.only(number)
+        # a start that is dragged leaves nothing behind
+        return self._memo("added", strand, lambda: _lift_added(self.robot, strand, whole.reference), newest=NEWEST)
 
     def reference(self, nominal: Nominal) -> Array:
         """The posture (6,), rad, that the arm stays near to.
@@ -81,16 +104,17 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        return self.undisturbed(nominal.learned.demonstrated).reference
+        return self._demonstrated(nominal.learned).reference
 
-    def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool) -> Lift:
+    def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool, before: Lift | None = None) -> Lift:
         """The joints along the motion with the behaviours of the end effector.
 
         Args:
             nominal: what it begins from.
             solution: that motion.
-            exact: whether the end effector is on that motion between the samples, too, whatever was shown before; else
-                it may be off by millimetres where the stack stretches space, and begins from what was shown before.
+            exact: whether the end effector is on that motion between the samples, too, and `before` plays no part; else
+                it may be off by millimetres where the stack stretches space.
+            before: joints along nearby rollouts to begin from.
         """
         fraction = []
         for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
@@ -100,11 +124,10 @@ class Follower:
             fraction.append(np.interp(np.linspace(0, 1, NUM_CONFIGURATIONS), place, fractions))
         index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
         paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)
-        reference, initial = self.reference(nominal), self._before.get((nominal.learned, None))
-        if exact or (initial is not None and len(initial) != len(paths)):
-            initial = None  # starts have come or gone
+        reference, initial = self.reference(nominal), None
+        if before is not None and not exact and len(before.tracked.q) == len(paths):  # else starts have come or gone
+            initial = before.tracked.q
         lifted = replace(lift(self.robot, np.stack(fraction), paths, reference, initial), num_guests=nominal.num_added)
-        self._before[nominal.learned, None] = lifted.tracked.q
         if not exact:
             return lifted
 
@@ -113,21 +136,29 @@ class Follower:
 
         return replace(lifted, exactly=exactly)
 
-    def along(self, nominal: Nominal, rollout: int, path: Array, *, exact: bool) -> JointPath:
-        """The joints along one path (T, 3) of the end effector, metres, T being `NUM_ARM_SAMPLES`.
+    def along(self, nominal: Nominal, path: Array, before: Array | None = None) -> JointPath:
+        """The joints along one path (T, 3) of the end effector, metres.
 
-        They begin from what was shown before, unless `exact`.
+        Args:
+            nominal: the motion whose posture the arm stays near to.
+            path: where the end effector goes.
+            before: (T, 6) joints along a nearby path to begin from, rad.
         """
-        number = nominal.numbers[rollout]
-        before = None if exact else self._before.get((nominal.learned, number))
-        joints = track(self.robot, path, self.reference(nominal), before)
-        self._before[nominal.learned, number] = joints.q
-        return joints
+        return track(self.robot, path, self.reference(nominal), before)
+
+    def admission(self, nominal: Nominal, obstacle: Union) -> Admission:
+        """Whether the whole arm can move from the task's starts to the goal, and from which added starts."""
+
+        def admission() -> Admission:
+            blocked = self.obstructions(nominal, obstacle)
+            return Admission(nominal if blocked else self.admitted(nominal, obstacle), blocked)
+
+        return self._memo("admission", (nominal, obstacle), admission, newest=1)
 
     def obstructions(self, nominal: Nominal, obstacle: Union) -> tuple[MotionWarning, ...]:
         """Why the whole arm cannot move from the task's starts to the goal; empty where it can."""
         try:
-            lifted = self.undisturbed(nominal.learned.demonstrated)
+            lifted = self._demonstrated(nominal.learned)
         except UnreachableError as error:
             return (unreachable(error),)
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
@@ -146,7 +177,14 @@ class Follower:
         """
         num_demonstrated = nominal.num_demonstrated
         added = nominal.strands[num_demonstrated:]
-        return np.array([False] * num_demonstrated + [not self._reaches(nominal.learned, strand) for strand in added])
+        reference = self.reference(nominal)
+
+        def reached(strand: Strand) -> bool:
+            tracked = track(self.robot, strand.start[None], reference)
+            return bool(tracked.error[0] <= MAX_TRACKING_ERROR)
+
+        reaches = [self._memo("reached", s, lambda s=s: reached(s), newest=NEWEST) for s in added]
+        return np.array([False] * num_demonstrated + [not reach for reach in reaches])
 
     def admitted(self, nominal: Nominal, obstacle: Union) -> Nominal:
         """The rollouts that the whole arm can begin: without those from added starts where it is out of reach or room.
@@ -158,7 +196,7 @@ class Follower:
         touches = np.zeros_like(far)
         candidates = np.flatnonzero(~far)[num:]
         if len(candidates):
-            postures = self.undisturbed(nominal.only(candidates)).tracked.q[:, 0]
+            postures = np.stack([self.undisturbed_along(nominal, k).tracked.q[0, 0] for k in candidates])
             near = self.whole_arm.clearance(postures, obstacle) < 0
             for rollout, posture in zip(candidates[near], postures[near], strict=True):
                 gaps = [load_collision_model().obstacle_distance(posture[None], part)[0][0] for part in obstacle.parts]
@@ -171,7 +209,7 @@ class Follower:
         return nominal.only(np.flatnonzero(~(far | touches)), warnings)
 
     def _touching(self, pins: Array, obstacle: Obstacle) -> list[MotionWarning]:
-        """What an obstacle touches of the arm at rest in the postures `pins` (R + 1, 6)."""
+        """Reasons why the arm cannot rest in the postures `pins` (R + 1, 6): what an obstacle touches of it."""
         pedestal = self.body.on_pedestal
         distance = obstacle.signed_distance(pedestal.positions(self.robot, pins[0])) - pedestal.radius
         if (distance >= 0).all() and (self.whole_arm.clearance(pins, obstacle) >= 0).all():
@@ -202,30 +240,30 @@ class Follower:
             warnings.append(MotionWarning(Kind.DAMPED, text, ARM))
         return tuple(warnings)
 
-    def _lift_demonstrated(self, learned: Learned) -> Lift:
-        bundle, starts = learned.demonstrated.bundle, learned.task.starts
-        num_rollouts = len(starts)
-        stride = np.linspace(0, len(bundle.index) // num_rollouts - 1, NUM_CONFIGURATIONS).round().astype(int)
-        fractions = bundle.fraction.reshape(num_rollouts, -1)[:, stride]
-        paths = bundle.positions.reshape(num_rollouts, -1, 3)[:, stride]
-        reference = inverse_kinematics(self.robot, starts.mean(axis=0))
-        return lift(self.robot, fractions, paths, reference)
+    def _demonstrated(self, learned: Learned) -> Lift:
+        """The joints along the rollouts from the task's starts. Raises UnreachableError, also a second time."""
+        lifted = self._memo("demonstrated", learned, lambda: _lift_demonstrated(self.robot, learned))
+        if isinstance(lifted, UnreachableError):
+            raise lifted
+        return lifted
 
-    def _join(self, nominal: Nominal) -> Lift:
-        learned, num_demonstrated = nominal.learned, nominal.num_demonstrated
-        whole = self.undisturbed(learned.demonstrated)
-        parts = zip(nominal.numbers, nominal.strands, strict=True)
-        lifts = [whole.only(n) if n < num_demonstrated else self._added(learned, strand) for n, strand in parts]
-        return joined(lifts, nominal.num_added)
 
-    def _lift_added(self, learned: Learned, strand: Strand) -> Lift:
-        path, fraction = strand.positions, strand.fraction
-        keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
-        return lift(self.robot, fraction[None, keep], path[None, keep], self.reference(learned.demonstrated))
+def _lift_demonstrated(robot: Robot, learned: Learned) -> Lift | UnreachableError:
+    bundle, starts = learned.demonstrated.bundle, learned.task.starts
+    num_rollouts = len(starts)
+    stride = np.linspace(0, len(bundle.index) // num_rollouts - 1, NUM_CONFIGURATIONS).round().astype(int)
+    fractions = bundle.fraction.reshape(num_rollouts, -1)[:, stride]
+    paths = bundle.positions.reshape(num_rollouts, -1, 3)[:, stride]
+    try:
+        return lift(robot, fractions, paths, inverse_kinematics(robot, starts.mean(axis=0)))
+    except UnreachableError as error:
+        return error
 
-    def _gets_to(self, learned: Learned, strand: Strand) -> bool:
-        reached = track(self.robot, strand.start[None], self.reference(learned.demonstrated))
-        return bool(reached.error[0] <= MAX_TRACKING_ERROR)
+
+def _lift_added(robot: Robot, strand: Strand, reference: Array) -> Lift:
+    path, fraction = strand.positions, strand.fraction
+    keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
+    return lift(robot, fraction[None, keep], path[None, keep], reference)
 
 
 def unreachable(error: UnreachableError) -> MotionWarning:
@@ -244,7 +282,7 @@ def _touching_starts(which: Indices, num_demonstrated: int) -> list[MotionWarnin
 
 
 def arm_samples(num: int) -> Indices:
-    """Which of the `num` samples of a rollout of the end effector the arm follows, (`NUM_ARM_SAMPLES`,)."""
+    """Indices (`NUM_ARM_SAMPLES`,) of the samples that the arm follows, of the `num` of a rollout of the hand."""
     return np.linspace(0, num - 1, NUM_ARM_SAMPLES).round().astype(int)
 
 
@@ -261,4 +299,4 @@ def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Ar
 
 
 PEDESTAL = ("base", "link 1")
-"""What no joint carries away from an obstacle."""
+"""Links that no joint can carry away from an obstacle."""

@@ -30,7 +30,7 @@ SHORTER = np.array([1.0, 0.5, 0.2, 0.05])
 DIFFERENCE = 1e-3
 """Metres between the places that the slope is taken from."""
 DAMPING = 1e-3
-"""Of the least-squares step, against the square of the slope, which is 1 far from obstacles."""
+"""Damping of the least-squares step, against the square of the slope, which is 1 far from obstacles."""
 
 Hands = Callable[[Array], Array]
 """Takes places (N, 3) of the motion below to where the hand is then, (N, 3), metres."""

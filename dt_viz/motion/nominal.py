@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -15,12 +14,11 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.imitation import Imitation
 from dt_viz.obstacles.shapes import Point
 from dt_viz.properties import cached_property
-from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
-"""Of each rollout before refinement: from the task's starts, and from added ones."""
+"""Samples of each rollout before refinement: from the task's starts, and from added ones."""
 MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
 """Steps towards the images of moved ends, and metres by which they may miss."""
 
@@ -43,7 +41,7 @@ class Strand:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What depends on the task and the imitation only, not on where motions start."""
+    """The learned motion of a task, wherever its rollouts start."""
 
     task: Task
     imitation: Imitation
@@ -64,26 +62,8 @@ class Learned:
         """The rollouts from the task's starts."""
         return Nominal(self, self._strands(self.task.starts, NUM_SAMPLES))
 
-    def nominal(self, added: tuple[Point, ...]) -> Nominal:
-        """The rollouts from the task's starts and from `added` ones, metres."""
-        return self._nominals(added) if added else self.demonstrated
-
-    @cached_property
-    def _nominals(self) -> Callable[[tuple[Point, ...]], Nominal]:
-        """The newest ones with added starts."""
-        strands = self.demonstrated.strands
-        return lru_cache(maxsize=4)(lambda added: Nominal(self, strands + tuple(map(self._added, added))))
-
     def warped(self, fraction: float) -> Learned:
         """The same with the imitation's flows run for a fraction of their durations."""
-        return self._warps(fraction)
-
-    @cached_property
-    def _warps(self) -> Callable[[float], Learned]:
-        """Only the newest is kept: what it is asked for at every stage of a frame."""
-        return lru_cache(maxsize=1)(self._warped)
-
-    def _warped(self, fraction: float) -> Learned:
         transform = self.system.transform.scaled(fraction)
         base = replace(self.system.base, goal=transform.forward(self.goal))
         return replace(self, system=DiffeomorphicSystem(transform, base))
@@ -93,10 +73,13 @@ class Learned:
         """ψ (1, 3) and its derivative (1, 3, 3) at the goal."""
         return self.system.transform.jacobian(self.goal[None])
 
-    @cached_property
-    def _added(self) -> Callable[[Point], Strand]:
-        """The rollout from an added start; only the newest are kept, so that a dragged one leaves nothing behind."""
-        return lru_cache(maxsize=2 * MAX_STARTS)(lambda start: self._strands(np.array([start]), NUM_ADDED_SAMPLES)[0])
+    def strand(self, start: Point) -> Strand:
+        """The rollout from an added start, metres."""
+        return self._strands(np.array([start]), NUM_ADDED_SAMPLES)[0]
+
+    def nominal(self, added: Sequence[Strand]) -> Nominal:
+        """The rollouts from the task's starts and from added ones."""
+        return Nominal(self, (*self.demonstrated.strands, *added)) if added else self.demonstrated
 
     def _strands(self, starts: Array, num_samples: int) -> tuple[Strand, ...]:
         images, jacobians = self.system.transform.jacobian(starts)
@@ -110,11 +93,11 @@ class Learned:
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """What a scenario's behaviours are stacked on: what was learned, and the rollouts from some starts."""
+    """The motion that transforms are stacked on: the learned one, and its rollouts from some starts."""
 
     learned: Learned
     strands: tuple[Strand, ...]
-    """Those of the task's starts first."""
+    """The rollouts; those from the task's starts first."""
     left_out: tuple[int, ...] = ()
     """Numbers of the starts, the task's first, that have no rollout here."""
     warnings: tuple[MotionWarning, ...] = ()
@@ -127,7 +110,7 @@ class Nominal:
 
     @property
     def imitation(self) -> Imitation:
-        """What was learned from the demonstrations."""
+        """The imitation of the demonstrations."""
         return self.learned.imitation
 
     @property
@@ -152,12 +135,12 @@ class Nominal:
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
-        """Of the start of each rollout, among all of the scenario's, the task's first."""
+        """Number of each rollout's start among all of the scenario's, the task's first."""
         total = len(self.strands) + len(self.left_out)
         return tuple(number for number in range(total) if number not in self.left_out)
 
     def rollout(self, number: int) -> int | None:
-        """Which rollout begins at the start of this number; None if it has none."""
+        """Index of the rollout that begins at the start of this number; None if it has none."""
         return self.numbers.index(number) if number in self.numbers else None
 
     def only(self, rollouts: Sequence[int] | Indices, warnings: Sequence[MotionWarning] = ()) -> Nominal:
@@ -165,10 +148,6 @@ class Nominal:
         kept = {self.numbers[k] for k in rollouts}
         left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
         return Nominal(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(warnings))
-
-    def moves_like(self, other: Nominal) -> bool:
-        """Whether both have the same rollouts."""
-        return self.learned is other.learned and self.strands == other.strands
 
     def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""
@@ -190,7 +169,7 @@ class Nominal:
 
     @cached_property
     def rays(self) -> Rays:
-        """In base space."""
+        """Rays of the rollouts in base space."""
         return Rays(np.stack([strand.image for strand in self.strands]), self.system.base)
 
     @cached_property

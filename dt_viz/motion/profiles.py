@@ -18,7 +18,7 @@ from dt_viz.metrics import (
 from dt_viz.obstacles.union import Union
 
 NUM_SAMPLES = 120
-"""At even distances along a path, start and goal included."""
+"""Number of samples at even distances along a path, start and goal included."""
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,11 @@ from dt_viz.scenario.scenario import Scenario
 DISTANCES = (0.06, 0.03, 0.015)
 """Metres by which the hand is pushed: less where there is no room for more."""
 PUSH_SECONDS = 0.3
-"""That a push takes, if the joints can be as fast."""
+"""Duration of a push, if the joints can be as fast."""
 NUM_PUSH_SAMPLES, NUM_SAMPLES = 12, 150
-"""Of the push and of the motion after it."""
+"""Samples of the push and of the motion after it."""
 NUM_DIRECTIONS = 4
-"""That are tried at each distance."""
+"""Directions that are tried at each distance."""
 TABLE_ROOM = 0.03
 """Metres above the table that a push leaves to the hand, where the motions themselves leave as much."""
 LOWER = 5e-3
@@ -36,11 +36,11 @@ LOWER = 5e-3
 
 @dataclass(frozen=True)
 class Pushed:
-    """What the arm does after a push: it is moved aside, and goes on to the goal."""
+    """Motion of the arm after a push: aside, and on to the goal."""
 
     scenario: Scenario
     motion: ArmMotion
-    """From where the arm was; the joints without the whole arm's avoidance are its `without`."""
+    """Joints from where the arm was; its `without` are those without the whole arm's avoidance."""
     path: Array
     """(T, 3) the end effector at the times of the motion, metres."""
     begins: int
@@ -123,7 +123,7 @@ def _motion(
 
 
 class Room(NamedTuple):
-    """What a motion has, metres; below 0 there is too little."""
+    """Room that a motion has, metres; below 0 there is too little."""
 
     table: float
     """Height above the table."""

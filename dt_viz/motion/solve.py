@@ -1,89 +1,18 @@
-"""The stack that a scenario asks for, built for its motion, and the exact rollouts of the whole stack."""
+"""A scenario's motion, at a precision: the end effector's stack, and on top of it how the whole arm avoids."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dt_viz.arm.whole_arm import ArmSolution, Lift
-from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism
-from dt_viz.flows.fields import Array, Indices
-from dt_viz.flows.rollouts import Bundle, Rays, refined
-from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.flows.fields import Array
+from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
-from dt_viz.obstacles.shapes import Point
-from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.transforms.base import Built, MotionBelow, Transform
-from dt_viz.warning import MotionWarning
-
-MAX_ATTEMPTS = 4
-"""At a duration that clears the samples that refinement finds, too."""
-
-
-@dataclass(frozen=True)
-class Precision:
-    """How exactly a motion is worked out, all in metres."""
-
-    tolerance: float
-    """Of a step of the behaviours' flows."""
-    spacing: float
-    """Largest distance between neighbouring samples."""
-    ends: float
-    """By which a rollout may miss its start and goal before the motion below is worked out again between others."""
-
-
-LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
-"""Nothing of this is seen at the size of a screen."""
-FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
-
-
-@dataclass(frozen=True)
-class Applied:
-    """A layer of a stack as it was made."""
-
-    place: int
-    """Place of the layer in the whole stack, in which some may be off."""
-    name: str
-    transform: Transform
-    made: Built
-    satisfied: bool
-    """Whether it finds in the motion what it was made for."""
-
-    @property
-    def may_improve(self) -> bool:
-        """Whether it is of use to try again."""
-        return not (self.satisfied or self.made.hopeless)
-
-
-@dataclass(frozen=True)
-class Solution:
-    """The stack that a scenario asks for, and its rollouts."""
-
-    transform: Diffeomorphism
-    rays: Rays
-    bundle: Bundle
-    built: tuple[Applied, ...]
-    """The layers that are on, from the inside out."""
-
-    @property
-    def system(self) -> DiffeomorphicSystem:
-        """The dynamical system whose motions these are."""
-        return DiffeomorphicSystem(self.transform, self.rays.base)
-
-    @property
-    def warnings(self) -> tuple[MotionWarning, ...]:
-        """The warnings of the transforms."""
-        return tuple(warning for applied in self.built for warning in applied.made.warnings)
-
-    def at(self, place: int) -> Applied | None:
-        """What was made of the layer at this place in the whole stack; None where that is off."""
-        return next((applied for applied in self.built if applied.place == place), None)
-
-    def positions_at(self, index: Indices, fraction: Array) -> Array:
-        """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
-        return self.transform.inverse(self.rays.at(index, fraction))
+from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
+from dt_viz.motion.warp import warped_stack
+from dt_viz.scenario.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -97,11 +26,11 @@ class Solved:
     below: Nominal
     """The same, warped as far as the stack is that is built on it."""
     stack: Solution
-    """Of the end effector, before the whole arm avoids anything."""
-    arm: ArmSolution | None
+    """Stack of the end effector, before the whole arm avoids anything."""
+    arm: ArmSolution | None = None
     """None where only the end effector avoids."""
-    lifted: Lift | None
-    """The joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
+    lifted: Lift | None = None
+    """Joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
 
     @property
     def ends(self) -> Array:
@@ -111,110 +40,54 @@ class Solved:
         return np.concatenate([self.nominal.starts, [goal + self.scenario.warp * moved]])
 
 
-def cut_off(nominal: Nominal, solution: Solution, level: int) -> DiffeomorphicSystem:
-    """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
-    stacked = [applied.made.transform for applied in solution.built[:level]]
-    return DiffeomorphicSystem(Chain([nominal.system.transform, *stacked]), solution.rays.base)
-
-
-def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
-    """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
-    levels = [positions]
-    for transform in transforms:
-        levels.append(transform.inverse(levels[-1]))
-    return np.stack(levels, axis=1)
-
-
-def solve(nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision: Precision) -> Solution:
-    """Build the transforms for the motion below them, and the exact rollouts of the whole stack.
-
-    A transform is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
-    transforms move change the motion a little; so look whether the transforms still fit, and mend them if not. Where
-    there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
+def solve(
+    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Lift | None = None
+) -> Solved:
+    """The motion of a scenario, every flow run for its full duration.
 
     Args:
-        nominal: the undisturbed motion.
-        layers: those that act, from the inside out, each with its place in the whole stack; see `Scenario.active`.
+        scenario: whose stack it is; its `warp` is left to `warped`.
+        nominal: the undisturbed motion, from starts that the arm can begin at.
         precision: how exactly.
+        follower: the arm.
+        before: joints to look for those of LIVE from, as shown last; the result differs by less than a milliradian.
+
+    Raises:
+        UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
     """
-    solution = None
-    for keeps_goal in (True, False):
-        rays, bundle = nominal.rays, nominal.bundle
-        ends_below = nominal.ends
-        durations, above = [0.0] * len(layers), (None,) * len(layers)
-        for _ in range(MAX_ATTEMPTS):
-            lowest = MotionBelow(
-                nominal.starts,
-                nominal.goal,
-                bundle.index,
-                bundle.levels[:, 0],
-                tolerance=precision.tolerance,
-                keeps_goal=keeps_goal,
-                num_demonstrated=nominal.num_demonstrated,
-            )
-            built = _build(layers, lowest, durations, above)
-            above = _above([made for _, made in built])
-            durations = [made.duration for _, made in built]
-            outer = [made.transform for _, made in built]
-            goal = built[-1][1].goal if built else nominal.goal
-
-            ends = np.concatenate([nominal.starts, [goal]])
-            below = Chain(outer).forward(ends) if outer else ends
-            if np.abs(below - ends_below).max() > precision.ends:
-                *z0, z_e = nominal.images(below)
-                rays, ends_below = Rays(np.stack(z0), replace(nominal.system.base, goal=z_e)), below
-                positions = nominal.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
-                bundle = replace(bundle, levels=positions[:, None])
-            bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
-            transforms = [nominal.system.transform, *outer]
-            bundle = refined(bundle, lambda i, u, r=rays, s=transforms: climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            solution = Solution(Chain(transforms), rays, bundle, _applied(layers, built, above, bundle))
-            if not any(applied.may_improve for applied in solution.built):
-                return solution
-        assert solution is not None
-        if not any(applied.transform.yields_goal and applied.may_improve for applied in solution.built):
-            break  # the goal has nothing to do with it
-    assert solution is not None
-    return solution
+    scenario = replace(scenario, warp=1.0)
+    stack, avoidance = build_stack(nominal, scenario.active, precision), scenario.arm_avoidance
+    if avoidance is None:
+        return Solved(scenario, nominal, nominal, stack)
+    live = precision is LIVE
+    if stack.built:
+        lifted = follower.behaving(nominal, stack, exact=not live, before=before)
+    else:
+        lifted = follower.undisturbed(nominal)
+    arm = follower.whole_arm.avoiding(lifted, avoidance, precision.spacing, coarse=live)
+    return Solved(scenario, nominal, nominal, stack, arm, lifted)
 
 
-def _build(
-    layers: Sequence[tuple[int, Layer]],
-    motion: MotionBelow,
-    durations: Sequence[float],
-    above: Sequence[Diffeomorphism | None],
-) -> list[tuple[MotionBelow, Built]]:
-    """Each layer's transform, with the motion that it was made for."""
-    built: list[tuple[MotionBelow, Built]] = []
-    targets: list[Point] = []
-    for (_, layer), at_least, outer in zip(layers, durations, above, strict=True):
-        told = {"name": layer.name, "at_least": at_least, "above": outer, "targets": tuple(targets)}
-        motion = replace(motion, **told)
-        made = layer.transform.build(motion)
-        built.append((motion, made))
-        if layer.transform.anchor is not None:
-            targets.append(layer.transform.anchor)
-        if len(built) < len(layers):
-            motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
-    return built
+def warped(
+    full: Solved, below: Nominal, fraction: float, precision: Precision, follower: Follower, before: Lift | None = None
+) -> Solved:
+    """The motion with every flow run for a fraction of its duration: straight to the goal at 0, in full at 1.
 
+    Args:
+        full: the motion at 1, at the same precision.
+        below: its undisturbed motion, warped as far.
+        fraction: s, from 0 to 1.
+        precision: how exactly.
+        follower: the arm.
+        before: as in `solve`.
 
-def _above(built: Sequence[Built]) -> tuple[Diffeomorphism | None, ...]:
-    """For each transform, the chain of those above it."""
-    transforms = [[made.transform for made in built[k + 1 :]] for k in range(len(built))]
-    return tuple(Chain(stacked) if stacked else None for stacked in transforms)
-
-
-def _applied(
-    layers: Sequence[tuple[int, Layer]],
-    built: Sequence[tuple[MotionBelow, Built]],
-    above: Sequence[Diffeomorphism | None],
-    bundle: Bundle,
-) -> tuple[Applied, ...]:
-    """The layers as they were made, and whether they find in the bundle what they were made for."""
-    found = []
-    for (place, layer), (motion, made), outer in zip(layers, built, above, strict=True):
-        at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
-        satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at))
-        found.append(Applied(place, layer.name, layer.transform, made, satisfied))
-    return tuple(found)
+    Raises:
+        UnreachableError: as `solve`.
+    """
+    stack, scenario = warped_stack(below, full.stack, fraction, precision), replace(full.scenario, warp=fraction)
+    avoidance = scenario.arm_avoidance
+    if full.arm is None or avoidance is None:
+        return Solved(scenario, full.nominal, below, stack)
+    lifted = follower.behaving(full.nominal, stack, exact=precision is not LIVE, before=before)
+    arm = follower.whole_arm.warped(full.arm, lifted, avoidance, fraction, precision.spacing)
+    return Solved(scenario, full.nominal, below, stack, arm, lifted)

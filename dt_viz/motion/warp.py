@@ -14,10 +14,10 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import Chain
 from dt_viz.flows.rollouts import Rays, refined
 from dt_viz.motion.nominal import Nominal
-from dt_viz.motion.solve import Precision, Solution, climb
+from dt_viz.motion.stack import Precision, Solution, climb
 
 
-def warped(nominal: Nominal, full: Solution, fraction: float, precision: Precision) -> Solution:
+def warped_stack(nominal: Nominal, full: Solution, fraction: float, precision: Precision) -> Solution:
     """The rollouts of a stack whose flows run for a fraction of their durations.
 
     Args:

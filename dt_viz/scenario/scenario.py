@@ -161,6 +161,16 @@ class Scenario:
         """Number of the obstacle that has handles; None if there is no obstacle."""
         return min(self.view.selected, len(self.obstacles) - 1) if self.obstacles else None
 
+    @property
+    def plain(self) -> Scenario:
+        """The same with the view that a scenario begins with: all that moves, and nothing of how it is looked at."""
+        return replace(self, view=View())
+
+    @property
+    def motion(self) -> Scenario:
+        """What the motions depend on: the same also without the choice of the one that the arm follows."""
+        return replace(self, view=View(), arm_rollout=0, scene="")
+
     def moves_like(self, other: Scenario) -> bool:
         """Whether both give the same motion, however it is looked at."""
         return replace(self, view=other.view) == other

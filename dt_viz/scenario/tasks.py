@@ -15,6 +15,7 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
 from dt_viz.learning.imitation import Imitation
 from dt_viz.metrics import resample_by_arc_length
+from dt_viz.properties import cached_property
 from dt_viz.scenario.slices import Slice
 from dt_viz.shipped import ASSETS
 
@@ -107,13 +108,17 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """A task to choose from. Calling it reads the demonstrations, and raises DemonstrationError if it cannot."""
+    """A task to choose from. Calling it gives the task, and raises DemonstrationError if its file cannot be used."""
 
     title: str
     load: Callable[[], Task]
 
     def __call__(self) -> Task:
-        """Load the task."""
+        """The task, loaded on first use; all threads get the same one."""
+        return self._task
+
+    @cached_property
+    def _task(self) -> Task:
         return self.load()
 
 

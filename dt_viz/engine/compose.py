@@ -1,0 +1,175 @@
+"""What a frame is made of: rollouts, the arm along one of them, profiles, and pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.arm.tracking import UnreachableError
+from dt_viz.engine.frame import Frame, Stage
+from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.fields import Array
+from dt_viz.flows.rollouts import Bundle
+from dt_viz.motion.certificates import Certificates
+from dt_viz.motion.diagnostics import anchor_warnings, motion_warnings, target_warnings
+from dt_viz.motion.following import ArmMotion, Follower, arm_samples, far_starts, unreachable
+from dt_viz.motion.nominal import Nominal
+from dt_viz.motion.profiles import Profiles, body_profile, hand_profile
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import Solution, cut_off
+from dt_viz.obstacles.union import Union
+from dt_viz.pictures.occupancy import occupancy_picture
+from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
+from dt_viz.pictures.slice_fields import arrows_and_colour, streamlines
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import levels
+from dt_viz.scenario.starts import followed
+from dt_viz.warning import MotionWarning
+
+
+def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Frame:
+    """The frame of stage ROLLOUTS."""
+    nominal, stack, arm = solved.nominal, solved.stack, solved.arm
+    if arm is None:
+        index, fraction, positions = stack.bundle.index, stack.bundle.fraction, stack.bundle.positions
+        clearance = float(scenario.obstacle.signed_distance(positions).min())
+    else:
+        index, fraction, positions = arm.index, arm.fraction, follower.robot.end_effector(arm.p)
+        clearance = arm.clearance
+    shown = Bundle(index, fraction, positions[:, None])
+    reached = positions[-1]
+    warnings = motion_warnings(solved, float(np.linalg.norm(reached - nominal.goal)))
+    warnings += anchor_warnings(stack)
+    if scenario.avoids and scenario.warp == 1:
+        warnings += target_warnings(solved, follower.robot)
+    made = [stack.at(place) for place in range(len(scenario.stack))]
+    return Frame(
+        scenario=scenario,
+        task=nominal.task,
+        stage=Stage.ROLLOUTS,
+        ghost=nominal.paths,
+        rollouts=shown.paths,
+        chosen=nominal.rollout(followed(scenario, nominal.num_demonstrated)),
+        times=shown.split(stack.rays.times(index, fraction)),
+        levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
+        level=level_of(scenario, stack),
+        goal=nominal.goal,
+        reached=reached,
+        blocked=(),
+        certificates=Certificates(clearance, found=warnings),
+        learned_steps=_learned_steps(nominal),
+        durations=tuple(applied.made.duration if applied else None for applied in made),
+        chosen_values=tuple(applied.made.chosen if applied else {} for applied in made),
+        arm_duration=arm.duration if arm else None,
+    )
+
+
+def with_arm(frame: Frame, solved: Solved, follower: Follower, before: Array | None = None) -> Frame:
+    """The frame with the arm's motion along the rollout that it follows.
+
+    Args:
+        frame: the rollouts.
+        solved: the motion that they are of.
+        follower: the arm.
+        before: (`NUM_ARM_SAMPLES`, 6) joints to begin from where the arm follows a path of the hand, rad.
+    """
+    nominal = solved.nominal
+    arm, warnings = None, ()
+    try:
+        far = follower.out_of_reach(nominal)
+        if frame.chosen is not None and not far[frame.chosen]:
+            arm, warnings = arm_along(frame, solved, frame.chosen, follower, before)
+        warnings += tuple(far_starts(np.flatnonzero(far), nominal.num_demonstrated))
+    except UnreachableError as error:
+        warnings = (unreachable(error),)
+    return replace(frame, arm=arm, certificates=frame.certificates.warning(*warnings))
+
+
+def arm_along(
+    frame: Frame, solved: Solved, rollout: int, follower: Follower, before: Array | None = None
+) -> tuple[ArmMotion, tuple[MotionWarning, ...]]:
+    """The arm's motion along a rollout, and what is wrong with it; see `with_arm`.
+
+    Raises:
+        UnreachableError: the arm cannot get to where the motions start.
+    """
+    nominal, times = solved.nominal, frame.times[rollout]
+    if solved.arm is not None and solved.lifted is not None:
+        rows = solved.arm.index == rollout
+        q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
+        warnings = follower.warnings(solved.lifted.tracked, rollout)
+    else:
+        bundle = solved.stack.bundle
+        path, fraction = frame.rollouts[rollout], bundle.split(bundle.fraction)[rollout]
+        keep = arm_samples(len(path))
+        joints = follower.along(nominal, path[keep], before)
+        q, times, fraction = joints.q, times[keep], fraction[keep]
+        warnings = follower.warnings(joints, rollout)
+    without = follower.undisturbed_along(nominal, rollout).at(np.zeros(len(fraction), int), fraction)
+    return ArmMotion(within_velocity_limits(times, q, follower.robot.velocity_limits), q, without), warnings
+
+
+def profiles(frame: Frame, solved: Solved, chosen: int, follower: Follower) -> Profiles:
+    """Profiles of a rollout, with and without behaviours."""
+    nominal = solved.nominal
+    obstacle, arm, task = frame.scenario.obstacle, solved.arm, nominal.task
+    path, undisturbed = frame.rollouts[chosen], nominal.paths[chosen]
+    of_mean, system = chosen >= nominal.num_demonstrated, solved.stack.system
+    demonstration = task.mean_path if of_mean else task.paths[chosen]
+    if arm is None:
+        return Profiles(
+            hand_profile(path, demonstration, system, obstacle),
+            hand_profile(undisturbed, demonstration, nominal.system, obstacle),
+            of_mean=of_mean,
+        )
+    p, fraction = arm.p[arm.index == chosen], nominal.strands[chosen].fraction
+    below = follower.robot.end_effector(arm.transform.forward(p))
+    q = follower.undisturbed_along(nominal, chosen).at(np.zeros(len(fraction), int), fraction)
+    clearance = follower.whole_arm.clearance
+    return Profiles(
+        body_profile(path, demonstration, system.lyapunov(below), clearance(p, obstacle)),
+        body_profile(undisturbed, demonstration, nominal.system.lyapunov(undisturbed), clearance(q, obstacle)),
+        of_body=True,
+        of_mean=of_mean,
+    )
+
+
+def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, coarse: bool) -> Pictures:
+    """The pictures that the view shows, on its slice and of its level.
+
+    Args:
+        scenario: whose view it is.
+        solved: the motion.
+        book: makes the pictures of ψ, as far as the motion is warped.
+        coarse: whether they are to follow a drag.
+    """
+    nominal, stack, view = solved.below, solved.stack, scenario.view
+    area = nominal.task.slice.posed(view.slice)
+    level = level_of(scenario, stack)
+    built = stack.built[:level]
+    system = stack.system if level is None else cut_off(nominal, stack, level)
+    # no motion comes to where an obstacle is that is avoided below this level
+    clearance = Union(tuple(part for applied in built for part in applied.transform.avoided.parts)).signed_distance
+    field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
+    return Pictures(
+        field=field,
+        streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
+        colour=colour,
+        generator=book.generator(area, view.generator_layer) if view.generator else None,
+        grid=book.grid(area, [applied.made.transform for applied in built], coarse=coarse) if view.grid else None,
+        base=book.base(stack.rays) if view.base else None,
+        occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
+    )
+
+
+def _learned_steps(nominal: Nominal) -> tuple[int, ...]:
+    flows = in_frame(nominal.system.transform)
+    return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
+
+
+def level_of(scenario: Scenario, stack: Solution) -> int | None:
+    """Index of the level that the view names; None if that is not in the stack."""
+    names = levels(scenario)[: 1 + len(stack.built)]
+    return names.index(scenario.view.level) if scenario.view.level in names else None

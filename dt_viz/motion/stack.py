@@ -1,0 +1,194 @@
+"""The stack of the end effector: its transforms, built for the motion below them, and its exact rollouts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.rollouts import Bundle, Rays, refined
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.motion.nominal import Nominal
+from dt_viz.obstacles.shapes import Point
+from dt_viz.scenario.scenario import Layer
+from dt_viz.transforms.base import Built, MotionBelow, Transform
+from dt_viz.warning import MotionWarning
+
+MAX_ATTEMPTS = 4
+"""Attempts at a flow time that also clears the samples that refinement adds."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How exactly a motion is worked out, all in metres."""
+
+    tolerance: float
+    """Tolerance of a step of the transforms' flows."""
+    spacing: float
+    """Largest distance between neighbouring samples."""
+    ends: float
+    """Distance by which a rollout may miss its start and goal before the motion below is made anew."""
+
+
+LIVE = Precision(tolerance=2e-5, spacing=0.012, ends=3e-4)
+"""Nothing of this is seen at the size of a screen."""
+FINE = Precision(tolerance=2e-9, spacing=0.005, ends=1e-7)
+
+
+@dataclass(frozen=True)
+class Applied:
+    """A layer of a stack as it was made."""
+
+    place: int
+    """Place of the layer in the whole stack, in which some may be off."""
+    name: str
+    transform: Transform
+    made: Built
+    satisfied: bool
+    """Whether it finds in the motion what it was made for."""
+
+    @property
+    def may_improve(self) -> bool:
+        """Whether it is of use to try again."""
+        return not (self.satisfied or self.made.hopeless)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A stack of the end effector, and its rollouts."""
+
+    transform: Diffeomorphism
+    rays: Rays
+    bundle: Bundle
+    built: tuple[Applied, ...]
+    """The layers that are on, from the inside out."""
+
+    @property
+    def system(self) -> DiffeomorphicSystem:
+        """The dynamical system whose motions these are."""
+        return DiffeomorphicSystem(self.transform, self.rays.base)
+
+    @property
+    def warnings(self) -> tuple[MotionWarning, ...]:
+        """The warnings of the transforms."""
+        return tuple(warning for applied in self.built for warning in applied.made.warnings)
+
+    def at(self, place: int) -> Applied | None:
+        """The layer at this place in the whole stack, as it was made; None where it is off."""
+        return next((applied for applied in self.built if applied.place == place), None)
+
+    def positions_at(self, index: Indices, fraction: Array) -> Array:
+        """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
+        return self.transform.inverse(self.rays.at(index, fraction))
+
+
+def cut_off(nominal: Nominal, solution: Solution, level: int) -> DiffeomorphicSystem:
+    """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
+    stacked = [applied.made.transform for applied in solution.built[:level]]
+    return DiffeomorphicSystem(Chain([nominal.system.transform, *stacked]), solution.rays.base)
+
+
+def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
+    """Levels (N, 1 + len(transforms), 3) above `positions` (N, 3) of a stack given from the inside out."""
+    levels = [positions]
+    for transform in transforms:
+        levels.append(transform.inverse(levels[-1]))
+    return np.stack(levels, axis=1)
+
+
+def build_stack(nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision: Precision) -> Solution:
+    """Build the transforms for the motion below them, and the exact rollouts of the whole stack.
+
+    A transform is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
+    transforms move change the motion a little; so look whether the transforms still fit, and mend them if not. Where
+    there is no way to the goal beside an obstacle that nearly touches it, the motions may end beside the goal.
+
+    Args:
+        nominal: the undisturbed motion.
+        layers: those that act, from the inside out, each with its place in the whole stack; see `Scenario.active`.
+        precision: how exactly.
+    """
+    solution = None
+    for keeps_goal in (True, False):
+        rays, bundle = nominal.rays, nominal.bundle
+        ends_below = nominal.ends
+        durations, above = [0.0] * len(layers), (None,) * len(layers)
+        for _ in range(MAX_ATTEMPTS):
+            lowest = MotionBelow(
+                nominal.starts,
+                nominal.goal,
+                bundle.index,
+                bundle.levels[:, 0],
+                tolerance=precision.tolerance,
+                keeps_goal=keeps_goal,
+                num_demonstrated=nominal.num_demonstrated,
+            )
+            built = _build(layers, lowest, durations, above)
+            above = _above([made for _, made in built])
+            durations = [made.duration for _, made in built]
+            outer = [made.transform for _, made in built]
+            goal = built[-1][1].goal if built else nominal.goal
+
+            ends = np.concatenate([nominal.starts, [goal]])
+            below = Chain(outer).forward(ends) if outer else ends
+            if np.abs(below - ends_below).max() > precision.ends:
+                *z0, z_e = nominal.images(below)
+                rays, ends_below = Rays(np.stack(z0), replace(nominal.system.base, goal=z_e)), below
+                positions = nominal.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
+                bundle = replace(bundle, levels=positions[:, None])
+            bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
+            transforms = [nominal.system.transform, *outer]
+            bundle = refined(bundle, lambda i, u, r=rays, s=transforms: climb(r.at(i, u), s)[:, 1:], precision.spacing)
+            solution = Solution(Chain(transforms), rays, bundle, _applied(layers, built, above, bundle))
+            if not any(applied.may_improve for applied in solution.built):
+                return solution
+        assert solution is not None
+        if not any(applied.transform.yields_goal and applied.may_improve for applied in solution.built):
+            break  # the goal has nothing to do with it
+    assert solution is not None
+    return solution
+
+
+def _build(
+    layers: Sequence[tuple[int, Layer]],
+    motion: MotionBelow,
+    durations: Sequence[float],
+    above: Sequence[Diffeomorphism | None],
+) -> list[tuple[MotionBelow, Built]]:
+    """Each layer's transform, with the motion that it was made for."""
+    built: list[tuple[MotionBelow, Built]] = []
+    targets: list[Point] = []
+    for (_, layer), at_least, outer in zip(layers, durations, above, strict=True):
+        told = {"name": layer.name, "at_least": at_least, "above": outer, "targets": tuple(targets)}
+        motion = replace(motion, **told)
+        made = layer.transform.build(motion)
+        built.append((motion, made))
+        if layer.transform.anchor is not None:
+            targets.append(layer.transform.anchor)
+        if len(built) < len(layers):
+            motion = replace(motion, goal=made.goal, positions=made.transform.inverse(motion.positions))
+    return built
+
+
+def _above(built: Sequence[Built]) -> tuple[Diffeomorphism | None, ...]:
+    """For each transform, the chain of those above it."""
+    transforms = [[made.transform for made in built[k + 1 :]] for k in range(len(built))]
+    return tuple(Chain(stacked) if stacked else None for stacked in transforms)
+
+
+def _applied(
+    layers: Sequence[tuple[int, Layer]],
+    built: Sequence[tuple[MotionBelow, Built]],
+    above: Sequence[Diffeomorphism | None],
+    bundle: Bundle,
+) -> tuple[Applied, ...]:
+    """The layers as they were made, and whether they find in the bundle what they were made for."""
+    found = []
+    for (place, layer), (motion, made), outer in zip(layers, built, above, strict=True):
+        at = {"positions": bundle.levels[:, len(found) + 1], "top": bundle.positions, "above": outer}
+        satisfied = layer.transform.satisfied(replace(motion, index=bundle.index, **at))
+        found.append(Applied(place, layer.name, layer.transform, made, satisfied))
+    return tuple(found)

@@ -1,0 +1,78 @@
+"""Results that are kept, by what they were computed from."""
+
+import threading
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scenes import changing
+
+from dt_viz.engine.session import Session
+from dt_viz.memo import Memo
+
+
+def test_a_result_is_computed_once_and_kinds_do_not_mix():
+    memo, made = Memo(), []
+    for kind, key in (("a", 1), ("a", 1), ("b", 1), ("a", 2), ("b", 1)):
+        assert memo(kind, key, lambda k=(kind, key): made.append(k) or k) == (kind, key)
+    assert made == [("a", 1), ("b", 1), ("a", 2)]
+
+
+def test_the_results_that_were_used_last_stay():
+    memo, made = Memo(), []
+    for key in (1, 2, 1, 3, 1, 2):
+        memo("a", key, lambda key=key: made.append(key), newest=2)
+    assert made == [1, 2, 3, 2]
+    assert memo.count("a") == 2
+
+
+def test_what_fails_is_tried_again_and_leaves_what_is_kept():
+    memo = Memo()
+    memo("a", 1, lambda: "kept", newest=1)
+
+    def fail():
+        raise ValueError
+
+    with pytest.raises(ValueError):
+        memo("a", 2, fail, newest=1)
+    assert memo("a", 2, lambda: "made", newest=2) == "made"
+    assert memo("a", 1, fail, newest=2) == "kept"
+
+
+class Blank:
+    """A display that shows nothing."""
+
+    def __getattr__(self, name):
+        return lambda *_, **__: None
+
+
+def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatch):
+    """Its worker, whoever edits, pushes, holds or asks for the task."""
+    users, compute = set(), Memo.__call__
+
+    def recorded(self, *args, **kwargs):
+        users.add(threading.get_ident())
+        return compute(self, *args, **kwargs)
+
+    monkeypatch.setattr(Memo, "__call__", recorded)
+    session = Session(new_engine(), initial, "draw_s", cast(Any, Blank()))
+    try:
+        assert session.wait_idle(60)
+        q = np.zeros(6)
+
+        def edit(number):
+            session.edit("temperature", **changing(session.scenario, temperature=3.0 + number))
+            session.choose_task(("draw_s", "lift_box")[number])
+            assert session.task.name in {"draw_s", "lift_box"}
+            session.push(q, lambda _: None)
+            session.hold(q, np.array([0.0, -0.5, 0.4]), lambda _: None, last=True)
+
+        threads = [threading.Thread(target=edit, args=(number,)) for number in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+        assert session.wait_idle(60)
+    finally:
+        session.close()
+    assert len(users) == 1 and threading.get_ident() not in users
