@@ -1,5 +1,7 @@
 """One list of diffeomorphisms, one set of checks; a new transform joins by one line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -131,11 +133,21 @@ def test_at_another_tolerance_it_is_the_same_map_nearly(case):
 
 
 def test_a_flow_takes_as_many_steps_as_its_tolerance_asks_for_unless_they_define_it():
-    chosen = Flow(field(2), 1.0, 40, tolerance=1e-8)
-    assert chosen.at_tolerance(1e-8) == chosen
-    assert chosen.at_tolerance(16e-8).steps == 20
-    assert chosen.at_tolerance(1e3).steps == 1
-    assert Flow(field(2), 1.0, 40).at_tolerance(1e-4).steps == 40
+    fixed, y = Flow(field(2), 1.0, 40), points(Flow(field(2)), 5)
+    chosen = replace(fixed, tolerance=1e-8)
+    for tolerance, steps in ((1e-8, 40), (16e-8, 20), (1e3, 1)):
+        np.testing.assert_array_equal(chosen.at_tolerance(tolerance).forward(y), replace(fixed, steps=steps).forward(y))
+    assert fixed.at_tolerance(1e-4) is fixed
+
+
+def test_a_controllers_jacobian_at_one_point_is_that_of_the_flow(case):
+    transform, _ = case
+    controlled = transform.at_tolerance(1e-7)
+    for y in points(transform, 5):
+        z, J = transform.jacobian(y)
+        found, D = controlled.jacobian(y)
+        np.testing.assert_allclose(found, z, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(D, J, rtol=0, atol=2e-3 * np.abs(J).max())
 
 
 def test_tangents_are_jacobian_products(case):

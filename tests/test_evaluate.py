@@ -224,18 +224,15 @@ def test_latency_counts_every_edit_and_reports_both_stages(lasa, tmp_path, sessi
 # --- velocity ---
 
 
-def test_velocity_measures_every_stack_and_the_error_of_a_controllers_tolerance(lasa, tmp_path, capsys):
+def test_velocity_measures_every_stack_and_its_error(lasa, tmp_path, capsys):
     out = tmp_path / "velocity.json"
     assert main(["velocity", "--task", "Hook", "--lasa", str(lasa), "--points", "9", "--out", str(out)]) == 0
     figures, printed = json.loads(out.read_text()), capsys.readouterr().out
     assert figures["settings"]["points"] == 9
     for name, stack in figures["stacks"].items():
-        assert number_after(printed, f"\n{name}  ") == pytest.approx(stack["rollouts"]["median_ms"], abs=0.006)
-        for measured in stack.values():
-            assert 0 < measured["median_ms"] <= measured["p95_ms"]
-        assert stack["controller"]["error"] < 1e-2
-    assert figures["stacks"]["imitation"]["controller"]["error"] == 0  # its steps define it
-    assert figures["stacks"]["one sphere"]["controller"]["error"] > 0
+        assert number_after(printed, f"\n{name}  ") == pytest.approx(stack["median_ms"], abs=0.006)
+        assert 0 < stack["median_ms"] <= stack["p95_ms"]
+        assert 0 < stack["error_median"] <= stack["error_max"] < 5e-3
 
 
 # --- avoidance ---

@@ -7,15 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from dt_viz.flows.fields import GaussianGrid, GridRBF
-from dt_viz.flows.integrators import (
-    MOST_STEPS,
-    TOGETHER,
-    euler,
-    implicit_euler,
-    integrate,
-    integrate_adaptive,
-    rk4,
-)
+from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4
 from dt_viz.obstacles.shapes import Sphere
 
 seeds = st.integers(0, 2**32 - 1)
@@ -78,19 +70,6 @@ def test_implicit_euler_inverts_euler_to_rounding(seed, dim, h):
     np.testing.assert_allclose(back, s, rtol=0, atol=1e-13)
     there, _ = euler(field, implicit_euler(field, s, None, h)[0], None, -h)
     np.testing.assert_allclose(there, s, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("num", [1, 5, TOGETHER // 2, TOGETHER])
-def test_implicit_euler_finds_several_steps_at_once_as_it_does_one_by_one(num):
-    rng = np.random.default_rng(num)
-    field, s = smooth_field(rng, 3, 0.3), rng.uniform(-1, 1, (num, 3))
-    U = rng.normal(size=(num, 3, 2))
-    steps = MOST_STEPS + 3
-    end, V = implicit_euler(field, s, U, 0.1, steps)
-    for _ in range(steps):
-        s, U = implicit_euler(field, s, U, 0.1)
-    np.testing.assert_allclose(end, s, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(V, U, rtol=0, atol=1e-11)
 
 
 @given(seeds, st.sampled_from(STEPS), st.floats(-0.15, 0.15))

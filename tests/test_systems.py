@@ -215,6 +215,14 @@ def test_the_velocity_approaches_the_exact_one_with_the_tolerance():
     assert errors[0] > 10 * errors[1] > 100 * errors[2]
 
 
+def test_a_controllers_velocity_at_one_point_is_exact_to_a_thousandth():
+    system, y = around_a_sphere(1e-10)
+    exact, controlled = system.velocity(y), system.at_tolerance(1e-6)
+    velocity = np.stack([controlled.velocity(point) for point in y])
+    speed = np.linalg.norm(exact, axis=1, keepdims=True)
+    assert 0 < np.abs((velocity - exact) / speed).max() < 1e-3
+
+
 def test_the_lyapunov_value_falls_strictly_and_the_goal_is_reached(system):
     y0 = np.random.default_rng(6).uniform(-0.7, 0.7, (6, 2))
     motion = system.rollout(y0, np.append(np.linspace(0, 5, 50), 100.0))

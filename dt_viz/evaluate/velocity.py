@@ -16,7 +16,6 @@ import platform
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.library import TOLERANCE
 from dt_viz.motion.nominal import Learned
-from dt_viz.motion.solve import FINE, solve
+from dt_viz.motion.stack import FINE, build_stack
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Point, Sphere, as_point
 from dt_viz.obstacles.solids import Solid
@@ -59,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
     figures: dict[str, dict[str, float]] = {}
     for name, stack in _stacks(task).items():
         layers = tuple(Layer(transform, name=f"{k}") for k, transform in enumerate(stack))
-        solution = solve(learned.demonstrated, Scenario(task.name, layers).active, FINE)
+        solution = build_stack(learned.demonstrated, Scenario(task.name, layers).active, FINE)
         samples = solution.bundle.positions
         points = samples[np.linspace(0, len(samples) - 1, options.points).round().astype(int)]
         figures[name] = _measured(solution.system, points)

@@ -1,8 +1,8 @@
 """Paths of single points along a flow, found as a whole: implicit Runge–Kutta methods solved by Newton's method.
 
-The m stages Y_i = s + h·Σ_j A_ij·V(Y_j) of a method are one system of equations for the whole path. A field takes hardly
-longer for a dozen points than for one, so a few iterations on it are quicker than the steps of an explicit method one
-after the other. The same linear system gives the derivative of the path's end by s.
+The m stages Y_i = s + h·Σ_j A_ij·V(Y_j) of a method are one system of equations for the whole path. A field takes
+hardly longer for a dozen points than for one, so a few iterations on that system are quicker than the steps of an
+explicit method one after the other. The same linear system gives the derivative of the path's end by s.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ FIRST = 1e3
 """Value, in tolerances, that takes the place of the correction before the first one."""
 UNRESOLVED = 100.0
 """Upper bound, in tolerances, of h·‖V‖·c², c the last Legendre coefficients of V along the path relative to ‖V‖. The
-method's order 2m − 1 makes its error about as small as c²; in stacks it is below a hundredth of h·‖V‖·c²."""
+method's order 2m − 1 makes its error about as small as c², in stacks less than a hundredth of h·‖V‖·c². Where V is of
+limited smoothness, as at the border of a bias point's region, that holds for tolerances down to 1e-7 m only."""
 HALVINGS = 10
 """Number of times that a path is halved before its field counts as too steep."""
 
@@ -45,7 +46,7 @@ class _Path(NamedTuple):
 def collocated(
     field: VectorField, s: Array, duration: float, tolerance: float, halvings: int = HALVINGS
 ) -> Mapped | None:
-    """Carry the point `s` (d,) along the flow of `field` with the Radau IIA method, in one step if that is exact enough.
+    """Carry the point `s` (d,) along the flow of `field` by the Radau IIA method, in one step if that is exact enough.
 
     Args:
         field: V.
