@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
-    from dt_viz.library import Arm, JointPath, Motion, Path, fit, load_jaco
+    from dt_viz.library import Arm, BlockedError, JointPath, Motion, Path, fit, load_jaco
     from dt_viz.motion.certificates import Certificates
     from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
     from dt_viz.transforms.avoidance import Avoidance
@@ -29,6 +29,7 @@ __all__ = [
     "Arm",
     "Avoidance",
     "BiasPoint",
+    "BlockedError",
     "Box",
     "Certificates",
     "Cylinder",
@@ -48,7 +49,7 @@ __all__ = [
 _MODULES = {
     "flows.diffeomorphisms": ("Integration",),
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
-    "library": ("Arm", "JointPath", "Motion", "Path", "fit", "load_jaco"),
+    "library": ("Arm", "BlockedError", "JointPath", "Motion", "Path", "fit", "load_jaco"),
     "motion.certificates": ("Certificates",),
     "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
     "transforms.avoidance": ("Avoidance",),

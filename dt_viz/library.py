@@ -27,8 +27,9 @@ from dt_viz.learning.imitation import ImitationSettings, Objective
 from dt_viz.learning.imitation import fit as fit_imitation
 from dt_viz.motion.certificates import Certificates, Shown, certified
 from dt_viz.motion.diagnostics import motion_warnings
+from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned
-from dt_viz.motion.solve import Solved
+from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, Solution, build_stack
 from dt_viz.properties import cached_property
 from dt_viz.scenario.scenario import Layer, Scenario
@@ -59,7 +60,11 @@ class JointPath:
     times: Array
     """(T,) seconds, later than the path's where the joints' velocity limits ask for it."""
     error: Array
-    """(T,) distances of the hand from the path, metres."""
+    """(T,) distances of the hand from the path, metres: what it misses, or gives way by."""
+
+
+class BlockedError(Exception):
+    """The whole arm finds no motion around an obstacle."""
 
 
 class Motion:
@@ -84,9 +89,10 @@ class Motion:
     def stack(self, *transforms: Transform) -> Motion:
         """The motion with more transforms on it, the last one outermost.
 
-        A motion in the plane stays there: what is stacked acts along the plane only.
+        A motion in the plane stays there: what is stacked acts along the plane only. What the joints are to avoid
+        (`Avoidance(space="cspace")`) changes the motions of the arm (`Arm.rollouts`), not those of the hand.
         """
-        scenario = Scenario("", self._layers)
+        scenario = self._scenario
         for transform in transforms:
             flat = transform.in_plane(PLANE) if self.dimension == 2 else transform
             names = {layer.name for layer in scenario.stack}
@@ -121,7 +127,7 @@ class Motion:
     def certificates(self) -> Certificates:
         """Checks of the paths from the demonstrations' starts, and warnings."""
         nominal, solution = self._learned.demonstrated, self._solution
-        scenario = Scenario("", self._layers)
+        scenario = self._scenario
         solved = Solved(scenario, nominal, nominal, solution, None, None)
         bundle, path = solution.bundle, solution.bundle.positions
         missed = float(np.linalg.norm(path[-1] - nominal.goal))
@@ -133,7 +139,11 @@ class Motion:
 
     @cached_property
     def _solution(self) -> Solution:
-        return build_stack(self._learned.demonstrated, Scenario("", self._layers).active, FINE)
+        return build_stack(self._learned.demonstrated, self._scenario.active, FINE)
+
+    @property
+    def _scenario(self) -> Scenario:
+        return Scenario("", self._layers)
 
     @cached_property
     def _controlled(self) -> DiffeomorphicSystem:
@@ -144,6 +154,8 @@ class Motion:
         return np.pad(points, ((0, 0), (0, 3 - self.dimension)))
 
 
+NUM_COORDINATES = 3
+"""Coordinates of motions in space."""
 PLANE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """The plane of motions with two coordinates."""
 
@@ -154,6 +166,7 @@ class Arm:
     def __init__(self, robot: Robot) -> None:
         """Wrap a robot; see `load_jaco`."""
         self.robot = robot
+        self._follower = Follower(robot)
 
     def follow(self, path: Path) -> JointPath:
         """The joints along a path of the hand.
@@ -163,11 +176,51 @@ class Arm:
 
         Raises:
             UnreachableError: the arm cannot get to where the path starts.
+            ValueError: the path lies in a plane that has no place in space.
         """
+        if path.positions.shape[1] != NUM_COORDINATES:
+            raise ValueError(f"the arm follows paths in space, with 3 coordinates, not {path.positions.shape[1]}")
         start = inverse_kinematics(self.robot, path.positions[0])
         tracked = track(self.robot, path.positions, start)
         times = within_velocity_limits(path.times, tracked.q, self.robot.velocity_limits)
         return JointPath(tracked.q, times, tracked.error)
+
+    def rollouts(self, motion: Motion, *, spacing: float = 0.005) -> tuple[JointPath, ...]:
+        """Motions of the whole arm from the demonstrations' starts, around what the motion tells it to avoid.
+
+        Args:
+            motion: in space, in the frame of the arm's base.
+            spacing: largest distance between neighbouring samples of the hand, metres.
+
+        Raises:
+            BlockedError: an obstacle leaves no room at a start or at the goal, or no way between them.
+            UnreachableError: the arm cannot get to where the motions start.
+            ValueError: the motion is one in a plane that has no place in space.
+        """
+        if motion.dimension != NUM_COORDINATES:
+            raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {motion.dimension}")
+        scenario, nominal = motion._scenario, motion._learned.demonstrated
+        avoidance = scenario.arm_avoidance
+        if avoidance is None:
+            return tuple(self.follow(path) for path in motion.rollouts(spacing=spacing))
+        blocked = self._follower.obstructions(nominal, avoidance.obstacle)
+        if blocked:
+            raise BlockedError("; ".join(warning.text for warning in blocked))
+        solved = solve(scenario, nominal, replace(FINE, spacing=spacing), self._follower)
+        arm = solved.arm
+        assert arm is not None
+        if not arm.cleared:
+            raise BlockedError("the arm finds no way around the obstacle")
+        due = solved.stack.rays.times(arm.index, arm.fraction)
+        away = self.robot.end_effector(arm.p) - solved.stack.positions_at(arm.index, arm.fraction)
+        rows = [arm.index == rollout for rollout in range(len(nominal.starts))]
+        limits = self.robot.velocity_limits
+        return tuple(
+            JointPath(
+                arm.p[row], within_velocity_limits(due[row], arm.p[row], limits), np.linalg.norm(away[row], axis=1)
+            )
+            for row in rows
+        )
 
 
 def load_jaco() -> Arm:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import dt_viz as dt
+from dt_viz.arm.collision import load_collision_model
 from dt_viz.examples import controller, plot
 from dt_viz.examples.viser_scene import Scene
 from dt_viz.library import Motion
@@ -56,6 +57,34 @@ def test_the_example_leads_motions_around_a_ball_and_the_arm_follows(push):
     assert known.warnings == ()
     joints = dt.load_jaco().follow(paths[0])
     assert joints.q.shape == (len(paths[0].times), 6) and joints.error.max() < 1e-3
+
+
+def test_the_whole_arm_avoids_what_the_joints_are_told_to(push):
+    arm, ball = dt.load_jaco(), dt.Sphere((0.0, -0.50, 0.22), diameter=0.12)
+    around = push.stack(dt.Avoidance(ball, space="cspace"))
+    for path, before in zip(around.rollouts(), push.rollouts(), strict=True):
+        np.testing.assert_array_equal(path.positions, before.positions)  # the hand's own motion is not changed
+    model, goal = load_collision_model(), push.goal
+    follows = [arm.follow(path) for path in push.rollouts()]
+    assert min(model.nearest_to_obstacle(joints.q, ball).distance for joints in follows) < 0
+    motions = arm.rollouts(around)
+    assert min(model.nearest_to_obstacle(joints.q, ball).distance for joints in motions) > 0
+    for joints, path in zip(motions, push.rollouts(), strict=True):
+        hand = arm.robot.end_effector(joints.q)
+        np.testing.assert_allclose(hand[[0, -1]], [path.positions[0], goal], atol=1e-3)
+        assert (np.diff(joints.times) > 0).all() and joints.error.max() > 0.01
+        speed = np.abs(np.diff(joints.q, axis=0)) / np.diff(joints.times)[:, None]
+        assert (speed <= arm.robot.velocity_limits * (1 + 1e-9)).all()
+    with pytest.raises(dt.BlockedError, match="goal"):
+        arm.rollouts(push.stack(dt.Avoidance(dt.Sphere(tuple(goal), diameter=0.15), space="cspace")))
+
+
+def test_the_arm_does_not_follow_a_drawing_that_has_no_place_in_space(letter):
+    arm = dt.load_jaco()
+    with pytest.raises(ValueError, match="in space"):
+        arm.rollouts(letter)
+    with pytest.raises(ValueError, match="in space"):
+        arm.follow(letter.rollouts()[0])
 
 
 def test_a_drawing_stays_in_its_plane_around_an_obstacle(letter):
