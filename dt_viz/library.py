@@ -21,7 +21,7 @@ from dt_viz.arm.robot import load_jaco as load_robot
 from dt_viz.arm.tracking import inverse_kinematics, track
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
-from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.flows.systems import CONTROLLER_TOLERANCE, DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
 from dt_viz.learning.imitation import fit as fit_imitation
@@ -36,9 +36,6 @@ from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.base import Transform
-
-TOLERANCE = 1e-6
-"""Largest error of a step of the flows that a velocity is computed with, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +116,10 @@ class Motion:
         return tuple(Path(path[:, : self.dimension], t) for path, t in zip(bundle.paths, times, strict=True))
 
     def velocity(self, y: ArrayLike) -> Array:
-        """ẏ (*B, d), m/s, at the places `y` (*B, d), metres: what a controller follows."""
+        """ẏ (*B, d), m/s, at the places `y` (*B, d), metres: what a controller follows.
+
+        It is exact to about a thousandth of its speed, and quickest for a single place.
+        """
         points = np.asarray(y, float)
         velocity = self._controlled.velocity(self._in_space(points.reshape(-1, self.dimension)))
         return velocity[:, : self.dimension].reshape(points.shape)
@@ -147,7 +147,7 @@ class Motion:
 
     @cached_property
     def _controlled(self) -> DiffeomorphicSystem:
-        return self._solution.system.at_tolerance(TOLERANCE)
+        return self._solution.system.at_tolerance(CONTROLLER_TOLERANCE)
 
     def _in_space(self, points: Array) -> Array:
         """Points (N, 3) of points (N, d)."""

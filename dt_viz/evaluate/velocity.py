@@ -21,9 +21,8 @@ import numpy as np
 
 from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to_write, whole_number, write_json
 from dt_viz.flows.fields import Array
-from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.flows.systems import CONTROLLER_TOLERANCE, DiffeomorphicSystem
 from dt_viz.learning.store import FitStore, default_cache_folder
-from dt_viz.library import TOLERANCE
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.stack import FINE, build_stack
 from dt_viz.obstacles.clouds import Cloud
@@ -63,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
         points = samples[np.linspace(0, len(samples) - 1, options.points).round().astype(int)]
         figures[name] = _measured(solution.system, points)
     environment = {"cores": os.cpu_count(), "python": platform.python_version(), "numpy": np.__version__}
-    settings = {"task": task.name, "points": options.points, "tolerance": TOLERANCE, "fine": FINE.tolerance}
+    settings = {"task": task.name, "points": options.points, "tolerance": CONTROLLER_TOLERANCE, "fine": FINE.tolerance}
     write_json(out, {"stacks": figures, "settings": settings | environment})
     print_table(
         ("velocity at one point", "median ms", "95 % ms", "error, median", "error, max"),
@@ -101,7 +100,7 @@ def _stacks(task: Task) -> Mapping[str, tuple[Transform, ...]]:
 
 def _measured(system: DiffeomorphicSystem, points: Array) -> dict[str, float]:
     """Time a controller's velocities at `points` (N, 3), one after the other, and compare them with exact ones."""
-    exact, controlled = system.velocity(points), system.at_tolerance(TOLERANCE)
+    exact, controlled = system.velocity(points), system.at_tolerance(CONTROLLER_TOLERANCE)
     controlled.velocity(points[0])  # what is computed once for each field is computed here
     velocities, seconds = [], []
     for point in points:

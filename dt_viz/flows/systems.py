@@ -10,6 +10,9 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
 
+CONTROLLER_TOLERANCE = 1e-6
+"""Tolerance (m) of the system that a controller asks for velocities."""
+
 
 @dataclass(frozen=True)
 class Attractor:
