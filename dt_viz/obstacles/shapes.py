@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices, Mask, PlacedField
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import (
@@ -36,6 +37,8 @@ FLATTEST = 0.3
 """Smallest half size, relative to the largest, that the kernel adapts to: a thinner field turns motions sharply."""
 MAX_BALLS, NUM_BALLS = 12, 10
 """Largest number of balls of a cover, and the number for a mesh."""
+MAX_REACH, MIN_TURN = 100.0, 1e-3
+"""Largest distance (m) of an obstacle's end from the origin, and smallest length of its quaternion, in a file."""
 NUM_STEPS = 10
 """Number of Newton steps to a surface."""
 THINNEST = 0.3
@@ -422,6 +425,21 @@ class CloudObstacle(_Triangles):
         """Return its points in the world (K, 3), metres, and whether each is occupied (K,)."""
         points, labels = self._to_world(self.cloud.points), self.cloud.labels
         return points, np.ones(len(points), dtype=bool) if labels is None else labels > 0.5
+
+
+SHAPES = (Sphere, Box, Cylinder, MeshObstacle, CloudObstacle)
+"""All kinds of obstacles."""
+
+
+def check_obstacle(obstacle: Obstacle) -> None:
+    """Raise FormatError unless an obstacle has a place, an orientation, an inside and a size that can be meant."""
+    turn = float(np.linalg.norm(obstacle.wxyz))
+    if not MIN_TURN <= turn <= 1 / MIN_TURN:
+        raise FormatError("obstacle", f"a quaternion of length {turn:g}", "a quaternion of about length 1")
+    reach = float(np.linalg.norm(obstacle.position)) + obstacle.radius
+    if not (obstacle.depth > 0 and reach <= MAX_REACH):
+        found = f"one {obstacle.depth:g} m deep that reaches {reach:g} m from the origin"
+        raise FormatError("obstacle", found, f"one that has an inside, and lies within {MAX_REACH:g} m")
 
 
 @lru_cache(maxsize=256)

@@ -17,7 +17,13 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.triangles import closest_on_triangles, grid_nodes, inside_of_grid, surface_samples
+from dt_viz.obstacles.triangles import (
+    check_triangles,
+    closest_on_triangles,
+    grid_nodes,
+    inside_of_grid,
+    surface_samples,
+)
 from dt_viz.properties import cached_property
 
 NUM_NODES = 64**3
@@ -44,7 +50,11 @@ BLOCK = 2048
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """The solid enclosed by triangles; compared and hashed by its vertices and faces."""
+    """The solid enclosed by triangles; compared and hashed by its vertices and faces.
+
+    Raises:
+        FormatError: as :func:`check_triangles`.
+    """
 
     vertices: Array
     """(V, 3) metres, in the solid's own frame."""
@@ -56,6 +66,7 @@ class Solid:
             array = np.array(getattr(self, name), dtype=kind)
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        check_triangles(self.vertices, self.faces)
 
     @cached_property
     def digest(self) -> bytes:
