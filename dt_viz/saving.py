@@ -21,7 +21,6 @@ from dt_viz.errors import DataError, FormatError, naming, parsing
 from dt_viz.files.checks import check_size, read_bytes
 from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
 from dt_viz.files.values import Codec
-from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
 from dt_viz.obstacles.shapes import SHAPES, Obstacle, check_obstacle
@@ -58,7 +57,7 @@ def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: Im
         DataError: a transform is not registered, or something could not be read again.
         OSError: the file cannot be written.
     """
-    path, arrays = Path(path), dict[str, Array]()
+    path, arrays = Path(path), dict[str, np.ndarray]()
     with naming(MotionError, path):
         plain = _codec().encode(motion, SavedMotion, "motion", arrays)
     text = {TEXT: np.array(json.dumps({"version": FORMAT, **plain}))}
@@ -115,7 +114,7 @@ def _codec() -> Codec:
     return Codec({Transform: registry.KINDS, Obstacle: SHAPES})
 
 
-def _checked(array: Array, name: str) -> Array:
+def _checked(array: np.ndarray, name: str) -> np.ndarray:
     """Return an array of the numbers that are written; smaller ones would grow eightfold when they are used."""
     if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
         raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")

@@ -17,7 +17,6 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array
 
 CLASS = "class"
 """Key of the name of an object's class: no field can be called so."""
@@ -37,7 +36,7 @@ class Codec:
     classes: Mapping[Any, tuple[type, ...]]
     """Dataclasses whose objects may stand where a field is annotated with a base class or a protocol."""
 
-    def encode(self, value: Any, annotation: Any, where: str, arrays: dict[str, Array]) -> Any:  # noqa: ANN401 - JSON
+    def encode(self, value: Any, annotation: Any, where: str, arrays: dict[str, np.ndarray]) -> Any:  # noqa: ANN401 - JSON
         """Return a value as what JSON can hold, and put its arrays into `arrays`.
 
         Raises:
@@ -68,7 +67,7 @@ class Codec:
         }
         return {CLASS: type(value).__name__, **held} if annotation in self.classes else held
 
-    def decode(self, plain: Any, annotation: Any, where: str, arrays: Mapping[str, Array]) -> Any:  # noqa: ANN401 - JSON
+    def decode(self, plain: Any, annotation: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:  # noqa: ANN401 - JSON
         """Return the value that `encode` wrote. Fields that the text lacks have their defaults.
 
         Raises:
@@ -97,7 +96,7 @@ class Codec:
             return _scalar(plain, annotation, where)
         return self._made(dict(_of_type(plain, dict, where, "an object")), annotation, where, arrays)
 
-    def _made(self, held: dict[str, Any], annotation: Any, where: str, arrays: Mapping[str, Array]) -> Any:  # noqa: ANN401
+    def _made(self, held: dict[str, Any], annotation: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:  # noqa: ANN401
         """Return an object made by its constructor, whose checks thus apply."""
         listed = self._listed(annotation, where)
         name = held.pop(CLASS, None) if annotation in self.classes else annotation.__name__
