@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.errors import DataError, FormatError, naming, parsing
-from dt_viz.files.checks import check_size, read_bytes
+from dt_viz.errors import DataError, FormatError, parsing
+from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
 from dt_viz.files.values import Codec
 from dt_viz.learning.demonstrations import Demonstration, check_demonstrations
@@ -58,9 +58,9 @@ def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: Im
         OSError: the file cannot be written.
     """
     path, arrays = Path(path), dict[str, np.ndarray]()
-    with naming(MotionError, path):
-        plain = _codec().encode(motion, SavedMotion, "motion", arrays)
-    text = {TEXT: np.array(json.dumps({"version": FORMAT, **plain}))}
+    with parsing(MotionError, path, "motion", "what Motion.load can read"):
+        plain = {"version": FORMAT, **_codec().encode(motion, SavedMotion, "motion", arrays)}
+        text = {TEXT: np.array(json.dumps(plain, default=lambda number: number.item()))}  # numpy's
     learned = {LEARNED + name: array for name, array in imitation.to_arrays().items()}
     content = npz_bytes(text | learned | arrays)
     read_motion(content, path)  # what could not be read is refused now
@@ -87,12 +87,12 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, Imitat
         DataError: as :func:`load_motion`.
     """
     with parsing(MotionError, source, "file", "a file that Motion.save wrote"):
-        check_size(len(content), MAX_BYTES)
         archive = NpzFile(content, max_bytes=MAX_BYTES)
         text = archive.read(TEXT) if TEXT in archive.names else np.zeros(0)
         if text.dtype.kind != "U" or text.ndim:
             raise FormatError("arrays", "no text that describes a motion", "a file that Motion.save wrote")
         plain = json.loads(str(text))
+        json.dumps(plain, ensure_ascii=False).encode()  # fails at half a character, which nothing could show
         version = plain.pop("version", None) if isinstance(plain, dict) else None
         if version != FORMAT:
             raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
