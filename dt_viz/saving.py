@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.errors import DataError, FormatError, parsing
+from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
 from dt_viz.files.values import Codec
-from dt_viz.learning.demonstrations import Demonstration, check_demonstrations
+from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
-from dt_viz.obstacles.shapes import SHAPES, Obstacle, check_obstacle
+from dt_viz.obstacles.shapes import SHAPES, Obstacle
 from dt_viz.scenario.scenario import Layer
 from dt_viz.transforms import registry
 from dt_viz.transforms.base import Transform
@@ -106,7 +106,8 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, Imitat
             raise FormatError("dimension of the imitation", found, "the same dimension")
         for layer in motion.layers:
             for obstacle in layer.transform.avoided.parts:
-                check_obstacle(obstacle)
+                check_between("distance of an obstacle", float(np.linalg.norm(obstacle.position)), 0.0, MAX_COORDINATE)
+                check_between("length of its quaternion", float(np.linalg.norm(obstacle.wxyz)), 1e-3, 1e3)
     return SavedMotion(demonstrations, motion.layers), imitation
 
 

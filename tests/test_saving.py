@@ -192,7 +192,7 @@ def test_a_field_that_cannot_be_written_is_named(flat, tmp_path, monkeypatch):
 def test_what_could_not_be_read_is_not_written(flat, tmp_path):
     path = tmp_path / "a.npz"
     for wrong, words in (
-        (dt.Avoidance(dt.Sphere((0.0, 0.0, 0.0), diameter=-1.0)), "one that has an inside"),
+        (dt.Avoidance(dt.Sphere((0.0, 1e9, 0.0))), "distance of an obstacle: found 1e\\+09; accepted: 0 to 100"),
         (dt.Avoidance(space="tsk"), "'tsk'; accepted: 'task' or 'cspace' or 'both'"),  # pyright: ignore[reportArgumentType]
         (dt.BiasPoint((0.0, np.nan, 0.0)), re.escape("position[1]: found nan; accepted: a finite number")),
     ):
@@ -209,6 +209,10 @@ def test_numbers_that_make_no_sense_are_refused_where_they_are_written():
         (lambda: dt.BiasPoint((0.0, 0.0, 0.0), radius=-0.1), "radius"),
         (lambda: dt.BiasPoint((0.0, 0.0, 0.0), strength=1e9), "strength"),
         (lambda: dt.Integration("rk4", 10**9), "steps"),
+        (lambda: dt.Sphere((0.0, 0.0, 0.0), diameter=-0.1), "diameter: found -0.1"),
+        (lambda: dt.Box((0.0, 0.0, 0.0), (0.1, 0.0, 0.1)), "sizes: found 0"),
+        (lambda: dt.Cylinder((0.0, 0.0, 0.0), height=float("inf")), "height: found inf"),
+        (lambda: SHAPED[3].resized(-1.0), "scale"),
     ):
         with pytest.raises(ValueError, match=words):
             make()
@@ -294,15 +298,25 @@ FORGED = {
     "a number for truth": (setting("layers", 0, "on", 1), {}, "on: found 1; accepted: true or false"),
     "half a character": (setting("layers", 0, "name", "\ud800"), {}, "surrogates"),
     "two coordinates": (setting(*AVOIDANCE, "obstacles", 0, "position", [0, 0]), {}, "found 2 values; accepted: 3 val"),
-    "a flat ball": (setting(*AVOIDANCE, "obstacles", 0, "diameter", 0), {}, "obstacle: found one 0 m deep"),
-    "a far ball": (setting(*AVOIDANCE, "obstacles", 0, "position", 0, 1e9), {}, "reaches 1e"),
-    "no orientation": (setting(*AVOIDANCE, "obstacles", 1, "wxyz", [0, 0, 0, 0]), {}, "quaternion of length 0"),
+    "a flat ball": (
+        setting(*AVOIDANCE, "obstacles", 0, "diameter", 0),
+        {},
+        r"obstacles\[0\].diameter: found 0; accepted: 1e-06 to 100",
+    ),
+    "a far ball": (setting(*AVOIDANCE, "obstacles", 0, "position", 0, 1e9), {}, "distance of an obstacle: found 1e"),
+    "no orientation": (setting(*AVOIDANCE, "obstacles", 1, "wxyz", [0, 0, 0, 0]), {}, "quaternion: found 0"),
     "no such array": (setting(*AVOIDANCE, "obstacles", 3, "mesh", "faces", "x"), {}, "faces: found no such array"),
     "text for an array": (setting(*AVOIDANCE, "obstacles", 3, "mesh", "faces", [1]), {}, "accepted: the name of an"),
+    "an array used twice": (
+        setting("demonstrations", 1, "times", "motion.demonstrations[0].times"),
+        {},
+        r"demonstrations\[1\].times: found no such array",
+    ),
     "faces of no vertices": (LEAVE, {f"{MESH}.faces": np.full((4, 3), 9999)}, "mesh.faces: found vertex 9999"),
     "faces of four": (LEAVE, {f"{MESH}.faces": np.zeros((4, 4), int)}, "mesh.mesh: found shapes"),
     "faces of fractions": (LEAVE, {f"{MESH}.faces": np.zeros((4, 3))}, "accepted: an array of int64"),
     "infinite vertices": (LEAVE, {f"{MESH}.vertices": np.full((4, 3), np.inf)}, "no such array of finite numbers"),
+    "a mesh that is a point": (LEAVE, {f"{MESH}.vertices": np.zeros((162, 3))}, "mesh.size: found 0"),
     "many faces": (LEAVE, {f"{MESH}.faces": np.zeros((600_000, 3), int)}, "at most 500000"),
     "small numbers": (LEAVE, {f"{MESH}.vertices": np.zeros((4, 3), np.float16)}, "values of type float16"),
     "huge arrays": (LEAVE, {f"{MESH}.vertices": np.zeros((MAX_BYTES // 24 + 1, 3))}, "bytes when unpacked"),

@@ -60,7 +60,7 @@ class Codec:
         return {CLASS: kind.__name__, **held} if annotation in self.classes else held
 
     def decode(self, plain: Plain, annotation: Annotation, where: str, arrays: Arrays) -> Any:  # noqa: ANN401 - any value
-        """Return the value that `encode` wrote. Fields that the text lacks have their defaults.
+        """Return the value that `encode` wrote, and take its arrays out of `arrays`. Fields not there have defaults.
 
         Raises:
             FormatError: it is not what the annotation says, or its class refuses it.
@@ -75,7 +75,7 @@ class Codec:
             return tuple(self.decode(*item, arrays) for item in _items(items, annotation, where))
         if _is_array(annotation):
             name, kind = _checked(plain, isinstance(plain, str), where, "the name of an array"), _numbers(annotation)
-            array = arrays.get(name)
+            array = arrays.pop(name, None)  # each is used once, or few bytes could fill the memory
             if array is None or array.dtype != kind or not np.isfinite(array).all():
                 raise FormatError(where, "no such array of finite numbers", f"an array of {kind.__name__}")
             return array

@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from dt_viz.errors import FormatError
+from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, Indices, Mask, PlacedField
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import (
@@ -37,8 +37,8 @@ FLATTEST = 0.3
 """Smallest half size, relative to the largest, that the kernel adapts to: a thinner field turns motions sharply."""
 MAX_BALLS, NUM_BALLS = 12, 10
 """Largest number of balls of a cover, and the number for a mesh."""
-MAX_REACH, MIN_TURN = 100.0, 1e-3
-"""Largest distance (m) of an obstacle's end from the origin, and smallest length of its quaternion, in a file."""
+SMALLEST, LARGEST = 1e-6, 100.0
+"""Bounds of sizes, metres."""
 NUM_STEPS = 10
 """Number of Newton steps to a surface."""
 THINNEST = 0.3
@@ -143,12 +143,15 @@ class _Turned:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball."""
+    """A ball. Raises FormatError, as other shapes, where its size makes no sense."""
 
     position: Point
     """Centre, metres."""
     diameter: float = 0.15
     """Metres."""
+
+    def __post_init__(self) -> None:
+        check_between("diameter", self.diameter, SMALLEST, LARGEST)
 
     @property
     def wxyz(self) -> Quaternion:
@@ -207,6 +210,10 @@ class Box(_Turned):
     """Side lengths along its own axes, metres."""
     wxyz: Quaternion = UPRIGHT
 
+    def __post_init__(self) -> None:
+        check_between("sizes", min(self.sizes), SMALLEST, LARGEST)
+        check_between("sizes", max(self.sizes), SMALLEST, LARGEST)
+
     @cached_property
     def _half(self) -> Array:
         return np.asarray(self.sizes) / 2
@@ -263,6 +270,10 @@ class Cylinder(_Turned):
     height: float = 0.2
     """Metres."""
     wxyz: Quaternion = UPRIGHT
+
+    def __post_init__(self) -> None:
+        check_between("diameter", self.diameter, SMALLEST, LARGEST)
+        check_between("height", self.height, SMALLEST, LARGEST)
 
     @cached_property
     def _half(self) -> Array:
@@ -324,6 +335,9 @@ class _Triangles(_Turned):
     """Base of shapes bounded by triangles; shapes that differ in scale only share what was computed for one."""
 
     scale: float
+
+    def __post_init__(self) -> None:
+        check_between("scale", self.scale, SMALLEST, 1 / SMALLEST)
 
     @property
     def solid(self) -> Solid:
@@ -429,17 +443,6 @@ class CloudObstacle(_Triangles):
 
 SHAPES = (Sphere, Box, Cylinder, MeshObstacle, CloudObstacle)
 """All kinds of obstacles."""
-
-
-def check_obstacle(obstacle: Obstacle) -> None:
-    """Raise FormatError unless an obstacle has a place, an orientation, an inside and a size that can be meant."""
-    turn = float(np.linalg.norm(obstacle.wxyz))
-    if not MIN_TURN <= turn <= 1 / MIN_TURN:
-        raise FormatError("obstacle", f"a quaternion of length {turn:g}", "a quaternion of about length 1")
-    reach = float(np.linalg.norm(obstacle.position)) + obstacle.radius
-    if not (obstacle.depth > 0 and reach <= MAX_REACH):
-        found = f"one {obstacle.depth:g} m deep that reaches {reach:g} m from the origin"
-        raise FormatError("obstacle", found, f"one that has an inside, and lies within {MAX_REACH:g} m")
 
 
 @lru_cache(maxsize=256)

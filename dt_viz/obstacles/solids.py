@@ -16,6 +16,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.triangles import (
     check_triangles,
@@ -26,6 +27,8 @@ from dt_viz.obstacles.triangles import (
 )
 from dt_viz.properties import cached_property
 
+SMALLEST = 1e-9
+"""Smallest size of a solid, and inverse of the largest, in its own unit."""
 NUM_NODES = 64**3
 """Approximate number of nodes of a distance grid."""
 MARGIN = 0.2
@@ -53,7 +56,7 @@ class Solid:
     """The solid enclosed by triangles; compared and hashed by its vertices and faces.
 
     Raises:
-        FormatError: as :func:`check_triangles`.
+        FormatError: as :func:`check_triangles`, or it is a point.
     """
 
     vertices: Array
@@ -67,6 +70,7 @@ class Solid:
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         check_triangles(self.vertices, self.faces)
+        check_between("size", float(np.ptp(self.bounds, axis=0).max()), SMALLEST, 1 / SMALLEST)
 
     @cached_property
     def digest(self) -> bytes:
