@@ -133,13 +133,14 @@ def _items(values: Sequence[Any], annotation: Annotation, where: str) -> list[tu
 
 
 def _is_array(annotation: Annotation) -> bool:
-    return (get_origin(annotation) or annotation) is np.ndarray
+    origin = get_origin(annotation) or annotation
+    return (get_origin(getattr(origin, "__value__", None)) or origin) is np.ndarray  # NDArray is an alias since 2.5
 
 
 def _numbers(annotation: Annotation) -> type[np.generic]:
     """Return the numbers that an array of this annotation is written in, which hold all others of their kind."""
-    *_, dtype = get_args(annotation) or (np.dtype[np.float64],)
-    (kind,) = get_args(dtype)
+    *_, kind = get_args(annotation) or (np.float64,)
+    kind = get_args(kind)[0] if get_origin(kind) is np.dtype else kind
     return np.int64 if issubclass(get_origin(kind) or kind, np.integer) else np.float64
 
 
