@@ -15,6 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dt_viz.errors import DataError
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
     from dt_viz.library import Arm, BlockedError, JointPath, Motion, Path, fit, load_jaco
@@ -33,6 +34,7 @@ __all__ = [
     "Box",
     "Certificates",
     "Cylinder",
+    "DataError",
     "Demonstration",
     "Integration",
     "JointPath",
@@ -47,6 +49,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "errors": ("DataError",),
     "flows.diffeomorphisms": ("Integration",),
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
     "library": ("Arm", "BlockedError", "JointPath", "Motion", "Path", "fit", "load_jaco"),

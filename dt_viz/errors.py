@@ -46,6 +46,12 @@ class FormatError(ValueError):
         return f"{self.field}: found {self.found}; accepted: {self.accepted}"
 
 
+def check_between(field: str, value: float, low: float, high: float) -> None:
+    """Raise FormatError unless a number lies between two others, these included; NaN does not."""
+    if not low <= value <= high:
+        raise FormatError(field, f"{value:g}", f"{low:g} to {high:g}")
+
+
 @contextmanager
 def naming(kind: type[DataError], source: str | Path) -> Iterator[None]:
     """Turn a FormatError into an error of one kind that names the source, too."""

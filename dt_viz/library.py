@@ -9,6 +9,7 @@ Everything is computed by what the page is computed by; `import dt_viz` offers t
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -32,6 +33,7 @@ from dt_viz.motion.nominal import NUM_SAMPLES, Learned
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, Solution, build_stack
 from dt_viz.properties import cached_property
+from dt_viz.saving import SavedMotion, load_motion, save_motion
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
@@ -136,6 +138,29 @@ class Motion:
         )
         times = solution.rays.times(bundle.index, bundle.fraction)
         return certified(known, solution, solved.ends, Shown(bundle.index, bundle.fraction, times, path))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.
+
+        A file that is there is replaced, and stays as it is if something fails.
+
+        Raises:
+            DataError: a transform is not one of `dt_viz.transforms.registry.KINDS`, or holds what could not be read.
+            OSError: the file cannot be written.
+        """
+        learned = self._learned
+        save_motion(path, SavedMotion(learned.task.demonstrations, self._layers), learned.imitation)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Motion:
+        """Read the motion that `save` wrote: its paths, velocities and certificates are the same to the last bit.
+
+        Raises:
+            DataError: there is no such file, it cannot be read, or is no saved motion. Nothing else is raised,
+                whatever the file holds; nothing is unpickled.
+        """
+        saved, imitation = load_motion(path)
+        return cls(Learned.of(_task(saved.demonstrations), imitation, imitates=True), saved.layers)
 
     @cached_property
     def _solution(self) -> Solution:

@@ -18,15 +18,24 @@ import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import scipy.io
 import trimesh
 
+from dt_viz import saving
 from dt_viz.errors import DataError
+from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning import demonstrations as demos
+from dt_viz.learning.imitation import ImitationSettings, fit
 from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles import files as shapes
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere
+from dt_viz.saving import SavedMotion, save_motion
+from dt_viz.scenario.scenario import Layer
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.bias import BiasPoint
 
 PROCESS = Path("/proc/self")
 """What Linux says of this process."""
@@ -38,6 +47,9 @@ NUMBERS = (0, 1, -1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63, -(2**63)
 WORDS = ("", "0", "-1", "nan", "-inf", "1e308", "-1e308", "1e-320", "999999999999", "9" * 400, "0x10", "1_0", "\u0661")
 VALUES = (None, True, -1, 0, 1, 3, 2**31, 2**63, 1e308, -0.5, "", "x" * 1000, [], {}, [[[]]], [0] * 1000)
 BYTES = (0, 1, 9, 10, 32, 44, 45, 48, 127, 128, 255)
+BALL = trimesh.creation.icosphere(2, 0.1)
+POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (400, 3))
+LABELS = np.linalg.norm(POINTS, axis=1) < 0.08
 
 Rng = np.random.Generator
 Mutation = Callable[[bytes, Rng], bytes]
@@ -106,6 +118,40 @@ def with_line_again(content: bytes, rng: Rng) -> bytes:
     return content + b"\n" + line * times
 
 
+def change_values(tree: dict | list, rng: Rng) -> None:
+    """Change some values of what JSON describes, in place."""
+    for _ in range(rng.integers(4)):
+        owner = tree
+        while True:
+            keys = list(owner) if isinstance(owner, dict) else list(range(len(owner)))
+            if not keys:
+                break
+            key = keys[int(rng.integers(len(keys)))]
+            inner = owner[key]
+            if isinstance(inner, dict | list) and inner and rng.random() < 0.85:
+                owner = inner
+                continue
+            owner[key] = copy.deepcopy(VALUES[int(rng.integers(len(VALUES)))])
+            break
+
+
+def with_changed_text(content: bytes, rng: Rng) -> bytes:
+    """A saved motion whose description is changed at some places, or some of whose arrays have another number."""
+    try:
+        with np.load(io.BytesIO(content)) as archive:
+            arrays = {name: member for name, member in archive.items() if isinstance(member, np.ndarray)}
+        motion = json.loads(str(arrays["motion"]))
+    except Exception:  # damaged before
+        return content
+    if isinstance(motion, dict | list):
+        change_values(motion, rng)
+    name = list(arrays)[int(rng.integers(len(arrays)))]
+    if rng.random() < 0.3 and arrays[name].dtype.kind in "fi" and arrays[name].size:
+        arrays[name] = arrays[name].copy()
+        arrays[name].flat[int(rng.integers(arrays[name].size))] = rng.choice([0, -1, 2, 10**9, -(2**40)])
+    return npz(**arrays | {"motion": np.array(json.dumps(motion))})
+
+
 def with_changed_scene(content: bytes, rng: Rng) -> bytes:
     """A GLB file whose description is changed at some places, its lengths set right."""
     if len(content) < 20 or content[:4] != b"glTF":
@@ -120,19 +166,7 @@ def with_changed_scene(content: bytes, rng: Rng) -> bytes:
         scene["scenes"] = [{"nodes": list(range(len(scene["nodes"])))}]
     if rng.random() < 0.1:
         scene["nodes"] = [{"mesh": 0, "children": [int(rng.integers(3))]} for _ in range(3)]
-    for _ in range(rng.integers(4)):
-        owner = scene
-        while True:
-            keys = list(owner) if isinstance(owner, dict) else list(range(len(owner)))
-            if not keys:
-                break
-            key = keys[int(rng.integers(len(keys)))]
-            inner = owner[key]
-            if isinstance(inner, dict | list) and inner and rng.random() < 0.85:
-                owner = inner
-                continue
-            owner[key] = copy.deepcopy(VALUES[int(rng.integers(len(VALUES)))])
-            break
+    change_values(scene, rng)
     text = json.dumps(scene).encode()
     text += b" " * (-len(text) % 4)
     rest = content[20 + length :]
@@ -223,6 +257,35 @@ def matlab(motions: list[np.ndarray], *, compressed: bool) -> bytes:
     return file.getvalue()
 
 
+STACK = (
+    Avoidance(
+        (
+            Sphere((0.1, 0.0, 0.0), 0.1),
+            Box((0.2, 0.1, 0.0)),
+            Cylinder((0.2, 0.3, 0.0), wxyz=(0.9, 0.1, 0.3, -0.3)),
+            MeshObstacle((0.3, 0.4, 0.0), solids.Solid(BALL.vertices, BALL.faces), scale=0.5),
+            CloudObstacle((0.5, 0.5, 0.0), clouds.Cloud(POINTS, LABELS.astype(float))),
+        ),
+        integration=Integration("rk4", 4),
+    ),
+    BiasPoint((0.5, 0.2, 0.0), radius=0.2),
+)
+"""All kinds of transforms and of obstacles."""
+LAYERS = tuple(Layer(transform, k == 0, f"Größe {k}") for k, transform in enumerate(STACK))
+
+
+def saved_motion() -> bytes:
+    """A small motion, saved."""
+    s = np.linspace(0, 1, 20)
+    arcs = [np.stack([s - 1, (1 + 0.1 * k) * s * (1 - s)], axis=1) for k in range(2)]
+    demonstrations = tuple(demos.Demonstration(2 * s, arc, f"arc {k}") for k, arc in enumerate(arcs))
+    imitation = fit(demonstrations, ImitationSettings(num_layers=2, num_points=12, max_iterations=2))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.npz"
+        save_motion(path, SavedMotion(demonstrations, LAYERS), imitation)
+        return path.read_bytes()
+
+
 @cache
 def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
     """For each loader whose files are read how: its kind, a name, a good file, and mutations of such files only."""
@@ -234,11 +297,9 @@ def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
     ]
     arrays = {f"positions_{k}": motion for k, motion in enumerate(motions)}
     arrays |= {f"times_{k}": np.arange(30.0) for k in range(2)} | {"name_0": np.array("first")}
-    ball = trimesh.creation.icosphere(2, 0.1)
-    scene = trimesh.Scene([ball, trimesh.creation.box((0.1, 0.1, 0.3))]).export(file_type="glb")
+    scene = trimesh.Scene([BALL, trimesh.creation.box((0.1, 0.1, 0.3))]).export(file_type="glb")
     assert isinstance(scene, bytes)
-    points = rng.uniform(-0.1, 0.1, (400, 3))
-    labels = np.linalg.norm(points, axis=1) < 0.08
+    points, labels = POINTS, LABELS
     table = [
         "x,y,z,occupied",
         *(f"{x:.4f},{y:.4f},{z:.4f},{int(o)}" for (x, y, z), o in zip(points, labels, strict=True)),
@@ -250,16 +311,17 @@ def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
         ("demonstrations", "a.npz", npz(**arrays), (with_changed_members,) * 4),
         ("demonstrations", "a.mat", matlab(motions, compressed=False), ()),
         ("demonstrations", "b.mat", matlab(motions, compressed=True), (with_changed_inside,) * 4),
-        ("mesh", "a.stl", exported(ball, "stl"), ()),
-        ("mesh", "b.stl", exported(ball, "stl_ascii"), ()),
-        ("mesh", "a.obj", exported(ball, "obj"), ()),
-        ("mesh", "a.ply", exported(ball, "ply"), ()),
-        ("mesh", "b.ply", exported(ball, "ply", encoding="ascii"), ()),
+        ("mesh", "a.stl", exported(BALL, "stl"), ()),
+        ("mesh", "b.stl", exported(BALL, "stl_ascii"), ()),
+        ("mesh", "a.obj", exported(BALL, "obj"), ()),
+        ("mesh", "a.ply", exported(BALL, "ply"), ()),
+        ("mesh", "b.ply", exported(BALL, "ply", encoding="ascii"), ()),
         ("mesh", "a.glb", scene, (with_changed_scene,) * 8),
         ("cloud", "a.npz", npz(points=points, labels=labels), (with_changed_members,) * 4),
         ("cloud", "b.npz", npz(points=points[labels].astype(np.float32)), (with_changed_members,) * 4),
         ("cloud", "a.csv", "\n".join(table).encode(), ()),
         ("cloud", "a.ply", "\n".join(cloud).encode(), ()),
+        ("motion", "a.npz", saved_motion(), (*(with_changed_members,) * 4, *(with_changed_text,) * 20)),
     )
 
 
@@ -279,6 +341,9 @@ def read(kind: str, name: str, content: bytes) -> None:
         for demonstration in demos.read_demonstrations(content, name):
             assert np.isfinite(demonstration.positions).all()
             assert (np.diff(demonstration.times) > 0).all()
+        return
+    if kind == "motion":
+        saving.read_motion(content, name)
         return
     solid = shapes.read_mesh(content, name).solid if kind == "mesh" else shapes.read_cloud(content, name).cloud.solid
     assert solid.distances.depth > 0

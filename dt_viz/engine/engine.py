@@ -143,7 +143,7 @@ class Engine:
         return self.memo(
             "warped",
             (motion, precision),
-            lambda: warped(full, below, motion.warp, precision, follower, before),
+            lambda: warped(full, below, motion.warp, precision, follower, before or full.lifted),
             newest=2,
         )
 

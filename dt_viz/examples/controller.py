@@ -1,9 +1,12 @@
 """A controller that follows the velocity field: wherever it is pushed to, the motion goes on to the goal.
 
-Run it: python -m dt_viz.examples.controller
+Run it: python -m dt_viz.examples.controller [FILE.npz]. The motion is learned once, and then read from the file.
 """
 
 from __future__ import annotations
+
+import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -32,12 +35,17 @@ def run(motion: dt.Motion, start: np.ndarray, longest: float = 60.0) -> np.ndarr
     return np.array(passed)
 
 
-def main() -> None:
+def main(file: str | None = None) -> None:
     """Push a box around a ball, and be pushed."""
-    motion = dt.fit(dt.load_demonstrations(ASSETS / "push_box.npz"))
     ball = dt.Sphere((0.10, -0.53, 0.15), diameter=0.15)
-    around = motion.stack(dt.Avoidance(ball, margin=0.02))
-    start = motion.rollouts()[0].positions[0]
+    if file is not None and Path(file).exists():
+        around = dt.Motion.load(file)
+    else:
+        motion = dt.fit(dt.load_demonstrations(ASSETS / "push_box.npz"))
+        around = motion.stack(dt.Avoidance(ball, margin=0.02))
+        if file is not None:
+            around.save(file)
+    start = around.rollouts()[0].positions[0]
     passed = run(around, start)
     print(f"{len(passed)} commands in {PERIOD * len(passed):.1f} s of motion")
     print(f"smallest distance from the ball: {1e3 * ball.signed_distance(passed).min():.1f} mm")
@@ -45,4 +53,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:2])

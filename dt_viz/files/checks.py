@@ -52,6 +52,12 @@ def check_at_most(field: str, num: int, limit: int, unit: str = "") -> None:
         raise FormatError(field, f"{num} {unit}".rstrip(), f"at most {limit} {unit}".rstrip())
 
 
+def check_at_least(field: str, num: int, least: int, unit: str = "") -> None:
+    """Raise FormatError if there are fewer than `least`."""
+    if num < least:
+        raise FormatError(field, f"{num} {unit}".rstrip(), f"at least {least}")
+
+
 def too_many(field: str, limit: int, unit: str = "") -> FormatError:
     """Return the error about a count that has passed its limit before all was counted."""
     return FormatError(field, f"more than {limit} {unit}".rstrip(), f"at most {limit} {unit}".rstrip())

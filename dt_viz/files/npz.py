@@ -1,4 +1,4 @@
-"""Reader of the arrays in an npz archive that never takes more memory than the caller allows.
+"""Reader of npz archives that never takes more memory than the caller allows, and a writer.
 
 `numpy.load` believes what an archive says of itself, unpacks members that need gigabytes for a few bytes (bzip2, LZMA)
 and evaluates their headers. This reader takes only stored or deflated members, counts their bytes while it unpacks
@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import re
+import threading
 import zipfile
-from collections.abc import Collection
-from typing import IO
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
@@ -96,6 +100,28 @@ class NpzFile:
         if file.take(1, or_less=True):  # at the end of the member zipfile compares its checksum
             raise FormatError(field, f"more than the {size} bytes of its header", "an array as numpy writes it")
         return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
+    """Return an archive of arrays of numbers or text."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file beside its place and move it there when it is whole, so that nobody ever finds half of it.
+
+    Raises:
+        OSError: it cannot be written; nothing is left behind, and a file that was there before stays.
+    """
+    partial = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        with suppress(OSError):  # it has been moved
+            partial.unlink()
 
 
 class _Bytes:

@@ -13,6 +13,7 @@ from typing import Literal, overload
 
 import numpy as np
 
+from dt_viz.errors import check_between
 from dt_viz.flows.collocation import collocated, implicit_euler_path
 from dt_viz.flows.fields import Array, VectorField
 from dt_viz.flows.integrators import Step, euler, implicit_euler, integrate, integrate_adaptive, rk4
@@ -368,16 +369,19 @@ Method = Literal["auto", "rk4", "euler"]
 """`auto` keeps the result exact to a tolerance; the others take equal steps, Euler's being the paper's."""
 METHODS: tuple[Method, ...] = ("auto", "rk4", "euler")
 STEPS: Mapping[Method, Step] = {"rk4": rk4, "euler": euler}
-MAX_STEPS = 50
-"""Largest number of steps that a user may choose."""
+MAX_STEPS, MOST_STEPS = 50, 1000
+"""Largest numbers of steps of a flow: on the page, and at all."""
 
 
 @dataclass(frozen=True)
 class Integration:
-    """A method and, where it is not `auto`, its number of steps."""
+    """A method and, where it is not `auto`, its number of steps. Raises FormatError on another number of them."""
 
     method: Method = "auto"
     steps: int = 8
+
+    def __post_init__(self) -> None:
+        check_between("steps", self.steps, 1, MOST_STEPS)
 
     @property
     def by_hand(self) -> bool:

@@ -9,11 +9,13 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Flow, min_det_jacobian, round_trip_error
+from dt_viz.errors import FormatError
+from dt_viz.files.checks import real_numbers
+from dt_viz.flows.diffeomorphisms import MOST_STEPS, Chain, Diffeomorphism, Flow, min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.demonstrations import DIMENSIONS, Demonstration
 from dt_viz.learning.flow_chain import Layer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import TimedAttractor, learn_timing
@@ -121,30 +123,51 @@ class Imitation:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> Imitation:
-        """Make the imitation that `to_arrays` describes. Raises KeyError or ValueError on other arrays."""
-        goal = np.asarray(arrays["goal"], dtype=float)
-        d = len(goal)
+        """Make the imitation that `to_arrays` describes. Raises FormatError on other arrays."""
+        d = int(np.size(arrays.get("goal", ())))
+        goal = _finite(arrays, "goal", d)
         flows: list[Diffeomorphism] = []
         while f"layer_{len(flows)}_weights" in arrays:
             prefix = f"layer_{len(flows)}_"
-            ell, steps, forward = arrays[prefix + "ell_steps_forward"]
-            axes = tuple(np.asarray(arrays[f"{prefix}axis_{j}"], dtype=float) for j in range(d))
-            field = GridRBF(GaussianGrid(axes, float(ell)), np.asarray(arrays[prefix + "weights"], dtype=float))
+            ell, steps, forward = _finite(arrays, f"{prefix}ell_steps_forward", 3)
+            axes = tuple(_finite(arrays, f"{prefix}axis_{j}", None) for j in range(d))
+            grid = GaussianGrid(axes, float(ell))
+            if not (ell > 0 and 1 <= steps <= MOST_STEPS and forward in (0, 1)):
+                found = f"ℓ = {ell:g} and {steps:g} steps"
+                raise FormatError(f"{prefix}ell_steps_forward", found, f"ℓ above 0 and 1 to {MOST_STEPS} steps")
+            field = GridRBF(grid, _finite(arrays, f"{prefix}weights", grid.num_points, d))
             integrators = (euler, implicit_euler) if forward else (implicit_euler, euler)
             flows.append(Flow(field, 1.0, int(steps), *integrators))
-        base = np.asarray(arrays["base"], dtype=float)
-        pace = {k: np.asarray(arrays[f"base_{k}"], dtype=float) for k in ("directions", "knots", "paces")}
-        seconds, min_det, error = (float(x) for x in arrays["certificates"])
+        if d not in DIMENSIONS or not flows:
+            raise FormatError("imitation", f"{d} coordinates and {len(flows)} layers", "2 or 3 coordinates, layers")
+        *base, speed, smoothing = _finite(arrays, "base", d + 2)
+        knots, directions = _finite(arrays, "base_knots", None), _finite(arrays, "base_directions", None, d)
+        paces = _finite(arrays, "base_paces", len(directions), len(knots))
+        if not (len(knots) > 1 and (np.diff(knots) > 0).all() and min(speed, smoothing, paces.min(initial=1.0)) > 0):
+            raise FormatError("base", "a pace, speed or width of 0 or below, or knots that do not increase", "above 0")
+        seconds, min_det, error = (float(x) for x in _finite(arrays, "certificates", 3))
         return cls(
             Chain(flows),
-            TimedAttractor(base[:d], float(base[d]), float(base[d + 1]), **pace),
-            np.asarray(arrays["starts"], dtype=float),
+            TimedAttractor(
+                np.array(base), float(speed), float(smoothing), directions=directions, knots=knots, paces=paces
+            ),
+            _finite(arrays, "starts", None, d),
             goal,
             seconds,
             min_det,
             error,
-            tuple(str(w) for w in arrays["warnings"]),
+            tuple(str(w) for w in np.ravel(arrays.get("warnings", ()))),
         )
+
+
+def _finite(arrays: Mapping[str, Array], name: str, *shape: int | None) -> Array:
+    """Return an array of finite numbers of this shape; None is any length but 0. Raises FormatError on another."""
+    found = real_numbers(arrays[name], name) if name in arrays else np.zeros(0)
+    fits = len(shape) == found.ndim and all(n in (None, m) for n, m in zip(shape, found.shape, strict=True))
+    if not (fits and found.size and np.isfinite(found).all()):
+        wanted = ", ".join("any length" if n is None else str(n) for n in shape)
+        raise FormatError(name, f"shape {found.shape}, or numbers that are not finite", f"finite numbers ({wanted})")
+    return found
 
 
 def fit(

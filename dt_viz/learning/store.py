@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
 
@@ -20,6 +21,9 @@ logger = logging.getLogger(__name__)
 
 FORMAT = 1
 """Version of the fit and its file; raised with every change, so that older files are not used."""
+
+MAX_BYTES = 40 * 10**6
+"""Largest number of bytes that a file unpacks to."""
 
 LONGEST_WRITE = 3600.0
 """Age after which an incomplete file counts as left behind by a server that has ended, seconds."""
@@ -164,16 +168,11 @@ class FitStore:
         imitation = fit(demonstrations, settings, progress)
         if self._folder is not None:
             path = self._folder / f"{key}.npz"
-            partial = path.with_suffix(f".{os.getpid()}-{threading.get_ident()}.partial")
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                with partial.open("wb") as file:
-                    np.savez_compressed(file, allow_pickle=False, **imitation.to_arrays())
-                partial.replace(path)
+                write_whole(path, npz_bytes(imitation.to_arrays()))
             except OSError as error:
                 logger.warning("the fit was not cached: %s", error)
-                with suppress(OSError):
-                    partial.unlink()
         return imitation
 
     def _read(self, key: str) -> Imitation | None:
@@ -181,11 +180,9 @@ class FitStore:
         if path is None or not path.exists():
             return None
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                if damaged := arrays.zip.testzip():  # numpy stops reading before a member's checksum
-                    raise ValueError(f"{damaged} does not match its checksum")
-                return Imitation.from_arrays(arrays)
-        except Exception as error:  # damaged bytes make zipfile, zlib and numpy raise almost anything
+            archive = NpzFile(path.read_bytes(), max_bytes=MAX_BYTES)
+            return Imitation.from_arrays({name: archive.read(name) for name in archive.names})
+        except Exception as error:  # damaged bytes make zipfile and zlib raise almost anything
             logger.warning("%s is damaged and will be fitted anew: %s", path, error)
             return None
 

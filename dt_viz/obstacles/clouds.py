@@ -10,12 +10,15 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_least, check_finite
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import fit_occupancy
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.triangles import grid_nodes
 from dt_viz.properties import cached_property
 
+MIN_POINTS = 50
 NUM_NODES = 44**3
 """Approximate number of nodes of the grid on which the surface is found."""
 REACH = 1.2
@@ -30,9 +33,33 @@ NUM_SAMPLES = 2000
 REGULARISATION = 0.1
 
 
+def check_points(points: Array, labels: Array | None) -> None:
+    """Raise FormatError unless these are enough finite points (K, 3), with labels (K,) of both kinds or none."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise FormatError("array 'points'", f"shape {points.shape}", "shape (K, 3)")
+    check_at_least("points", len(points), MIN_POINTS)
+    check_finite(points, "points", lambda row: f"in point {row + 1}")
+    if labels is None:
+        return
+    if labels.shape != (len(points),):
+        raise FormatError("array 'labels'", f"shape {labels.shape}", f"shape ({len(points)},)")
+    wrong = np.flatnonzero((labels != 0) & (labels != 1))
+    if len(wrong):
+        found = f"{labels[wrong[0]]:g} for point {wrong[0] + 1}"
+        raise FormatError("labels", found, "1 for occupied and 0 for free")
+    if (labels == labels[0]).all():
+        kind = "occupied" if labels[0] else "free"
+        raise FormatError("labels", f"all {len(labels)} points {kind}", "both kinds, or no labels")
+    check_at_least("labels", int(labels.sum()), MIN_POINTS, "occupied points")
+
+
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points on or in a solid, or labelled points; compared and hashed by content."""
+    """Points on or in a solid, or labelled points; compared and hashed by content.
+
+    Raises:
+        FormatError: they are too few, or, without labels, the same; or not finite, or wrongly labelled.
+    """
 
     points: Array
     """(K, 3) metres, in the cloud's own frame."""
@@ -45,6 +72,9 @@ class Cloud:
                 array = np.array(values, dtype=float)
                 array.flags.writeable = False
                 object.__setattr__(self, name, array)
+        check_points(self.points, self.labels)
+        if self.labels is None:  # a search among very many points in one place takes the square of their number
+            check_at_least("points", len(np.unique(self.points, axis=0)), MIN_POINTS, "different ones")
 
     @cached_property
     def digest(self) -> bytes:

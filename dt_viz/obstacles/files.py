@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
-from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers
+from dt_viz.files.checks import check_at_most, checked_suffix, read_bytes, real_numbers
 from dt_viz.files.glb import read_glb
 from dt_viz.files.meshes import read_obj, read_stl
 from dt_viz.files.npz import NpzFile
@@ -29,17 +29,17 @@ from dt_viz.files.ply import read_ply
 from dt_viz.files.text import decimal_numbers, read_table
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.interruption import checkpoint
-from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.clouds import Cloud, check_points
 from dt_viz.obstacles.mending import closed
 from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.triangles import MAX_FACES, check_triangles
 
 MAX_BYTES = 20 * 10**6
 """Largest number of bytes of a file."""
 MAX_UNPACKED = 2 * MAX_BYTES
 """Largest number of bytes that an npz unpacks to."""
-MAX_FACES = 500_000
 MAX_VERTICES = 3 * MAX_FACES
-MIN_POINTS, MAX_POINTS = 50, 1_000_000
+MAX_POINTS = 1_000_000
 ENOUGH_POINTS = 100_000
 """Number of points that are used of a cloud; of more, so many are taken at random."""
 MIN_SIZE, MAX_SIZE = 0.01, 1.0
@@ -126,12 +126,7 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> Load
     with parsing(ShapeError, source, "file", f"a {suffix} file of a mesh"):
         vertices, faces = _triangles(content, suffix)
         checkpoint()
-        if not len(faces):
-            raise FormatError("faces", "none", "a closed mesh of triangles; a point cloud is loaded as a cloud")
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            wrong = faces.min() if faces.min() < 0 else faces.max()
-            raise FormatError("faces", f"vertex {wrong}", f"indices of the {len(vertices)} vertices")
-        check_finite(vertices, "vertices", lambda row: f"in vertex {row + 1}")
+        check_triangles(vertices, faces)
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     vertices = _checked_size(vertices, vertices[used], source, scale)
@@ -180,22 +175,17 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
     with parsing(ShapeError, source, "file", f"a {suffix} file of points"):
         points, labels = {".ply": _ply_points, ".npz": _npz_points, ".csv": _csv_points}[suffix](content)
         checkpoint()
-        _check_enough("points", len(points), "")
         check_at_most("points", len(points), MAX_POINTS)
-        check_finite(points, "points", lambda row: f"in point {row + 1}")
-        if labels is not None:
-            _check_labels(labels)
+        check_points(points, labels)
         occupied = points if labels is None else points[labels > 0.5]
-        _check_enough("labels", len(occupied), " occupied points")
         points, notes = _checked_size(points, occupied, source, scale), []
         if len(points) > ENOUGH_POINTS:
             some = np.sort(np.random.default_rng(0).permutation(len(points))[:ENOUGH_POINTS])
             notes.append(f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random")
             points, labels = points[some], None if labels is None else labels[some]
-        if labels is None:  # a search among very many points in one place takes the square of their number
+        if labels is None:
             points = np.unique(points, axis=0)
-            _check_enough("points", len(points), " different ones")
-    cloud = Cloud(points, labels)
+        cloud = Cloud(points, labels)
     checkpoint()
     with parsing(ShapeError, source, "points", "points that something occupies"):
         depth = cloud.solid.distances.depth
@@ -214,11 +204,6 @@ def _suffix(content: bytes, source: Path, accepted: tuple[str, ...], scale: floa
         if not (np.isfinite(scale) and scale > 0):
             raise FormatError("scale", f"{scale}", "metres for one unit of the file, above 0")
         return checked_suffix(content, source, accepted, MAX_BYTES)
-
-
-def _check_enough(field: str, num: int, what: str) -> None:
-    if num < MIN_POINTS:
-        raise FormatError(field, f"{num}{what}", f"at least {MIN_POINTS}")
 
 
 def _checked_size(points: Array, shape: Array, source: Path, scale: float) -> Array:
@@ -245,16 +230,6 @@ def _box(sizes: Array) -> str:
     return " × ".join(f"{size:.4g}" for size in sizes) + " m"
 
 
-def _check_labels(labels: Array) -> None:
-    wrong = np.flatnonzero((labels != 0) & (labels != 1))
-    if len(wrong):
-        found = f"{labels[wrong[0]]:g} for point {wrong[0] + 1}"
-        raise FormatError("labels", found, "1 for occupied and 0 for free")
-    if (labels == labels[0]).all():
-        kind = "occupied" if labels[0] else "free"
-        raise FormatError("labels", f"all {len(labels)} points {kind}", "both kinds, or no labels")
-
-
 def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
     """Read vertices (V, 3) and faces (F, 3) of all parts of a file."""
     if suffix == ".stl":
@@ -279,10 +254,6 @@ def _npz_points(content: bytes) -> tuple[Array, Array | None]:
         raise FormatError("arrays", found, "'points' and optionally 'labels'")
     points = real_numbers(archive.read("points"), "array 'points'", "biuf")
     labels = real_numbers(archive.read("labels"), "array 'labels'", "biuf") if "labels" in archive.names else None
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise FormatError("array 'points'", f"shape {points.shape}", "shape (K, 3)")
-    if labels is not None and labels.shape != (len(points),):
-        raise FormatError("array 'labels'", f"shape {labels.shape}", f"shape ({len(points)},)")
     return points, labels
 
 

@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, Indices, Mask, PlacedField
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import (
@@ -36,6 +37,8 @@ FLATTEST = 0.3
 """Smallest half size, relative to the largest, that the kernel adapts to: a thinner field turns motions sharply."""
 MAX_BALLS, NUM_BALLS = 12, 10
 """Largest number of balls of a cover, and the number for a mesh."""
+SMALLEST, LARGEST = 1e-6, 100.0
+"""Bounds of sizes, metres."""
 NUM_STEPS = 10
 """Number of Newton steps to a surface."""
 THINNEST = 0.3
@@ -140,12 +143,15 @@ class _Turned:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball."""
+    """A ball. Raises FormatError, as other shapes, where its size makes no sense."""
 
     position: Point
     """Centre, metres."""
     diameter: float = 0.15
     """Metres."""
+
+    def __post_init__(self) -> None:
+        check_between("diameter", self.diameter, SMALLEST, LARGEST)
 
     @property
     def wxyz(self) -> Quaternion:
@@ -204,6 +210,10 @@ class Box(_Turned):
     """Side lengths along its own axes, metres."""
     wxyz: Quaternion = UPRIGHT
 
+    def __post_init__(self) -> None:
+        check_between("sizes", min(self.sizes), SMALLEST, LARGEST)
+        check_between("sizes", max(self.sizes), SMALLEST, LARGEST)
+
     @cached_property
     def _half(self) -> Array:
         return np.asarray(self.sizes) / 2
@@ -260,6 +270,10 @@ class Cylinder(_Turned):
     height: float = 0.2
     """Metres."""
     wxyz: Quaternion = UPRIGHT
+
+    def __post_init__(self) -> None:
+        check_between("diameter", self.diameter, SMALLEST, LARGEST)
+        check_between("height", self.height, SMALLEST, LARGEST)
 
     @cached_property
     def _half(self) -> Array:
@@ -321,6 +335,9 @@ class _Triangles(_Turned):
     """Base of shapes bounded by triangles; shapes that differ in scale only share what was computed for one."""
 
     scale: float
+
+    def __post_init__(self) -> None:
+        check_between("scale", self.scale, SMALLEST, 1 / SMALLEST)
 
     @property
     def solid(self) -> Solid:
@@ -422,6 +439,10 @@ class CloudObstacle(_Triangles):
         """Return its points in the world (K, 3), metres, and whether each is occupied (K,)."""
         points, labels = self._to_world(self.cloud.points), self.cloud.labels
         return points, np.ones(len(points), dtype=bool) if labels is None else labels > 0.5
+
+
+SHAPES = (Sphere, Box, Cylinder, MeshObstacle, CloudObstacle)
+"""All kinds of obstacles."""
 
 
 @lru_cache(maxsize=256)

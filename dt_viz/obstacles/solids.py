@@ -16,10 +16,19 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.triangles import closest_on_triangles, grid_nodes, inside_of_grid, surface_samples
+from dt_viz.obstacles.triangles import (
+    check_triangles,
+    closest_on_triangles,
+    grid_nodes,
+    inside_of_grid,
+    surface_samples,
+)
 from dt_viz.properties import cached_property
 
+SMALLEST = 1e-9
+"""Smallest size of a solid, and inverse of the largest, in its own unit."""
 NUM_NODES = 64**3
 """Approximate number of nodes of a distance grid."""
 MARGIN = 0.2
@@ -44,7 +53,11 @@ BLOCK = 2048
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """The solid enclosed by triangles; compared and hashed by its vertices and faces."""
+    """The solid enclosed by triangles; compared and hashed by its vertices and faces.
+
+    Raises:
+        FormatError: as :func:`check_triangles`, or it is a point.
+    """
 
     vertices: Array
     """(V, 3) metres, in the solid's own frame."""
@@ -56,6 +69,8 @@ class Solid:
             array = np.array(getattr(self, name), dtype=kind)
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        check_triangles(self.vertices, self.faces)
+        check_between("size", float(np.ptp(self.bounds, axis=0).max()), SMALLEST, 1 / SMALLEST)
 
     @cached_property
     def digest(self) -> bytes:

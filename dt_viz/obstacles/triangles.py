@@ -5,12 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.files.checks import check_at_most, check_finite
 from dt_viz.flows.fields import Array, Indices, Mask
 
+MAX_FACES = 500_000
 CHUNK = 1_000_000
 """Number of pairs of a triangle and a line that are tested in one step."""
 MAX_CROSSINGS = 3_000_000
 """Largest number of pairs of a triangle and a line near it; 500,000 even triangles have some 10,000."""
+
+
+def check_triangles(vertices: Array, faces: Indices) -> None:
+    """Raise FormatError unless these are finite vertices (V, 3) and at least one, but not too many, faces (F, 3)."""
+    if vertices.ndim != 2 or faces.ndim != 2 or vertices.shape[1] != 3 or faces.shape[1] != 3:
+        raise FormatError("mesh", f"shapes {vertices.shape} and {faces.shape}", "vertices (V, 3) and faces (F, 3)")
+    if not len(faces):
+        raise FormatError("faces", "none", "a closed mesh of triangles; a point cloud is loaded as a cloud")
+    check_at_most("faces", len(faces), MAX_FACES)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        wrong = faces.min() if faces.min() < 0 else faces.max()
+        raise FormatError("faces", f"vertex {wrong}", f"indices of the {len(vertices)} vertices")
+    check_finite(vertices, "vertices", lambda row: f"in vertex {row + 1}")
 
 
 def closest_on_triangles(s: Array, triangles: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Integration
 from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
 from dt_viz.flows.integrators import integrate_adaptive, rk4
@@ -15,6 +16,7 @@ from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import (
+    MOST_DURATION,
     ArmAvoidance,
     Built,
     Choice,
@@ -69,7 +71,11 @@ place: such a path arrives at up to 60° from the straight way out."""
 
 @dataclass(frozen=True, init=False)
 class Avoidance(Transform):
-    """Motions are led around obstacles: those of the end effector, those of the whole arm, or both."""
+    """Motions are led around obstacles: those of the end effector, those of the whole arm, or both.
+
+    Raises:
+        FormatError: a number makes no sense, such as a negative margin.
+    """
 
     obstacles: tuple[Obstacle, ...]
     """All are avoided together; there may be none."""
@@ -132,6 +138,10 @@ class Avoidance(Transform):
         integration: Integration = AUTO,
         plane: tuple[Point, Point] | None = None,
     ) -> None:
+        check_between("temperature", temperature, 0.1, 1000.0)
+        check_between("margin", margin, 0.0, 1.0)
+        if duration is not None:
+            check_between("duration", duration, 0.0, MOST_DURATION)
         values = {
             "obstacles": tuple(obstacles) if isinstance(obstacles, Iterable) else (obstacles,),
             "space": space,

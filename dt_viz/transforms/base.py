@@ -19,6 +19,9 @@ from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
 from dt_viz.warning import Kind, MotionWarning
 
+MOST_DURATION = 100.0
+"""Longest flow time that a transform may have."""
+
 
 @dataclass(frozen=True)
 class MotionBelow:

@@ -11,11 +11,13 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, Flow, Integration
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.transforms.base import (
+    MOST_DURATION,
     Built,
     FlowIntegration,
     MotionBelow,
@@ -81,6 +83,9 @@ class BiasPoint(Transform):
 
     With the goal where it is, every motion passes the place on its way. If the goal moves, it does so to the place.
     It is made for the motions that have a demonstration: one that was started elsewhere changes nothing about it.
+
+    Raises:
+        FormatError: a number makes no sense, such as a negative radius.
     """
 
     position: Point
@@ -118,6 +123,12 @@ class BiasPoint(Transform):
         Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True, of_flow=True),
         FlowIntegration(),
     )
+
+    def __post_init__(self) -> None:
+        if self.radius is not None:
+            check_between("radius", self.radius, 1e-3, 100.0)
+        if self.strength is not None:
+            check_between("strength", self.strength, 0.0, MOST_DURATION)
 
     @property
     def anchor(self) -> Point:

@@ -1,0 +1,122 @@
+"""Saved motions: npz files of all that a motion is made of, read back to the last bit, and never unpickled.
+
+`motion` (text)
+    JSON: the version, the demonstrations and the layers, as `dt_viz.files.values` writes them.
+`imitation.…`
+    What was learned, as `Imitation.to_arrays` gives it.
+others
+    The arrays that the text names, such as the vertices of meshes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.errors import DataError, FormatError, check_between, parsing
+from dt_viz.files.checks import read_bytes
+from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
+from dt_viz.files.values import Codec
+from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
+from dt_viz.learning.imitation import Imitation
+from dt_viz.obstacles.shapes import SHAPES, Obstacle
+from dt_viz.scenario.scenario import Layer
+from dt_viz.transforms import registry
+from dt_viz.transforms.base import Transform
+
+FORMAT = 1
+"""Version of the file; raised where files from before cannot be read any more, also by a change of the imitation's
+arrays. A new field that has a default does not need that."""
+MAX_BYTES = 40 * 10**6
+"""Largest number of bytes of a file, and of what it unpacks to."""
+TEXT, LEARNED = "motion", "imitation."
+"""Name of the array that holds the text, and prefix of those of the imitation."""
+
+
+class MotionError(DataError):
+    """A motion that cannot be saved, or a file that is no saved motion."""
+
+
+@dataclass(frozen=True)
+class SavedMotion:
+    """What a motion is made of."""
+
+    demonstrations: tuple[Demonstration, ...]
+    layers: tuple[Layer, ...]
+    """The transforms on the imitation, from the inside out."""
+
+
+def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: Imitation) -> None:
+    """Write a motion to a file, whatever its suffix; an existing one is replaced only by a whole one.
+
+    Raises:
+        DataError: a transform is not registered, or something could not be read again.
+        OSError: the file cannot be written.
+    """
+    path, arrays = Path(path), dict[str, np.ndarray]()
+    with parsing(MotionError, path, "motion", "what Motion.load can read"):
+        plain = {"version": FORMAT, **_codec().encode(motion, SavedMotion, "motion", arrays)}
+        text = {TEXT: np.array(json.dumps(plain, default=lambda number: number.item()))}  # numpy's
+    learned = {LEARNED + name: array for name, array in imitation.to_arrays().items()}
+    content = npz_bytes(text | learned | arrays)
+    read_motion(content, path)  # what could not be read is refused now
+    write_whole(path, content)
+
+
+def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, Imitation]:
+    """Read a motion from a file.
+
+    Raises:
+        DataError: there is no such file, it cannot be read, or is no motion saved in this format. Nothing else is
+            raised, whatever the file holds.
+    """
+    path = Path(path)
+    with parsing(MotionError, path, "path", "a readable file"):
+        content = read_bytes(path, MAX_BYTES)
+    return read_motion(content, path)
+
+
+def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, Imitation]:
+    """Read a motion from the bytes of a file; `source` is its name, for messages.
+
+    Raises:
+        DataError: as :func:`load_motion`.
+    """
+    with parsing(MotionError, source, "file", "a file that Motion.save wrote"):
+        archive = NpzFile(content, max_bytes=MAX_BYTES)
+        text = archive.read(TEXT) if TEXT in archive.names else np.zeros(0)
+        if text.dtype.kind != "U" or text.ndim:
+            raise FormatError("arrays", "no text that describes a motion", "a file that Motion.save wrote")
+        plain = json.loads(str(text))
+        json.dumps(plain, ensure_ascii=False).encode()  # fails at half a character, which nothing could show
+        version = plain.pop("version", None) if isinstance(plain, dict) else None
+        if version != FORMAT:
+            raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
+        arrays = {name: _checked(archive.read(name), name) for name in archive.names if name != TEXT}
+        motion: SavedMotion = _codec().decode(plain, SavedMotion, "motion", arrays)
+        learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}
+        imitation = Imitation.from_arrays(learned)
+        demonstrations = check_demonstrations(motion.demonstrations, source)
+        if imitation.base.dim != demonstrations[0].dimension:
+            found = f"{imitation.base.dim}, and demonstrations in {demonstrations[0].dimension}"
+            raise FormatError("dimension of the imitation", found, "the same dimension")
+        for layer in motion.layers:
+            for obstacle in layer.transform.avoided.parts:
+                check_between("distance of an obstacle", float(np.linalg.norm(obstacle.position)), 0.0, MAX_COORDINATE)
+                check_between("length of its quaternion", float(np.linalg.norm(obstacle.wxyz)), 1e-3, 1e3)
+    return SavedMotion(demonstrations, motion.layers), imitation
+
+
+def _codec() -> Codec:
+    return Codec({Transform: registry.KINDS, Obstacle: SHAPES})
+
+
+def _checked(array: np.ndarray, name: str) -> np.ndarray:
+    """Return an array of the numbers that are written; smaller ones would grow eightfold when they are used."""
+    if array.dtype not in (np.float64, np.int64) and array.dtype.kind != "U":
+        raise FormatError(f"array {name[:40]!r}", f"values of type {array.dtype}", "float64, int64 or text")
+    return array

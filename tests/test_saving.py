@@ -1,0 +1,440 @@
+"""Saved motions: read back to the last bit, written whole or not at all, and refused where they make no sense."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar, cast
+
+import hostile
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_hostile_files import npz_member
+from test_new_transform import shown_in_the_readme
+
+import dt_viz as dt
+from dt_viz.examples import controller
+from dt_viz.files import npz
+from dt_viz.files.values import Codec
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.obstacles.shapes import SHAPES, MeshObstacle, Obstacle
+from dt_viz.saving import FORMAT, MAX_BYTES, read_motion
+from dt_viz.shipped import ASSETS
+from dt_viz.transforms import registry
+from dt_viz.transforms.base import Built, MotionBelow, Transform
+
+SHAPED = cast(dt.Avoidance, hostile.STACK[0]).obstacles
+"""An obstacle of each kind."""
+
+
+def arcs(dim=2):
+    s = np.linspace(0, 1, 30)
+    for k in range(2):
+        path = np.stack([0.5 * s, (0.4 + 0.1 * k) * s * (1 - s), 0.2 * s**2], axis=1)
+        yield Demonstration(2 * s, path[:, :dim], f"arc {k}")
+
+
+@pytest.fixture(scope="module")
+def flat() -> dt.Motion:
+    return dt.fit(list(arcs()))
+
+
+@pytest.fixture(scope="module")
+def saved() -> bytes:
+    return hostile.saved_motion()
+
+
+@pytest.fixture(scope="module")
+def motions(flat) -> dict[str, dt.Motion]:
+    """A motion of each kind, with obstacles of all kinds and all transforms at once."""
+    ball, bias = dt.Sphere((0.2, 0.06, 0.05), 0.05), dt.BiasPoint((0.3, 0.16, 0.08), radius=0.1)
+    far = tuple(part.moved((0.1 + 0.2 * k, -0.25, 0.3), part.wxyz) for k, part in enumerate(SHAPED))
+    near = SHAPED[3].moved((0.35, 0.03, 0.05), (0.9, 0.1, 0.3, -0.3))
+    by_hand = dt.Avoidance(near, duration=0.5, generator="probability", integration=dt.Integration("rk4", 6))
+    stack = dt.Avoidance((ball, *far), margin=0.02, temperature=4.0), bias, by_hand
+    space = dt.fit(list(arcs(3)))
+    return {
+        "space": space.stack(*stack),
+        "space, velocities": dt.fit(list(arcs(3)), "velocity").stack(*stack),
+        "plane": flat.stack(*stack),
+        "plane, velocities": dt.fit(list(arcs()), "velocity").stack(stack[1], stack[0]),
+        "plain": space,
+        "a drawing": dt.fit(dt.load_demonstrations(ASSETS / "draw_s.npz")),
+    }
+
+
+def assert_same(a: dt.Motion, b: dt.Motion):
+    """To the last bit."""
+    assert a.transforms == b.transforms and a.dimension == b.dimension
+    lower, upper = a.goal - 0.1, a.goal + 0.1
+    points = np.random.default_rng(0).uniform(lower, upper, (30, a.dimension))
+    for starts in (None, points[:3]):
+        for path, other in zip(a.rollouts(starts), b.rollouts(starts), strict=True):
+            assert path.positions.tobytes() == other.positions.tobytes()
+            assert path.times.tobytes() == other.times.tobytes()
+    for place in (points, points[0]):
+        assert a.velocity(place).tobytes() == b.velocity(place).tobytes()
+    assert a.certificates() == b.certificates()
+
+
+@pytest.mark.parametrize("name", ["space", "space, velocities", "plane", "plane, velocities", "plain", "a drawing"])
+def test_a_motion_is_read_back_to_the_last_bit(motions, name, tmp_path):
+    motions[name].save(tmp_path / "a.npz")
+    again = dt.Motion.load(tmp_path / "a.npz")
+    assert_same(motions[name], again)
+    again.save(tmp_path / "b.npz")
+    assert_same(motions[name], dt.Motion.load(tmp_path / "b.npz"))
+
+
+def test_all_kinds_of_transforms_and_obstacles_are_among_them(motions):
+    stacked = [transform for motion in motions.values() for transform in motion.transforms]
+    assert {type(transform) for transform in stacked} == set(registry.KINDS)
+    assert {type(part) for transform in stacked for part in transform.avoided.parts} == set(SHAPES)
+
+
+DIGEST = """
+import hashlib, sys
+import numpy as np
+import dt_viz as dt
+motion = dt.Motion.load(sys.argv[1])
+digest = hashlib.sha256(repr(motion.certificates()).encode())
+for path in motion.rollouts():
+    digest.update(path.positions.tobytes() + path.times.tobytes())
+digest.update(motion.velocity(motion.goal + 0.05).tobytes())
+print(digest.hexdigest())
+"""
+
+
+@pytest.mark.parametrize("name", ["space", "plane"])
+def test_another_process_finds_the_same(motions, name, tmp_path, capsys, monkeypatch):
+    path = tmp_path / "a.npz"
+    motions[name].save(path)
+    found = subprocess.check_output([sys.executable, "-c", DIGEST, str(path)], text=True)
+    monkeypatch.setattr(sys, "argv", ["", str(path)])
+    with monkeypatch.context() as context:
+        context.setattr(dt.Motion, "load", lambda _: motions[name])
+        exec(DIGEST, {})
+    assert found == capsys.readouterr().out
+
+
+def test_layers_keep_their_names_and_whether_they_are_on(saved):
+    assert read_motion(saved, "a.npz")[0].layers == hostile.LAYERS
+
+
+POINTS = st.tuples(*3 * [st.floats(-1, 1)])
+POSITIVE = st.floats(1e-3, 1, exclude_min=True)
+INTEGRATIONS = st.builds(dt.Integration, st.sampled_from(["auto", "rk4", "euler"]), st.integers(1, 50))
+PLANES = st.none() | st.tuples(POINTS, POINTS)
+OBSTACLES = st.one_of(
+    st.builds(dt.Sphere, POINTS, POSITIVE),
+    st.builds(dt.Box, POINTS, st.tuples(*3 * [POSITIVE])),
+    st.builds(dt.Cylinder, POINTS, POSITIVE, POSITIVE, st.tuples(POSITIVE, *3 * [st.floats(-1, 1)])),
+    st.builds(replace, st.sampled_from(SHAPED[3:]), position=POINTS, scale=POSITIVE),
+)
+TRANSFORMS = st.one_of(
+    st.builds(
+        dt.Avoidance,
+        st.lists(OBSTACLES, max_size=3),
+        space=st.sampled_from(["task", "cspace", "both"]),
+        generator=st.sampled_from(["free-space", "probability"]),
+        temperature=st.floats(0.5, 50),
+        margin=st.floats(0, 0.5),
+        duration=st.none() | st.floats(0, 5),
+        integration=INTEGRATIONS,
+        plane=PLANES,
+    ),
+    st.builds(
+        dt.BiasPoint, POINTS, st.none() | POSITIVE, st.none() | st.floats(0, 5), PLANES, st.booleans(), INTEGRATIONS
+    ),
+)
+
+
+@given(TRANSFORMS)
+def test_the_codec_gives_equal_values_back_through_text(transform):
+    codec, arrays = Codec({Transform: registry.KINDS, Obstacle: SHAPES}), {}
+    text = json.dumps(codec.encode(transform, Transform, "it", arrays), allow_nan=False)
+    assert codec.decode(json.loads(text), Transform, "it", arrays) == transform
+
+
+def test_a_new_transform_of_one_file_and_one_line_is_saved_without_code_of_its_own(flat, tmp_path, monkeypatch):
+    twirl = shown_in_the_readme()
+    turned = flat.stack(twirl((0.3, 0.1, 0.0), angle=np.float64(-0.3)), dt.BiasPoint((0.3, 0.2, 0.0)))
+    path = tmp_path / "a.npz"
+    with pytest.raises(dt.DataError, match=re.escape("layers[0].transform: found a Twirl, which is not registered")):
+        turned.save(path)
+    assert not path.exists()
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, twirl))  # the one line
+    turned.save(path)
+    assert_same(turned, dt.Motion.load(path))
+    monkeypatch.undo()
+    with pytest.raises(dt.DataError, match=r"class: found 'Twirl'; accepted: Avoidance or BiasPoint$"):
+        dt.Motion.load(path)
+
+
+def test_a_field_that_cannot_be_written_is_named(flat, tmp_path, monkeypatch):
+    @dataclass(frozen=True)
+    class Odd(Transform):
+        title: ClassVar[str] = "Odd"
+        table: dict[str, float]
+
+        def build(self, motion: MotionBelow) -> Built:
+            raise NotImplementedError
+
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, Odd))
+    with pytest.raises(dt.DataError, match=re.escape("layers[0].transform.table: found a field of type dict")):
+        flat.stack(Odd({})).save(tmp_path / "a.npz")
+
+
+def test_what_could_not_be_read_is_not_written(flat, tmp_path):
+    path = tmp_path / "a.npz"
+    for wrong, words in (
+        (dt.Avoidance(dt.Sphere((0.0, 1e9, 0.0))), "distance of an obstacle: found 1e\\+09; accepted: 0 to 100"),
+        (dt.Avoidance(space="tsk"), "'tsk'; accepted: 'task' or 'cspace' or 'both'"),  # pyright: ignore[reportArgumentType]
+        (dt.BiasPoint((0.0, np.nan, 0.0)), re.escape("position[1]: found nan; accepted: a finite number")),
+    ):
+        with pytest.raises(dt.DataError, match=words):
+            flat.stack(wrong).save(path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_numbers_that_make_no_sense_are_refused_where_they_are_written():
+    for make, words in (
+        (lambda: dt.Avoidance(margin=-0.01), "margin: found -0.01; accepted: 0 to 1"),
+        (lambda: dt.Avoidance(temperature=0.0), "temperature"),
+        (lambda: dt.Avoidance(duration=float("nan")), "duration"),
+        (lambda: dt.BiasPoint((0.0, 0.0, 0.0), radius=-0.1), "radius"),
+        (lambda: dt.BiasPoint((0.0, 0.0, 0.0), strength=1e9), "strength"),
+        (lambda: dt.Integration("rk4", 10**9), "steps"),
+        (lambda: dt.Sphere((0.0, 0.0, 0.0), diameter=-0.1), "diameter: found -0.1"),
+        (lambda: dt.Box((0.0, 0.0, 0.0), (0.1, 0.0, 0.1)), "sizes: found 0"),
+        (lambda: dt.Cylinder((0.0, 0.0, 0.0), height=float("inf")), "height: found inf"),
+        (lambda: SHAPED[3].resized(-1.0), "scale"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a", "a.motion", "a.b.NPZ"])
+@pytest.mark.parametrize("kind", [str, Path])
+def test_the_file_has_the_name_that_is_given(flat, tmp_path, name, kind):
+    path = kind(tmp_path / name)
+    flat.save(path)
+    assert [found.name for found in tmp_path.iterdir()] == [name]
+    assert len(dt.Motion.load(path).rollouts()) == 2
+
+
+@pytest.mark.parametrize("fails", ["write_bytes", "replace"])
+def test_a_file_is_replaced_by_a_whole_one_or_stays(flat, tmp_path, monkeypatch, fails):
+    path = tmp_path / "a.npz"
+    flat.save(path)
+    before = path.read_bytes()
+    failing = getattr(Path, fails)
+
+    def full(self, argument):
+        if fails == "write_bytes":
+            failing(self, argument[:100])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as context, pytest.raises(OSError, match="No space left"):
+        context.setattr(Path, fails, full)
+        flat.stack(dt.BiasPoint((0.3, 0.2, 0.0))).save(path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+    flat.stack(dt.BiasPoint((0.3, 0.2, 0.0))).save(path)
+    assert len(dt.Motion.load(path).transforms) == 1 and list(tmp_path.iterdir()) == [path]
+
+
+def changed(content, change, **arrays):
+    """The file with its description changed in place, and with other arrays; None leaves one out."""
+    path = hostile.io.BytesIO(content)
+    with np.load(path) as archive:
+        members = dict(archive)
+    motion = json.loads(str(members["motion"]))
+    change(motion)
+    members |= {"motion": np.array(json.dumps(motion))} | arrays
+    return npz.npz_bytes({name: array for name, array in members.items() if array is not None})
+
+
+def setting(*keys):
+    """Changes the value at this place of the description; the last of `keys` is the new one."""
+    *place, last, value = keys
+
+    def change(motion):
+        for key in place:
+            motion = motion[key]
+        motion[last] = value
+
+    return change
+
+
+AVOIDANCE = ("layers", 0, "transform")
+MESH = "motion.layers[0].transform.obstacles[3].mesh"
+LEAVE = dict.copy
+"""Changes nothing."""
+FORGED = {
+    "another version": (setting("version", FORMAT + 1), {}, f"version: found 2; accepted: {FORMAT}; another version"),
+    "no version": (lambda m: m.pop("version"), {}, "version: found None"),
+    "an unknown class": (setting(*AVOIDANCE, "class", "eval"), {}, r"transform.class: found 'eval'; accepted: Avo"),
+    "a class of another kind": (setting(*AVOIDANCE, "class", "Sphere"), {}, "class: found 'Sphere'"),
+    "no class": (lambda m: m["layers"][0]["transform"].pop("class"), {}, "class: found None"),
+    "a class that is no name": (setting(*AVOIDANCE, "class", []), {}, r"class: found \[\]"),
+    "a value for an object": (setting(*AVOIDANCE, 3), {}, "transform: found 3; accepted: an object"),
+    "an unknown field": (setting(*AVOIDANCE, "__init__", 1), {}, "fields of .*: found '__init__'"),
+    "a field that is missing": (lambda m: m["layers"][1]["transform"].pop("position"), {}, "too few fields.*position"),
+    "another literal": (setting(*AVOIDANCE, "space", "x"), {}, "space: found 'x'"),
+    "not a number": (setting(*AVOIDANCE, "margin", float("nan")), {}, "margin: found nan"),
+    "text for a number": (setting(*AVOIDANCE, "margin", "1"), {}, "margin: found '1'; accepted: a finite number"),
+    "true for a number": (setting(*AVOIDANCE, "margin", True), {}, "margin: found True"),
+    "a negative margin": (setting(*AVOIDANCE, "margin", -1), {}, r"margin: found -1; accepted: 0 to 1"),
+    "no end of steps": (setting(*AVOIDANCE, "integration", "steps", 10**9), {}, "integration.steps: found 1e"),
+    "a fraction of a step": (
+        setting(*AVOIDANCE, "integration", "steps", 1.5),
+        {},
+        "steps: found 1.5; accepted: an int",
+    ),
+    "a number for truth": (setting("layers", 0, "on", 1), {}, "on: found 1; accepted: true or false"),
+    "half a character": (setting("layers", 0, "name", "\ud800"), {}, "surrogates"),
+    "two coordinates": (setting(*AVOIDANCE, "obstacles", 0, "position", [0, 0]), {}, "found 2 values; accepted: 3 val"),
+    "a flat ball": (
+        setting(*AVOIDANCE, "obstacles", 0, "diameter", 0),
+        {},
+        r"obstacles\[0\].diameter: found 0; accepted: 1e-06 to 100",
+    ),
+    "a far ball": (setting(*AVOIDANCE, "obstacles", 0, "position", 0, 1e9), {}, "distance of an obstacle: found 1e"),
+    "no orientation": (setting(*AVOIDANCE, "obstacles", 1, "wxyz", [0, 0, 0, 0]), {}, "quaternion: found 0"),
+    "no such array": (setting(*AVOIDANCE, "obstacles", 3, "mesh", "faces", "x"), {}, "faces: found no such array"),
+    "text for an array": (setting(*AVOIDANCE, "obstacles", 3, "mesh", "faces", [1]), {}, "accepted: the name of an"),
+    "an array used twice": (
+        setting("demonstrations", 1, "times", "motion.demonstrations[0].times"),
+        {},
+        r"demonstrations\[1\].times: found no such array",
+    ),
+    "faces of no vertices": (LEAVE, {f"{MESH}.faces": np.full((4, 3), 9999)}, "mesh.faces: found vertex 9999"),
+    "faces of four": (LEAVE, {f"{MESH}.faces": np.zeros((4, 4), int)}, "mesh.mesh: found shapes"),
+    "faces of fractions": (LEAVE, {f"{MESH}.faces": np.zeros((4, 3))}, "accepted: an array of int64"),
+    "infinite vertices": (LEAVE, {f"{MESH}.vertices": np.full((4, 3), np.inf)}, "no such array of finite numbers"),
+    "a mesh that is a point": (LEAVE, {f"{MESH}.vertices": np.zeros((162, 3))}, "mesh.size: found 0"),
+    "many faces": (LEAVE, {f"{MESH}.faces": np.zeros((600_000, 3), int)}, "at most 500000"),
+    "small numbers": (LEAVE, {f"{MESH}.vertices": np.zeros((4, 3), np.float16)}, "values of type float16"),
+    "huge arrays": (LEAVE, {f"{MESH}.vertices": np.zeros((MAX_BYTES // 24 + 1, 3))}, "bytes when unpacked"),
+    "a point, very often": (
+        lambda m: m["layers"][0]["transform"]["obstacles"][4]["cloud"].update(labels=None),
+        {"motion.layers[0].transform.obstacles[4].cloud.points": np.zeros((9999, 3))},
+        "points: found 1 different ones; accepted: at least 50",
+    ),
+    "no demonstration": (setting("demonstrations", []), {}, "demonstrations: found none"),
+    "times that fall": (LEAVE, {"motion.demonstrations[0].times": -np.arange(20.0)}, "times of 'arc 0'"),
+    "another dimension": (
+        LEAVE,
+        {f"motion.demonstrations[{k}].positions": np.random.default_rng(0).uniform(0, 1, (20, 3)) for k in range(2)},
+        "dimension of the imitation: found 2, and demonstrations in 3",
+    ),
+    "no goal": (LEAVE, {"imitation.goal": None}, "goal: found"),
+    "a long goal": (LEAVE, {"imitation.goal": np.zeros(5)}, "axis_2: found shape"),
+    "no layers": (LEAVE, {"imitation.layer_0_weights": None}, "2 coordinates and 0 layers"),
+    "other weights": (LEAVE, {"imitation.layer_0_weights": np.zeros((3, 2))}, r"layer_0_weights: found shape \(3, 2\)"),
+    "no width": (LEAVE, {"imitation.layer_0_ell_steps_forward": np.array([0.0, 4, 1])}, "ℓ = 0 and 4 steps"),
+    "many steps": (LEAVE, {"imitation.layer_0_ell_steps_forward": np.array([1, 1e9, 1])}, "1 to 1000 steps"),
+    "backward time": (LEAVE, {"imitation.base_knots": np.arange(48.0)[::-1]}, "knots that do not increase"),
+    "a certificate of nothing": (LEAVE, {"imitation.certificates": np.full(3, np.nan)}, "certificates: found"),
+    "pickled arrays": (LEAVE, {"imitation.goal": np.array([{}], object)}, "pickled objects are never opened"),
+    "a pickled description": (LEAVE, {"motion": np.array({}, object)}, "pickled objects are never opened"),
+    "numbers for the description": (LEAVE, {"motion": np.zeros(3)}, "arrays: found no text that describes a motion"),
+    "other text": (LEAVE, {"motion": np.array("motion")}, "something that cannot be read"),
+    "deep text": (LEAVE, {"motion": np.array("[" * 100_000)}, "something that cannot be read"),
+    "a list": (LEAVE, {"motion": np.array("[1]")}, "version: found None"),
+}
+
+
+def refusal(content) -> str:
+    with pytest.raises(dt.DataError) as info:
+        read_motion(content, "a.npz")
+    message = str(info.value)
+    assert message.startswith("a.npz: ") and ": found " in message and "; accepted: " in message
+    assert "\n" not in message and len(message) < 600
+    return message
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_a_forged_file_is_refused_in_a_sentence(saved, name):
+    change, arrays, words = FORGED[name]
+    assert re.search(words, refusal(changed(saved, change, **arrays)))
+
+
+def test_a_file_from_before_a_field_was_added_is_read(saved):
+    def without(motion):
+        for name in ("margin", "plane", "integration"):
+            del motion["layers"][0]["transform"][name]
+
+    motion, _ = read_motion(changed(saved, without), "a.npz")
+    assert motion.layers[0].transform == replace(hostile.STACK[0], integration=dt.Integration())
+
+
+def test_other_files_are_refused(saved, tmp_path):
+    for content in (
+        b"",
+        saved[:-1],
+        saved[: len(saved) // 2],
+        b"{}",
+        npz_member(3),
+        hostile.npz(points=np.zeros((9, 3))),
+    ):
+        refusal(content)
+    assert "no text that describes a motion" in refusal((ASSETS / "push_box.npz").read_bytes())
+    (tmp_path / "large").write_bytes(bytes(MAX_BYTES + 1))
+    with pytest.raises(dt.DataError, match="at most 40 MB"):
+        dt.Motion.load(tmp_path / "large")
+    for path in (tmp_path, tmp_path / "nothing.npz", str(tmp_path / "nothing")):
+        with pytest.raises(dt.DataError, match="found no such file; accepted: a readable file"):
+            dt.Motion.load(path)
+
+
+def read_mutated(saved, numbers, monkeypatch):
+    """Read changed files: each is a motion or refused; some are read, and most are not."""
+    for module in (hostile.solids, hostile.clouds):
+        monkeypatch.setattr(module, "NUM_NODES", 10**3)
+    mutations = (*hostile.EVERYWHERE, hostile.with_changed_members, *(hostile.with_changed_text,) * 12)
+    num_read = 0
+    for number in numbers:
+        rng, content = np.random.default_rng((12, number)), saved
+        for _ in range(rng.integers(1, 4)):
+            content = mutations[int(rng.integers(len(mutations)))](content, rng)
+        try:
+            motion, imitation = read_motion(content, "a.npz")
+        except dt.DataError:
+            refusal(content)
+            continue
+        num_read += 1
+        assert all(isinstance(layer.transform, registry.KINDS) for layer in motion.layers)
+        assert np.isfinite(imitation.starts).all() and len(imitation.starts)
+    assert 0.02 * len(numbers) < num_read < 0.7 * len(numbers)
+
+
+def test_mutated_files_are_read_or_refused(saved, monkeypatch):
+    read_mutated(saved, range(60), monkeypatch)
+
+
+@pytest.mark.slow
+def test_very_many_mutated_files_are_read_or_refused(saved, monkeypatch):
+    read_mutated(saved, range(3000), monkeypatch)
+
+
+def test_meshes_are_shared_by_content(flat, tmp_path):
+    mesh = SHAPED[3]
+    assert isinstance(mesh, MeshObstacle)
+    flat.stack(dt.Avoidance(mesh)).save(tmp_path / "a")
+    (again,) = dt.Motion.load(tmp_path / "a").transforms[0].avoided.parts
+    assert again == mesh and cast(MeshObstacle, again).mesh.distances is mesh.mesh.distances
+
+
+def test_the_controller_follows_a_saved_motion(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(controller, "PERIOD", 0.1)
+    path = tmp_path / "around.npz"
+    controller.main(str(path))
+    learned = capsys.readouterr().out
+    assert path.exists()
+    controller.main(str(path))
+    assert capsys.readouterr().out == learned and "distance from the goal" in learned
