@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import viser
 
@@ -22,6 +21,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
 from dt_viz.ui.panel.plots import JointPlots
@@ -29,7 +29,7 @@ from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
 from dt_viz.ui.panel.starts import StartsPanel
-from dt_viz.ui.panel.transforms import TransformsPanel
+from dt_viz.ui.panel.transforms import add_transform_controls
 from dt_viz.ui.scene.arm_layers import NUM_ARMS
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
@@ -68,15 +68,7 @@ VIEW_HINTS: Mapping[str, str] = {
 }
 _NO_SCENE = "–"
 MAX_FLOWS = 3
-"""That ψ is composed of, for a start: each picture brings its own number."""
-
-
-@dataclass(frozen=True)
-class _Bound:
-    """A control and how it reads the scenario."""
-
-    control: Control
-    read: Callable[[Scenario], Any]
+"""Number of flows that ψ is composed of until a picture of the generator brings its own."""
 
 
 class Panel:
@@ -103,9 +95,8 @@ class Panel:
         """
         self._notify, self._look_home = notify, look_home
         self._gui = gui
-        self._session: Session | None = None
         self._titles = dict(titles)
-        self._bound: list[_Bound] = []
+        self._bindings = Bindings()
         self._notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
         self._shows = self._waits = False
@@ -114,26 +105,25 @@ class Panel:
         self._settled = "", ""
         """Hint and status of the scenario reported last."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
-        self._adopted: Scenario | None = None
         self._status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
 
-        on_press(self._cancel, self._cancel_learning)
+        self._bindings.on(self._cancel, lambda session, _pressed: session.cancel())
         self._build_task()
         tabs = gui.add_tab_group()
         self._chores = Chores(self.fail)
         later = self._chores.later
         with tabs.add_tab("World"):
             self._obstacles = ObstaclePanel(
-                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER)), later
+                gui, self._bindings, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER)), later
             )
-            self._transforms = TransformsPanel(gui, self._bind, later)
-            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER), later)
+            add_transform_controls(gui, self._bindings, later)
+            StartsPanel(gui, self._bindings, lambda text: self._say(text, *_AMBER), later)
         with tabs.add_tab("Stack"):
-            self._stack = StackPanel(gui, self._bind)
+            self._stack = StackPanel(gui, self._bindings)
         with tabs.add_tab("Show"):
-            self._slice = SlicePanel(gui, self._bind)
+            self._slice = SlicePanel(gui, self._bindings)
             self._build_plots(robot)
             self._build_view()
         with tabs.add_tab("Arm"):
@@ -143,12 +133,7 @@ class Panel:
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
-        self._session = session
-        self._obstacles.connect(session)
-        self._transforms.connect(session)
-        self._starts.connect(session)
-        self._stack.connect(session)
-        self._slice.connect(session)
+        self._bindings.connect(session)
 
     def close(self) -> None:
         """The visitor has left: stop what plays, and what is read."""
@@ -165,18 +150,7 @@ class Panel:
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
-        self._adopted = scenario
-        self._obstacles.adopt(scenario)
-        self._transforms.adopt(scenario)
-        self._stack.adopt(scenario)
-        self._slice.adopt(scenario)
-        self.push.adopt(scenario)
-        for bound in self._bound:
-            bound.control.value = bound.read(scenario)
-        self._flow.handle.visible = scenario.view.generator
-        self.joints.visible = scenario.view.joint_plots
-        self.health.visible = scenario.view.health_plots
-        self._play.label = "Pause" if scenario.view.playing else "Play"
+        self._bindings.adopt(scenario)
         if self._reported is not None and not self._reported.begins_like(scenario):
             self._wait()
 
@@ -184,22 +158,17 @@ class Panel:
         """Show how the rebuild went and how far its result is to be trusted."""
         if frame.stage is Stage.ROLLOUTS:
             return  # the next stage is a few milliseconds away
-        if self._adopted is not None and not frame.scenario.begins_like(self._adopted):
+        adopted = self._bindings.scenario
+        if adopted is not None and not frame.scenario.begins_like(adopted):
             return  # another task or scene was chosen meanwhile
         self._reported, self._shows, self._waits = frame.scenario, True, False
         self._learned()
         if self._noticed is not None and frame.scenario != self._noticed:
             self._notice.visible, self._noticed = False, None
         self._give_hint(hint(frame))
-        self._transforms.report(frame)
-        self._stack.report(frame)
-        self._slice.report(frame)
+        self._bindings.report(frame)
         self.joints.draw(frame.arm)
         self.health.draw(frame.profiles)
-        self.push.report(frame)
-        _set_max(self._rollout.handle, len(frame.task.demonstrations) + len(frame.scenario.starts))
-        if frame.pictures.generator is not None:
-            _set_max(self._flow.handle, frame.pictures.generator.num_flows)
         self._settled = hint(frame), status_html(frame, pace)
         self._status.content = self._settled[1]
 
@@ -215,14 +184,13 @@ class Panel:
         """Nothing is computed that would be reported: show the status of what is shown, if that is adopted."""
         if self._waits:
             self._waits = False
-            stays = self._reported and self._adopted and self._reported.begins_like(self._adopted)
+            adopted = self._bindings.scenario
+            stays = self._reported and adopted and self._reported.begins_like(adopted)
             said, self._status.content = self._settled if stays else ("", "")
             self._give_hint(said)
 
     def _give_hint(self, text: str) -> None:
-        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
-        if self._hint.content != said:
-            self._hint.content = said
+        self._hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
 
     def learning(self, fraction: float, message: str) -> None:
         """Show how far learning a task is."""
@@ -238,8 +206,9 @@ class Panel:
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
-        if self._shows and self._adopted is not None:
-            instead = f"This is “{self._titles[self._adopted.task]}” as before."
+        adopted = self._bindings.scenario
+        if self._shows and adopted is not None:
+            instead = f"This is “{self._titles[adopted.task]}” as before."
         else:
             instead = "Choose another task, or move the obstacle to start again."
         self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
@@ -249,7 +218,7 @@ class Panel:
         self._learned()
         self._notify(_sentence(text), colour)
         self._notice.content, self._notice.visible = _alarm(text, colour, background), True
-        self._noticed = self._adopted
+        self._noticed = self._bindings.scenario
 
     def _learned(self) -> None:
         """Nothing is being learned any more."""
@@ -257,38 +226,13 @@ class Panel:
             self._bar.visible = self._cancel.visible = False
             self._status.content = ""
 
-    def _edit(self, gesture: str, **changes: Any) -> None:
-        if self._session is not None:
-            self._session.edit(gesture, **changes)
-
-    def _bind(
-        self, handle: Any, read: Callable[[Scenario], Any], change: Callable[[Scenario, Any], Mapping[str, Any]]
-    ) -> Control:
-        """Tie a control to the scenario: `read` gives its value, `change` the fields that a new value replaces."""
-
-        def act(value: Any) -> None:
-            if self._session is not None:
-                self._edit(handle.label, **change(self._session.scenario, value))
-
-        return self._tie(handle, read, act)
-
-    def _tie(self, handle: Any, read: Callable[[Scenario], Any], act: Callable[[Any], None]) -> Control:
-        """Have a control show what `read` gives, and `act` on new values."""
-        control = Control(handle, act)
-        self._bound.append(_Bound(control, read))
-        return control
-
-    def _cancel_learning(self) -> None:
-        if self._session is not None:
-            self._session.cancel()
-
     def _build_task(self) -> None:
         names = {title: name for name, title in self._titles.items()}
 
         def choose(session: Session, title: str) -> None:
             session.choose_task(names[title])
 
-        self._tie(
+        self._bindings.choice(
             self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
         )
         self._hint = self._gui.add_html("")
@@ -300,18 +244,17 @@ class Panel:
             else:
                 session.load(scenes[title].task, prepared(scenes[title]))
 
-        self._tie(
+        self._bindings.choice(
             self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
             partial(self._begin, load),
         )
-        Control(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+        self._bindings.on(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
 
-    def _begin(self, begin: Callable[[Session, str], None], title: str) -> None:
+    def _begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         """Begin a task or a scene; where that cannot be, say why and stay."""
-        if self._session is not None:
-            self._wait()
-            self._beginnings.submit(partial(self._begun, begin, self._session, title))
+        self._wait()
+        self._beginnings.submit(partial(self._begun, begin, session, title))
 
     def _begun(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         begin(session, title)
@@ -320,47 +263,47 @@ class Panel:
 
     def _stay(self, error: Exception) -> None:
         self.fail(error)
-        if self._session is not None:
-            self.adopt(self._session.scenario)
+        self._bindings.restore()
 
-    def _travel(self, button: str) -> None:
-        session = self._session
-        if session is not None:
-            {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
-            if button == "Reset":
-                self._look_home()
+    def _travel(self, session: Session, button: str) -> None:
+        {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
+        if button == "Reset":
+            self._look_home()
 
     def _build_arm(self) -> None:
         gui = self._gui
-        self._play = gui.add_button("Pause")
-
-        on_press(self._play, self._play_or_pause)
-        self._bind(
+        play = gui.add_button("Pause")
+        self._bindings.properties(play, label=lambda s: "Pause" if s.view.playing else "Play")
+        self._bindings.on(play, _play_or_pause)
+        self._bindings.input(
             gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
             lambda s: s.view.speed,
             lambda s, value: {"view": replace(s.view, speed=value)},
         )
-        self.push = PushButton(gui)
-        self._rollout = self._bind(
-            gui.add_slider("Follows rollout", 1, 8, 1, 1),
-            lambda s: s.arm_rollout + 1,
-            lambda _s, value: {"arm_rollout": int(value) - 1},
-        )
+        self.push = PushButton(gui, self._bindings)
+        followed = gui.add_slider("Follows rollout", 1, 8, 1, 1)
+        self._bindings.properties(followed, max=self._num_rollouts)
+        self._bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})
 
-    def _play_or_pause(self) -> None:
-        if self._session is not None:
-            view = self._session.scenario.view
-            self._edit("play", view=replace(view, playing=not view.playing))
+    def _num_rollouts(self, _scenario: Scenario) -> int:
+        frame = self._bindings.frame
+        return KEEP if frame is None else len(frame.task.demonstrations) + len(frame.scenario.starts)
+
+    def _num_flows(self, _scenario: Scenario) -> int:
+        picture = None if self._bindings.frame is None else self._bindings.frame.pictures.generator
+        return KEEP if picture is None else picture.num_flows
 
     def _build_plots(self, robot: Robot) -> None:
         """Each right under its checkbox, high up in the tab, to be seen when they open."""
         self._build_checkbox("joint_plots")
         self.joints = JointPlots(self._gui, robot)
+        self._bindings.properties(self.joints, visible=lambda s: s.view.joint_plots)
         self._build_checkbox("health_plots")
         self.health = HealthPlots(self._gui)
+        self._bindings.properties(self.health, visible=lambda s: s.view.health_plots)
 
     def _build_checkbox(self, name: str) -> None:
-        self._bind(
+        self._bindings.input(
             self._gui.add_checkbox(VIEW_LABELS[name], getattr(View(), name), hint=VIEW_HINTS.get(name)),
             lambda s: getattr(s.view, name),
             lambda s, value: {"view": replace(s.view, **{name: value})},
@@ -370,16 +313,11 @@ class Panel:
         for name in VIEW_LABELS:
             if name not in PLOTS:
                 self._build_checkbox(name)
-        self._flow = self._bind(
-            self._gui.add_slider(
-                "Of flow",
-                0,
-                MAX_FLOWS,
-                1,
-                0,
-                visible=False,
-                hint="ψ is several flows, 1 is the first; 0: their mean",
-            ),
+        hint = "ψ is several flows, 1 is the first; 0: their mean"
+        flow = self._gui.add_slider("Of flow", 0, MAX_FLOWS, 1, 0, visible=False, hint=hint)
+        self._bindings.properties(flow, visible=lambda s: s.view.generator, max=self._num_flows)
+        self._bindings.input(
+            flow,
             lambda s: s.view.generator_layer,
             lambda s, value: {"view": replace(s.view, generator_layer=int(value))},
         )
@@ -396,9 +334,9 @@ class Panel:
         on_press(save, lambda: self._saver.request(resolution.value, transparent.value))
 
 
-def _set_max(slider: Any, value: int) -> None:
-    if slider.max != value:
-        slider.max = value
+def _play_or_pause(session: Session, _pressed: bool) -> None:
+    view = session.scenario.view
+    session.edit("play", view=replace(view, playing=not view.playing))
 
 
 def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
