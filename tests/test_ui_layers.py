@@ -339,7 +339,7 @@ def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(serv
     panel.adopt(session.scenario)
     panel.report(replace(frame(scenario=session.scenario), task=TASKS["draw_s"]()), PACE)
     settled = panel._status.content, panel._hint.content
-    panel._begin(lambda session, name: session.choose_task(name), chosen)
+    panel._begin(lambda session, name: session.choose_task(name), cast(Session, session), chosen)
     assert COMPUTING in panel._status.content and session.asked == []
     session.may.set()
     assert panel._beginnings.wait_idle(30)
@@ -416,8 +416,8 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
     panel = panel_of(server)
-    handles = [bound.control.handle for bound in panel._bound]
-    box = {handle.label: handle for handle in handles if handle.label in VIEW_LABELS.values()}
+    handles = server.gui._gui_input_handle_from_uuid.values()
+    box = {handle.label: handle for handle in handles if getattr(handle, "label", "") in VIEW_LABELS.values()}
     of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._folder, box[VIEW_LABELS["health_plots"]]]
     of_tab += [panel.health._folder, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
     orders = [handle.order for handle in of_tab]

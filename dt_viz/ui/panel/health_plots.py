@@ -40,8 +40,7 @@ class HealthPlots:
 
     @visible.setter
     def visible(self, visible: bool) -> None:
-        if visible != self._folder.visible:
-            self._folder.visible = visible
+        self._folder.visible = visible
 
     def draw(self, profiles: Profiles | None) -> None:
         """Show these profiles; None leaves what is there."""

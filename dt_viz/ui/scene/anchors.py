@@ -6,6 +6,7 @@ A ring is around the region that it acts in. In a drawing the handles move it in
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 
 import numpy as np
 import viser
@@ -74,7 +75,6 @@ class AnchorPicture:
             thickness_units="screen",
             visible=False,
         )
-        self._flat = True
         self._label = scene.add_label(
             f"{node}/label",
             "",
@@ -101,40 +101,29 @@ class AnchorPicture:
         plane = transform.anchor_plane
         self.handles.stand(transform.anchor, viser.transforms.SO3.from_matrix(axes_of(plane)).wxyz)
         flat = plane is not None
-        if self.gizmo.active_axes[2] == flat:
-            self.gizmo.active_axes = (True, True, not flat)
-        if self._flat != flat:
-            self._flat, self.region.points = flat, _rings(flat=flat)
+        self.gizmo.active_axes = (True, True, not flat)
+        self.region.points = _rings(flat=flat)
         self.name = name
-        label = f"{name.lower()}: goal" if transform.ends_motions else name.lower()
-        if self._label.text != label:
-            self._label.text = label
-        colour = palette.BIAS if on else palette.STALE
-        if tuple(self.ball.color) != colour:
-            self.ball.color = colour
-            self.region.colors = np.array(palette.REGION if on else palette.STALE, dtype=np.uint8)
+        self._label.text = f"{name.lower()}: goal" if transform.ends_motions else name.lower()
+        self.ball.color = palette.BIAS if on else palette.STALE
+        self.region.colors = np.array(palette.REGION if on else palette.STALE, dtype=np.uint8)
         self.handles.show(selected)
-        if not self.gizmo.visible:
-            self.gizmo.visible = True
+        self.gizmo.visible = True
 
     def show_region(self, transform: Transform, used: float | None) -> None:
         """Show how far it acts: the radius that was used, or the one asked for; nothing while neither is known."""
         radius = used or transform.region
-        shown = radius is not None
-        if shown:
-            scale = (radius, radius, radius)
-            if self.region.scale != scale:
-                self.region.scale = scale
-        if self.region.visible != shown:
-            self.region.visible = shown
+        if radius is not None:
+            self.region.scale = (radius, radius, radius)
+        self.region.visible = radius is not None
 
     def hide(self) -> None:
         """There is no such transform."""
         self.name = ""
-        if self.gizmo.visible:
-            self.gizmo.visible = False
+        self.gizmo.visible = False
 
 
+@lru_cache(maxsize=2)
 def _rings(*, flat: bool) -> Array:
     """Segments (K, 2, 3) of a circle of radius 1 in the plane of the first two axes, or in those of any two."""
     turn = np.linspace(0, 2 * np.pi, NUM_SEGMENTS + 1)

@@ -32,24 +32,18 @@ class LevelRollouts(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        shown = frame.level is not None
         if frame.level is not None:
             paths = frame.levels[frame.level]
             self.lines.show(paths, colour=palette.STALE if frame.blocked else None)
             self._mark(paths[0][-1], frame.goal)
-            area, text = frame.slice, manifold(frame.scenario)
-            if self.label.text != text:
-                self.label.text = text
+            self.label.text, area = manifold(frame.scenario), frame.slice
             self.label.position = area.centre + np.array([0.0, 0.0, np.ptp(area.border[:, 2]) / 2 + LABEL_GAP])
-        if self._node.visible != shown:
-            self._node.visible = shown
+        self.visible = frame.level is not None
 
     def _mark(self, end: Array, goal: Array) -> None:
         """Mark the end (3,) of the motions unless it is the goal (3,), metres."""
         self._end.position = end
-        elsewhere = bool(np.linalg.norm(end - goal) > MAX_GOAL_MISS)
-        if self._end.visible != elsewhere:
-            self._end.visible = elsewhere
+        self._end.visible = bool(np.linalg.norm(end - goal) > MAX_GOAL_MISS)
 
 
 def manifold(scenario: Scenario) -> str:

@@ -95,16 +95,11 @@ class ObstaclePicture:
             self._look = look
             self.mesh.vertices, self.mesh.faces = shaded(look)
             self.gizmo.disable_rotations = isinstance(look, Sphere)
-        if self.mesh.scale != scale:
-            self.mesh.scale = scale
+        self.mesh.scale = scale
         self.handles.scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
         self.handles.show(selected)
-        side = "back" if opened else "front"
-        if self.mesh.side != side:
-            self.mesh.side = side
-        opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
-        if self.mesh.opacity != opacity:
-            self.mesh.opacity = opacity
+        self.mesh.side = "back" if opened else "front"
+        self.mesh.opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
 
     def remove(self) -> None:
         """Take it out of the scene."""

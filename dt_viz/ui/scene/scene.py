@@ -83,9 +83,7 @@ class Rollouts(Picture):
                 lines.show(paths, colour=palette.ROLLOUT_BESIDE)
             else:
                 lines.show(paths, chosen)
-        thickness = BOLD if frame.level is None else THIN
-        if self.lines.node.thickness != thickness:
-            self.lines.node.thickness = thickness
+        self.lines.node.thickness = BOLD if frame.level is None else THIN
         self._starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
         self._starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
 
@@ -123,14 +121,11 @@ class Goal(Picture):
         self._goal.position = frame.goal
         self._end.position = frame.reached
         elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
-        text = OLD_GOAL if elsewhere else GOAL
-        if self.label.text != text:
-            self.label.text = text
+        self.label.text = OLD_GOAL if elsewhere else GOAL
         # a transform that moves the goal says so itself
         goals = [to.anchor for to in anchored(frame.scenario).values() if to.anchor is not None and to.ends_motions]
         marked = any(np.linalg.norm(frame.reached - goal) < BALL_RADIUS for goal in goals)
-        if self._end.visible != (elsewhere and not marked):
-            self._end.visible = elsewhere and not marked
+        self._end.visible = elsewhere and not marked
 
 
 class Table(Picture):
