@@ -53,7 +53,9 @@ def scenario(request, engine, initial, monkeypatch):
     """The kind is looked up and added as the page does."""
     monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))  # the one line
     plain = initial("lift_box")
-    twirl = registry.by_title()["Twirl"].beside(surroundings(engine.task("lift_box"), plain))
+    twirl = next(kind for kind in registry.KINDS if kind.title == "Twirl").beside(
+        surroundings(engine.task("lift_box"), plain)
+    )
     stack, name = with_added(plain, twirl)
     scenario = replace(plain, stack=stack)
     if request.param[1] == name:

@@ -393,7 +393,7 @@ def test_two_samples_at_one_time_give_a_finite_speed():
 
 def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(server):
     plots = JointPlots(server.gui, ROBOT)
-    plots.draw(motion())
+    plots.follow(motion())
     assert len(plots.angles.data[0]) != NUM_SAMPLES
     plots.visible = True
     assert all(len(column) == NUM_SAMPLES for plot in (plots.angles, plots.speeds) for column in plot.data)
@@ -404,10 +404,10 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
     np.testing.assert_allclose(limits, np.sort(np.degrees(finite)))
     assert (plots.speeds.data[7] == 100).all()
     before = plots.angles.data
-    plots.draw(None)
+    plots.follow(None)
     assert plots.angles.data is before
     plots.visible = False
-    plots.draw(motion(seconds=9.0))
+    plots.follow(motion(seconds=9.0))
     assert plots.angles.data is before
 
 
@@ -418,8 +418,8 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
     panel = panel_of(server)
     handles = server.gui._gui_input_handle_from_uuid.values()
     box = {handle.label: handle for handle in handles if getattr(handle, "label", "") in VIEW_LABELS.values()}
-    of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._folder, box[VIEW_LABELS["health_plots"]]]
-    of_tab += [panel.health._folder, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
+    of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._node, box[VIEW_LABELS["health_plots"]]]
+    of_tab += [panel.health._node, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
     orders = [handle.order for handle in of_tab]
     assert orders == sorted(orders)
     assert len({handle._impl.parent_container_id for handle in of_tab}) == 1

@@ -76,7 +76,7 @@ def test_what_is_resized_is_not_sent_again(shown):
 @pytest.mark.parametrize(("selected", "expected"), [(0, [1, 0, 0]), (1, [0, 1, 0]), (2, [0, 0, 1]), (7, [0, 0, 1])])
 def test_only_the_selected_obstacle_has_handles_and_none_in_a_picture(shown, selected, expected):
     def handles():
-        return [int(item.has_handles) for item in shown.items]
+        return [int(item.handles.shown) for item in shown.items]
 
     shown.adopt(scenario(*ALL, selected=selected))
     assert handles() == expected

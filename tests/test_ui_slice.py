@@ -69,7 +69,7 @@ def test_one_thing_at_a_time_has_handles_and_none_in_a_picture(scene):
     for moving in (True, False):
         for each in (picture, obstacles, biases):
             each.adopt(seen(move_slice=moving))
-        assert obstacles.items[0].has_handles is not moving
+        assert obstacles.items[0].handles.shown is not moving
     picture.adopt(seen(move_slice=True))
     with picture.without_handles():
         assert picture.gizmo.opacity == 0 and picture.visible

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import Point, Quaternion, rotation
+from dt_viz.obstacles.shapes import Point, Quaternion, as_point, as_quaternion, rotation
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,9 @@ class Slice:
     @property
     def pose(self) -> SlicePose:
         """Where it lies."""
-        x, y, z = (float(c) for c in self.centre)
         frame = np.column_stack([self.axes, self.normal])
-        i, j, k, w = (float(c) for c in Rotation.from_matrix(frame).as_quat())
-        return SlicePose((x, y, z), (w, i, j, k))
+        wxyz = np.roll(Rotation.from_matrix(frame).as_quat(), 1)
+        return SlicePose(as_point(self.centre), as_quaternion(wxyz))
 
     def posed(self, pose: SlicePose | None) -> Slice:
         """This rectangle elsewhere; None leaves it where it is."""

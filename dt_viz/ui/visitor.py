@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +15,7 @@ from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.motion.pushing import Pushed
-from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
@@ -152,39 +153,35 @@ class Visitor:
         self.session.close()
         self._playback.close()
 
-    def _obstacle_moved(self, index: int, position: Array, wxyz: Array, phase: str) -> None:
+    @contextmanager
+    def _dragging(self, phase: str) -> Iterator[Scenario]:
+        """Take the edits of a drag together for undo; yields the scenario to edit."""
         if phase == "start":
             self.session.begin_gesture()
-        x, y, z = (float(c) for c in position)
-        w, i, j, k = (float(c) for c in wxyz)
-        obstacles = list(self.session.scenario.obstacles)
-        if index < len(obstacles):  # or it was deleted a moment ago
-            obstacles[index] = obstacles[index].moved((x, y, z), (w, i, j, k))
-            stack = with_avoidance(self.session.scenario, obstacles=tuple(obstacles))
-            self.session.edit(f"obstacle {index}", stack=stack)
+        yield self.session.scenario
         if phase == "end":
             self.session.end_gesture()
+
+    def _obstacle_moved(self, index: int, position: Array, wxyz: Array, phase: str) -> None:
+        with self._dragging(phase) as scenario:
+            obstacles = list(scenario.obstacles)
+            if index < len(obstacles):  # or it was deleted a moment ago
+                obstacles[index] = obstacles[index].moved(as_point(position), as_quaternion(wxyz))
+                self.session.edit(f"obstacle {index}", stack=with_avoidance(scenario, obstacles=tuple(obstacles)))
 
     def _obstacle_selected(self, index: int) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, selected=index))
 
     def _anchor_moved(self, name: str, position: Array, phase: str) -> None:
-        if phase == "start":
-            self.session.begin_gesture()
-        scenario = self.session.scenario
-        transform = transform_of(scenario, name)
-        if transform is not None:  # or it was deleted a moment ago
-            moved = with_transform(scenario, name, transform.anchored(as_point(position)))
-            self.session.edit(name, stack=moved)
-        if phase == "end":
-            self.session.end_gesture()
+        with self._dragging(phase) as scenario:
+            transform = transform_of(scenario, name)
+            if transform is not None:  # or it was deleted a moment ago
+                moved = transform.anchored(as_point(position))
+                self.session.edit(name, stack=with_transform(scenario, name, moved))
 
     def _start_moved(self, index: int, position: Array, phase: str) -> None:
-        if phase == "start":
-            self.session.begin_gesture()
-        self.session.edit(f"start {index}", starts=with_moved_start(self.session.scenario, index, position))
-        if phase == "end":
-            self.session.end_gesture()
+        with self._dragging(phase) as scenario:
+            self.session.edit(f"start {index}", starts=with_moved_start(scenario, index, position))
 
     def _start_chosen(self, index: int) -> None:
         if index < len(self.session.scenario.starts):  # or it was removed a moment ago
@@ -200,14 +197,9 @@ class Visitor:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
 
     def _slice_moved(self, position: Array, wxyz: Array, phase: str) -> None:
-        if phase == "start":
-            self.session.begin_gesture()
-        x, y, z = (float(c) for c in position)
-        w, i, j, k = (float(c) for c in wxyz)
-        pose = SlicePose((x, y, z), (w, i, j, k))
-        self.session.edit("slice", view=replace(self.session.scenario.view, slice=pose))
-        if phase == "end":
-            self.session.end_gesture()
+        with self._dragging(phase) as scenario:
+            pose = SlicePose(as_point(position), as_quaternion(wxyz))
+            self.session.edit("slice", view=replace(scenario.view, slice=pose))
 
     def _push(self) -> None:
         if self._playback.q is not None:

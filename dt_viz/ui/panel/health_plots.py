@@ -11,20 +11,22 @@ from dt_viz.motion.profiles import Profiles
 from dt_viz.ui.panel.plots import LOOK, SMALL, columns
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import css
+from dt_viz.ui.scene.picture import Shown
 
 HEIGHT = 130
 """Of a plot, pixels."""
 _MILLIMETRES = 1e3
 
 
-class HealthPlots:
+class HealthPlots(Shown):
     """A folder with three plots and a table: the shown motion beside what it would be without any behaviour."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         """Make the folder, hidden."""
         self._drawn: Profiles | None = None
-        self._folder = gui.add_folder("Health", visible=False)
-        with self._folder:
+        folder = gui.add_folder("Health", visible=False)
+        super().__init__(folder)
+        with folder:
             self.table = gui.add_html("")
             gui.add_html(_legend())
             self.lyapunov = _plot(gui, "Lyapunov value, of its start’s", palette.LEVEL)
@@ -32,15 +34,6 @@ class HealthPlots:
             self.distance = _plot(gui, "", palette.ROLLOUT)
             self._whose = gui.add_html("")
             self.clearance = _plot(gui, "", palette.GOAL, zero=True)
-
-    @property
-    def visible(self) -> bool:
-        """Whether the folder is shown."""
-        return self._folder.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self._folder.visible = visible
 
     def draw(self, profiles: Profiles | None) -> None:
         """Show these profiles; None leaves what is there."""

@@ -17,7 +17,7 @@ from dt_viz.engine.session import Session
 from dt_viz.files import ply
 from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.files import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.scenario.stack import with_avoidance
@@ -289,5 +289,5 @@ def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obs
     best = int(room.argmax())
     along = mean[min(best + 1, 100)] - mean[max(best - 1, 0)]
     aside = np.cross(along, np.cross(*task.slice.axes.T))
-    x, y, z = (float(c) for c in mean[best] + ASIDE * obstacle.depth * aside / max(float(np.linalg.norm(aside)), 1e-12))
-    return obstacle.moved((x, y, z), obstacle.wxyz)
+    aside /= max(float(np.linalg.norm(aside)), 1e-12)
+    return obstacle.moved(as_point(mean[best] + ASIDE * obstacle.depth * aside), obstacle.wxyz)

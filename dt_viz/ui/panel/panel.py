@@ -167,7 +167,7 @@ class Panel:
             self._notice.visible, self._noticed = False, None
         self._give_hint(hint(frame))
         self._bindings.report(frame)
-        self.joints.draw(frame.arm)
+        self.joints.follow(frame.arm)
         self.health.draw(frame.profiles)
         self._settled = hint(frame), status_html(frame, pace)
         self._status.content = self._settled[1]

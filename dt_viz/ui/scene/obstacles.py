@@ -75,11 +75,6 @@ class ObstaclePicture:
         gestures.on_drag(self.mesh, dragged)
         gestures.on_click(self.mesh, partial(selected, index))
 
-    @property
-    def has_handles(self) -> bool:
-        """Whether handles are shown."""
-        return self.handles.shown
-
     def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool, opened: bool) -> None:
         """Look like the obstacle and stand where it does, unless that is where the browser has put it already.
 
