@@ -35,13 +35,13 @@ from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.starts import Starts
 
 FIELD_OF_VIEW = 0.75
-"""Vertical, rad."""
+"""Vertical field of view, rad."""
 NOTICE_SECONDS = 12.0
-"""That a notification stays, unless it is closed."""
+"""Time after which a notification closes by itself, seconds."""
 
 
 def initial_scenario(engine: Engine, task: str) -> Scenario:
-    """The scenario that a task begins with. Raises what `Engine.task` raises."""
+    """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
     scenario = Scenario(task)
     sphere = Sphere(engine.task(task).obstacle_position)
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
@@ -56,15 +56,15 @@ class Visitor:
         """Build the page and start computing.
 
         Args:
-            client: the visitor.
-            engine: used by this visitor only.
-            robot: to draw.
-            titles: of the tasks, by name.
-            task: the first task's name.
+            client: connection of the visitor.
+            engine: engine of this visitor only.
+            robot: robot to draw.
+            titles: titles of the tasks, by name.
+            task: name of the first task.
         """
         self.client = client
         self.shown: Frame | None = None
-        """The frame that was drawn last."""
+        """The last drawn frame."""
         client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
@@ -101,14 +101,14 @@ class Visitor:
         with self.client.atomic():
             self.pictures.draw(frame)
             self.carried.stand(frame.task.pots)
-            if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then it is where it was
+            if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then the arm stays where it was
                 self.arm.stale = bool(frame.blocked) or self.pictures.stale
         if frame.stage is not Stage.ROLLOUTS:
             if self.pushed_path.is_of_another(frame.scenario):
                 self._playback.end_detour()
             self._playback.follow(frame.arm)
             self.grip.draw(frame)
-            if not self.grip.ball.visible:  # in a drag: nobody says any more that it ends
+            if not self.grip.ball.visible:  # a drag of the ball ends without an event
                 self._playback.let_go()
             self._panel.report(frame, pace)
         self.client.flush()
@@ -139,7 +139,7 @@ class Visitor:
         self._panel.cancelled(task)
 
     def _look_at(self, task: Task) -> None:
-        """Put the camera where the task wants it."""
+        """Move the camera to the task's view."""
         self.client.camera.position, self.client.camera.look_at = task.camera
         self.client.camera.fov = FIELD_OF_VIEW
 
@@ -148,7 +148,7 @@ class Visitor:
             self._look_at(self.shown.task)
 
     def close(self) -> None:
-        """The visitor has left: stop all threads."""
+        """Stop all threads: the visitor has left."""
         self._panel.close()
         self.session.close()
         self._playback.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,6 +23,8 @@ class _Binding:
     put: Callable[[Any], None]
     last: Any = KEEP
     """Value that was read last."""
+    of_frame: bool = False
+    """Whether a frame was looked at for it, so that the next one may change it."""
 
 
 class Bindings:
@@ -36,11 +38,18 @@ class Bindings:
     def __init__(self) -> None:
         self.scenario: Scenario | None = None
         """The scenario adopted last."""
-        self.frame: Frame | None = None
-        """The frame reported last."""
+        self._frame: Frame | None = None
+        self._looked = False
+        """Whether the binding that is being read has looked at the frame."""
         self._session: Session | None = None
         self._bindings: list[_Binding] = []
         self._showing = threading.Lock()  # edits are adopted by one thread, frames reported by another
+
+    @property
+    def frame(self) -> Frame | None:
+        """The frame reported last; bindings that look at it are read again with the next one."""
+        self._looked = True
+        return self._frame
 
     @property
     def session(self) -> Session:
@@ -96,25 +105,26 @@ class Bindings:
         """Show what is new in a scenario."""
         with self._showing:
             self.scenario = scenario
-            self._show()
+            self._show(self._bindings)
 
     def report(self, frame: Frame) -> None:
         """Show what is new in a frame."""
         with self._showing:
-            self.frame = frame
-            self._show()
+            self._frame = frame
+            self._show([binding for binding in self._bindings if binding.of_frame])
 
     def restore(self) -> None:
         """Show the adopted scenario on all inputs, also on those that a browser has moved in vain."""
         with self._showing:
             for binding in self._bindings:
                 binding.last = KEEP
-            self._show()
+            self._show(self._bindings)
 
-    def _show(self) -> None:
+    def _show(self, bindings: Sequence[_Binding]) -> None:
         if self.scenario is not None:
-            for binding in self._bindings:
+            for binding in bindings:
+                self._looked = False
                 value, last = binding.read(self.scenario), binding.last
-                binding.last = value
+                binding.last, binding.of_frame = value, self._looked
                 if value is not KEEP and (last is KEEP or value != last):
                     binding.put(value)

@@ -14,12 +14,12 @@ from dt_viz.ui.scene.palette import css
 from dt_viz.ui.scene.picture import Shown
 
 HEIGHT = 130
-"""Of a plot, pixels."""
+"""Height of a plot, pixels."""
 _MILLIMETRES = 1e3
 
 
 class HealthPlots(Shown):
-    """A folder with three plots and a table: the shown motion beside what it would be without any behaviour."""
+    """A folder with three plots and a table: the shown motion beside the one without avoidance and biases."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         """Make the folder, hidden."""
@@ -56,7 +56,7 @@ class HealthPlots(Shown):
 
 
 def table_html(profiles: Profiles) -> str:
-    """Fréchet distance and M.C.D. of both motions, side by side."""
+    """Return a table of the Fréchet distance and M.C.D. of both motions."""
     shown, without = profiles.shown, profiles.undisturbed
     bounded = bool(np.isfinite(shown.clearance).all())
     rows = (
@@ -78,7 +78,7 @@ def _length(metres: float | None) -> str:
 
 
 def _plot(gui: viser.GuiApi, title: str, colour: tuple[int, int, int], *, zero: bool = False) -> viser.GuiUplotHandle:
-    """A plot of a pair of curves along the path, below its title."""
+    """Add a plot of a pair of curves along the path, below its title."""
     if title:
         gui.add_html(_title(title))
     series = [

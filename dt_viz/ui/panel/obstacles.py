@@ -34,11 +34,11 @@ SHAPES: Mapping[str, Obstacle] = {
     "Cube (fig. 3a)": Box(ORIGIN, (0.12, 0.12, 0.12)),
     "Box": Box(ORIGIN, (0.16, 0.10, 0.06)),
 }
-"""What can be added, by its button."""
+"""Shapes that can be added, by the name of their button."""
 ASIDE = 0.4
-"""Of its inner radius, by which a new obstacle stands beside the motion: dead ahead no side is the shorter one."""
+"""Offset of a new obstacle from the motion, in its inner radii: dead ahead no side is the shorter one."""
 MIN_SIZE, MAX_SIZE = 0.03, 0.40
-"""Of a box along one axis, and of a cylinder's height, metres."""
+"""Smallest and largest side of a box, and height of a cylinder, metres."""
 FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
 NONE: str = "none"
 
@@ -59,7 +59,8 @@ class ObstaclePanel:
             later: does work beside the server's event loop.
         """
         self._bindings, self._say = bindings, say
-        self._refused: tuple[bytes, str, str] | None = None  # content and name of a file, and the unit it may be in
+        self._refused: tuple[bytes, str, str] | None = None
+        """Content and name of a file that was refused for its size, and the unit that would fit."""
         self._reader = Reader(lambda: say("Another visitor's file is being read; yours is read after it.", False))
         with gui.add_folder("Obstacles"):
             hint = "the one with handles; or click it in the scene"
@@ -132,7 +133,7 @@ class ObstaclePanel:
         on_press(self._again, lambda: self._begin(self.load_again))
 
     def close(self) -> None:
-        """The visitor has left: stop reading."""
+        """Stop reading: the visitor has left."""
         self._reader.close()
 
     def _begin(self, load: Callable[[], None]) -> None:
@@ -255,11 +256,11 @@ def name_of(obstacle: Obstacle) -> str:
 
 
 def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[str, ...]]:
-    """The obstacle that a file holds, around the origin, and what is to be said about it.
+    """Return the obstacle that a file holds, around the origin, and notes about it for the page.
 
     Args:
         content: all bytes of the file.
-        name: of the file; its suffix says what it is. A PLY without faces is a point cloud.
+        name: name of the file; its suffix says what it is. A PLY without faces is a point cloud.
         scale: metres for one unit of the file.
 
     Raises:
@@ -281,7 +282,7 @@ def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[
 
 
 def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obstacle:
-    """The obstacle beside the mean demonstration, where that is farthest from its ends and other obstacles."""
+    """Return the obstacle beside the mean demonstration, where that is farthest from its ends and other obstacles."""
     mean = task.mean_path
     ends = np.concatenate([task.starts, mean[-1:]])
     room = np.linalg.norm(mean[:, None] - ends, axis=-1).min(axis=1)

@@ -55,7 +55,7 @@ VIEW_LABELS: Mapping[str, str] = {
     "generator": "Learned generator",
 }
 PLOTS = {"joint_plots", "health_plots"}
-"""Those of them that are in the panel, not in the scene."""
+"""Fields of `View` whose pictures are in the panel, not in the scene."""
 VIEW_HINTS: Mapping[str, str] = {
     "field": "on the slice: longer and darker is faster",
     "streamlines": "motions from all over the slice: exact, as images of straight rays",
@@ -86,12 +86,12 @@ class Panel:
         """Build the controls; they act once `connect` has given them a session.
 
         Args:
-            gui: of the visitor.
-            titles: of the tasks, by name.
-            robot: whose joints are plotted.
+            gui: controls of the visitor.
+            titles: titles of the tasks, by name.
+            robot: robot whose joints are plotted.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
-            notify: says something in a colour where it is seen however far the panel is scrolled.
-            look_home: puts the camera back to where the task wants it.
+            notify: shows a text in a colour beside the panel, however far that is scrolled.
+            look_home: moves the camera back to the task's view.
         """
         self._notify, self._look_home = notify, look_home
         self._gui = gui
@@ -100,10 +100,10 @@ class Panel:
         self._notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
         self._shows = self._waits = False
-        """Whether a frame was reported at all, and whether another task or scene is computed than that of the last."""
+        """Whether a frame has been reported, and whether another task or scene than its own is being computed."""
         self._reported: Scenario | None = None
         self._settled = "", ""
-        """Hint and status of the scenario reported last."""
+        """Hint and status of the last reported scenario."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
         self._status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
@@ -136,7 +136,7 @@ class Panel:
         self._bindings.connect(session)
 
     def close(self) -> None:
-        """The visitor has left: stop what plays, and what is read."""
+        """Stop playing and reading: the visitor has left."""
         self._obstacles.close()
         self._stack.close()
         self._saver.close()
@@ -145,7 +145,7 @@ class Panel:
 
     @property
     def legend(self) -> Legend | None:
-        """Of the colours on the slice."""
+        """Legend of the colours on the slice."""
         return self._slice.legend
 
     def adopt(self, scenario: Scenario) -> None:
@@ -155,7 +155,7 @@ class Panel:
             self._wait()
 
     def report(self, frame: Frame, pace: Pace) -> None:
-        """Show how the rebuild went and how far its result is to be trusted."""
+        """Show the speed of the rebuild, its warnings and its certificates."""
         if frame.stage is Stage.ROLLOUTS:
             return  # the next stage is a few milliseconds away
         adopted = self._bindings.scenario
@@ -173,7 +173,7 @@ class Panel:
         self._status.content = self._settled[1]
 
     def _wait(self) -> None:
-        """Say that another task or scene is computed than the one reported last, whose status is pale."""
+        """Show that another task or scene is being computed; the status of the last one turns pale."""
         if not self._waits:
             self._waits = True
             self._give_hint("")
@@ -181,7 +181,7 @@ class Panel:
             self._status.content = f"{said}<div style='{_PALE}'>{self._settled[1]}</div>"
 
     def _settle(self) -> None:
-        """Nothing is computed that would be reported: show the status of what is shown, if that is adopted."""
+        """Stop waiting for a report; show the last frame's status again if it is of the adopted task and scene."""
         if self._waits:
             self._waits = False
             adopted = self._bindings.scenario
@@ -193,7 +193,7 @@ class Panel:
         self._hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
 
     def learning(self, fraction: float, message: str) -> None:
-        """Show how far learning a task is."""
+        """Show the progress of learning a task."""
         self._bar.visible = self._cancel.visible = True
         self._bar.value = 100 * fraction
         self._status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
@@ -214,14 +214,14 @@ class Panel:
         self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
 
     def _say(self, text: str, colour: Colour, background: Colour) -> None:
-        """Say something that stays until the next scenario is shown, and for a while beside the panel."""
+        """Show a text until the next scenario is shown, and for a while beside the panel."""
         self._learned()
         self._notify(_sentence(text), colour)
         self._notice.content, self._notice.visible = _alarm(text, colour, background), True
         self._noticed = self._bindings.scenario
 
     def _learned(self) -> None:
-        """Nothing is being learned any more."""
+        """Hide the progress of learning."""
         if self._bar.visible:
             self._bar.visible = self._cancel.visible = False
             self._status.content = ""
@@ -252,14 +252,14 @@ class Panel:
         self._bindings.on(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
 
     def _begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
-        """Begin a task or a scene; where that cannot be, say why and stay."""
+        """Begin a task or a scene; if that fails, show why and stay."""
         self._wait()
         self._beginnings.submit(partial(self._begun, begin, session, title))
 
     def _begun(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         begin(session, title)
         if self._reported is not None and self._reported.begins_like(session.scenario):
-            self._settle()  # it was chosen again before it was left
+            self._settle()  # the shown task was chosen again before it was left
 
     def _stay(self, error: Exception) -> None:
         self.fail(error)
@@ -294,7 +294,7 @@ class Panel:
         return KEEP if picture is None else picture.num_flows
 
     def _build_plots(self, robot: Robot) -> None:
-        """Each right under its checkbox, high up in the tab, to be seen when they open."""
+        """Build the plots, each under its checkbox, high up in the tab, to be seen when they open."""
         self._build_checkbox("joint_plots")
         self.joints = JointPlots(self._gui, robot)
         self._bindings.properties(self.joints, visible=lambda s: s.view.joint_plots)
@@ -340,7 +340,7 @@ def _play_or_pause(session: Session, _pressed: bool) -> None:
 
 
 def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
-    """The scene's scenario for its task, once what takes seconds to draw of it is there."""
+    """Return a function that makes the scene's scenario, with the surfaces of its obstacles, which take seconds."""
 
     def scenario(task: Task) -> Scenario:
         begun = scene.scenario(task)
@@ -356,7 +356,7 @@ CHANGED = "The scene is changed. “Reset” brings it back as it was."
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
 HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
 OF_MESHES = frozenset({Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE})
-"""Kinds of warnings about what the arm's meshes come near to."""
+"""Kinds of warnings about collisions of the arm's meshes."""
 _BLUE = ((29, 79, 124), (232, 241, 250))
 _GREEN = ((0, 92, 66), (230, 245, 239))
 _AMBER = ((138, 75, 0), (255, 244, 224))
@@ -367,7 +367,7 @@ _SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.
 
 
 def hint(frame: Frame) -> str:
-    """What to try in the task, or to see in the scene of the paper."""
+    """Return what to try in the task, or what to see in the scene of the paper."""
     scene = SCENES.get(frame.scenario.scene)
     if scene is None:
         return frame.task.hint
@@ -375,10 +375,10 @@ def hint(frame: Frame) -> str:
 
 
 def status_html(frame: Frame, pace: Pace) -> str:
-    """The status line: speed, clearance, certificates, and every warning."""
+    """Return the status line: speed, clearance, certificates, and every warning."""
     known, scenario = frame.certificates, frame.scenario
     hides_arm = not (scenario.view.arm or scenario.view.onion)
-    # what is not known after the last stage never will be
+    # figures that are missing after the last stage will not come
     unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
     off = "–" if frame.blocked else "off"
     whole_arm = scenario.arm_avoidance is not None
@@ -409,18 +409,18 @@ def status_html(frame: Frame, pace: Pace) -> str:
     said = warp + "".join(_alarm(warning, *_AMBER) for warning in warnings)
     if not (said or blocked) and frame.stage is Stage.CERTIFIED:
         said = _alarm("every check holds", *_GREEN)
-    # its room stays while checks are made, so that what is below does not jump under the pointer
+    # the room for warnings stays during checks, so that controls below do not jump under the pointer
     return f"{blocked}<table style='{_SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{said}</div>"
 
 
 def _rebuild(pace: Pace) -> str:
-    """How fast it goes."""
+    """Describe the speed of rebuilding."""
     rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
     return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
 
 
 def _tiny(length: float) -> str:
-    """A length in metres that should be next to nothing."""
+    """Format a length, metres, that should be close to zero."""
     return f"{1e3 * length:.0e} mm" if 0 < length < 1e-4 else f"{1e3 * length:.1f} mm"
 
 
@@ -430,7 +430,7 @@ def _clearance(clearance: float, *, whole_arm: bool) -> str:
 
 
 def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
-    """T of the flows: of the avoidance, and of the transforms that call it otherwise."""
+    """Return the rows with t of the flows: of the avoidance, and of the transforms that call it otherwise."""
     hand, strengths = None, []
     for layer, duration in zip(frame.scenario.stack, frame.durations, strict=False):
         if duration is None:
@@ -447,7 +447,7 @@ def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
 
 
 def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:
-    """What the arm's meshes come near to."""
+    """Return the rows about the collisions of the arm's meshes."""
     if report is None:
         obstacle = itself = table = unknown
     else:
@@ -462,7 +462,7 @@ def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple
 
 
 def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
-    """A distance in metres, and of which links; `otherwise` says what one below zero means."""
+    """Format a distance, metres, and its links; `otherwise` is the word for a negative one."""
     size = f"{1e3 * abs(distance):.0f} mm"
     if distance <= 0:
         size = f"{otherwise} {size}" if distance < 0 else otherwise
@@ -470,7 +470,7 @@ def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
 
 
 def _sentence(text: str) -> str:
-    """The text with a capital letter, unless it begins with the name of a file."""
+    """Begin a text with a capital letter, unless it begins with the name of a file."""
     return text if "." in text.split(" ", 1)[0] else text[:1].upper() + text[1:]
 
 

@@ -18,28 +18,28 @@ from dt_viz.ui.scene.palette import css
 from dt_viz.ui.scene.picture import Following
 
 NUM_SAMPLES = 80
-"""Of each curve: what is sent in a drag stays small."""
+"""Number of samples of a curve, few enough to be sent during a drag."""
 MAX_SPEED = 200
-"""Percent of a joint's limit that the plot shows at most: a joint that leaps would press all others to the ground."""
+"""Largest speed in the plot, percent of the joint's limit: a joint that leaps would flatten all other curves."""
 HEIGHT = 170
-"""Of a plot, pixels."""
+"""Height of a plot, pixels."""
 SMALL = "font-size:0.75em;line-height:1.3;padding:0.2em 0.9em 0"
 
 
 @dataclass(frozen=True)
 class JointCurves:
-    """What the plots show."""
+    """Curves of the plots."""
 
     times: Array
-    """(N,) seconds, evenly spaced."""
+    """(N,) even times, seconds."""
     angles: Array
-    """(N, 6) degrees, unwrapped."""
+    """(N, 6) joint angles, degrees, unwrapped."""
     speeds: Array
-    """(N, 6) of the velocity limits, percent."""
+    """(N, 6) joint speeds, percent of the velocity limits."""
 
 
 def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> JointCurves:
-    """Curves of a motion; a speed is the largest around its moment, so that no peak is lost between two samples."""
+    """Compute the curves; a speed is the largest around its moment, so that no peak is lost between two samples."""
     times = np.linspace(motion.times[0], motion.times[-1], num)
     angles = np.stack([np.interp(times, motion.times, angle) for angle in np.degrees(motion.q).T], axis=1)
     steps = np.maximum(np.diff(motion.times), 1e-9)
@@ -51,7 +51,7 @@ def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> Joi
 
 
 class JointPlots(Following):
-    """A folder with both plots; they are drawn only while shown."""
+    """A folder with both plots."""
 
     def __init__(self, gui: viser.GuiApi, robot: Robot) -> None:
         """Make the folder, hidden."""
@@ -86,7 +86,7 @@ class JointPlots(Following):
 
 
 def columns(*arrays: Array) -> tuple[NDArray[np.float64], ...]:
-    """What uPlot takes: all columns of arrays (N,) and (N, k), one after the other."""
+    """Split arrays (N,) and (N, k) into the columns that uPlot takes."""
     return tuple(np.column_stack(arrays).T.astype(np.float64))
 
 

@@ -31,13 +31,13 @@ from dt_viz.ui.scene.levels import manifold
 
 BASE = "Base attractor"
 BELOW = 1e9
-"""Order of what stands below the rows in their folder."""
+"""Order of the controls below the rows in their folder."""
 ON, OFF, UP, DOWN, SEE, SEEN = "● on", "○ off", "↑", "↓", "see", "● seen"
 
 
 @dataclass(frozen=True)
 class Row:
-    """One transform as the list shows it."""
+    """Row of the list: a transform with its buttons."""
 
     name: str
     label: str
@@ -57,11 +57,13 @@ class StackPanel:
             self._warp = WarpControls(gui, bindings, BELOW)
             add_transform_settings(gui, bindings, BELOW + 2)
         bindings.show(self._wanted, self._show)
-        legend = gui.add_html("", visible=False)  # at the end: it comes and goes, and would move what is below
+        legend = gui.add_html(
+            "", visible=False
+        )  # at the end: it appears and disappears, which would move controls below it
         bindings.properties(legend, content=legend_html, visible=lambda s: bool(legend_html(s)))
 
     def close(self) -> None:
-        """Stop what plays."""
+        """Stop playing."""
         self._warp.close()
 
     def _wanted(self, scenario: Scenario) -> tuple[Row, ...]:
@@ -98,7 +100,7 @@ def press(session: Session, name: str, button: str) -> None:
 
 
 def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row, ...]:
-    """The list from the top down, with the durations that the last frame had."""
+    """Return the rows from the top down, with the durations of the last frame."""
     on = {layer.name for layer in scenario.stack if layer.on}
     seen, order, rows = levels(scenario), listed(scenario), []
     for k, name in enumerate(order):
@@ -123,7 +125,7 @@ def durations(frame: Frame) -> dict[str, float | None]:
 
 
 def legend_html(scenario: Scenario) -> str:
-    """Which lines are those of the selected level; nothing if none is shown."""
+    """Return a legend of the selected level's lines; empty if none is selected."""
     if scenario.view.level not in levels(scenario):
         return ""
     swatch = (

@@ -1,4 +1,4 @@
-"""Controls of the transforms that are added: which there are, and what each is for."""
+"""Controls that add, select and delete transforms, and those of the selected one's own settings."""
 
 from __future__ import annotations
 

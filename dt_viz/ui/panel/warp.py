@@ -12,12 +12,12 @@ from dt_viz.engine.session import Session
 from dt_viz.ui.panel.bindings import Bindings
 
 SECONDS = 5.0
-"""That playing takes."""
+"""Duration of playing."""
 STEP = 0.05
-"""Seconds between two edits: as many a second as a dragged slider sends."""
+"""Interval of the edits, seconds, as of a dragged slider."""
 PLAY, STOP = "0 → 1", "Stop"
 NAME = "Warp"
-"""Of the slider, and so of the gesture for undo."""
+"""Name of the slider, and of its gesture for undo."""
 
 
 class WarpPlayer:
@@ -27,8 +27,8 @@ class WarpPlayer:
         """Wait to be started.
 
         Args:
-            changed: told when it begins to play and when it ends.
-            seconds: that it takes.
+            changed: called with True when playing begins and with False when it ends.
+            seconds: duration of playing.
         """
         self._changed = changed
         self._seconds = seconds
@@ -41,7 +41,7 @@ class WarpPlayer:
         return self._thread is not None and self._thread.is_alive()
 
     def toggle(self, session: Session) -> None:
-        """Begin, or stop where it is."""
+        """Start to play, or stop at the current warp."""
         if self.playing:
             self._stop.set()
         else:
@@ -59,7 +59,7 @@ class WarpPlayer:
         self._changed(True)
         session.begin_gesture()
         began, mine = time.monotonic(), None
-        while mine is None or session.scenario.moves_like(mine):  # else somebody else has taken hold
+        while mine is None or session.scenario.moves_like(mine):  # else the user edits something
             warp = min(1.0, (time.monotonic() - began) / self._seconds)
             session.edit(NAME, warp=round(warp, 3))
             mine = session.scenario

@@ -14,11 +14,11 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Lines, Picture
 
 LABEL_GAP = 0.03
-"""Above the slice, metres."""
+"""Height of the label above the slice, metres."""
 
 
 class LevelRollouts(Picture):
-    """What the motions would be without what is stacked on the selected level, and the name of its manifold."""
+    """Rollouts of the selected level, without the transforms stacked on it, and the name of its manifold."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/level", show_axes=False, visible=False))
@@ -47,7 +47,7 @@ class LevelRollouts(Picture):
 
 
 def manifold(scenario: Scenario) -> str:
-    """What the manifold of the level that the view shows is called."""
+    """Return the name of the manifold of the level that the view shows."""
     level = scenario.view.level
     if level == IMITATION:
         return "manifold of the imitation" if scenario.imitation else "base attractor: straight motions"

@@ -31,20 +31,20 @@ from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlic
 from dt_viz.ui.scene.starts import Starts
 
 BOLD, THIN = 0.0048, 0.0026
-"""Of the rollouts of the whole stack, metres: by themselves, and beside those of a level."""
+"""Thickness of the whole stack's rollouts, metres: by themselves, and beside those of a level."""
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
-"""Labels of where the demonstrations end: if motions end there, and if they do not."""
+"""Labels of the demonstrations' end: where motions end there, and where they end elsewhere."""
 ADDED = 0.0022
 """Thickness of rollouts from added starts, metres."""
 OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
-"""What the view shows of a motion, and nothing says that it may be of another one: rollouts are grey then."""
+"""Fields of `View` whose pictures are hidden while there is no motion: unlike the rollouts they cannot turn grey."""
 OF_A_TASK = {"demonstrations", "ghost"}
-"""The same of what belongs to a task or a scene."""
+"""Fields of `View` whose pictures are hidden while another task or scene is being computed."""
 COMPUTING = "computing"
 
 
 class Demonstrations(Picture):
-    """What was shown to the robot, thin."""
+    """The demonstrations, as thin lines."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._lines = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018)
@@ -59,7 +59,7 @@ class Demonstrations(Picture):
 
 
 class Rollouts(Picture):
-    """What the robot will do, bold, with a dot at each start; thin and pale beside those of a level of the stack.
+    """The rollouts, bold, with a dot at each start; thin and pale beside those of a level of the stack.
 
     Motions that begin at added starts are thin.
     """
@@ -104,7 +104,7 @@ class Ghost(Picture):
 
 
 class Goal(Picture):
-    """Where the motions should end, and a second ball where they do if something covers the goal."""
+    """The goal as a ball, and a second ball where motions end if something covers the goal."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._goal = scene.add_frame("/goal", show_axes=False)
@@ -122,7 +122,7 @@ class Goal(Picture):
         self._end.position = frame.reached
         elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
         self.label.text = OLD_GOAL if elsewhere else GOAL
-        # a transform that moves the goal says so itself
+        # the marker of a transform that moves the goal says so
         goals = [to.anchor for to in anchored(frame.scenario).values() if to.anchor is not None and to.ends_motions]
         marked = any(np.linalg.norm(frame.reached - goal) < BALL_RADIUS for goal in goals)
         self._end.visible = elsewhere and not marked
@@ -147,7 +147,7 @@ class Table(Picture):
 
 
 def set_lights(scene: viser.SceneApi) -> None:
-    """Lights that look the same on the screen and in an exported picture, which has no environment map."""
+    """Set lights that look the same on the screen and in an exported picture, which has no environment map."""
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map(hdri=None)
     scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(214, 208, 200), intensity=1.8)
@@ -169,7 +169,7 @@ class ScenePictures:
         slice_moved: SliceMoved,
         starts: Starts,
     ) -> None:
-        """Build the scene of this robot; the others are told what the user does, see their pictures."""
+        """Build the scene of this robot; the callbacks are those of the pictures."""
         set_lights(scene)
         self.obstacles = Obstacles(scene, moved, selected)
         self.anchors = Anchors(scene, anchor_moved, anchor_selected)
@@ -197,12 +197,12 @@ class ScenePictures:
             "onion": Onion(scene, robot),
         }
         self._view, self._blocked = View(), False
-        self._showing = threading.Lock()  # whoever changes the view is not who draws
+        self._showing = threading.Lock()  # views change on another thread than the one that draws
         self._drawing = threading.Lock()
         self._frame: Frame | None = None
         self._adopted: Scenario | None = None
         self._grey = False
-        """Whether it was drawn as `stale`."""
+        """Whether the last frame was drawn as `stale`."""
         function = ColourSlice(scene)
         self._by_colour: dict[str, Picture] = {
             "det": function,
@@ -247,7 +247,7 @@ class ScenePictures:
         with self._showing:
             self._view = scenario.view
             self._show()
-        if self.stale != self._grey:  # who draws at this moment has seen one of both, or is waited for
+        if self.stale != self._grey:  # a thread that is drawing has seen the new scenario, or is waited for
             with self._drawing:
                 if self._frame is not None:
                     self._draw(self._frame)
