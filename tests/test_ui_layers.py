@@ -213,7 +213,7 @@ def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
     fresh, stale = colours(()), colours(("the obstacle touches the base",))
     assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
     np.testing.assert_array_equal(colours(()), fresh)
-    starts = rollouts._starts
+    starts = rollouts.starts
     rollouts.draw(replace(frame(blocked=("no way",)), task=TASKS["draw_s"](), rollouts=paths))
     np.testing.assert_array_equal(np.reshape(starts.colors, (-1, 3))[0], palette.STALE)
     colours(())
@@ -296,21 +296,21 @@ def test_the_status_of_another_task_is_pale_and_says_what_is_done(server):
     said = {s.task: replace(frame(scenario=s), task=TASKS[s.task]()) for s in (scenario, other)}
     panel.adopt(scenario)
     panel.report(said["draw_s"], PACE)
-    settled = panel._status.content
-    assert COMPUTING not in settled and said["draw_s"].task.hint in html.unescape(panel._hint.content)
+    settled = panel.status.content
+    assert COMPUTING not in settled and said["draw_s"].task.hint in html.unescape(panel.hint.content)
     panel.adopt(other)
     for _ in range(2):
-        waiting = panel._status.content
+        waiting = panel.status.content
         assert COMPUTING in waiting and f"opacity:0.3;filter:grayscale(1)'>{settled}" in waiting
-        assert said["draw_s"].task.hint not in html.unescape(panel._hint.content)
+        assert said["draw_s"].task.hint not in html.unescape(panel.hint.content)
         panel.report(said["draw_s"], PACE)  # what was under way when it was chosen
     panel.report(said["lift_box"], PACE)
-    assert COMPUTING not in panel._status.content
-    assert said["lift_box"].task.hint in html.unescape(panel._hint.content)
+    assert COMPUTING not in panel.status.content
+    assert said["lift_box"].task.hint in html.unescape(panel.hint.content)
     panel.adopt(scenario)
-    assert COMPUTING in panel._status.content
+    assert COMPUTING in panel.status.content
     panel.fail(ValueError("nothing comes"))
-    assert COMPUTING not in panel._status.content
+    assert COMPUTING not in panel.status.content
     panel.close()
     server.gui.reset()
 
@@ -338,15 +338,15 @@ def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(serv
     panel.connect(cast(Session, session))
     panel.adopt(session.scenario)
     panel.report(replace(frame(scenario=session.scenario), task=TASKS["draw_s"]()), PACE)
-    settled = panel._status.content, panel._hint.content
+    settled = panel.status.content, panel.hint.content
     panel._begin(lambda session, name: session.choose_task(name), cast(Session, session), chosen)
-    assert COMPUTING in panel._status.content and session.asked == []
+    assert COMPUTING in panel.status.content and session.asked == []
     session.may.set()
     assert panel._beginnings.wait_idle(30)
     assert session.asked == [chosen]
-    assert (COMPUTING not in panel._status.content) == settles
-    assert ((panel._status.content, panel._hint.content) == settled) == settles
-    assert panel._notice.visible == (chosen == "push_box")
+    assert (COMPUTING not in panel.status.content) == settles
+    assert ((panel.status.content, panel.hint.content) == settled) == settles
+    assert panel.notice.visible == (chosen == "push_box")
     panel.close()
     server.gui.reset()
 
@@ -418,8 +418,8 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
     panel = panel_of(server)
     handles = server.gui._gui_input_handle_from_uuid.values()
     box = {handle.label: handle for handle in handles if getattr(handle, "label", "") in VIEW_LABELS.values()}
-    of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._node, box[VIEW_LABELS["health_plots"]]]
-    of_tab += [panel.health._node, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
+    of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints.node, box[VIEW_LABELS["health_plots"]]]
+    of_tab += [panel.health.node, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
     orders = [handle.order for handle in of_tab]
     assert orders == sorted(orders)
     assert len({handle._impl.parent_container_id for handle in of_tab}) == 1
@@ -453,7 +453,7 @@ def test_what_is_refused_is_said_beside_the_panel_too(server):
     panel = panel_of(server, notify=lambda *told: said.append(told))
     panel.fail(DemonstrationError("file.csv", "points", "3", "at least 20"))
     ((text, colour),) = said
-    assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel._notice.content)
+    assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel.notice.content)
     assert colour[0] > 2 * max(colour[1:])  # red
 
 

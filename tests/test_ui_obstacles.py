@@ -264,11 +264,11 @@ def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
     ((text, wrong),) = opened.said
     assert not wrong  # it is a question
     assert text == "ball.stl seems to be in millimetres: 80 × 80 × 80 units. Read it in millimetres?"
-    assert opened.panel._again.visible and opened.panel._again.label == "Read it in millimetres"
+    assert opened.panel.again.visible and opened.panel.again.label == "Read it in millimetres"
     opened.panel.load_again()
     *_, added = opened.session.scenario.obstacles
     assert added.size == pytest.approx(0.08, abs=1e-3)
-    assert not opened.panel._again.visible and opened.panel._unit.value == "millimetres"
+    assert not opened.panel.again.visible and opened.panel.unit.value == "millimetres"
     opened.panel.load_again()
     assert len(opened.session.scenario.obstacles) == 2 and len(opened.said) == 1
 
@@ -278,7 +278,7 @@ def test_a_size_that_no_unit_makes_sensible_is_an_error(opened, size):
     opened.panel.load(stl(BALL_MESH.copy().apply_scale(size)), "ball.stl", 1.0)
     ((text, wrong),) = opened.said
     assert wrong and "; accepted: a largest side of 0.01 m to 1 m" in text
-    assert not opened.panel._again.visible
+    assert not opened.panel.again.visible
 
 
 def test_a_file_whose_visitor_has_left_becomes_no_obstacle(opened):

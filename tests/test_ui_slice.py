@@ -87,7 +87,7 @@ def test_arrows_and_streamlines_show_what_they_are_given(scene):
     shown = frame(pictures=Pictures(field=FieldPicture(points, velocities), streamlines=(line, line + 1.0)))
     arrows.draw(shown)
     streams.draw(shown)
-    np.testing.assert_allclose(arrows._arrows.node.points.mean(axis=1), points, atol=1e-6)
+    np.testing.assert_allclose(arrows.arrows.node.points.mean(axis=1), points, atol=1e-6)
     np.testing.assert_allclose(streams.lines.node.points[:6, 0], line[:-1], atol=1e-6)
     heads = streams.heads.node.points
     assert len(heads) == 2

@@ -114,12 +114,12 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
     panel, bound = panel
     bound.adopt(SCENARIO)
     bound.report(frame())
-    shown = [handle.label for handle in panel._rows if handle.visible]
+    shown = [handle.label for handle in panel.rows if handle.visible]
     assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, strength 0.80", IMITATION, BASE]
     bound.adopt(changed(SCENARIO, layers=(), obstacles=()))
-    assert [handle.label for handle in panel._rows if handle.visible] == [IMITATION, BASE]
+    assert [handle.label for handle in panel.rows if handle.visible] == [IMITATION, BASE]
     bound.adopt(SCENARIO)
-    assert len(panel._rows) == 5
+    assert len(panel.rows) == 5
 
 
 def test_the_selected_level_is_drawn_and_named(scene):
@@ -145,8 +145,8 @@ def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
     seen = replace(SCENARIO, view=View(level="Bias 2"))
     for goal, marked in ((2.0, False), (2.1, True), (2.0, False)):
         picture.draw(frame(seen, level=2, goal=np.full(3, goal)))
-        assert picture._end.visible == marked
-        np.testing.assert_array_equal(picture._end.position, np.full(3, 2.0))
+        assert picture.end.visible == marked
+        np.testing.assert_array_equal(picture.end.position, np.full(3, 2.0))
 
 
 # --- Bias points ---

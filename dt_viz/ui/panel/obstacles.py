@@ -119,18 +119,18 @@ class ObstaclePanel:
                 lambda s, value: {"stack": with_avoidance(s, margin=value / 100)},
             )
             with gui.add_folder("From a file", expand_by_default=False):
-                self._unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
+                self.unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
                 hint = f"{FORMATS}; a mesh must be closed; a csv of points begins with x,y,z or x,y,z,occupied"
                 self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
                 bindings.properties(self._upload, visible=_has_room)
-                self._again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
+                self.again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
 
         @self._upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:
             file = self._upload.value
-            self._begin(partial(self.load, file.content, file.name, UNITS[self._unit.value]))
+            self._begin(partial(self.load, file.content, file.name, UNITS[self.unit.value]))
 
-        on_press(self._again, lambda: self._begin(self.load_again))
+        on_press(self.again, lambda: self._begin(self.load_again))
 
     def close(self) -> None:
         """Stop reading: the visitor has left."""
@@ -156,7 +156,7 @@ class ObstaclePanel:
         """Add what the file holds that was refused for its size, in the unit that was suggested."""
         if self._refused is not None:
             content, name, unit = self._refused
-            self._unit.value = unit
+            self.unit.value = unit
             self.load(content, name, UNITS[unit])
 
     def _load(self, content: bytes, name: str, scale: float) -> None:
@@ -171,7 +171,7 @@ class ObstaclePanel:
         except SizeError as error:
             if error.unit is not None:
                 self._refused = content, name, error.unit
-                self._again.label = f"Read it in {error.unit}"
+                self.again.label = f"Read it in {error.unit}"
             self._say(error.question or str(error), error.question is None)
         except ShapeError as error:
             self._say(str(error), True)
@@ -180,7 +180,7 @@ class ObstaclePanel:
             if notes:
                 self._say(f"{name}: {'; '.join(notes)}", False)
         finally:
-            self._again.visible = self._refused is not None
+            self.again.visible = self._refused is not None
 
     def _size(
         self,

@@ -97,7 +97,7 @@ class Panel:
         self._gui = gui
         self._titles = dict(titles)
         self._bindings = Bindings()
-        self._notice = gui.add_html("", visible=False)
+        self.notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
         self._shows = self._waits = False
         """Whether a frame has been reported, and whether another task or scene than its own is being computed."""
@@ -105,7 +105,7 @@ class Panel:
         self._settled = "", ""
         """Hint and status of the last reported scenario."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
-        self._status = gui.add_html("")
+        self.status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
 
@@ -164,13 +164,13 @@ class Panel:
         self._reported, self._shows, self._waits = frame.scenario, True, False
         self._learned()
         if self._noticed is not None and frame.scenario != self._noticed:
-            self._notice.visible, self._noticed = False, None
+            self.notice.visible, self._noticed = False, None
         self._give_hint(hint(frame))
         self._bindings.report(frame)
         self.joints.follow(frame.arm)
         self.health.draw(frame.profiles)
         self._settled = hint(frame), status_html(frame, pace)
-        self._status.content = self._settled[1]
+        self.status.content = self._settled[1]
 
     def _wait(self) -> None:
         """Show that another task or scene is being computed; the status of the last one turns pale."""
@@ -178,7 +178,7 @@ class Panel:
             self._waits = True
             self._give_hint("")
             said = f"<div style='{_SMALL}'>{COMPUTING}</div>"
-            self._status.content = f"{said}<div style='{_PALE}'>{self._settled[1]}</div>"
+            self.status.content = f"{said}<div style='{_PALE}'>{self._settled[1]}</div>"
 
     def _settle(self) -> None:
         """Stop waiting for a report; show the last frame's status again if it is of the adopted task and scene."""
@@ -186,17 +186,17 @@ class Panel:
             self._waits = False
             adopted = self._bindings.scenario
             stays = self._reported and adopted and self._reported.begins_like(adopted)
-            said, self._status.content = self._settled if stays else ("", "")
+            said, self.status.content = self._settled if stays else ("", "")
             self._give_hint(said)
 
     def _give_hint(self, text: str) -> None:
-        self._hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
+        self.hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
 
     def learning(self, fraction: float, message: str) -> None:
         """Show the progress of learning a task."""
         self._bar.visible = self._cancel.visible = True
         self._bar.value = 100 * fraction
-        self._status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
+        self.status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
@@ -217,14 +217,14 @@ class Panel:
         """Show a text until the next scenario is shown, and for a while beside the panel."""
         self._learned()
         self._notify(_sentence(text), colour)
-        self._notice.content, self._notice.visible = _alarm(text, colour, background), True
+        self.notice.content, self.notice.visible = _alarm(text, colour, background), True
         self._noticed = self._bindings.scenario
 
     def _learned(self) -> None:
         """Hide the progress of learning."""
         if self._bar.visible:
             self._bar.visible = self._cancel.visible = False
-            self._status.content = ""
+            self.status.content = ""
 
     def _build_task(self) -> None:
         names = {title: name for name, title in self._titles.items()}
@@ -235,7 +235,7 @@ class Panel:
         self._bindings.choice(
             self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
         )
-        self._hint = self._gui.add_html("")
+        self.hint = self._gui.add_html("")
         scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
 
         def load(session: Session, title: str) -> None:

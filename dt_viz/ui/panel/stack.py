@@ -51,7 +51,7 @@ class StackPanel:
         """Build an empty list, the warp and the settings."""
         self._gui, self._bindings = gui, bindings
         self._folder = gui.add_folder("Stack, the outermost on top")
-        self._rows: list[Any] = []
+        self.rows: list[Any] = []
         self._shown: tuple[Row, ...] = ()
         with self._folder:
             self._warp = WarpControls(gui, bindings, BELOW)
@@ -73,18 +73,18 @@ class StackPanel:
     def _show(self, wanted: tuple[Row, ...]) -> None:
         """Reuse the rows that there are, from the top; those that are not needed are hidden."""
         self._shown = wanted
-        while len(self._rows) < len(wanted):
-            self._add_row(wanted[len(self._rows)])
-        for handle, row in zip(self._rows, wanted, strict=False):
+        while len(self.rows) < len(wanted):
+            self._add_row(wanted[len(self.rows)])
+        for handle, row in zip(self.rows, wanted, strict=False):
             handle.label, handle.options, handle.visible = row.label, row.buttons, True
-        for handle in self._rows[len(wanted) :]:
+        for handle in self.rows[len(wanted) :]:
             handle.visible = False
 
     def _add_row(self, row: Row) -> None:
-        k = len(self._rows)
+        k = len(self.rows)
         with self._folder:
             handle = self._gui.add_button_group(row.label, row.buttons)
-        self._rows.append(handle)
+        self.rows.append(handle)
 
         def pressed(session: Session, button: str) -> None:
             if k < len(self._shown):

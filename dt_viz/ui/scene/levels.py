@@ -23,7 +23,7 @@ class LevelRollouts(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/level", show_axes=False, visible=False))
         self.lines = Lines(scene, "/level/rollouts", palette.LEVEL, 0.0052)
-        self._end = scene.add_frame("/level/end", show_axes=False, visible=False)
+        self.end = scene.add_frame("/level/end", show_axes=False, visible=False)
         scene.add_icosphere("/level/end/ball", radius=0.009, color=palette.LEVEL)
         scene.add_label(
             "/level/end/label", "its end", position=(0.0, 0.0, 0.02), anchor="bottom-center", font_screen_scale=0.8
@@ -42,8 +42,8 @@ class LevelRollouts(Picture):
 
     def _mark(self, end: Array, goal: Array) -> None:
         """Mark the end (3,) of the motions unless it is the goal (3,), metres."""
-        self._end.position = end
-        self._end.visible = bool(np.linalg.norm(end - goal) > MAX_GOAL_MISS)
+        self.end.position = end
+        self.end.visible = bool(np.linalg.norm(end - goal) > MAX_GOAL_MISS)
 
 
 def manifold(scenario: Scenario) -> str:

@@ -23,17 +23,17 @@ class Shown:
     """A part of the page under one node, which can be hidden."""
 
     def __init__(self, node: Any) -> None:  # noqa: ANN401 - a node of the scene, or a folder of the panel
-        self._node = node
+        self.node = node
 
     @property
     def visible(self) -> bool:
         """Whether it is shown."""
-        return self._node.visible
+        return self.node.visible
 
     @visible.setter
     def visible(self, visible: bool) -> None:
-        if visible != self._node.visible:
-            self._node.visible = visible  # first, so that a frame that comes meanwhile is drawn
+        if visible != self.node.visible:
+            self.node.visible = visible  # first, so that a frame that comes meanwhile is drawn
             if visible:
                 self._catch_up()
 

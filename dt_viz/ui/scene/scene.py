@@ -68,7 +68,7 @@ class Rollouts(Picture):
         self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, BOLD)
         super().__init__(self.lines.node)
         self.added = Lines(scene, "/rollouts/added", palette.ROLLOUT, ADDED)
-        self._starts = scene.add_point_cloud(
+        self.starts = scene.add_point_cloud(
             "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
         )
 
@@ -84,8 +84,8 @@ class Rollouts(Picture):
             else:
                 lines.show(paths, chosen)
         self.lines.node.thickness = BOLD if frame.level is None else THIN
-        self._starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
-        self._starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
+        self.starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
+        self.starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
 
 
 class Ghost(Picture):
