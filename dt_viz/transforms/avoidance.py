@@ -43,8 +43,8 @@ MAX_MANUAL_DURATION = 2.0
 MAX_DURATION = 2.5
 """Longest flow time that is tried: a motion that still collides runs through the flow's centre."""
 SNAPSHOT = 0.05
-"""Interval of flow time between two checks of the clearance, one RK4 step. The field turns points around in about ten of
-them, so a step is off by micrometres; between the last two checks the duration is interpolated."""
+"""Interval of flow time between two checks of the clearance, one RK4 step. The field turns points around in about ten
+of them, so a step is off by micrometres; between the last two checks the duration is interpolated."""
 TOLERANCE = 1e-5
 """Tolerance of a step of the integration up to the duration that is known to be needed, metres."""
 NUM_DEEPEST = 8
