@@ -26,8 +26,9 @@ from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
-from dt_viz.ui.panel.panel import CHANGED, COMPUTING, PLOTS, VIEW_LABELS, Panel, hint, status_html
+from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS, Panel
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
+from dt_viz.ui.panel.status import CHANGED, COMPUTING, hint, status_html
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import PEDESTAL

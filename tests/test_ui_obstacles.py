@@ -22,7 +22,7 @@ from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel.obstacles import SHAPES, ObstaclePanel, add, delete, duplicate, name_of, with_room
-from dt_viz.ui.panel.panel import _clearance, _collision_rows
+from dt_viz.ui.panel.status import clearance_text, collision_rows
 from dt_viz.ui.scene.handles import in_slice
 from dt_viz.ui.scene.obstacles import Obstacles, shaded
 from dt_viz.ui.scene.slice_layers import OccupancySlice
@@ -311,9 +311,9 @@ def test_obstacles_are_called_by_number_and_shape():
 
 
 def test_the_status_says_that_there_is_no_obstacle():
-    assert _clearance(float(Union().signed_distance(np.zeros((4, 3))).min()), whole_arm=False) == "no obstacle"
+    assert clearance_text(float(Union().signed_distance(np.zeros((4, 3))).min()), whole_arm=False) == "no obstacle"
     report = CollisionReport(NOTHING, None, Nearest(0.034, ("hand",), 4.0))
-    assert _collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
+    assert collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
 
 
 # --- The learned occupancy ---

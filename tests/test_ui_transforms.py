@@ -20,7 +20,7 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, anchored
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel import warp as warp_module
-from dt_viz.ui.panel.panel import status_html
+from dt_viz.ui.panel.status import status_html
 from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
 from dt_viz.ui.panel.warp import WarpPlayer
 from dt_viz.warning import Kind

@@ -93,7 +93,9 @@ class Avoidance(Transform):
     stays_outermost: ClassVar[bool] = True
     yields_goal: ClassVar[bool] = True
     settings: ClassVar[tuple[Setting, ...]] = (
-        Choice("space", "Avoid with", SPACE_NAMES, "what gives way: the hand's path, or the arm by its joint angles"),
+        Choice(
+            "space", "Avoid with", SPACE_NAMES, "who gives way: the path of the hand, or the arm by its joint angles"
+        ),
         Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
         Number(
             "temperature",
@@ -115,7 +117,7 @@ class Avoidance(Transform):
             0.5,
             automatic=True,
             of_flow=True,
-            hint="the shortest flow that does what the transform is for",
+            hint="auto: the shortest flow that clears the obstacles by the margin",
         ),
         FlowIntegration(),
     )

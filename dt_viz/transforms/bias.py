@@ -112,7 +112,7 @@ class BiasPoint(Transform):
             15.0,
             scale=100.0,
             automatic=True,
-            hint="of the region that it acts in; auto: by how far the motion is away",
+            hint="radius of the region in which it acts; auto: from the distance of the motion",
         ),
         Switch("moves_goal", "Moves the goal", "motions end here instead of at the goal"),
         Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True, of_flow=True),

@@ -22,7 +22,6 @@ from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.panel.panel import Panel
-from dt_viz.ui.panel.push import PushedPath
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import ArmPicture
@@ -31,6 +30,7 @@ from dt_viz.ui.scene.carried import Carried
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
 from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.pushed_path import PushedPath
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.starts import Starts
 

@@ -63,7 +63,7 @@ class ObstaclePanel:
         """Content and name of a file that was refused for its size, and the unit that would fit."""
         self._reader = Reader(lambda: say("Another visitor's file is being read; yours is read after it.", False))
         with gui.add_folder("Obstacles"):
-            hint = "the one with handles; or click it in the scene"
+            hint = "the obstacle with handles; a click in the scene selects one, too"
             choice = gui.add_dropdown("Selected", (NONE,), hint=hint)
             bindings.properties(choice, options=_names)
             bindings.input(
@@ -74,7 +74,7 @@ class ObstaclePanel:
             group = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
             bindings.properties(group, visible=_has_room)  # groups of buttons cannot be disabled
             bindings.on(group, lambda session, name: later(partial(add, session, SHAPES[name])))
-            change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected one")
+            change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected obstacle")
             bindings.properties(change, visible=lambda s: bool(s.obstacles))
             changes = {"Duplicate": duplicate, "Delete": delete}
             bindings.on(change, lambda session, name: later(partial(changes[name], session)))

@@ -9,7 +9,6 @@ from functools import partial
 
 import viser
 
-from dt_viz.arm.collision import SELF_REACH, CollisionReport
 from dt_viz.arm.robot import Robot
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
@@ -29,13 +28,12 @@ from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
 from dt_viz.ui.panel.starts import StartsPanel
+from dt_viz.ui.panel.status import AMBER, COMPUTING, PALE, RED, SMALL, TWO_LINES, alarm, hint, sentence, status_html
 from dt_viz.ui.panel.transforms import add_transform_controls
 from dt_viz.ui.scene.arm_layers import NUM_ARMS
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
-from dt_viz.ui.scene.palette import css
 from dt_viz.ui.scene.picture import Colour
-from dt_viz.warning import ARM, Kind
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -60,7 +58,7 @@ VIEW_HINTS: Mapping[str, str] = {
     "field": "on the slice: longer and darker is faster",
     "streamlines": "motions from all over the slice: exact, as images of straight rays",
     "ghost": "what was learned, without obstacles and bias points",
-    "ghost_arm": "where it would be at the same moment; left out where both are in one place",
+    "ghost_arm": "at the same moment; links that coincide are left out",
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
     "joint_plots": "angles and speeds over time, with their limits",
@@ -116,10 +114,10 @@ class Panel:
         later = self._chores.later
         with tabs.add_tab("World"):
             self._obstacles = ObstaclePanel(
-                gui, self._bindings, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER)), later
+                gui, self._bindings, lambda text, wrong: self._say(text, *(RED if wrong else AMBER)), later
             )
             add_transform_controls(gui, self._bindings, later)
-            StartsPanel(gui, self._bindings, lambda text: self._say(text, *_AMBER), later)
+            StartsPanel(gui, self._bindings, lambda text: self._say(text, *AMBER), later)
         with tabs.add_tab("Stack"):
             self._stack = StackPanel(gui, self._bindings)
         with tabs.add_tab("Show"):
@@ -177,8 +175,8 @@ class Panel:
         if not self._waits:
             self._waits = True
             self._give_hint("")
-            said = f"<div style='{_SMALL}'>{COMPUTING}</div>"
-            self.status.content = f"{said}<div style='{_PALE}'>{self._settled[1]}</div>"
+            said = f"<div style='{SMALL}'>{COMPUTING}</div>"
+            self.status.content = f"{said}<div style='{PALE}'>{self._settled[1]}</div>"
 
     def _settle(self) -> None:
         """Stop waiting for a report; show the last frame's status again if it is of the adopted task and scene."""
@@ -190,19 +188,19 @@ class Panel:
             self._give_hint(said)
 
     def _give_hint(self, text: str) -> None:
-        self.hint.content = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
+        self.hint.content = f"<div style='{SMALL};min-height:{TWO_LINES}'>{html.escape(text)}</div>"
 
     def learning(self, fraction: float, message: str) -> None:
         """Show the progress of learning a task."""
         self._bar.visible = self._cancel.visible = True
         self._bar.value = 100 * fraction
-        self.status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
+        self.status.content = f"<div style='{SMALL}'>Learning the motion: {html.escape(message)}</div>"
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
         self._settle()
         expected = isinstance(error, DataError | ImitationError)
-        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
+        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *RED)
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
@@ -211,13 +209,13 @@ class Panel:
             instead = f"This is “{self._titles[adopted.task]}” as before."
         else:
             instead = "Choose another task, or move the obstacle to start again."
-        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
+        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *AMBER)
 
     def _say(self, text: str, colour: Colour, background: Colour) -> None:
         """Show a text until the next scenario is shown, and for a while beside the panel."""
         self._learned()
-        self._notify(_sentence(text), colour)
-        self.notice.content, self.notice.visible = _alarm(text, colour, background), True
+        self._notify(sentence(text), colour)
+        self.notice.content, self.notice.visible = alarm(text, colour, background), True
         self._noticed = self._bindings.scenario
 
     def _learned(self) -> None:
@@ -245,7 +243,7 @@ class Panel:
                 session.load(scenes[title].task, prepared(scenes[title]))
 
         self._bindings.choice(
-            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each"),
+            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
             partial(self._begin, load),
         )
@@ -349,134 +347,3 @@ def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
         return begun
 
     return scenario
-
-
-COMPUTING = "Computing the motion…"
-CHANGED = "The scene is changed. “Reset” brings it back as it was."
-WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
-HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
-OF_MESHES = frozenset({Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE})
-"""Kinds of warnings about collisions of the arm's meshes."""
-_BLUE = ((29, 79, 124), (232, 241, 250))
-_GREEN = ((0, 92, 66), (230, 245, 239))
-_AMBER = ((138, 75, 0), (255, 244, 224))
-_RED = ((179, 38, 30), (253, 236, 234))
-_PALE = "opacity:0.3;filter:grayscale(1)"
-_TWO_LINES, _WARNING = "2.7em", "2.6em"
-_SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
-
-
-def hint(frame: Frame) -> str:
-    """Return what to try in the task, or what to see in the scene of the paper."""
-    scene = SCENES.get(frame.scenario.scene)
-    if scene is None:
-        return frame.task.hint
-    return CHANGED if scene.is_changed(frame.scenario, frame.task) else scene.line
-
-
-def status_html(frame: Frame, pace: Pace) -> str:
-    """Return the status line: speed, clearance, certificates, and every warning."""
-    known, scenario = frame.certificates, frame.scenario
-    hides_arm = not (scenario.view.arm or scenario.view.onion)
-    # figures that are missing after the last stage will not come
-    unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
-    off = "–" if frame.blocked else "off"
-    whole_arm = scenario.arm_avoidance is not None
-    rows = (
-        ("Rebuild", _rebuild(pace)),
-        ("Clearance", off if frame.blocked else _clearance(known.clearance, whole_arm=whole_arm)),
-        *(_collision_rows(None, "arm hidden") if hides_arm else _collision_rows(known.collision, unknown)),
-        *_duration_rows(frame, off),
-        ("Smallest det J", unknown if known.min_det_jacobian is None else f"{known.min_det_jacobian:.2g}"),
-        ("There and back", unknown if known.round_trip_error is None else _tiny(known.round_trip_error)),
-        ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[known.lyapunov_falls]),
-    )
-    cells = "".join(
-        f"<tr style='vertical-align:top'><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
-        f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
-        for name, value in rows
-    )
-    seen = [warning for warning in known.warnings if not (hides_arm and warning.source == ARM)]
-    hand_only = scenario.avoids and not whole_arm
-    warnings = [f"{w}{HAND_ONLY}" if hand_only and w.kind is Kind.ARM_ENTERS else str(w) for w in seen]
-    of_motion = any(warning.kind not in OF_MESHES for warning in seen)
-    if known.clearance < 0 and scenario.avoids and scenario.warp == 1 and not (of_motion or frame.blocked):
-        warnings.insert(0, "the motions go through the obstacle at this flow time")
-    blocked = ""
-    if frame.blocked:
-        blocked = _alarm(f"no motion: {'; '.join(map(str, frame.blocked))}. What is shown is the last good one.", *_RED)
-    warp = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
-    said = warp + "".join(_alarm(warning, *_AMBER) for warning in warnings)
-    if not (said or blocked) and frame.stage is Stage.CERTIFIED:
-        said = _alarm("every check holds", *_GREEN)
-    # the room for warnings stays during checks, so that controls below do not jump under the pointer
-    return f"{blocked}<table style='{_SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{said}</div>"
-
-
-def _rebuild(pace: Pace) -> str:
-    """Describe the speed of rebuilding."""
-    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
-    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
-
-
-def _tiny(length: float) -> str:
-    """Format a length, metres, that should be close to zero."""
-    return f"{1e3 * length:.0e} mm" if 0 < length < 1e-4 else f"{1e3 * length:.1f} mm"
-
-
-def _clearance(clearance: float, *, whole_arm: bool) -> str:
-    whose = "body points" if whole_arm else "end effector"
-    return "no obstacle" if clearance == float("inf") else f"{1e3 * clearance:.1f} mm, {whose}"
-
-
-def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
-    """Return the rows with t of the flows: of the avoidance, and of the transforms that call it otherwise."""
-    hand, strengths = None, []
-    for layer, duration in zip(frame.scenario.stack, frame.durations, strict=False):
-        if duration is None:
-            continue
-        if layer.transform.most == 1:
-            hand = duration
-        else:
-            strengths.append(f"{duration:.2f} {layer.name}")
-    both = hand is not None and frame.arm_duration is not None
-    parts = ((hand, " hand" if both else ""), (frame.arm_duration, " arm"))
-    flow_time = " · ".join(f"{t:.2f}{whose}" for t, whose in parts if t is not None)
-    times = (("Flow time t", flow_time or off),) if flow_time or not strengths else ()
-    return (*times, *((("Strength", " · ".join(strengths)),) if strengths else ()))
-
-
-def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:
-    """Return the rows about the collisions of the arm's meshes."""
-    if report is None:
-        obstacle = itself = table = unknown
-    else:
-        obstacle = "no obstacle"
-        if report.obstacle.links:
-            obstacle = _distance(report.obstacle.distance, "enters by", report.obstacle.links)
-        itself = f"over {1e3 * SELF_REACH:.0f} mm"
-        if report.itself is not None:
-            itself = _distance(report.itself.distance, "touches", report.itself.links)
-        table = _distance(report.table.distance, "below by", report.table.links)
-    return ("Arm to obstacle", obstacle), ("Arm to itself", itself), ("Arm to table", table)
-
-
-def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
-    """Format a distance, metres, and its links; `otherwise` is the word for a negative one."""
-    size = f"{1e3 * abs(distance):.0f} mm"
-    if distance <= 0:
-        size = f"{otherwise} {size}" if distance < 0 else otherwise
-    return f"{size}, {' – '.join(links)}"
-
-
-def _sentence(text: str) -> str:
-    """Begin a text with a capital letter, unless it begins with the name of a file."""
-    return text if "." in text.split(" ", 1)[0] else text[:1].upper() + text[1:]
-
-
-def _alarm(text: str, colour: Colour, background: Colour) -> str:
-    return (
-        "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
-        f"border-left:3px solid {css(colour)};color:{css(colour)};background:{css(background)}'>"
-        f"{html.escape(_sentence(text))}</div>"
-    )

@@ -148,7 +148,7 @@ def _add_choice(gui: viser.GuiApi, field: _Field, setting: Choice, order: float 
 
 
 def _add_integration(gui: viser.GuiApi, field: _Field, _setting: FlowIntegration, order: float | None) -> None:
-    hint = "auto: as exact as is seen; the others take equal steps, and the status says what they cost"
+    hint = "auto: errors stay invisible; the others take equal steps, and the status warns of their errors"
     methods = {label: method for method, label in METHOD_LABELS.items()}
     field.bind(
         gui.add_dropdown("Integrator", tuple(methods), order=order, visible=False, hint=hint),

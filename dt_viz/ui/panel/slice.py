@@ -41,7 +41,7 @@ class SlicePanel:
         bindings.on(self.back, _put_back)
         names = {label: name for name, label in COLOUR_LABELS.items()}
         bindings.input(
-            gui.add_dropdown("Colour", tuple(names), hint="of the slice"),
+            gui.add_dropdown("Colour", tuple(names), hint="quantity shown on the slice"),
             lambda s: COLOUR_LABELS[s.view.colour],
             lambda s, label: {"view": replace(s.view, colour=names[label])},
         )

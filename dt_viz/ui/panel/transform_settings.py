@@ -29,7 +29,7 @@ def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) 
     bindings.properties(which, options=tunable)
     bindings.input(which, tuned, lambda s, value: {"view": replace(s.view, tuned=value)})
     order += 1
-    hint = "what is fitted to the demonstrations: the motions or eq. (3)"
+    hint = "objective of the fit: the motions, or the velocities (eq. (3))"
     objective = gui.add_dropdown("Learn", OBJECTIVES, order=order, hint=hint)
     bindings.input(objective, lambda s: s.objective, lambda _s, value: {"objective": value})
     note = gui.add_html("", order=order)

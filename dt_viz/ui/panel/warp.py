@@ -81,7 +81,7 @@ class WarpControls:
             order: order of the first of them in the folder.
         """
         self._player = WarpPlayer(self._show)
-        hint = "for how much of its time each flow runs: at 0 motions are straight and so is space, at 1 all is done"
+        hint = "part of its time that each flow runs: at 0 motions and space are straight, at 1 the stack is complete"
         bindings.input(
             gui.add_slider(NAME, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint),
             lambda s: s.warp,
