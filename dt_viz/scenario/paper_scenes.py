@@ -116,7 +116,7 @@ def _sphere_in_the_stroke(task: Task) -> Scenario:
     u = STROKE_PLACES.get(task.name)
     place = task.obstacle_position if u is None else as_point(task.mean_path[round(100 * u)])
     sphere = Sphere(place, STROKE_SPHERE)
-    return _avoiding(task, Avoidance(sphere, space="both", temperature=STROKE_TEMPERATURE))
+    return _avoiding(task, Avoidance(sphere, space="cspace", temperature=STROKE_TEMPERATURE))
 
 
 def _two_points(task: Task) -> Scenario:
@@ -163,7 +163,7 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "cube",
             "Fig. 3 (a): a cube in the S",
-            "Every stroke leaves the cube, the rest stays. Only the path gives way: avoid with “Both” for the arm.",
+            "Every stroke leaves the cube, the rest stays. Only the path of the hand gives way here.",
             "draw_s",
             _cube_in_the_letter,
             view=HAND_ONLY,
