@@ -116,7 +116,7 @@ def _sphere_in_the_stroke(task: Task) -> Scenario:
     u = STROKE_PLACES.get(task.name)
     place = task.obstacle_position if u is None else as_point(task.mean_path[round(100 * u)])
     sphere = Sphere(place, STROKE_SPHERE)
-    return _avoiding(task, Avoidance(sphere, space="cspace", temperature=STROKE_TEMPERATURE))
+    return _avoiding(task, Avoidance(sphere, space="both", temperature=STROKE_TEMPERATURE))
 
 
 def _two_points(task: Task) -> Scenario:
