@@ -43,11 +43,12 @@ from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.metrics import maximum_collision_distance, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Union
 
 LIMIT_TOLERANCE = 1e-9
 """Excess over a joint limit, rad, that counts as rounding."""
-TURN_ARC = 0.2
-"""Length of the path over which a turn is measured, in radii of the obstacle."""
+TURN_ARC = 0.015
+"""Length of the path over which a turn is measured, metres."""
 NO_MOTION = 1
 """Exit status if the obstacle leaves no motion."""
 
@@ -78,10 +79,10 @@ class Measured:
     """Distance of the end effector's last position from the demonstrations' goal."""
 
 
-def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Sphere, robot: Robot) -> Measured:
+def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Union, robot: Robot) -> Measured:
     """Measure one rollout of the arm."""
     model = load_collision_model()
-    x, arc = robot.end_effector(motion.q), TURN_ARC * obstacle.radius
+    x = robot.end_effector(motion.q)
     depth = maximum_collision_distance(x, obstacle.signed_distance) + 0.0  # never -0
     outside = (motion.q < robot.lower - LIMIT_TOLERANCE) | (motion.q > robot.upper + LIMIT_TOLERANCE)
     return Measured(
@@ -92,8 +93,8 @@ def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Sphe
         arm=model.report(motion.q, obstacle),
         depth_without=max(0.0, -model.nearest_to_obstacle(motion.without, obstacle).distance),
         num_outside=int(outside.any(axis=1).sum()),
-        turn=sharpest_turn(x, arc),
-        turn_without=sharpest_turn(robot.end_effector(motion.without), arc),
+        turn=sharpest_turn(x, TURN_ARC),
+        turn_without=sharpest_turn(robot.end_effector(motion.without), TURN_ARC),
         goal_miss=float(np.linalg.norm(x[-1] - goal)),
     )
 
@@ -113,9 +114,9 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".npz")
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
-    obstacle = Sphere(options.obstacle, options.diameter)
+    obstacle = Union((Sphere(options.obstacle, options.diameter),))
     try:
-        frame, motions = engine.arm_motions(scenario_around(obstacle, task, options))
+        frame, motions = engine.arm_motions(scenario_around(obstacle.parts, task, options))
     except UnreachableError as error:
         print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
         return NO_MOTION
