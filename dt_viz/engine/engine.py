@@ -208,7 +208,7 @@ class Engine:
     def _admission(self, scenario: Scenario) -> Admission:
         """Whether the scenario has a motion, and from which starts."""
         nominal, avoidance = self.nominal(scenario), scenario.arm_avoidance
-        return Admission(nominal) if avoidance is None else self.follower.admission(nominal, avoidance.obstacle)
+        return Admission(nominal) if avoidance is None else self.follower.admission(nominal, avoidance)
 
     def _stages(self, scenario: Scenario, checkpoint: Checkpoint) -> Iterator[Frame]:
         with _in_turn():

@@ -191,10 +191,12 @@ def _shaped(shape: str, centre: Array, sizes: Array, turn: Array | Quaternion) -
 
 
 def _sizes(obstacle: Obstacle) -> tuple[float, float, float]:
+    """Sizes as `_shaped` takes them."""
     if isinstance(obstacle, Box):
         return obstacle.sizes
-    diameter = 2 * obstacle.depth if isinstance(obstacle, Sphere) else obstacle.diameter  # a cylinder
-    return (diameter, diameter, obstacle.height if isinstance(obstacle, Cylinder) else diameter)
+    if isinstance(obstacle, Cylinder):
+        return obstacle.diameter, obstacle.diameter, obstacle.height
+    return (2 * obstacle.radius, 2 * obstacle.radius, 2 * obstacle.radius)
 
 
 def _row(place: Place, margin: float) -> tuple[str, ...]:

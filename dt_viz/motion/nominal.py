@@ -102,6 +102,8 @@ class Nominal:
     """Numbers of the starts, the task's first, that have no rollout here."""
     warnings: tuple[MotionWarning, ...] = ()
     """Why they have none."""
+    stance: tuple[float, ...] | None = None
+    """Posture that the arm stays near to, six joint angles, rad; None is its usual one."""
 
     @property
     def task(self) -> Task:
@@ -147,7 +149,8 @@ class Nominal:
         """Some of the rollouts, and why the others are left out."""
         kept = {self.numbers[k] for k in rollouts}
         left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
-        return Nominal(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(warnings))
+        strands = tuple(self.strands[k] for k in rollouts)
+        return replace(self, strands=strands, left_out=tuple(sorted(left_out)), warnings=tuple(warnings))
 
     def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""
