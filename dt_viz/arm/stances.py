@@ -25,10 +25,10 @@ SPREAD = (0.2, 2.0)
 """Smallest and largest standard deviation of their joints from the usual posture, rad."""
 REACHED = 1e-4
 """Largest distance of the hand from a place that counts as reached, metres."""
-IN_THE_WAY = 2.0
+IN_THE_WAY = 10.0
 """Cost of each metre that the mean motion lacks of the clearance that is asked for, against a metre from the usual
 postures."""
-AT_ENDS, ENDS = 10.0, 0.06
+AT_ENDS, ENDS = 40.0, 0.06
 """Factor by which that costs more at the ends of the motion, and distance from them over which this fades, metres."""
 
 
