@@ -14,7 +14,7 @@ from dt_viz.arm.body_points import BodyPoints
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import loses_branch, track
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.properties import cached_property
@@ -28,6 +28,8 @@ REACHED = 1e-4
 IN_THE_WAY = 10.0
 """Cost of each metre that the mean motion lacks of the clearance that is asked for, against a metre from the usual
 postures."""
+ALIKE = 0.15
+"""Root mean square distance of postures, by `LEVERS`, up to which stances are alike, metres."""
 AT_ENDS, ENDS = 40.0, 0.06
 """Factor by which that costs more at the ends of the motion, and distance from them over which this fades, metres."""
 
@@ -64,7 +66,13 @@ class Stances:
     def clearance(self, obstacle: Union | Obstacle) -> tuple[Array, Array]:
         """Distances, metres, of the covering spheres from an obstacle, at the starts (K, R) and on the path (K, T)."""
         distance = (obstacle.signed_distance(self._points) - self.body.radius[:, None]).min(axis=0)
-        return tuple(np.split(distance.reshape(len(self.references), -1), [self.at_starts.shape[1]], axis=1))
+        distance, num_starts = distance.reshape(len(self.references), -1), self.at_starts.shape[1]
+        return distance[:, :num_starts], distance[:, num_starts:]
+
+    def alike(self, stance: int) -> Mask:
+        """(K,) which stances are like one of them."""
+        apart = (self.on_path - self.on_path[stance]) * LEVERS
+        return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < ALIKE
 
     def cost(self, on_path: Array, asked: float) -> Array:
         """Costs (K,), metres, of the detour from the usual postures and of what lies in the way on the path.

@@ -139,7 +139,7 @@ class Engine:
         )
         if motion.warp == 1:
             return full
-        below = self.memo("below", (nominal, motion.warp), lambda: nominal.warped(motion.warp), newest=1)
+        below = self.memo("below", (full.nominal, motion.warp), lambda: full.nominal.warped(motion.warp), newest=1)
         return self.memo(
             "warped",
             (motion, precision),

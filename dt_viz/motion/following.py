@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -10,13 +11,13 @@ import numpy as np
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import SELF_MARGIN, CollisionModel, load_collision_model
 from dt_viz.arm.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
-from dt_viz.arm.stances import Stances, stances
+from dt_viz.arm.stances import stances
 from dt_viz.arm.tracking import JointPath, UnreachableError, drawn_onto, inverse_kinematics, track
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
-from dt_viz.motion.nominal import Learned, Nominal, Strand
+from dt_viz.motion.nominal import Learned, Nominal, Stance, Strand
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_STARTS
@@ -158,19 +159,32 @@ class Follower:
         asked = avoidance.obstacle, avoidance.margin
         return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=1)
 
+    def alternatives(self, nominal: Nominal, avoidance: ArmAvoidance) -> Iterator[Nominal]:
+        """The same motions in other stances that have room at as many starts and at the goal, the best first."""
+        ranked = self._stances(nominal.learned, avoidance.obstacle, avoidance.margin)
+        _, free = next(ranked)
+        for stance, others in ranked:
+            if not (others >= free).all():
+                return
+            yield self._standing(nominal, stance)
+
     def _admission(self, nominal: Nominal, obstacle: Union, margin: float) -> Admission:
         blocked = self._unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
         if blocked:
             return Admission(nominal, blocked)
-        stance, free = self._stance(nominal.learned, obstacle, margin)
+        stance, free = next(self._stances(nominal.learned, obstacle, margin))
         if not free[-1]:
             text = "the goal is inside the obstacle: the arm there touches it"
             return Admission(nominal, (MotionWarning(Kind.GOAL_COVERED, text, ARM),))
         if not free[:-1].any():
             return Admission(nominal, tuple(_touching_starts(np.arange(len(free) - 1), len(free) - 1)))
-        if stance is not None:
-            nominal = self._memo("standing", (nominal, stance), lambda: replace(nominal, stance=stance), newest=4)
-        return Admission(self.admitted(nominal, obstacle, ~free[:-1]))
+        return Admission(self.admitted(self._standing(nominal, stance), obstacle, ~free[:-1]))
+
+    def _standing(self, nominal: Nominal, stance: Stance | None) -> Nominal:
+        """The same motions in another stance."""
+        if stance == nominal.stance:
+            return nominal
+        return self._memo("standing", (nominal, stance), lambda: replace(nominal, stance=stance), newest=8)
 
     def _unreached(self, learned: Learned) -> tuple[MotionWarning, ...]:
         """Warnings about the task's starts and goal that are out of the arm's reach."""
@@ -198,21 +212,23 @@ class Follower:
                 return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
         return ()
 
-    def _stance(self, learned: Learned, obstacle: Union, margin: float) -> tuple[tuple[float, ...] | None, Mask]:
-        """The stance with most room at the task's starts and goal, the nearest one of several with the same.
+    def _stances(self, learned: Learned, obstacle: Union, margin: float) -> Iterator[tuple[Stance | None, Mask]]:
+        """The stances with most room at the task's starts and goal, the best first: the usual one where it has enough.
 
-        Returns:
-            The stance, None where it is the usual one; which of the starts and the goal (R + 1,) it leaves free.
+        Yields:
+            A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
         """
-        pins, asked = self._demonstrated(learned).pins, max(margin - OVERSHOOT, 0.0)
-        near = self.whole_arm.clearance(pins, obstacle)
-        if (near >= asked).all():
-            return None, np.ones(len(pins), bool)
-        room = self._mesh_room(pins, obstacle, near, margin)
-        if (room >= margin).all():
-            return None, np.ones(len(pins), bool)
+        usual, asked = self._demonstrated(learned), max(margin - OVERSHOOT, 0.0)
+        near = self.whole_arm.clearance(usual.pins, obstacle)
+        enough = bool((near >= asked).all())
+        room = near if enough else self._mesh_room(usual.pins, obstacle, near, margin)
+        if enough or (room >= margin).all():
+            yield None, room >= 0
+        paths = learned.demonstrated.paths
         known = self._memo(
-            "stances", learned, lambda: _stances(self.whole_arm, learned, self._demonstrated(learned).reference)
+            "stances",
+            learned,
+            lambda: stances(self.robot, self.whole_arm.body, usual.reference, learned.task.starts, _mean(paths)),
         )
         at_starts, on_path = known.clearance(obstacle)  # of the spheres, which are larger than the arm
         clearance = np.concatenate([at_starts, on_path[:, -1:]], axis=1)
@@ -220,13 +236,12 @@ class Follower:
         free[0], ample[0] = room >= 0, room >= margin
         # the goal first, then as many starts as possible, then as much room as is asked for
         merit = [free[:, -1], free.sum(axis=1), ample.sum(axis=1), -known.cost(on_path, asked)]
+        left = ~known.alike(0) if ample[0].all() else np.ones(len(free), bool)
         for best in np.lexsort(merit[::-1])[::-1]:
-            if best == 0:
-                return None, free[0]
-            stance = tuple(known.references[best].tolist())
-            if self._sound(learned, stance):
-                return stance, free[best]
-        raise AssertionError("the usual stance is one of them")
+            stance = None if best == 0 else _as_stance(known.references[best])
+            if left[best] and (stance is None or self._sound(learned, stance)):
+                left &= ~known.alike(int(best))
+                yield stance, free[best]
 
     def _mesh_room(self, q: Array, obstacle: Union, near: Array, enough: float) -> Array:
         """Distances (N,), metres, of the arm's meshes at configurations q (N, 6) where `near` is not enough already."""
@@ -235,7 +250,7 @@ class Follower:
         room[close] = np.min(list(parts), axis=0)
         return room
 
-    def _sound(self, learned: Learned, stance: tuple[float, ...]) -> bool:
+    def _sound(self, learned: Learned, stance: Stance) -> bool:
         """Whether the arm can follow the task's motions in a stance without coming near itself."""
 
         def sound() -> bool:
@@ -308,7 +323,7 @@ class Follower:
             warnings.append(MotionWarning(Kind.DAMPED, text, ARM))
         return tuple(warnings)
 
-    def _demonstrated(self, learned: Learned, stance: tuple[float, ...] | None = None) -> Lift:
+    def _demonstrated(self, learned: Learned, stance: Stance | None = None) -> Lift:
         """The joints along the rollouts from the task's starts. Raises UnreachableError, also a second time."""
         if stance is not None:
             return self._memo(
@@ -335,11 +350,15 @@ def _lift_demonstrated(robot: Robot, learned: Learned, reference: Array) -> Lift
     return lift(robot, fractions, paths, reference)
 
 
-def _stances(whole_arm: WholeArm, learned: Learned, usual: Array) -> Stances:
-    """The stances for the motions of a task; `usual` (6,) is the posture that the arm usually stays near to, rad."""
-    paths = learned.demonstrated.paths
+def _mean(paths: Sequence[Array]) -> Array:
+    """The mean (`NUM_ON_PATH`, 3) of rollouts with equally many samples, metres."""
     kept = np.linspace(0, len(paths[0]) - 1, NUM_ON_PATH).round().astype(int)
-    return stances(whole_arm.robot, whole_arm.body, usual, learned.task.starts, np.mean(paths, axis=0)[kept])
+    return np.mean(paths, axis=0)[kept]
+
+
+def _as_stance(posture: Array) -> Stance:
+    a, b, c, d, e, f = (float(angle) for angle in posture)
+    return a, b, c, d, e, f
 
 
 def _lift_added(robot: Robot, strand: Strand, reference: Array) -> Lift:

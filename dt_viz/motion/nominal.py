@@ -19,6 +19,8 @@ from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
 """Samples of each rollout before refinement: from the task's starts, and from added ones."""
+Stance = tuple[float, float, float, float, float, float]
+"""Posture that the arm stays near to along all rollouts: six joint angles, rad."""
 MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
 """Steps towards the images of moved ends, and metres by which they may miss."""
 
@@ -102,8 +104,8 @@ class Nominal:
     """Numbers of the starts, the task's first, that have no rollout here."""
     warnings: tuple[MotionWarning, ...] = ()
     """Why they have none."""
-    stance: tuple[float, ...] | None = None
-    """Posture that the arm stays near to, six joint angles, rad; None is its usual one."""
+    stance: Stance | None = None
+    """Posture that the arm stays near to; None is its usual one."""
 
     @property
     def task(self) -> Task:
