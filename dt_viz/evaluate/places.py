@@ -10,8 +10,8 @@ The npz file holds for each of K places with N obstacles in each:
 ``no_way`` (K,)
     whether the arm says that it finds no way between them.
 ``hand_room`` (K, R + 1)
-    distance of the hand's meshes from the obstacles at the R starts and at the goal, metres, as the hand is held there
-    without obstacles.
+    distance of the hand's covering spheres from the obstacles at the R starts and at the goal, metres, where the hand is
+    turned to where it has most room.
 ``arm_depth``, ``arm_clearance``, ``hand_clearance``, ``depth_without``, ``frechet``, ``goal_miss`` (K, R)
     metres, of each rollout; ``turn`` and ``turn_without`` in degrees, ``num_outside``; NaN where there is no motion.
 """
@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dt_viz.arm.collision import CollisionModel
-from dt_viz.arm.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
+from dt_viz.arm.body_points import load_body_points
+from dt_viz.arm.robot import NUM_JOINTS, Robot, load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame
 from dt_viz.evaluate.avoidance import Measured, measure
@@ -60,6 +60,8 @@ ALLOWANCE = 1e-3
 SHARP = 90.0
 """Turn over `dt_viz.evaluate.avoidance.TURN_ARC` beyond which it is sharp, degrees."""
 SHAPES = ("sphere", "box", "cylinder")
+NUM_TURNS = 500
+"""Number of orientations of the hand that room is looked for in."""
 SEEDS = 1_000_003
 """Difference of the seeds of the first and the second obstacle of a place."""
 
@@ -70,7 +72,7 @@ class Place:
 
     union: Union
     hand_room: Array
-    """(R + 1,) distance of the hand's meshes from the obstacles at the starts and at the goal, metres."""
+    """(R + 1,) room that the hand has at the starts and at the goal, see `hand_room`."""
     frame: Frame
     rollouts: dict[int, Measured]
     """By the numbers of their starts; empty where the arm is blocked."""
@@ -117,15 +119,13 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".npz")
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
-    hand = CollisionModel(robot, [mesh for mesh in collision_meshes() if mesh.joint == NUM_JOINTS - 1])
     places, rows = [], []
     margin = 0.0
     for k, obstacles in enumerate(_obstacles(task, options)):
         scenario = scenario_around(obstacles, task, options)
         margin = scenario.avoidance.margin
         union = Union(obstacles)
-        pins = engine.follower.undisturbed(engine.nominal(scenario).learned.demonstrated).pins
-        room = np.min([hand.obstacle_distance(pins, part)[0] for part in union.parts], axis=0)
+        room = hand_room(robot, union, engine.nominal(scenario).learned.demonstrated.ends)
         places.append(_measured(engine, scenario, union, room, robot, only_blocked=options.only_blocked))
         rows.append((str(k), *_row(places[-1], margin)))
     write_npz(out, **_arrays(places, len(task.paths)))
@@ -139,6 +139,22 @@ def run(options: argparse.Namespace) -> int:
     print_table(header, rows)
     _summarise(places, margin)
     return 0
+
+
+def hand_room(robot: Robot, obstacle: Union, places: Array) -> Array:
+    """Distance (N,), metres, of the hand from an obstacle, turned to where it is largest, whatever the arm can do.
+
+    Args:
+        robot: whose hand it is.
+        obstacle: what is in the way.
+        places: (N, 3) of the end effector, metres.
+    """
+    body = load_body_points()
+    of_hand = body.joint == NUM_JOINTS - 1
+    turns = Rotation.random(NUM_TURNS, np.random.default_rng(0)).as_matrix()
+    points = (body.offset[of_hand] - robot.end_effector_offset) @ turns.transpose(0, 2, 1)  # (turns, points, 3)
+    distance = obstacle.signed_distance(places[:, None, None] + points) - body.radius[of_hand]
+    return distance.min(axis=2).max(axis=1)
 
 
 def _measured(
