@@ -10,8 +10,8 @@ The npz file holds for each of K places with N obstacles in each:
 ``no_way`` (K,)
     whether the arm says that it finds no way between them.
 ``hand_room`` (K, R + 1)
-    distance of the hand's covering spheres from the obstacles at the R starts and at the goal, metres, where the hand is
-    turned to where it has most room.
+    distance of the hand's covering spheres from the obstacles at the R starts and at the goal, metres, turned to where
+    the hand has most room.
 ``arm_depth``, ``arm_clearance``, ``hand_clearance``, ``depth_without``, ``frechet``, ``goal_miss`` (K, R)
     metres, of each rollout; ``turn`` and ``turn_without`` in degrees, ``num_outside``; NaN where there is no motion.
 """
