@@ -137,6 +137,11 @@ class Nominal:
         """How many of the rollouts have none: the last ones."""
         return sum(number >= self.num_demonstrated for number in self.numbers)
 
+    @property
+    def num_hosts(self) -> int:
+        """Number of the rollouts, the first ones, that begin at the task's starts."""
+        return len(self.strands) - self.num_added
+
     @cached_property
     def numbers(self) -> tuple[int, ...]:
         """Number of each rollout's start among all of the scenario's, the task's first."""

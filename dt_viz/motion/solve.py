@@ -70,9 +70,9 @@ def solve(
     if avoidance is None or avoidance.duration is not None or solved.cleared:
         return solved
     for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
-        tried = _solved(scenario, other, precision, follower)
+        tried = _solved(scenario, other, LIVE, follower)  # quick, and the same stance is found at each precision
         if tried.cleared:
-            return tried
+            return tried if precision is LIVE else _solved(scenario, other, precision, follower)
     return solved
 
 
