@@ -178,7 +178,7 @@ class TestStance:
         def only_elsewhere(lifted, *arguments, **options):
             found = avoiding(lifted, *arguments, **options)
             same = np.array_equal(lifted.reference, follower.reference(nominal))
-            return replace(found, cleared=False) if same else found
+            return replace(found, stuck=np.arange(1)) if same else found
 
         monkeypatch.setattr(follower.whole_arm, "avoiding", only_elsewhere)
         other = solve(scenario, nominal, LIVE, follower)

@@ -163,12 +163,17 @@ class ArmSolution:
     """t of the avoidance flow."""
     clearance: float
     """Smallest distance of the covering spheres from the obstacle along the hosts, metres."""
-    cleared: bool
-    """Whether all samples of the hosts keep the clearance that is asked for."""
+    stuck: Indices
+    """Hosts that do not keep the clearance that is asked for."""
     too_near: Indices
     """Guests, counted among all rollouts, that do not keep it."""
     moved: Indices
     """Guests that begin more than `MOVED` away from their start."""
+
+    @property
+    def cleared(self) -> bool:
+        """Whether all hosts keep the clearance that is asked for."""
+        return not len(self.stuck)
 
 
 class WholeArm:
@@ -367,12 +372,10 @@ class _Solver:
         hosts, near = self._of_hosts(bundle), self._lack(p) > ROUNDING
         clearance = float(self._arm.clearance(p[hosts], self._avoidance.obstacle).min())
         q = self._lifted.at(bundle.index, bundle.fraction)
-        cleared, too_near = not near[hosts].any(), np.unique(bundle.index[near & ~hosts])
+        stuck, too_near = (np.unique(bundle.index[near & which]) for which in (hosts, ~hosts))
         away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
         moved = np.unique(bundle.index[away & ~hosts & (bundle.fraction == 0)])
-        return ArmSolution(
-            transform, bundle.index, bundle.fraction, q, p, duration, clearance, cleared, too_near, moved
-        )
+        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, stuck, too_near, moved)
 
     def _of_hosts(self, bundle: Bundle) -> Mask:
         return bundle.index < self._lifted.num_hosts

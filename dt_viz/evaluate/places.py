@@ -46,12 +46,11 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
-from dt_viz.motion.stack import FINE
+from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import Task
-from dt_viz.warning import Kind
 
 WITHIN = 0.05
 """Default of the largest distance of an obstacle from the mean demonstration, metres."""
@@ -74,13 +73,10 @@ class Place:
     hand_room: Array
     """(R + 1,) room that the hand has at the starts and at the goal, see `hand_room`."""
     frame: Frame
+    no_way: bool
+    """Whether the arm finds no way, though it is not blocked at the ends."""
     rollouts: dict[int, Measured]
     """By the numbers of their starts; empty where the arm is blocked."""
-
-    @property
-    def no_way(self) -> bool:
-        """Whether the arm says that it finds no way."""
-        return any(warning.kind is Kind.ARM_BLOCKED for warning in self.frame.certificates.found)
 
     def largest(self, value: Callable[[Measured], float]) -> float:
         """The largest value of the rollouts."""
@@ -158,16 +154,20 @@ def hand_room(robot: Robot, obstacle: Union, places: Array) -> Array:
 
 
 def _measured(
-    engine: Engine, scenario: Scenario, union: Union, hand_room: Array, robot: Robot, *, only_blocked: bool
+    engine: Engine, scenario: Scenario, union: Union, room: Array, robot: Robot, *, only_blocked: bool
 ) -> Place:
     if only_blocked:
-        return Place(union, hand_room, next(engine.frames(scenario)), {})
+        frame = next(engine.frames(scenario))
+        return Place(union, room, frame, not frame.blocked and not engine.solved(scenario, LIVE).cleared, {})
     frame, motions = engine.arm_motions(scenario)
     if not motions:
-        return Place(union, hand_room, frame, {})
-    numbers, paths = engine.solved(scenario, FINE).nominal.numbers, frame.task.paths
-    of_rollouts = (measure(q, paths[k], frame.goal, union, robot) for k, q in zip(numbers, motions, strict=True))
-    return Place(union, hand_room, frame, dict(zip(numbers, of_rollouts, strict=True)))
+        return Place(union, room, frame, no_way=False, rollouts={})
+    solved, paths = engine.solved(scenario, FINE), frame.task.paths
+    of_rollouts = {
+        number: measure(motion, paths[number], frame.goal, union, robot)
+        for number, motion in zip(solved.nominal.numbers, motions, strict=True)
+    }
+    return Place(union, room, frame, not solved.cleared, of_rollouts)
 
 
 def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, ...]]:
@@ -275,7 +275,12 @@ def _summarise(places: Sequence[Place], margin: float) -> None:
     print(f"\n{len(free)} of {len(places)} places leave the hand free at the starts and at the goal")
     print(f"called blocked: {_share(sum(bool(p.frame.blocked) for p in free), free)} of these", end=", ")
     print(f"{_share(len(places) - len(open_), places)} of all")
-    print(f"without a way that the arm finds: {_share(sum(place.no_way for place in open_), open_)} of the others")
+    print(
+        f"without a way that the arm finds: {_share(sum(place.no_way for place in open_), open_)} of the others",
+        end=", ",
+    )
+    some = sum(len(place.frame.rollouts) < len(place.hand_room) - 1 for place in open_)
+    print(f"only from some of the starts: {_share(some, open_)}")
     if not any(place.rollouts for place in places):
         return
     clearance, detour = np.array([place.clearance() for place in open_]), [place.detour(margin) for place in open_]

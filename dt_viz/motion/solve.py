@@ -14,6 +14,8 @@ from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.transforms.base import start_warnings
+from dt_viz.warning import Kind
 
 NUM_ALTERNATIVES = 3
 """Number of other stances that are tried where the arm finds no way around the obstacle."""
@@ -56,8 +58,8 @@ def solve(
 
     Args:
         scenario: whose stack it is; its `warp` is left to `warped`.
-        nominal: the undisturbed motion, from starts that the arm can begin at; where the arm finds no way in its
-            stance, that of the result may be another.
+        nominal: the undisturbed motion, from starts that the arm can begin at. Where the arm finds no way, that of the
+            result has another stance, or lacks the starts that have none.
         precision: how exactly.
         follower: the arm.
         before: joints to look for those of LIVE from, as shown last; the result differs by less than a milliradian.
@@ -73,7 +75,14 @@ def solve(
         tried = _solved(scenario, other, LIVE, follower)  # quick, and the same stance is found at each precision
         if tried.cleared:
             return tried if precision is LIVE else _solved(scenario, other, precision, follower)
-    return solved
+    assert solved.arm is not None
+    others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
+    if not (others < nominal.num_hosts).any():
+        return solved
+    numbers, how = np.array(nominal.numbers), "without a way around the obstacle for the arm"
+    told = start_warnings(numbers[solved.arm.stuck], nominal.num_demonstrated, Kind.START_COVERED, how)
+    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), precision, follower)
+    return tried if tried.cleared else solved
 
 
 def _solved(
