@@ -1,6 +1,6 @@
 """Put a sphere into a motion and measure the motion of the end effector and the whole arm.
 
-The npz file holds for each rollout i, as the page finally shows it:
+The npz file holds for each rollout i, as the page finally shows it, but for those whose start has no room:
 
 ``q_i`` (T, 6), ``times_i`` (T,)
     joint angles, rad, continuous joints unwrapped, and seconds.
@@ -42,6 +42,7 @@ from dt_viz.evaluate.options import (
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.metrics import maximum_collision_distance, sharpest_turn
+from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
 
@@ -116,7 +117,8 @@ def run(options: argparse.Namespace) -> int:
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
     obstacle = Union((Sphere(options.obstacle, options.diameter),))
     try:
-        frame, motions = engine.arm_motions(scenario_around(obstacle.parts, task, options))
+        scenario = scenario_around(obstacle.parts, task, options)
+        frame, motions = engine.arm_motions(scenario)
     except UnreachableError as error:
         print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
         return NO_MOTION
@@ -126,10 +128,12 @@ def run(options: argparse.Namespace) -> int:
         return NO_MOTION
 
     arrays: dict[str, Any] = {}
-    measured = []
-    for i, (motion, demonstration) in enumerate(zip(motions, task.paths, strict=True)):
-        measured.append(measure(motion, demonstration, frame.goal, obstacle, robot))
-        arrays |= {f"q_{i}": motion.q, f"x_{i}": measured[-1].x, f"times_{i}": motion.times, f"demo_{i}": demonstration}
+    measured: dict[int, Measured] = {}
+    numbers = engine.solved(scenario, FINE).nominal.numbers
+    for i, motion in zip(numbers, motions, strict=True):
+        demonstration = task.paths[i]
+        measured[i] = measure(motion, demonstration, frame.goal, obstacle, robot)
+        arrays |= {f"q_{i}": motion.q, f"x_{i}": measured[i].x, f"times_{i}": motion.times, f"demo_{i}": demonstration}
     write_npz(out, **arrays)
     _print(options, task.name, measured, motions)
     for warning in frame.certificates.warnings:
@@ -137,7 +141,10 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _print(options: argparse.Namespace, task: str, measured: list[Measured], motions: tuple[ArmMotion, ...]) -> None:
+def _print(
+    options: argparse.Namespace, task: str, by_number: dict[int, Measured], motions: tuple[ArmMotion, ...]
+) -> None:
+    measured = list(by_number.values())
     x, y, z = options.obstacle
     who = {"task": "end effector", "cspace": "whole arm", "both": "end effector and whole arm"}[options.space]
     avoidance = "without avoidance" if options.no_avoidance else f"avoidance by the {who}"
@@ -151,7 +158,7 @@ def _print(options: argparse.Namespace, task: str, measured: list[Measured], mot
             f"{m.turn:.0f}° ({m.turn_without:.0f}°)",
             f"{m.num_outside} of {len(motion.q)}",
         )
-        for i, (m, motion) in enumerate(zip(measured, motions, strict=True))
+        for (i, m), motion in zip(by_number.items(), motions, strict=True)
     ]
     print_table(
         (
