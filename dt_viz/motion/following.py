@@ -246,6 +246,8 @@ class Follower:
     def _mesh_room(self, q: Array, obstacle: Union, near: Array, enough: float) -> Array:
         """Distances (N,), metres, of the arm's meshes at configurations q (N, 6) where `near` is not enough already."""
         room, close = near.copy(), near < enough
+        if not close.any():
+            return room
         parts = (load_collision_model().obstacle_distance(q[close], part)[0] for part in obstacle.parts)
         room[close] = np.min(list(parts), axis=0)
         return room
