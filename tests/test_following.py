@@ -186,6 +186,15 @@ class TestStance:
         manual = changed(scenario, duration=0.3)  # what is asked for by hand is done as it is asked for
         assert solve(manual, nominal, LIVE, follower).nominal is nominal
 
+    def test_starts_from_which_there_is_no_way_are_left_out_and_named(self, engine, initial):
+        task = engine.task("push_box")
+        obstacle = around(task.mean_path[8])
+        solved = engine.solved(placed(initial("push_box"), obstacle), LIVE)
+        assert solved.cleared and 0 < len(solved.nominal.left_out) < 7
+        said = " ".join(warning.text for warning in solved.nominal.warnings)
+        assert all(str(number + 1) in said for number in solved.nominal.left_out)
+        assert load_collision_model().obstacle_distance(solved.arm.p[::5], obstacle)[0].min() > 0
+
     def test_a_start_left_out_leaves_the_arm_with_another(self, new_engine, initial):
         scenario = placed(initial("push_box"), around(new_engine().task("push_box").starts[0], 0.1))
         frame, motions = new_engine().arm_motions(scenario)
