@@ -186,14 +186,21 @@ class TestStance:
         manual = changed(scenario, duration=0.3)  # what is asked for by hand is done as it is asked for
         assert solve(manual, nominal, LIVE, follower).nominal is nominal
 
-    def test_starts_from_which_there_is_no_way_are_left_out_and_named(self, engine, initial):
-        task = engine.task("push_box")
-        obstacle = around(task.mean_path[8])
-        solved = engine.solved(placed(initial("push_box"), obstacle), LIVE)
-        assert solved.cleared and 0 < len(solved.nominal.left_out) < 7
-        said = " ".join(warning.text for warning in solved.nominal.warnings)
-        assert all(str(number + 1) in said for number in solved.nominal.left_out)
-        assert load_collision_model().obstacle_distance(solved.arm.p[::5], obstacle)[0].min() > 0
+    def test_starts_from_which_there_is_no_way_are_left_out_and_named(self, engine, follower, initial, monkeypatch):
+        nominal = engine.nominal(initial("lift_box"))
+        scenario = placed(initial("lift_box"), around(np.mean(nominal.paths, axis=0)[90]))
+        avoiding, num = follower.whole_arm.avoiding, len(nominal.strands)
+
+        def never_from_the_third(lifted, *arguments, **options):
+            found = avoiding(lifted, *arguments, **options)
+            return replace(found, stuck=np.array([2])) if lifted.num_hosts == num else found
+
+        monkeypatch.setattr(follower.whole_arm, "avoiding", never_from_the_third)
+        solved = solve(scenario, nominal, LIVE, follower)
+        assert solved.cleared and solved.nominal.left_out == (2,)
+        assert len(np.unique(solved.arm.index)) == len(solved.stack.bundle.paths) == num - 1
+        (warning,) = solved.nominal.warnings
+        assert warning.text == "start 3 is without a way around the obstacle for the arm"
 
     def test_a_start_left_out_leaves_the_arm_with_another(self, new_engine, initial):
         scenario = placed(initial("push_box"), around(new_engine().task("push_box").starts[0], 0.1))
