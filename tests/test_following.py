@@ -197,7 +197,7 @@ class TestStance:
 
         monkeypatch.setattr(follower.whole_arm, "avoiding", never_from_the_third)
         solved = solve(scenario, nominal, LIVE, follower)
-        assert solved.cleared and solved.nominal.left_out == (2,)
+        assert solved.arm is not None and solved.cleared and solved.nominal.left_out == (2,)
         assert len(np.unique(solved.arm.index)) == len(solved.stack.bundle.paths) == num - 1
         (warning,) = solved.nominal.warnings
         assert warning.text == "start 3 is without a way around the obstacle for the arm"
