@@ -228,10 +228,11 @@ class Arm:
         avoidance = scenario.arm_avoidance
         if avoidance is None:
             return tuple(self.follow(path) for path in motion.rollouts(spacing=spacing))
-        blocked = self._follower.obstructions(nominal, avoidance.obstacle)
-        if blocked:
-            raise BlockedError("; ".join(warning.text for warning in blocked))
-        solved = solve(scenario, nominal, replace(FINE, spacing=spacing), self._follower)
+        admission = self._follower.admission(nominal, avoidance)
+        in_the_way = admission.blocked or admission.nominal.warnings
+        if in_the_way:
+            raise BlockedError("; ".join(warning.text for warning in in_the_way))
+        solved = solve(scenario, admission.nominal, replace(FINE, spacing=spacing), self._follower)
         arm = solved.arm
         assert arm is not None
         if not arm.cleared:

@@ -15,6 +15,7 @@ from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.options import with_negative_values
+from dt_viz.evaluate.places import hand_room
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
 from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
 from dt_viz.flows.diffeomorphisms import Identity
@@ -22,7 +23,10 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 from dt_viz.learning.imitation import ImitationSettings, fit, grown_grid
 from dt_viz.learning.timing import TimedAttractor
-from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
+from dt_viz.metrics import discrete_frechet, distance_from_path, resample_by_arc_length, rms_at_equal_times
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Union
+from dt_viz.scenario.tasks import lasa_tasks
 
 NUM_DEMONSTRATIONS = 2
 
@@ -308,9 +312,9 @@ def test_the_whole_arm_avoids_what_the_hand_alone_does_not(lasa, tmp_path, middl
 
 def test_avoidance_says_why_there_is_no_motion(lasa, tmp_path, capsys):
     out = tmp_path / "a.npz"
-    start = run_avoidance(lasa, out, [0.5, -0.5, 0.9])["demo_0"][0]
+    goal = run_avoidance(lasa, out, [0.5, -0.5, 0.9])["demo_0"][-1]
     for where, reason in {
-        ",".join(map(str, start)): "starts 1, 2 are inside the obstacle",
+        ",".join(map(str, goal)): "the goal is inside the obstacle",
         "0,0,0.1": "the obstacle touches the arm's base",
     }.items():
         sphere = ["--obstacle", where, "--diameter", "0.15"]
@@ -319,18 +323,57 @@ def test_avoidance_says_why_there_is_no_motion(lasa, tmp_path, capsys):
         assert f"no motion: {reason}" in capsys.readouterr().err
 
 
+def test_a_start_that_has_no_room_is_left_out_of_what_is_measured(lasa, tmp_path, capsys):
+    start = run_avoidance(lasa, tmp_path / "a.npz", [0.5, -0.5, 0.9])["demo_0"][0]
+    arrays = run_avoidance(lasa, tmp_path / "a.npz", start, "--space", "cspace")
+    assert 0 < sum(name.startswith("q_") for name in arrays) < NUM_DEMONSTRATIONS and "q_0" not in arrays
+    assert "warning: start" in capsys.readouterr().out
+    for name in arrays:
+        if name.startswith("q_"):
+            np.testing.assert_allclose(arrays[f"x_{name[2:]}"][0], arrays[f"demo_{name[2:]}"][0], atol=0.01)
+
+
 def test_places_are_measured_on_the_meshes(lasa, tmp_path, capsys):
     out = tmp_path / "places.npz"
-    arguments = ["--task", "Hook", "--lasa", str(lasa), "--count", "2", "--diameter", "0.1", "--out", str(out)]
+    arguments = ["--task", "Hook", "--lasa", str(lasa), "--count", "2", "--size", "0.1", "--out", str(out)]
     assert main(["places", *arguments]) == 0
     printed = capsys.readouterr().out
     with np.load(out) as arrays:
-        assert np.linalg.norm(arrays["places"] - arrays["places"][0], axis=1).max() <= 0.05
+        assert np.linalg.norm(arrays["places"] - arrays["places"][0], axis=2).max() <= 0.05
         assert arrays["arm_depth"].shape == (3, NUM_DEMONSTRATIONS)
+        assert number_after(printed, "at least 9 mm kept") == (np.nanmin(arrays["arm_clearance"], axis=1) >= 9e-3).sum()
         assert np.nanmax(arrays["arm_depth"]) == number_after(printed, "M.C.D. of the whole arm") == 0
         assert np.nanmin(arrays["depth_without"]) > 0
     assert main(["places", *arguments, "--no-avoidance"]) == 0
     assert number_after(capsys.readouterr().out, "M.C.D. of the whole arm") > 30
+
+
+def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, tmp_path, capsys):
+    out = tmp_path / "places.npz"
+    where = ["--along", "0,1", "--spread", "0", "--shape", "any", "--number", "2", "--size", "0.06,0.25"]
+    arguments = ["--task", "Hook", "--lasa", str(lasa), "--count", "12", *where, "--only-blocked", "--out", str(out)]
+    assert main(["places", *arguments]) == 0
+    printed = capsys.readouterr().out
+    mean = lasa_tasks(lasa)["Hook"]().mean_path
+    with np.load(out) as arrays:
+        places, sizes = arrays["places"][1:], arrays["sizes"][1:]
+        assert places.shape == sizes.shape == (12, 2, 3)
+        assert set(arrays["shapes"][1:].ravel()) == {"sphere", "box", "cylinder"}
+        assert 0.06 <= sizes.min() < 0.1 and 0.2 < sizes.max() <= 0.25
+        nearest = np.linalg.norm(places[:, :, None] - mean, axis=3).argmin(axis=2)
+        assert nearest.min() < 25 and nearest.max() > 75
+        assert distance_from_path(places.reshape(-1, 3), mean).max() < 1e-9
+        free = (arrays["hand_room"] > 0).all(axis=1)
+        assert number_after(printed, "called blocked:") == (arrays["blocked"] & free).sum()
+
+
+def test_the_hand_has_room_where_some_orientation_of_it_has(robot):
+    far, near, inside = (
+        hand_room(robot, Union((Sphere((0.0, -0.5, 0.3), size),)), np.array([[0.0, -0.4, 0.3]]))[0]
+        for size in (0.02, 0.15, 0.3)
+    )
+    assert far > near > 0 > inside
+    assert far - near == pytest.approx(0.065, abs=0.01)  # the hand points at the ball, whatever its size
 
 
 def test_values_may_begin_with_a_minus():
@@ -485,6 +528,15 @@ def test_what_cannot_be_used_is_named(lasa, tmp_path, monkeypatch, capsys, argum
             ["avoidance", *TASK, *SPHERE, "--space", "joint"],
             "argument --space: invalid choice: 'joint'",
         ),
+        (
+            ["places", *TASK, "--size", "0.2,0.1", "--out", "a.npz"],
+            "argument --size: found '0.2,0.1'; accepted: a number",
+        ),
+        (
+            ["places", *TASK, "--along", "0,1.1", "--out", "a.npz"],
+            "argument --along: found '0,1.1'; accepted: a number",
+        ),
+        (["places", *TASK, "--spread", "-1", "--out", "a.npz"], "argument --spread: found '-1'; accepted: metres, at"),
         (["starts", *TASK, "--count", "many"], "argument --count: found 'many'; accepted: a whole number, 1 or more"),
         (["imitation", "Hook.mat"], "the following arguments are required: --out"),
         (

@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 from scenes import changed, kinds
 
+from dt_viz.arm.arm_system import Section
+from dt_viz.arm.collision import SELF_MARGIN, load_collision_model
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
-from dt_viz.motion.stack import LIVE, build_stack
+from dt_viz.motion.solve import solve
+from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.base import ArmAvoidance
 from dt_viz.warning import Kind
 
 FAR = Sphere((3.0, 3.0, 3.0))
@@ -50,20 +55,30 @@ def _too_far(fits, robot):
     return Engine({"push_box": replace(TASKS["push_box"], load=shifted)}, fits, robot)
 
 
-class TestObstructions:
+class TestAdmission:
+    def admission(self, follower, nominal, *obstacles):
+        return follower.admission(nominal, ArmAvoidance(Union(obstacles)))
+
     def reasons(self, follower, nominal, obstacle):
-        return follower.obstructions(nominal, Union((obstacle,)))
+        return self.admission(follower, nominal, obstacle).blocked
 
     def test_nothing_is_in_the_way_of_what_has_to_be_avoided(self, follower, nominal, initial):
-        assert follower.obstructions(nominal, initial("push_box").obstacle) == ()
-        assert self.reasons(follower, nominal, FAR) == ()
-        assert follower.obstructions(nominal, Union()) == ()
+        for obstacles in (initial("push_box").obstacles, (FAR,), ()):
+            admission = self.admission(follower, nominal, *obstacles)
+            assert admission.nominal is nominal and not admission.blocked  # in its usual stance, too
 
-    def test_a_covered_start_is_named(self, follower, nominal):
+    def test_a_covered_start_is_left_out_and_named(self, follower, nominal):
         away = np.linalg.norm(nominal.task.starts - nominal.task.starts[2], axis=1)
-        (reason,) = self.reasons(follower, nominal, around(nominal.task.starts[2], 0.12))
+        admission = self.admission(follower, nominal, around(nominal.task.starts[2], 0.12))
+        assert not admission.blocked and 2 in admission.nominal.left_out
+        (reason,) = admission.nominal.warnings
         assert reason.kind is Kind.START_COVERED and reason.text.startswith("start") and "3" in reason.text
-        assert (away[[k for k in range(7) if str(k + 1) in reason.text]] < 0.15).all()
+        assert (away[list(admission.nominal.left_out)] < 0.15).all()
+        assert len(admission.nominal.strands) + len(admission.nominal.left_out) == 7
+
+    def test_it_is_blocked_where_no_start_is_left(self, follower, nominal):
+        (reason,) = self.reasons(follower, nominal, around(nominal.task.starts.mean(axis=0), 0.4))
+        assert reason.kind is Kind.START_COVERED and "1, 2, 3, 4, 5, 6, 7" in reason.text
 
     def test_a_covered_goal_is_named(self, follower, nominal):
         (reason,) = self.reasons(follower, nominal, around(nominal.goal, 0.15))
@@ -77,26 +92,121 @@ class TestObstructions:
         (reason,) = self.reasons(follower, nominal, around((0.0, 0.08, height), 0.1))
         assert name in reason.text and "cannot move away" in reason.text
 
-    def test_the_spheres_that_cover_the_arm_are_no_reason_while_its_meshes_are_free(self, follower, nominal):
-        """An obstacle between the sphere and the mesh of a hand at rest."""
-        pins = follower.undisturbed(nominal).pins
-        clear_of_meshes = 0
-        for dy in np.linspace(0.0, 0.2, 41):
-            obstacle = around(nominal.goal + np.array([0.0, -dy, 0.0]), 0.1)
-            covered = follower.whole_arm.clearance(pins, obstacle).min() < 0
-            if covered and not self.reasons(follower, nominal, obstacle):
-                clear_of_meshes += 1
-        assert clear_of_meshes >= 1
-
     def test_demonstrations_out_of_reach_are_named(self, too_far, initial, robot):
         nominal = too_far.nominal(initial("push_box"))
         follower = Follower(robot)
-        (reason,) = follower.obstructions(nominal, Union((FAR,)))
+        (reason,) = self.reasons(follower, nominal, FAR)
         assert reason.kind is Kind.OUT_OF_REACH
         assert "cannot reach the starts" in reason.text and "no configuration reaches" in reason.text
         for _ in range(2):  # the second answer is the remembered one
             with pytest.raises(UnreachableError):
                 follower.undisturbed(nominal)
+
+
+class TestStance:
+    """A ball beside the goal, which the hand clears and the arm at rest there does not."""
+
+    @pytest.fixture(name="beside", params=["push_box", "drop_pots"])
+    def _beside(self, request, engine, initial):
+        nominal = engine.nominal(initial(request.param))
+        mean = np.mean(nominal.paths, axis=0)
+        place = mean[np.argmin(np.abs(np.linalg.norm(mean - nominal.goal, axis=1) - 0.11))]
+        return nominal, ArmAvoidance(Union((around(place),)))
+
+    def truth(self, q, avoidance):
+        """Distance of the meshes from the obstacle at each posture."""
+        (part,) = avoidance.obstacle.parts
+        return load_collision_model().obstacle_distance(q, part)[0]
+
+    def test_the_arm_rests_elsewhere_with_the_hand_where_it_was(self, follower, beside, robot):
+        nominal, avoidance = beside
+        assert self.truth(follower.undisturbed(nominal).pins, avoidance).min() < 0  # so there is something to do
+        found = follower.admission(nominal, avoidance)
+        assert not found.blocked and not found.nominal.left_out and found.nominal.stance is not None
+        lifted = follower.undisturbed(found.nominal)
+        assert self.truth(lifted.pins, avoidance).min() >= avoidance.margin - 1e-3
+        np.testing.assert_allclose(robot.end_effector(lifted.pins), nominal.ends, rtol=0, atol=1e-5)
+
+    def test_it_can_be_taken_along_all_motions(self, follower, beside, robot):
+        nominal, avoidance = beside
+        lifted = follower.undisturbed(follower.admission(nominal, avoidance).nominal)
+        assert lifted.tracked.error.max() < MAX_TRACKING_ERROR
+        assert not lifted.tracked.limits_hit.any() and not lifted.tracked.damped.any()
+        assert (lifted.tracked.q > robot.lower).all() and (lifted.tracked.q < robot.upper).all()
+        itself = load_collision_model().nearest_to_itself(lifted.tracked.q[0])
+        assert itself is None or itself.distance >= SELF_MARGIN
+
+    def test_one_section_leads_to_it_from_every_start(self, follower, beside, robot):
+        nominal, avoidance = beside
+        lifted = follower.undisturbed(follower.admission(nominal, avoidance).nominal)
+        q = lifted.tracked.q[:, ::20]
+        again = Section(robot, lifted.reference).postures(robot.end_effector(q))
+        np.testing.assert_allclose(again, q, rtol=0, atol=1e-3)
+
+    def test_it_does_not_depend_on_what_was_asked_before(self, follower, beside, robot):
+        nominal, avoidance = beside
+        stance = follower.admission(nominal, avoidance).nominal.stance
+        assert Follower(robot).admission(nominal, avoidance).nominal.stance == stance
+
+    def test_the_motion_ends_at_the_goal_around_the_obstacle(self, engine, beside, robot):
+        nominal, avoidance = beside
+        scenario = changed(Scenario(nominal.task.name), obstacles=avoidance.obstacle.parts, space="cspace")
+        solved = engine.solved(scenario, FINE)
+        assert solved.cleared and solved.nominal.stance is not None
+        rows = np.r_[np.diff(solved.arm.index) > 0, True]
+        hand = robot.end_effector(solved.arm.p[rows])
+        np.testing.assert_allclose(hand, np.broadcast_to(nominal.goal, hand.shape), rtol=0, atol=1e-4)
+        assert self.truth(solved.arm.p[::7], avoidance).min() >= avoidance.margin - 1e-3
+
+    def test_joints_of_another_stance_are_no_beginning(self, follower, beside):
+        nominal, avoidance = beside
+        standing = follower.admission(nominal, avoidance).nominal
+        solution = build_stack(nominal, (), LIVE)
+        before = follower.behaving(nominal, solution, exact=False)
+        fresh = follower.behaving(standing, solution, exact=False)
+        after = follower.behaving(standing, solution, exact=False, before=before)
+        np.testing.assert_array_equal(after.tracked.q, fresh.tracked.q)
+
+    def test_where_the_arm_finds_no_way_other_stances_are_tried(self, engine, follower, initial, monkeypatch):
+        nominal = engine.nominal(initial("lift_box"))
+        middle = np.mean(nominal.paths, axis=0)[90]
+        scenario = placed(initial("lift_box"), around(middle))
+        usual = solve(scenario, nominal, LIVE, follower)
+        assert usual.nominal is nominal and usual.cleared
+        avoiding = follower.whole_arm.avoiding
+
+        def only_elsewhere(lifted, *arguments, **options):
+            found = avoiding(lifted, *arguments, **options)
+            same = np.array_equal(lifted.reference, follower.reference(nominal))
+            return replace(found, stuck=np.arange(1)) if same else found
+
+        monkeypatch.setattr(follower.whole_arm, "avoiding", only_elsewhere)
+        other = solve(scenario, nominal, LIVE, follower)
+        assert other.cleared and other.nominal.stance is not None
+        manual = changed(scenario, duration=0.3)  # what is asked for by hand is done as it is asked for
+        assert solve(manual, nominal, LIVE, follower).nominal is nominal
+
+    def test_starts_from_which_there_is_no_way_are_left_out_and_named(self, engine, follower, initial, monkeypatch):
+        nominal = engine.nominal(initial("lift_box"))
+        scenario = placed(initial("lift_box"), around(np.mean(nominal.paths, axis=0)[90]))
+        avoiding, num = follower.whole_arm.avoiding, len(nominal.strands)
+
+        def never_from_the_third(lifted, *arguments, **options):
+            found = avoiding(lifted, *arguments, **options)
+            return replace(found, stuck=np.array([2])) if lifted.num_hosts == num else found
+
+        monkeypatch.setattr(follower.whole_arm, "avoiding", never_from_the_third)
+        solved = solve(scenario, nominal, LIVE, follower)
+        assert solved.arm is not None and solved.cleared and solved.nominal.left_out == (2,)
+        assert len(np.unique(solved.arm.index)) == len(solved.stack.bundle.paths) == num - 1
+        (warning,) = solved.nominal.warnings
+        assert warning.text == "start 3 is without a way around the obstacle for the arm"
+
+    def test_a_start_left_out_leaves_the_arm_with_another(self, new_engine, initial):
+        scenario = placed(initial("push_box"), around(new_engine().task("push_box").starts[0], 0.1))
+        frame, motions = new_engine().arm_motions(scenario)
+        assert 0 < len(motions) < 7 and Kind.START_COVERED in kinds(frame.certificates.found)
+        assert frame.chosen == 0 and len(frame.rollouts) == len(motions)
 
 
 class TestFollowing:

@@ -9,12 +9,12 @@ from scenes import changed
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.tracking import track
-from dt_viz.arm.whole_arm import MAX_DURATION, ROUNDING, ArmSolution, Lift, WholeArm
+from dt_viz.arm.whole_arm import MAX_DURATION, MAX_EXTENSION, ROUNDING, ArmSolution, Lift, WholeArm
 from dt_viz.flows.diffeomorphisms import Identity, min_det_jacobian
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.stack import FINE, LIVE
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.scenario.scenario import Scenario
 
 ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)
@@ -146,9 +146,34 @@ class TestAroundTheMiddle:
     def test_the_duration_is_the_shortest(self, case, coarse):
         solution = case.avoiding(coarse=coarse)
         less = case.avoiding(coarse=coarse, duration=0.9 * solution.duration)
-        assert not less.cleared
+        margin = case.scenario.arm_avoidance.margin - 1e-3
+        assert not less.cleared or case.truth(split(less, less.p), case.middle) < margin
         same = case.avoiding(coarse=coarse, duration=solution.duration)
         assert same.cleared
+
+
+@pytest.mark.parametrize("shape", ["ball", "box"])
+class TestMargin:
+    """The covering spheres stick out of the arm: where they do so little, the meshes keep less than is asked for."""
+
+    @pytest.fixture(name="obstacle")
+    def _obstacle(self, push, shape):
+        x, y, z = (float(c) for c in push.nominal.task.mean_path[40] + [0.0, 0.02, 0.01])
+        return Sphere((x, y, z), 0.15) if shape == "ball" else Box((x, y, z), (0.12, 0.1, 0.14), (0.8, 0.6, 0.0, 0.0))
+
+    def test_the_meshes_keep_what_is_asked_for(self, push, obstacle):
+        margin = push.scenario.arm_avoidance.margin
+        by_spheres, solution = (push.avoiding(obstacle, coarse=coarse) for coarse in (True, False))
+        assert push.truth(split(by_spheres, by_spheres.p), obstacle) < margin - 1.5e-3  # so there is something to do
+        assert margin - 1e-3 <= push.truth(split(solution, solution.p), obstacle) < margin + 1e-3
+
+    def test_it_is_the_same_flow_for_longer(self, push, obstacle):
+        by_spheres, solution = (push.avoiding(obstacle, coarse=coarse) for coarse in (True, False))
+        assert 0 < solution.duration - by_spheres.duration < MAX_EXTENSION
+        q = push.arm.limits.inside(solution.q)
+        assert np.abs(solution.transform.inverse(q) - solution.p).max() < 1e-5
+        longer = push.avoiding(obstacle, coarse=True, duration=solution.duration)
+        assert np.abs(longer.transform.inverse(q) - solution.p).max() < 1e-2  # a coarse flow
 
 
 def test_orientation_is_kept_along_the_motions(case):

@@ -221,7 +221,7 @@ def track(
             raise ValueError(f"initial must be {shape} like the path, got {guess.shape}")
     q = _sweep(robot, guess.reshape(*paths.shape[:2], NUM_JOINTS), paths, posture)
     for stride in strides:
-        lost = np.flatnonzero(_loses_branch(q, paths))
+        lost = np.flatnonzero(loses_branch(q, paths))
         if not len(lost):
             break
         part = posture.take(lost)
@@ -378,7 +378,7 @@ def _spd_inverse(A: Array, damping: Array | float) -> Array:
     return out / (a * out[0, 0] + h * out[0, 1] + g * out[0, 2])
 
 
-def _loses_branch(q: Array, paths: Array) -> NDArray[np.bool_]:
+def loses_branch(q: Array, paths: Array) -> NDArray[np.bool_]:
     """Find which (B,) joints (B, T, 6) jump by more than a continuous solution along paths (B, T, 3) can."""
     moved = np.linalg.norm(np.diff(paths, axis=1), axis=-1)
     allowed = 0.05 + JUMP_PER_ROOT_METRE * np.sqrt(moved)  # the constant is for repeated samples

@@ -15,7 +15,16 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from dt_viz.arm.body_points import BodyPoints
-from dt_viz.arm.cspace import LEVERS, REACH_PER_TEMPERATURE, GradientField, JointLimits, WholeArmField, squared_lengths
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.arm.cspace import (
+    LEVERS,
+    REACH_PER_TEMPERATURE,
+    SPEED,
+    GradientField,
+    JointLimits,
+    WholeArmField,
+    squared_lengths,
+)
 from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import JointPath, track
@@ -48,6 +57,14 @@ MOVED = 5e-3
 """Metres beside its start where a guest's hand may begin before it is said."""
 ROUNDING = 1e-3
 """Metres of clearance that do not count."""
+MESH_ROUNDING = 0.5e-3
+"""Metres of the meshes' clearance that do not count: between two samples they may come a little nearer."""
+EXTENSION_STEP = 0.03
+"""Flow time between two looks at the meshes' clearance."""
+MAX_EXTENSION = 0.15
+"""Longest flow time that is added for the meshes: they are at most three centimetres nearer than asked for."""
+NUM_EXTENDED_FOR = 40
+"""Number of samples, those that lack most, that this time is chosen for."""
 COARSE_STEP = 0.2
 """Length of a coarse RK4 step, in flow time: off by a tenth of a millimetre at the hand, about."""
 TOLERANCE = 3e-9
@@ -146,12 +163,17 @@ class ArmSolution:
     """t of the avoidance flow."""
     clearance: float
     """Smallest distance of the covering spheres from the obstacle along the hosts, metres."""
-    cleared: bool
-    """Whether all samples of the hosts keep the clearance that is asked for."""
+    stuck: Indices
+    """Hosts that do not keep the clearance that is asked for."""
     too_near: Indices
     """Guests, counted among all rollouts, that do not keep it."""
     moved: Indices
     """Guests that begin more than `MOVED` away from their start."""
+
+    @property
+    def cleared(self) -> bool:
+        """Whether all hosts keep the clearance that is asked for."""
+        return not len(self.stuck)
 
 
 class WholeArm:
@@ -214,6 +236,17 @@ class WholeArm:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
         points = self.body.of_chain(self.robot.chain(q.T))
         return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)
+
+    def mesh_clearance(self, q: Array, obstacle: Union | Obstacle, enough: Array) -> Array:
+        """Distance (N,), metres, of the arm's meshes at configurations q (N, 6) from the obstacle.
+
+        Beyond `enough` (N,) it is any value from there on that is not too large.
+        """
+        clearance = self.clearance(q, obstacle)  # of the spheres, which is smaller
+        near = np.flatnonzero(clearance < enough)
+        if len(near):
+            clearance[near] = load_collision_model().gaps(q[near], obstacle, enough[near])
+        return clearance
 
     def _generators(self, lifted: Lift, avoidance: ArmAvoidance) -> Iterator[VectorField]:
         """The fields to try, the most promising first; none where nothing comes too near an obstacle."""
@@ -298,43 +331,51 @@ class _Solver:
     def _with_duration(self, duration: float) -> ArmSolution:
         transform = self._transform(duration)
         bundle = self._sampled(transform)
-        p = bundle.positions / LEVERS
-        lack = self._lack(p)
-        hosts = self._of_hosts(bundle)
-        chosen = self._generator is not None and self._avoidance.duration is None
-        for _ in range(MAX_ROUNDS if chosen else 0):
-            if duration >= MAX_DURATION or not (lack[hosts] > ROUNDING).any():
-                break
-            # the flow is a one-parameter group: go on from where the samples are
-            more = min(self._clearing_duration(p[hosts][lack[hosts] > 0]), MAX_DURATION - duration)
-            duration += more
-            transform = self._transform(duration)
-            if self._avoidance.integration.by_hand:  # a few coarse steps are no such group
-                levels = self._evaluate(transform, bundle.index, bundle.fraction)
-            else:
-                levels = (self._transform(more).inverse(p) * LEVERS)[:, None]
-            bundle = self._refined(replace(bundle, levels=levels), transform)
-            p = bundle.positions / LEVERS
+        if self._generator is None or self._avoidance.duration is not None:
+            return self._along(bundle, transform, duration)
+        for _ in range(MAX_ROUNDS):
+            p = (bundle.positions / LEVERS)[self._of_hosts(bundle)]
             lack = self._lack(p)
-            hosts = self._of_hosts(bundle)
-        return self._along(bundle, transform, duration, lack)
+            if duration >= MAX_DURATION or not (lack > ROUNDING).any():
+                break
+            more = min(self._clearing_duration(p[lack > 0]), MAX_DURATION - duration)
+            duration += more
+            bundle, transform = self._continued(bundle, more, duration)
+        for _ in range(0 if self._coarse else MAX_ROUNDS):
+            p = (bundle.positions / LEVERS)[self._of_hosts(bundle)]
+            lack = self._mesh_lack(p)
+            worst = np.argsort(-lack)[:NUM_EXTENDED_FOR]
+            if lack[worst[0]] <= MESH_ROUNDING:
+                break
+            more = min(self._extension(p[worst[lack[worst] > 0]]), MAX_DURATION - duration)
+            if more <= 0:
+                break
+            duration += more
+            bundle, transform = self._continued(bundle, more, duration)
+        return self._along(bundle, transform, duration)
+
+    def _continued(self, bundle: Bundle, more: float, duration: float) -> tuple[Bundle, Diffeomorphism]:
+        """The samples carried on by the flow, by `more` up to this duration, and its transform then."""
+        transform = self._transform(duration)
+        if self._avoidance.integration.by_hand:  # a few coarse steps are no one-parameter group
+            levels = self._evaluate(transform, bundle.index, bundle.fraction)
+        else:
+            levels = (self._transform(more).inverse(bundle.positions / LEVERS) * LEVERS)[:, None]
+        return self._refined(replace(bundle, levels=levels), transform), transform
 
     def through(self, transform: Diffeomorphism, duration: float) -> ArmSolution:
         """The motions of a transform that is there already, of which that is the full duration."""
-        bundle = self._sampled(transform)
-        return self._along(bundle, transform, duration, self._lack(bundle.positions / LEVERS))
+        return self._along(self._sampled(transform), transform, duration)
 
-    def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float, lack: Array) -> ArmSolution:
+    def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float) -> ArmSolution:
         p = bundle.positions / LEVERS
-        hosts, near = self._of_hosts(bundle), lack > ROUNDING
+        hosts, near = self._of_hosts(bundle), self._lack(p) > ROUNDING
         clearance = float(self._arm.clearance(p[hosts], self._avoidance.obstacle).min())
         q = self._lifted.at(bundle.index, bundle.fraction)
-        cleared, too_near = not near[hosts].any(), np.unique(bundle.index[near & ~hosts])
+        stuck, too_near = (np.unique(bundle.index[near & which]) for which in (hosts, ~hosts))
         away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
         moved = np.unique(bundle.index[away & ~hosts & (bundle.fraction == 0)])
-        return ArmSolution(
-            transform, bundle.index, bundle.fraction, q, p, duration, clearance, cleared, too_near, moved
-        )
+        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, stuck, too_near, moved)
 
     def _of_hosts(self, bundle: Bundle) -> Mask:
         return bundle.index < self._lifted.num_hosts
@@ -365,11 +406,27 @@ class _Solver:
         return refined(bundle, lambda i, u: self._evaluate(transform, i, u), self._spacing)
 
     def _lack(self, p: Array) -> Array:
-        """(N,) metres by which configurations (N, 6) miss the clearance that is asked for."""
-        distance = np.sqrt(squared_lengths(p, self._lifted.pins))
+        """(N,) metres by which the spheres at configurations (N, 6) miss the clearance that is asked for."""
         margin = max(self._avoidance.margin - OVERSHOOT, 2 * ROUNDING)
-        asked = np.minimum(margin, (self._room + SLOPE * distance).min(axis=1))
-        return asked - self._arm.clearance(p, self._avoidance.obstacle)
+        return self._asked(p, margin, self._room) - self._arm.clearance(p, self._avoidance.obstacle)
+
+    def _mesh_lack(self, p: Array, beyond: float = 0.0) -> Array:
+        """(N,) metres by which the meshes at configurations (N, 6) miss the clearance that is asked for, and less.
+
+        They are exact down to −`beyond`.
+        """
+        asked = self._asked(p, self._avoidance.margin, self._mesh_room)
+        return asked - self._arm.mesh_clearance(p, self._avoidance.obstacle, asked + beyond)
+
+    @cached_property
+    def _mesh_room(self) -> Array:
+        pins, margin = self._lifted.pins, self._avoidance.margin
+        return self._arm.mesh_clearance(pins, self._avoidance.obstacle, np.full(len(pins), margin)) - ROUNDING
+
+    def _asked(self, p: Array, margin: float, room: Array) -> Array:
+        """(N,) metres of clearance that are asked for at configurations (N, 6), with this room (K,) at the pins."""
+        distance = np.sqrt(squared_lengths(p, self._lifted.pins))
+        return np.minimum(margin, (room + SLOPE * distance).min(axis=1))
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or `MAX_DURATION`."""
@@ -383,6 +440,31 @@ class _Solver:
             state, _ = rk4(self._generator, state, None, -SNAPSHOT)
             before, lack = lack, self._lack(limits.inverse(state))
             if (lack <= 0).all():
-                return duration + SNAPSHOT * float((before / np.maximum(before - lack, 1e-12)).clip(0, 1).max())
+                return duration + SNAPSHOT * _crossing(before, lack)
             state, lack, duration = state[lack > 0], lack[lack > 0], duration + SNAPSHOT
         return duration
+
+    def _extension(self, p: Array) -> float:
+        """The shortest duration after which the flow has carried the meshes of configurations (N, 6) clear.
+
+        Those that take longer than `MAX_EXTENSION` are left as they are; 0 where all do.
+        """
+        assert self._generator is not None
+        limits, duration = self._arm.limits, 0.0
+        state, lack = limits.forward(p), self._mesh_lack(p)
+        for done in np.arange(0, MAX_EXTENSION, EXTENSION_STEP):
+            checkpoint()
+            state, _ = rk4(self._generator, state, None, -EXTENSION_STEP)
+            before, lack = lack, self._mesh_lack(limits.inverse(state), SPEED * EXTENSION_STEP)
+            clear = lack <= 0
+            if clear.any():
+                duration = done + EXTENSION_STEP * _crossing(before[clear], lack[clear])
+            state, lack = state[~clear], lack[~clear]
+            if not len(state):
+                break
+        return float(duration)
+
+
+def _crossing(before: Array, after: Array) -> float:
+    """Part of a step after which the last of some values (N,), above 0 before and at most 0 after it, has become 0."""
+    return float((before / np.maximum(before - after, 1e-12)).clip(0, 1).max())

@@ -51,7 +51,7 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         stage=Stage.ROLLOUTS,
         ghost=nominal.paths,
         rollouts=shown.paths,
-        chosen=nominal.rollout(followed(scenario, nominal.num_demonstrated)),
+        chosen=_chosen(scenario, nominal),
         times=shown.split(stack.rays.times(index, fraction)),
         levels=tuple(stack.bundle.split(level) for level in np.moveaxis(stack.bundle.levels, 1, 0)),
         level=level_of(scenario, stack),
@@ -81,7 +81,7 @@ def with_arm(frame: Frame, solved: Solved, follower: Follower, before: Array | N
         far = follower.out_of_reach(nominal)
         if frame.chosen is not None and not far[frame.chosen]:
             arm, warnings = arm_along(frame, solved, frame.chosen, follower, before)
-        warnings += tuple(far_starts(np.flatnonzero(far), nominal.num_demonstrated))
+        warnings += tuple(far_starts(np.array(nominal.numbers)[far], nominal.num_demonstrated))
     except UnreachableError as error:
         warnings = (unreachable(error),)
     return replace(frame, arm=arm, certificates=frame.certificates.warning(*warnings))
@@ -116,8 +116,9 @@ def profiles(frame: Frame, solved: Solved, chosen: int, follower: Follower) -> P
     nominal = solved.nominal
     obstacle, arm, task = frame.scenario.obstacle, solved.arm, nominal.task
     path, undisturbed = frame.rollouts[chosen], nominal.paths[chosen]
-    of_mean, system = chosen >= nominal.num_demonstrated, solved.stack.system
-    demonstration = task.mean_path if of_mean else task.paths[chosen]
+    number, system = nominal.numbers[chosen], solved.stack.system
+    of_mean = number >= nominal.num_demonstrated
+    demonstration = task.mean_path if of_mean else task.paths[number]
     if arm is None:
         return Profiles(
             hand_profile(path, demonstration, system, obstacle),
@@ -162,6 +163,13 @@ def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, coarse: bo
         base=book.base(stack.rays) if view.base else None,
         occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
     )
+
+
+def _chosen(scenario: Scenario, nominal: Nominal) -> int | None:
+    """Index of the rollout that the arm follows: the first one where that from a task's start is left out."""
+    number = followed(scenario, nominal.num_demonstrated)
+    chosen = nominal.rollout(number)
+    return 0 if chosen is None and number < nominal.num_demonstrated else chosen
 
 
 def _learned_steps(nominal: Nominal) -> tuple[int, ...]:

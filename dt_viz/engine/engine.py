@@ -140,7 +140,7 @@ class Engine:
         )
         if motion.warp == 1:
             return full
-        below = self.memo("below", (nominal, motion.warp), lambda: nominal.warped(motion.warp), newest=1)
+        below = self.memo("below", (full.nominal, motion.warp), lambda: full.nominal.warped(motion.warp), newest=1)
         return self.memo(
             "warped",
             (motion, precision),
@@ -209,7 +209,7 @@ class Engine:
     def _admission(self, scenario: Scenario) -> Admission:
         """Whether the scenario has a motion, and from which starts."""
         nominal, avoidance = self.nominal(scenario), scenario.arm_avoidance
-        return Admission(nominal) if avoidance is None else self.follower.admission(nominal, avoidance.obstacle)
+        return Admission(nominal) if avoidance is None else self.follower.admission(nominal, avoidance)
 
     def _stages(self, scenario: Scenario, checkpoint: Checkpoint) -> Iterator[Frame]:
         with _in_turn():

@@ -53,7 +53,8 @@ class Frame:
     """Why there is no motion for this scenario; what is shown then is the last one that there was."""
     certificates: Certificates
     chosen: int | None = 0
-    """Number of the rollout that the arm follows; None where it cannot begin the one that the scenario asks for."""
+    """Index of the rollout that the arm follows: the first one where it cannot begin the one that is asked for;
+    None where that begins at an added start."""
     learned_steps: tuple[int, ...] = ()
     """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
     durations: tuple[float | None, ...] = ()

@@ -1,6 +1,6 @@
 """Put a sphere into a motion and measure the motion of the end effector and the whole arm.
 
-The npz file holds for each rollout i, as the page finally shows it:
+The npz file holds for each rollout i, as the page finally shows it, but for those whose start has no room:
 
 ``q_i`` (T, 6), ``times_i`` (T,)
     joint angles, rad, continuous joints unwrapped, and seconds.
@@ -42,12 +42,14 @@ from dt_viz.evaluate.options import (
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.metrics import maximum_collision_distance, sharpest_turn
+from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Union
 
 LIMIT_TOLERANCE = 1e-9
 """Excess over a joint limit, rad, that counts as rounding."""
-TURN_ARC = 0.2
-"""Length of the path over which a turn is measured, in radii of the obstacle."""
+TURN_ARC = 0.015
+"""Length of the path over which a turn is measured, metres."""
 NO_MOTION = 1
 """Exit status if the obstacle leaves no motion."""
 
@@ -78,10 +80,10 @@ class Measured:
     """Distance of the end effector's last position from the demonstrations' goal."""
 
 
-def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Sphere, robot: Robot) -> Measured:
+def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Union, robot: Robot) -> Measured:
     """Measure one rollout of the arm."""
     model = load_collision_model()
-    x, arc = robot.end_effector(motion.q), TURN_ARC * obstacle.radius
+    x = robot.end_effector(motion.q)
     depth = maximum_collision_distance(x, obstacle.signed_distance) + 0.0  # never -0
     outside = (motion.q < robot.lower - LIMIT_TOLERANCE) | (motion.q > robot.upper + LIMIT_TOLERANCE)
     return Measured(
@@ -92,8 +94,8 @@ def measure(motion: ArmMotion, demonstration: Array, goal: Array, obstacle: Sphe
         arm=model.report(motion.q, obstacle),
         depth_without=max(0.0, -model.nearest_to_obstacle(motion.without, obstacle).distance),
         num_outside=int(outside.any(axis=1).sum()),
-        turn=sharpest_turn(x, arc),
-        turn_without=sharpest_turn(robot.end_effector(motion.without), arc),
+        turn=sharpest_turn(x, TURN_ARC),
+        turn_without=sharpest_turn(robot.end_effector(motion.without), TURN_ARC),
         goal_miss=float(np.linalg.norm(x[-1] - goal)),
     )
 
@@ -113,9 +115,10 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".npz")
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
-    obstacle = Sphere(options.obstacle, options.diameter)
+    obstacle = Union((Sphere(options.obstacle, options.diameter),))
     try:
-        frame, motions = engine.arm_motions(scenario_around(obstacle, task, options))
+        scenario = scenario_around(obstacle.parts, task, options)
+        frame, motions = engine.arm_motions(scenario)
     except UnreachableError as error:
         print(f"no motion: the arm cannot reach the starts: {error}", file=sys.stderr)
         return NO_MOTION
@@ -125,10 +128,12 @@ def run(options: argparse.Namespace) -> int:
         return NO_MOTION
 
     arrays: dict[str, Any] = {}
-    measured = []
-    for i, (motion, demonstration) in enumerate(zip(motions, task.paths, strict=True)):
-        measured.append(measure(motion, demonstration, frame.goal, obstacle, robot))
-        arrays |= {f"q_{i}": motion.q, f"x_{i}": measured[-1].x, f"times_{i}": motion.times, f"demo_{i}": demonstration}
+    measured: dict[int, Measured] = {}
+    numbers = engine.solved(scenario, FINE).nominal.numbers
+    for i, motion in zip(numbers, motions, strict=True):
+        demonstration = task.paths[i]
+        measured[i] = measure(motion, demonstration, frame.goal, obstacle, robot)
+        arrays |= {f"q_{i}": motion.q, f"x_{i}": measured[i].x, f"times_{i}": motion.times, f"demo_{i}": demonstration}
     write_npz(out, **arrays)
     _print(options, task.name, measured, motions)
     for warning in frame.certificates.warnings:
@@ -136,7 +141,10 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _print(options: argparse.Namespace, task: str, measured: list[Measured], motions: tuple[ArmMotion, ...]) -> None:
+def _print(
+    options: argparse.Namespace, task: str, by_number: dict[int, Measured], motions: tuple[ArmMotion, ...]
+) -> None:
+    measured = list(by_number.values())
     x, y, z = options.obstacle
     who = {"task": "end effector", "cspace": "whole arm", "both": "end effector and whole arm"}[options.space]
     avoidance = "without avoidance" if options.no_avoidance else f"avoidance by the {who}"
@@ -150,7 +158,7 @@ def _print(options: argparse.Namespace, task: str, measured: list[Measured], mot
             f"{m.turn:.0f}° ({m.turn_without:.0f}°)",
             f"{m.num_outside} of {len(motion.q)}",
         )
-        for i, (m, motion) in enumerate(zip(measured, motions, strict=True))
+        for (i, m), motion in zip(by_number.items(), motions, strict=True)
     ]
     print_table(
         (

@@ -45,9 +45,9 @@ def add_avoidance(parser: argparse.ArgumentParser, space: str) -> None:
     parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
 
 
-def scenario_around(obstacle: Obstacle, task: Task, options: argparse.Namespace) -> Scenario:
-    """Return the scenario of an obstacle with the options of `add_avoidance`."""
-    avoidance = Avoidance(obstacle, space=options.space, generator=options.generator)
+def scenario_around(obstacles: Sequence[Obstacle], task: Task, options: argparse.Namespace) -> Scenario:
+    """Return the scenario of obstacles with the options of `add_avoidance`."""
+    avoidance = Avoidance(obstacles, space=options.space, generator=options.generator)
     return avoiding(task, avoidance, on=not options.no_avoidance)
 
 
@@ -90,6 +90,33 @@ def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
         if not 0 < number <= maximum:
             raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {unit}, more than 0, at most {maximum:g}")
         return number
+
+    return convert
+
+
+def number(unit: str, minimum: float, maximum: float) -> Callable[[str], float]:
+    """Return a type for argparse: a number between two others."""
+
+    def convert(text: str) -> float:
+        found = _number(text)
+        if not minimum <= found <= maximum:
+            accepted = f"{unit}, at least {minimum:g} and at most {maximum:g}"
+            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
+        return found
+
+    return convert
+
+
+def interval(minimum: float, maximum: float) -> Callable[[str], tuple[float, float]]:
+    """Return a type for argparse: LOW,HIGH within bounds, or one number for both."""
+
+    def convert(text: str) -> tuple[float, float]:
+        parts = [_number(part) for part in text.split(",")]
+        low, high = parts[0], parts[-1]
+        if len(parts) > 2 or not minimum <= low <= high <= maximum:
+            accepted = f"a number or LOW,HIGH, at least {minimum:g} and at most {maximum:g}"
+            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
+        return low, high
 
     return convert
 

@@ -1,26 +1,43 @@
-"""Put a sphere at the middle of the demonstrations and at random places nearby, and measure the whole arm for each.
+"""Put obstacles at random places along the mean demonstration, and measure the whole arm for each.
 
-The npz file holds the places (K, 3), metres, the middle of the mean demonstration first, and for each place and rollout
-(K, R): ``arm_depth``, ``arm_clearance``, ``depth_without``, ``frechet``, ``goal_miss`` in metres, ``turn`` and
-``turn_without`` in degrees, ``num_outside``; NaN where the arm touches the sphere at a start or at the goal.
+The npz file holds for each of K places with N obstacles in each:
+
+``places`` (K, N, 3), ``sizes`` (K, N, 3), ``turns`` (K, N, 4), ``shapes`` (K, N)
+    centres and side lengths, metres, of a cylinder its diameter twice and its height; unit quaternions wxyz; names.
+    The first place is at the middle of the part of the mean demonstration that they are spread along.
+``blocked`` (K,), ``left_out`` (K,)
+    whether the arm finds no room at the starts or at the goal, and the number of the task's starts left out.
+``no_way`` (K,)
+    whether the arm says that it finds no way between them.
+``hand_room`` (K, R + 1)
+    distance of the hand's covering spheres from the obstacles at the R starts and at the goal, metres, turned to where
+    the hand has most room.
+``arm_depth``, ``arm_clearance``, ``hand_clearance``, ``depth_without``, ``frechet``, ``goal_miss`` (K, R)
+    metres, of each rollout; ``turn`` and ``turn_without`` in degrees, ``num_outside``; NaN where there is no motion.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from dt_viz.arm.robot import load_jaco
+from dt_viz.arm.body_points import load_body_points
+from dt_viz.arm.robot import NUM_JOINTS, Robot, load_jaco
 from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Frame
 from dt_viz.evaluate.avoidance import Measured, measure
 from dt_viz.evaluate.options import (
     add_avoidance,
     add_task,
     chosen_task,
-    positive_number,
+    interval,
+    number,
     print_table,
     ready_to_write,
     scenario_around,
@@ -29,12 +46,49 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.motion.stack import FINE, LIVE
+from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
+from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import Task
 
 WITHIN = 0.05
-"""Largest distance of a random place from the middle, metres."""
+"""Default of the largest distance of an obstacle from the mean demonstration, metres."""
+ALLOWANCE = 1e-3
+"""Metres by which the meshes may come nearer than the margin where it counts as kept."""
+SHARP = 90.0
+"""Turn over `dt_viz.evaluate.avoidance.TURN_ARC` beyond which it is sharp, degrees."""
+SHAPES = ("sphere", "box", "cylinder")
+NUM_TURNS = 500
+"""Number of orientations of the hand that room is looked for in."""
+SEEDS = 1_000_003
+"""Difference of the seeds of the first and the second obstacle of a place."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """What was measured with obstacles at one place."""
+
+    union: Union
+    hand_room: Array
+    """(R + 1,) room that the hand has at the starts and at the goal, see `hand_room`."""
+    frame: Frame
+    no_way: bool
+    """Whether the arm finds no way, though it is not blocked at the ends."""
+    rollouts: dict[int, Measured]
+    """By the numbers of their starts; empty where the arm is blocked."""
+
+    def largest(self, value: Callable[[Measured], float]) -> float:
+        """The largest value of the rollouts."""
+        return max(value(measured) for measured in self.rollouts.values())
+
+    def clearance(self) -> float:
+        """Smallest distance of the arm's meshes from the obstacles, metres, negative inside."""
+        return -self.largest(lambda m: -m.arm.obstacle.distance)
+
+    def detour(self, margin: float) -> float:
+        """Largest Fréchet distance relative to the depth without avoidance plus the margin."""
+        return self.largest(lambda m: m.frechet / (m.depth_without + margin))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +96,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_task(parser)
     parser.add_argument("--count", type=whole_number(0), default=20, help="random places (default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the places (default: %(default)s)")
-    parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
+    parser.add_argument("--shape", choices=(*SHAPES, "any"), default="sphere", help="(default: %(default)s)")
+    parser.add_argument("--number", type=int, choices=(1, 2, 3), default=1, help="obstacles (default: %(default)s)")
+    size = "diameter or sides in metres, or a range of them (default: 0.15)"
+    parser.add_argument("--size", type=interval(1e-3, 1), default=(0.15, 0.15), metavar="LOW[,HIGH]", help=size)
+    along = "part of the mean demonstration's length, from 0 to 1, that they are spread along (default: 0.5)"
+    parser.add_argument("--along", type=interval(0, 1), default=(0.5, 0.5), metavar="FROM[,TO]", help=along)
+    spread = "largest distance of an obstacle from there, metres (default: %(default)s)"
+    parser.add_argument("--spread", type=number("metres", 0, 1), default=WITHIN, help=spread)
+    parser.add_argument("--only-blocked", action="store_true", help="measure no motions, only which are blocked")
     add_avoidance(parser, "cspace")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
@@ -53,64 +115,192 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".npz")
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
-    places = _places(task, options.count, np.random.default_rng(options.seed))
-    found: list[list[Measured]] = []
-    rows = []
-    for k, (x, y, z) in enumerate(places):
-        obstacle = Sphere((x, y, z), options.diameter)
-        scenario = scenario_around(obstacle, task, options)
-        frame, motions = engine.arm_motions(scenario)
-        pairs = zip(motions, task.paths, strict=False)
-        found.append([measure(motion, path, frame.goal, obstacle, robot) for motion, path in pairs])
-        rows.append((str(k), *_row(found[-1], scenario), *map(str, (frame.blocked or frame.certificates.warnings)[:1])))
-    names = ("frechet", "depth_without", "turn", "turn_without", "num_outside", "goal_miss")
-    arrays = {name: _table(found, len(task.paths), lambda m, name=name: getattr(m, name)) for name in names}
-    arrays["arm_depth"] = _table(found, len(task.paths), lambda m: m.arm.depth)
-    arrays["arm_clearance"] = _table(found, len(task.paths), lambda m: m.arm.obstacle.distance)
-    write_npz(out, places=places, **arrays)
-    print(f"{task.name}, sphere of {options.diameter:g} m; lengths in mm, the worst rollout of each place")
+    places, rows = [], []
+    margin = 0.0
+    for k, obstacles in enumerate(_obstacles(task, options)):
+        scenario = scenario_around(obstacles, task, options)
+        margin = scenario.avoidance.margin
+        union = Union(obstacles)
+        room = hand_room(robot, union, engine.nominal(scenario).learned.demonstrated.ends)
+        places.append(_measured(engine, scenario, union, room, robot, only_blocked=options.only_blocked))
+        rows.append((str(k), *_row(places[-1], margin)))
+    write_npz(out, **_arrays(places, len(task.paths)))
+    low, high = options.size
+    size = f"{low:g} m" if low == high else f"{low:g} to {high:g} m"
+    print(f"{task.name}, {options.number} × {options.shape} of {size}; lengths in mm, the worst rollout of each place")
     header = (
-        "place", "M.C.D. without", "M.C.D. arm", "clearance", "F.D.", "F.D./forced", "turn (without)",
+        "place", "hand's room", "M.C.D. without", "M.C.D. arm", "clearance", "F.D.", "F.D./forced", "turn (without)",
         "goal missed", "outside limits", "",
     )  # fmt: skip
-    print_table(header, [(*row, *[""] * (len(header) - len(row))) for row in rows])
-    measured = [m for place in found for m in place]
-    free = sum(bool(place) for place in found)
-    print(f"\n{free} of {len(places)} places leave start and goal free; there, over all rollouts:")
-    depth, clearance = max(m.arm.depth for m in measured), min(m.arm.obstacle.distance for m in measured)
-    print(f"M.C.D. of the whole arm {1e3 * depth:.1f} mm, clearance {1e3 * clearance:.1f} mm")
-    print(f"F.D. mean {1e3 * np.mean([m.frechet for m in measured]):.0f} mm")
-    print(f"configurations outside the joint limits {sum(m.num_outside for m in measured)}")
-    print(f"goal missed by {1e3 * max(m.goal_miss for m in measured):.3f} mm")
+    print_table(header, rows)
+    _summarise(places, margin)
     return 0
 
 
-def _places(task: Task, count: int, rng: np.random.Generator) -> Array:
-    """Return the middle of the mean demonstration and random places in a ball around it, (1 + count, 3), metres."""
-    middle = task.mean_path[50]
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return np.concatenate([[middle], middle + WITHIN * rng.uniform(size=(count, 1)) ** (1 / 3) * direction])
+def hand_room(robot: Robot, obstacle: Union, places: Array) -> Array:
+    """Distance (N,), metres, of the hand from an obstacle, turned to where it is largest, whatever the arm can do.
+
+    Args:
+        robot: whose hand it is.
+        obstacle: what is in the way.
+        places: (N, 3) of the end effector, metres.
+    """
+    body = load_body_points()
+    of_hand = body.joint == NUM_JOINTS - 1
+    turns = Rotation.random(NUM_TURNS, np.random.default_rng(0)).as_matrix()
+    points = (body.offset[of_hand] - robot.end_effector_offset) @ turns.transpose(0, 2, 1)  # (turns, points, 3)
+    distance = obstacle.signed_distance(places[:, None, None] + points) - body.radius[of_hand]
+    return distance.min(axis=2).max(axis=1)
 
 
-def _row(measured: list[Measured], scenario: Scenario) -> tuple[str, ...]:
-    if not measured:
-        return ("",) * 8
-    worst = max(measured, key=lambda m: m.turn)
+def _measured(
+    engine: Engine, scenario: Scenario, union: Union, room: Array, robot: Robot, *, only_blocked: bool
+) -> Place:
+    if only_blocked:
+        frame = next(engine.frames(scenario))
+        return Place(union, room, frame, not frame.blocked and not engine.solved(scenario, LIVE).cleared, {})
+    frame, motions = engine.arm_motions(scenario)
+    if not motions:
+        return Place(union, room, frame, no_way=False, rollouts={})
+    solved, paths = engine.solved(scenario, FINE), frame.task.paths
+    of_rollouts = {
+        number: measure(motion, paths[number], frame.goal, union, robot)
+        for number, motion in zip(solved.nominal.numbers, motions, strict=True)
+    }
+    return Place(union, room, frame, not solved.cleared, of_rollouts)
+
+
+def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, ...]]:
+    """The obstacles of the first place, and of each random one."""
+    count, (low, high), (begin, end) = options.count, options.size, options.along
+    first = SHAPES[0] if options.shape == "any" else options.shape
+    middle = _shaped(first, _on(task, (begin + end) / 2), np.full(3, (low + high) / 2), UPRIGHT)
+    drawn = []
+    for nth in range(options.number):
+        rng = np.random.default_rng(options.seed + SEEDS * nth)
+        direction = rng.normal(size=(count, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        offset = options.spread * rng.uniform(size=(count, 1)) ** (1 / 3) * direction
+        along, sizes = rng.uniform(begin, end, size=count), rng.uniform(low, high, size=(count, 3))
+        turns = np.roll(Rotation.from_rotvec(np.pi * rng.normal(size=(count, 3))).as_quat(), 1, axis=1)
+        shapes = rng.choice(SHAPES, size=count) if options.shape == "any" else np.full(count, options.shape)
+        centres = np.array([_on(task, s) for s in along]).reshape(-1, 3) + offset
+        drawn.append([_shaped(*values) for values in zip(shapes, centres, sizes, turns, strict=True)])
+    return [(middle,), *zip(*drawn, strict=True)]
+
+
+def _on(task: Task, fraction: float) -> Array:
+    """Point (3,) of the mean demonstration at a fraction of its length, metres."""
+    path = task.mean_path
+    return np.array([np.interp(fraction * (len(path) - 1), np.arange(len(path)), axis) for axis in path.T])
+
+
+def _shaped(shape: str, centre: Array, sizes: Array, turn: Array | Quaternion) -> Obstacle:
+    """An obstacle: of a cylinder the first size is the diameter and the last one its height."""
+    x, y, z = (float(size) for size in sizes)
+    a, b, c, d = (float(part) for part in turn)
+    if shape == "box":
+        return Box(as_point(centre), (x, y, z), (a, b, c, d))
+    if shape == "cylinder":
+        return Cylinder(as_point(centre), x, z, (a, b, c, d))
+    return Sphere(as_point(centre), x)
+
+
+def _sizes(obstacle: Obstacle) -> tuple[float, float, float]:
+    """Sizes as `_shaped` takes them."""
+    if isinstance(obstacle, Box):
+        return obstacle.sizes
+    if isinstance(obstacle, Cylinder):
+        return obstacle.diameter, obstacle.diameter, obstacle.height
+    return (2 * obstacle.radius, 2 * obstacle.radius, 2 * obstacle.radius)
+
+
+def _row(place: Place, margin: float) -> tuple[str, ...]:
+    room = f"{1e3 * place.hand_room.min():.0f}"
+    said = "; ".join(map(str, (place.frame.blocked or place.frame.certificates.warnings)[:1]))
+    if not place.rollouts:
+        return (room, *[""] * 8, said)
+    worst = max(place.rollouts.values(), key=lambda m: m.turn)
     return (
-        f"{1e3 * max(m.depth_without for m in measured):.0f}",
-        f"{1e3 * max(m.arm.depth for m in measured):.1f}",
-        f"{1e3 * min(m.arm.obstacle.distance for m in measured):.1f}",
-        f"{1e3 * max(m.frechet for m in measured):.0f}",
-        f"{max(m.frechet / (m.depth_without + scenario.avoidance.margin) for m in measured):.2f}",
+        room,
+        f"{1e3 * place.largest(lambda m: m.depth_without):.0f}",
+        f"{1e3 * place.largest(lambda m: m.arm.depth):.1f}",
+        f"{1e3 * place.clearance():.1f}",
+        f"{1e3 * place.largest(lambda m: m.frechet):.0f}",
+        f"{place.detour(margin):.2f}",
         f"{worst.turn:.0f}° ({worst.turn_without:.0f}°)",
-        f"{1e3 * max(m.goal_miss for m in measured):.3f}",
-        f"{sum(m.num_outside for m in measured)}",
+        f"{1e3 * place.largest(lambda m: m.goal_miss):.3f}",
+        f"{sum(m.num_outside for m in place.rollouts.values())}",
+        said,
     )
 
 
-def _table(found: list[list[Measured]], num_rollouts: int, value: Callable[[Measured], float]) -> Array:
-    table = np.full((len(found), num_rollouts), np.nan)
-    for row, place in zip(table, found, strict=True):
-        row[: len(place)] = [value(m) for m in place]
-    return table
+def _arrays(places: Sequence[Place], num_rollouts: int) -> dict[str, Any]:
+    """What is written."""
+    most = max(len(place.union.parts) for place in places)
+
+    def of_parts(value: Callable[[Obstacle], Any]) -> Array:
+        """Values of the obstacles, repeating the last one where a place has fewer."""
+        return np.array(
+            [[value(place.union.parts[min(k, len(place.union.parts) - 1)]) for k in range(most)] for place in places]
+        )
+
+    def of_rollouts(value: Callable[[Measured], float]) -> Array:
+        table = np.full((len(places), num_rollouts), np.nan)
+        for row, place in zip(table, places, strict=True):
+            for number_, measured in place.rollouts.items():
+                row[number_] = value(measured)
+        return table
+
+    names = ("hand_clearance", "frechet", "depth_without", "turn", "turn_without", "num_outside", "goal_miss")
+    return {
+        "places": of_parts(lambda part: part.position),
+        "sizes": of_parts(_sizes),
+        "turns": of_parts(lambda part: part.wxyz),
+        "shapes": of_parts(lambda part: type(part).__name__.lower()),
+        "blocked": np.array([bool(place.frame.blocked) for place in places]),
+        "left_out": np.array([num_rollouts - len(place.frame.rollouts) for place in places]),
+        "no_way": np.array([place.no_way for place in places]),
+        "hand_room": np.array([place.hand_room for place in places]),
+        "arm_depth": of_rollouts(lambda m: m.arm.depth),
+        "arm_clearance": of_rollouts(lambda m: m.arm.obstacle.distance),
+        **{name: of_rollouts(lambda m, name=name: getattr(m, name)) for name in names},
+    }
+
+
+def _summarise(places: Sequence[Place], margin: float) -> None:
+    """Print the figures over all places."""
+    free = [place for place in places if place.hand_room.min() > 0]
+    open_ = [place for place in places if not place.frame.blocked]
+    print(f"\n{len(free)} of {len(places)} places leave the hand free at the starts and at the goal")
+    print(f"called blocked: {_share(sum(bool(p.frame.blocked) for p in free), free)} of these", end=", ")
+    print(f"{_share(len(places) - len(open_), places)} of all")
+    print(
+        f"without a way that the arm finds: {_share(sum(place.no_way for place in open_), open_)} of the others",
+        end=", ",
+    )
+    some = sum(len(place.frame.rollouts) < len(place.hand_room) - 1 for place in open_)
+    print(f"only from some of the starts: {_share(some, open_)}")
+    if not any(place.rollouts for place in places):
+        return
+    clearance, detour = np.array([place.clearance() for place in open_]), [place.detour(margin) for place in open_]
+    kept, touched = int((clearance >= margin - ALLOWANCE).sum()), int((clearance < 0).sum())
+    sharp = sum(place.largest(lambda m: m.turn) > SHARP for place in open_)
+    sharp_without = sum(place.largest(lambda m: m.turn_without) > SHARP for place in open_)
+    depth, outside = max(p.largest(lambda m: m.arm.depth) for p in open_), (lambda m: m.num_outside)
+    hand = min(-place.largest(lambda m: -m.hand_clearance) for place in open_)
+    print("at the places that are not blocked:")
+    print(f"M.C.D. of the whole arm {1e3 * depth:.1f} mm, clearance {1e3 * clearance.min():.1f} mm; ", end="")
+    print(f"clearance of the end effector {1e3 * hand:.1f} mm")
+    print(
+        f"collisions {_share(touched, open_)}, at least {1e3 * (margin - ALLOWANCE):.0f} mm kept {_share(kept, open_)}"
+    )
+    print(f"F.D. / forced, median {np.median(detour):.2f}, 95 % {np.percentile(detour, 95):.2f}")
+    print(f"turns sharper than {SHARP:.0f}° {_share(sharp, open_)}, without avoidance {_share(sharp_without, open_)}")
+    print(f"F.D. mean {1e3 * np.mean([m.frechet for place in open_ for m in place.rollouts.values()]):.0f} mm")
+    print(f"configurations outside the joint limits {sum(outside(m) for p in open_ for m in p.rollouts.values())}")
+    print(f"goal missed by {1e3 * max(place.largest(lambda m: m.goal_miss) for place in open_):.3f} mm")
+
+
+def _share(num: int, of: Sequence[Place]) -> str:
+    return f"{num} of {len(of)} ({100 * num / max(len(of), 1):.1f} %)"

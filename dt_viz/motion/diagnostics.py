@@ -110,7 +110,7 @@ def _top(solved: Solved, applied: Applied, index: Indices, positions: Array) -> 
         index,
         positions,
         name=applied.name,
-        num_demonstrated=nominal.num_demonstrated,
+        num_demonstrated=nominal.num_hosts,
     )
 
 

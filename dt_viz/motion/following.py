@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.collision import load_collision_model
-from dt_viz.arm.robot import NUM_JOINTS, Robot
+from dt_viz.arm.collision import SELF_MARGIN, CollisionModel, load_collision_model
+from dt_viz.arm.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
+from dt_viz.arm.stances import stances
 from dt_viz.arm.tracking import JointPath, UnreachableError, drawn_onto, inverse_kinematics, track
-from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
+from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
-from dt_viz.motion.nominal import Learned, Nominal, Strand
+from dt_viz.motion.nominal import Learned, Nominal, Stance, Strand
 from dt_viz.motion.stack import Solution
-from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.base import start_warnings
+from dt_viz.transforms.base import ArmAvoidance, start_warnings
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 BY_FRACTION = 0.3
@@ -29,6 +31,10 @@ MAX_TRACKING_ERROR = 1e-3
 """Metres by which the hand may miss its path before it is said."""
 NUM_ARM_SAMPLES = 200
 """Samples of the motion that the arm shows where it follows a path of the end effector."""
+NUM_ON_PATH = 20
+"""Samples of the mean motion that stances are tried on."""
+SELF_STRIDE = 5
+"""Stride of the configurations between which the distance of the arm's links from each other is searched."""
 NEWEST = 2 * MAX_STARTS
 """Number of added starts whose joints are kept."""
 
@@ -92,11 +98,12 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
-        number, strand, whole = nominal.numbers[rollout], nominal.strands[rollout], self._demonstrated(nominal.learned)
+        number, strand, stance = nominal.numbers[rollout], nominal.strands[rollout], nominal.stance
         if number < nominal.num_demonstrated:
-            return whole.only(number)
+            return self._demonstrated(nominal.learned, stance).only(number)
+        reference = self.reference(nominal)
         # a start that is dragged leaves nothing behind
-        return self._memo("added", strand, lambda: _lift_added(self.robot, strand, whole.reference), newest=NEWEST)
+        return self._memo("added", (strand, stance), lambda: _lift_added(self.robot, strand, reference), newest=NEWEST)
 
     def reference(self, nominal: Nominal) -> Array:
         """The posture (6,), rad, that the arm stays near to.
@@ -104,7 +111,7 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        return self._demonstrated(nominal.learned).reference
+        return self._demonstrated(nominal.learned, nominal.stance).reference
 
     def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool, before: Lift | None = None) -> Lift:
         """The joints along the motion with the behaviours of the end effector.
@@ -126,7 +133,8 @@ class Follower:
         paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)
         reference, initial = self.reference(nominal), None
         if before is not None and not exact and len(before.tracked.q) == len(paths):  # else starts have come or gone
-            initial = before.tracked.q
+            same = np.array_equal(before.reference, reference)
+            initial = before.tracked.q if same else None  # those of another stance may lie on another branch
         lifted = replace(lift(self.robot, np.stack(fraction), paths, reference, initial), num_guests=nominal.num_added)
         if not exact:
             return lifted
@@ -146,28 +154,121 @@ class Follower:
         """
         return track(self.robot, path, self.reference(nominal), before)
 
-    def admission(self, nominal: Nominal, obstacle: Union) -> Admission:
-        """Whether the whole arm can move from the task's starts to the goal, and from which added starts."""
+    def admission(self, nominal: Nominal, avoidance: ArmAvoidance) -> Admission:
+        """Whether the whole arm can move around what it avoids, from which starts, and in which stance."""
+        asked = avoidance.obstacle, avoidance.margin
+        return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=1)
 
-        def admission() -> Admission:
-            blocked = self.obstructions(nominal, obstacle)
-            return Admission(nominal if blocked else self.admitted(nominal, obstacle), blocked)
+    def alternatives(self, nominal: Nominal, avoidance: ArmAvoidance) -> Iterator[Nominal]:
+        """The same motions in other stances that have room at as many starts and at the goal, the best first."""
+        ranked = self._stances(nominal.learned, avoidance.obstacle, avoidance.margin)
+        _, free = next(ranked)
+        for stance, others in ranked:
+            if not (others >= free).all():
+                return
+            yield self._standing(nominal, stance)
 
-        return self._memo("admission", (nominal, obstacle), admission, newest=1)
+    def _admission(self, nominal: Nominal, obstacle: Union, margin: float) -> Admission:
+        blocked = self._unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
+        if blocked:
+            return Admission(nominal, blocked)
+        stance, free = next(self._stances(nominal.learned, obstacle, margin))
+        if not free[-1]:
+            text = "the goal is inside the obstacle: the arm there touches it"
+            return Admission(nominal, (MotionWarning(Kind.GOAL_COVERED, text, ARM),))
+        if not free[:-1].any():
+            return Admission(nominal, tuple(_touching_starts(np.arange(len(free) - 1), len(free) - 1)))
+        return Admission(self.admitted(self._standing(nominal, stance), obstacle, ~free[:-1]))
 
-    def obstructions(self, nominal: Nominal, obstacle: Union) -> tuple[MotionWarning, ...]:
-        """Why the whole arm cannot move from the task's starts to the goal; empty where it can."""
+    def _standing(self, nominal: Nominal, stance: Stance | None) -> Nominal:
+        """The same motions in another stance."""
+        if stance == nominal.stance:
+            return nominal
+        return self._memo("standing", (nominal, stance), lambda: replace(nominal, stance=stance), newest=8)
+
+    def _unreached(self, learned: Learned) -> tuple[MotionWarning, ...]:
+        """Warnings about the task's starts and goal that are out of the arm's reach."""
         try:
-            lifted = self._demonstrated(nominal.learned)
+            lifted = self._demonstrated(learned)
         except UnreachableError as error:
             return (unreachable(error),)
         missed = lifted.tracked.error[:, [0, -1]] > MAX_TRACKING_ERROR
         reasons = far_starts(np.flatnonzero(missed[:, 0]), len(missed))
         if missed[:, 1].any():
             reasons.append(MotionWarning(Kind.OUT_OF_REACH, "the goal is out of the arm's reach", ARM))
-        for part in obstacle.parts:
-            reasons += self._touching(lifted.pins, part)
         return tuple(reasons)
+
+    def _pedestal_touched(self, learned: Learned, obstacle: Union) -> tuple[MotionWarning, ...]:
+        """Warnings about what touches the links that no joint carries away."""
+        pedestal, posture = self.body.on_pedestal, self._demonstrated(learned).pins[:1]
+        for part in obstacle.parts:
+            distance = part.signed_distance(pedestal.positions(self.robot, posture[0])) - pedestal.radius
+            if (distance >= 0).all():
+                continue
+            # the spheres are larger than the arm: ask the meshes
+            (gap,), (link,) = load_pedestal().obstacle_distance(posture, part)
+            if gap < 0:
+                text = f"the obstacle touches the arm's {load_pedestal().links[link].name}, which cannot move away"
+                return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
+        return ()
+
+    def _stances(self, learned: Learned, obstacle: Union, margin: float) -> Iterator[tuple[Stance | None, Mask]]:
+        """The stances with most room at the task's starts and goal, the best first: the usual one where it has enough.
+
+        Yields:
+            A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
+        """
+        usual, asked = self._demonstrated(learned), max(margin - OVERSHOOT, 0.0)
+        near = self.whole_arm.clearance(usual.pins, obstacle)
+        enough = bool((near >= asked).all())
+        room = near if enough else self._mesh_room(usual.pins, obstacle, near, margin)
+        if enough or (room >= margin).all():
+            yield None, room >= 0
+        paths = learned.demonstrated.paths
+        known = self._memo(
+            "stances",
+            learned,
+            lambda: stances(self.robot, self.whole_arm.body, usual.reference, learned.task.starts, _mean(paths)),
+        )
+        at_starts, on_path = known.clearance(obstacle)  # of the spheres, which are larger than the arm
+        clearance = np.concatenate([at_starts, on_path[:, -1:]], axis=1)
+        free, ample = clearance >= 0, clearance >= asked
+        free[0], ample[0] = room >= 0, room >= margin
+        # the goal first, then as many starts as possible, then as much room as is asked for
+        merit = [free[:, -1], free.sum(axis=1), ample.sum(axis=1), -known.cost(on_path, asked)]
+        left = ~known.alike(0) if ample[0].all() else np.ones(len(free), bool)
+        for best in np.lexsort(merit[::-1])[::-1]:
+            stance = None if best == 0 else _as_stance(known.references[best])
+            if left[best] and (stance is None or self._sound(learned, stance)):
+                left &= ~known.alike(int(best))
+                yield stance, free[best]
+
+    def _mesh_room(self, q: Array, obstacle: Union, near: Array, enough: float) -> Array:
+        """Distances (N,), metres, of the arm's meshes at configurations q (N, 6) where `near` is not enough already.
+
+        Where they touch the obstacle it is some negative number.
+        """
+        room, model = near.copy(), load_collision_model()
+        close = np.flatnonzero(near < enough)
+        room[close] = model.gaps(q[close], obstacle, np.full(len(close), enough))
+        apart = close[room[close] >= 0]  # or the obstacle is inside a link, which takes longer to tell
+        if len(apart):
+            room[apart] = np.min([model.obstacle_distance(q[apart], part)[0] for part in obstacle.parts], axis=0)
+        return room
+
+    def _sound(self, learned: Learned, stance: Stance) -> bool:
+        """Whether the arm can follow the task's motions in a stance without coming near itself."""
+
+        def sound() -> bool:
+            lifted = self._demonstrated(learned, stance)
+            tracked = lifted.tracked
+            if (tracked.error > MAX_TRACKING_ERROR).any() or tracked.limits_hit.any() or tracked.damped.any():
+                return False
+            paths = tracked.q[0, ::SELF_STRIDE], lifted.pins[:-1]
+            nearest = [load_collision_model().nearest_to_itself(path) for path in paths]
+            return all(near is None or near.distance >= SELF_MARGIN for near in nearest)
+
+        return self._memo("sound", (learned, stance), sound)
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
         """(R,) bool: which rollouts begin at an added start that the arm cannot get to.
@@ -175,57 +276,45 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
-        num_demonstrated = nominal.num_demonstrated
-        added = nominal.strands[num_demonstrated:]
         reference = self.reference(nominal)
 
         def reached(strand: Strand) -> bool:
             tracked = track(self.robot, strand.start[None], reference)
             return bool(tracked.error[0] <= MAX_TRACKING_ERROR)
 
-        reaches = [self._memo("reached", s, lambda s=s: reached(s), newest=NEWEST) for s in added]
-        return np.array([False] * num_demonstrated + [not reach for reach in reaches])
+        def far(number: int, strand: Strand) -> bool:
+            if number < nominal.num_demonstrated:
+                return False
+            return not self._memo("reached", (strand, nominal.stance), lambda: reached(strand), newest=NEWEST)
 
-    def admitted(self, nominal: Nominal, obstacle: Union) -> Nominal:
-        """The rollouts that the whole arm can begin: without those from added starts where it is out of reach or room.
+        return np.array([far(*numbered) for numbered in zip(nominal.numbers, nominal.strands, strict=True)])
+
+    def admitted(self, nominal: Nominal, obstacle: Union, touched: Mask | None = None) -> Nominal:
+        """The rollouts that the whole arm can begin: without those from starts where it is out of reach or room.
+
+        Args:
+            nominal: all rollouts.
+            obstacle: what is in the way.
+            touched: (R,) which of the task's starts have no room; None is none of them.
 
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
         num, far = nominal.num_demonstrated, self.out_of_reach(nominal)
         touches = np.zeros_like(far)
+        if touched is not None:
+            touches[:num] = touched
         candidates = np.flatnonzero(~far)[num:]
         if len(candidates):
             postures = np.stack([self.undisturbed_along(nominal, k).tracked.q[0, 0] for k in candidates])
-            near = self.whole_arm.clearance(postures, obstacle) < 0
-            for rollout, posture in zip(candidates[near], postures[near], strict=True):
-                gaps = [load_collision_model().obstacle_distance(posture[None], part)[0][0] for part in obstacle.parts]
-                touches[rollout] = min(gaps) < 0
+            near = self.whole_arm.clearance(postures, obstacle)
+            touches[candidates] = self._mesh_room(postures, obstacle, near, 0.0) < 0
         if not (far | touches).any():
             return nominal
         numbers = np.array(nominal.numbers)
         # of the motions, not of the arm that is shown: these have none
         warnings = far_starts(numbers[far], num, source="") + _touching_starts(numbers[touches], num)
         return nominal.only(np.flatnonzero(~(far | touches)), warnings)
-
-    def _touching(self, pins: Array, obstacle: Obstacle) -> list[MotionWarning]:
-        """Reasons why the arm cannot rest in the postures `pins` (R + 1, 6): what an obstacle touches of it."""
-        pedestal = self.body.on_pedestal
-        distance = obstacle.signed_distance(pedestal.positions(self.robot, pins[0])) - pedestal.radius
-        if (distance >= 0).all() and (self.whole_arm.clearance(pins, obstacle) >= 0).all():
-            return []
-        # the spheres are larger than the arm: ask the meshes
-        model = load_collision_model()
-        gaps, links = model.obstacle_distance(pins, obstacle)
-        name = model.links[int(links[0])].name
-        if gaps[0] < 0 and name in PEDESTAL:
-            text = f"the obstacle touches the arm's {name}, which cannot move away"
-            return [MotionWarning(Kind.ARM_BLOCKED, text, ARM)]
-        reasons = _touching_starts(np.flatnonzero(gaps[:-1] < 0), len(gaps) - 1)
-        if gaps[-1] < 0:
-            text = "the goal is inside the obstacle: the arm there touches it"
-            reasons.append(MotionWarning(Kind.GOAL_COVERED, text, ARM))
-        return reasons
 
     def warnings(self, joints: JointPath, rollout: int) -> tuple[MotionWarning, ...]:
         """Why the joints along a rollout, counted from 0, are not to be trusted."""
@@ -240,24 +329,42 @@ class Follower:
             warnings.append(MotionWarning(Kind.DAMPED, text, ARM))
         return tuple(warnings)
 
-    def _demonstrated(self, learned: Learned) -> Lift:
+    def _demonstrated(self, learned: Learned, stance: Stance | None = None) -> Lift:
         """The joints along the rollouts from the task's starts. Raises UnreachableError, also a second time."""
-        lifted = self._memo("demonstrated", learned, lambda: _lift_demonstrated(self.robot, learned))
+        if stance is not None:
+            return self._memo(
+                "stance", (learned, stance), lambda: _lift_demonstrated(self.robot, learned, np.array(stance)), newest=8
+            )
+        lifted = self._memo("demonstrated", learned, lambda: _lift_usual(self.robot, learned))
         if isinstance(lifted, UnreachableError):
             raise lifted
         return lifted
 
 
-def _lift_demonstrated(robot: Robot, learned: Learned) -> Lift | UnreachableError:
-    bundle, starts = learned.demonstrated.bundle, learned.task.starts
-    num_rollouts = len(starts)
+def _lift_usual(robot: Robot, learned: Learned) -> Lift | UnreachableError:
+    try:
+        return _lift_demonstrated(robot, learned, inverse_kinematics(robot, learned.task.starts.mean(axis=0)))
+    except UnreachableError as error:
+        return error
+
+
+def _lift_demonstrated(robot: Robot, learned: Learned, reference: Array) -> Lift:
+    bundle, num_rollouts = learned.demonstrated.bundle, len(learned.task.starts)
     stride = np.linspace(0, len(bundle.index) // num_rollouts - 1, NUM_CONFIGURATIONS).round().astype(int)
     fractions = bundle.fraction.reshape(num_rollouts, -1)[:, stride]
     paths = bundle.positions.reshape(num_rollouts, -1, 3)[:, stride]
-    try:
-        return lift(robot, fractions, paths, inverse_kinematics(robot, starts.mean(axis=0)))
-    except UnreachableError as error:
-        return error
+    return lift(robot, fractions, paths, reference)
+
+
+def _mean(paths: Sequence[Array]) -> Array:
+    """The mean (`NUM_ON_PATH`, 3) of rollouts with equally many samples, metres."""
+    kept = np.linspace(0, len(paths[0]) - 1, NUM_ON_PATH).round().astype(int)
+    return np.mean(paths, axis=0)[kept]
+
+
+def _as_stance(posture: Array) -> Stance:
+    a, b, c, d, e, f = (float(angle) for angle in posture)
+    return a, b, c, d, e, f
 
 
 def _lift_added(robot: Robot, strand: Strand, reference: Array) -> Lift:
@@ -298,5 +405,7 @@ def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Ar
     return WholeArm(robot, load_body_points()).clearance(postures, obstacle)
 
 
-PEDESTAL = ("base", "link 1")
-"""Links that no joint can carry away from an obstacle."""
+@lru_cache(maxsize=1)
+def load_pedestal() -> CollisionModel:
+    """The base and link 1, which no joint can carry away from an obstacle."""
+    return CollisionModel(load_jaco(), [mesh for mesh in collision_meshes() if mesh.joint < 1])

@@ -19,6 +19,8 @@ from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
 """Samples of each rollout before refinement: from the task's starts, and from added ones."""
+Stance = tuple[float, float, float, float, float, float]
+"""Posture that the arm stays near to along all rollouts: six joint angles, rad."""
 MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
 """Steps towards the images of moved ends, and metres by which they may miss."""
 
@@ -102,6 +104,8 @@ class Nominal:
     """Numbers of the starts, the task's first, that have no rollout here."""
     warnings: tuple[MotionWarning, ...] = ()
     """Why they have none."""
+    stance: Stance | None = None
+    """Posture that the arm stays near to; None is its usual one."""
 
     @property
     def task(self) -> Task:
@@ -133,6 +137,11 @@ class Nominal:
         """How many of the rollouts have none: the last ones."""
         return sum(number >= self.num_demonstrated for number in self.numbers)
 
+    @property
+    def num_hosts(self) -> int:
+        """Number of the rollouts, the first ones, that begin at the task's starts."""
+        return len(self.strands) - self.num_added
+
     @cached_property
     def numbers(self) -> tuple[int, ...]:
         """Number of each rollout's start among all of the scenario's, the task's first."""
@@ -147,7 +156,8 @@ class Nominal:
         """Some of the rollouts, and why the others are left out."""
         kept = {self.numbers[k] for k in rollouts}
         left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
-        return Nominal(self.learned, tuple(self.strands[k] for k in rollouts), tuple(sorted(left_out)), tuple(warnings))
+        strands = tuple(self.strands[k] for k in rollouts)
+        return replace(self, strands=strands, left_out=tuple(sorted(left_out)), warnings=tuple(warnings))
 
     def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""

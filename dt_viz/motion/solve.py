@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -13,6 +14,11 @@ from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.transforms.base import start_warnings
+from dt_viz.warning import Kind
+
+NUM_ALTERNATIVES = 3
+"""Number of other stances that are tried where the arm finds no way around the obstacle."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,11 @@ class Solved:
     """Joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
 
     @property
+    def cleared(self) -> bool:
+        """Whether the whole arm, where it avoids, finds a way."""
+        return self.arm is None or self.arm.cleared
+
+    @property
     def ends(self) -> Array:
         """(R + 1, 3) where the end effector's motions are to begin, and where all are to end, metres."""
         goal, built = self.nominal.goal, self.stack.built
@@ -47,7 +58,8 @@ def solve(
 
     Args:
         scenario: whose stack it is; its `warp` is left to `warped`.
-        nominal: the undisturbed motion, from starts that the arm can begin at.
+        nominal: the undisturbed motion, from starts that the arm can begin at. Where the arm finds no way, that of the
+            result has another stance, or lacks the starts that have none.
         precision: how exactly.
         follower: the arm.
         before: joints to look for those of LIVE from, as shown last; the result differs by less than a milliradian.
@@ -56,6 +68,27 @@ def solve(
         UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
     """
     scenario = replace(scenario, warp=1.0)
+    solved, avoidance = _solved(scenario, nominal, precision, follower, before), scenario.arm_avoidance
+    if avoidance is None or avoidance.duration is not None or solved.cleared:
+        return solved
+    for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
+        tried = _solved(scenario, other, LIVE, follower)  # quick, and the same stance is found at each precision
+        if tried.cleared:
+            return tried if precision is LIVE else _solved(scenario, other, precision, follower)
+    assert solved.arm is not None
+    others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
+    if not (others < nominal.num_hosts).any():
+        return solved
+    numbers, how = np.array(nominal.numbers), "without a way around the obstacle for the arm"
+    told = start_warnings(numbers[solved.arm.stuck], nominal.num_demonstrated, Kind.START_COVERED, how)
+    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), precision, follower)
+    return tried if tried.cleared else solved
+
+
+def _solved(
+    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Lift | None = None
+) -> Solved:
+    """The motion in the stance of `nominal`; see `solve`."""
     stack, avoidance = build_stack(nominal, scenario.active, precision), scenario.arm_avoidance
     if avoidance is None:
         return Solved(scenario, nominal, nominal, stack)

@@ -124,7 +124,7 @@ def build_stack(nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision
                 bundle.levels[:, 0],
                 tolerance=precision.tolerance,
                 keeps_goal=keeps_goal,
-                num_demonstrated=nominal.num_demonstrated,
+                num_demonstrated=nominal.num_hosts,
             )
             built = _build(layers, lowest, durations, above)
             above = _above([made for _, made in built])
