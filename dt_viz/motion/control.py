@@ -1,0 +1,409 @@
+"""The robot in the loop: its joint velocity is that of the newest stack at the posture where it is, within limits.
+
+With ψ_q the robot's dodge, Q the section of postures and ψ the end effector's stack, a robot at p is at q = ψ_q(p),
+x = x(q) and z = ψ(x) of the base attractor (`dt_viz.arm.arm_system`). ψ is a conjugacy, so all that lies ahead is known
+at once: z(t) in closed form, x(t) = ψ⁻¹(z(t)), and
+
+    p(t) = ψ_q⁻¹(Q(x(t)) + δ·exp(−t/τ)),    δ = q − Q(x(q)),
+
+which on the section, δ = 0, is the motion of eq. (4), and from anywhere else converges to it. It is worked out when the
+stack or the state changes; a tick samples it, and closes what gap there is as fast as the limits allow.
+
+When ψ_q changes with time, q stays and its image moves: ṗ has the part ∂ψ_q⁻¹/∂t, too, by which an obstacle that
+approaches moves the robot, at rest as well, and lets it come back. A robot that is behind its image waits with z(t).
+Whoever moves the robot by hand changes q, by ψ_q(p) at the place where it is then.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline
+
+from dt_viz.arm.arm_system import ArmSystem, Section
+from dt_viz.arm.cspace import LEVERS
+from dt_viz.arm.retiming import RAMP, within_velocity_limits
+from dt_viz.arm.robot import NUM_JOINTS
+from dt_viz.arm.tracking import track
+from dt_viz.arm.whole_arm import ROUNDING
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
+from dt_viz.flows.fields import Array
+from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
+from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
+from dt_viz.motion.dodging import NO_DODGE, Dodge, dodge, lack
+from dt_viz.motion.following import Follower
+from dt_viz.motion.solve import Solved
+
+ACCELERATION = 4.0
+"""Limit of the joints' acceleration, rad/s². The JACO's manual names none; this one takes a joint to its limit of
+velocity in about 0.2 s, which is what the arm does when it is driven by velocities."""
+VELOCITY_SHARE = 0.85
+"""Part of the velocity limits that the motion ahead uses: the rest closes gaps."""
+BRAKING_SHARE = 0.7
+"""Part of the acceleration that a gap is closed with, so that braking never takes more than there is."""
+STIFFNESS = 10.0
+"""Rate at which a small gap closes, 1/s."""
+GAP = 0.05
+"""Gap of a joint, rad, at which the motion goes on at half its pace."""
+MOVED = 3e-3
+"""Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
+CONVERGENCE = 0.5
+"""Time constant τ of the convergence to the section, seconds."""
+NUM_SAMPLES = 80
+"""Samples of the motion ahead."""
+NUM_HOSTS = 40
+"""Samples of it that the dodge is made for."""
+TURNING = 2.0
+"""Rate at which the way out of an obstacle turns, rad/s."""
+HOLDING_SPEED = 0.25
+"""Speed at which the hand follows whoever holds it, m/s."""
+SHOVE_SECONDS = 0.3
+"""Duration of a shove, if the joints can be as fast."""
+AT_REST = 1e-3
+"""Gap, rad, and velocity, rad/s, of joints that count as at rest."""
+ASIDE = 5e-3
+"""Displacement, metres by `LEVERS`, from which on a robot at rest counts as having stepped aside."""
+
+
+class Phase(Enum):
+    """What the robot is doing."""
+
+    MOVING = "moving"
+    HOMING = "going home"
+    RESTING = "resting"
+    ASIDE = "stepped aside"
+    HELD = "held"
+    TOUCHED = "touched"
+    """There is no way out: it waits where it is or gives way."""
+
+
+class Aim(Enum):
+    """Where the robot is to go."""
+
+    GOAL = "goal"
+    HOME = "home"
+    HAND = "hand"
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """An undisturbed motion from where the robot is to where it is to rest."""
+
+    times: Array
+    """(K,) seconds."""
+    q: Array
+    """(K, 6) rad."""
+    z: Array
+    """(K, 3) base coordinates; the hand's place where nothing is learned."""
+
+    @property
+    def end(self) -> float:
+        """Time at which it ends, seconds."""
+        return float(self.times[-1])
+
+    def at(self, clock: float) -> Array:
+        """The posture (6,) at a time."""
+        return np.array([np.interp(clock, self.times, joint) for joint in self.q.T])
+
+
+class Ahead:
+    """The motion ahead: the image of a course under ψ_q⁻¹, slowed down to the joints' limits."""
+
+    def __init__(self, course: Course, dodge: Dodge, p: Array, first: int, limits: Array) -> None:
+        """Take the images p (K', 6) of the samples of the course from the `first` on."""
+        self.course, self.dodge, self.p = course, dodge, p
+        self.times = course.times[first:]
+        slowed = within_velocity_limits(self.times, p, limits)
+        self._pace = np.diff(self.times) / np.maximum(np.diff(slowed), 1e-12)
+        self._curve = CubicHermiteSpline(self.times, p, np.gradient(p, self.times, axis=0))
+
+    def at(self, clock: float) -> Array:
+        """The posture (6,) at a time of the course."""
+        return self._curve(min(max(clock, self.times[0]), self.times[-1]))
+
+    def pace(self, clock: float) -> float:
+        """Seconds of the course in a second there, at most 1."""
+        segment = int(np.searchsorted(self.times, clock, side="right")) - 1
+        return float(self._pace[min(max(segment, 0), len(self._pace) - 1)])
+
+
+class Controller:
+    """A robot's state and what it follows; `step` is for one thread, `follow` and the rest may come from another."""
+
+    def __init__(self, follower: Follower, solved: Solved, acceleration: float = ACCELERATION) -> None:
+        """Take an arm and the stack that it follows first; its state is that of the first `step`.
+
+        Args:
+            follower: the arm.
+            solved: as in `follow`.
+            acceleration: limit for all joints, rad/s².
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        self.robot = follower.robot
+        self.acceleration = acceleration
+        self._arm, self._follower = follower.whole_arm, follower
+        self._lock = threading.RLock()
+        self._solved = solved
+        self._section = Section(self.robot, follower.reference(solved.nominal))
+        self._aim, self._home, self._then = Aim.GOAL, 0, Aim.GOAL
+        self._ahead: Ahead | None = None
+        self._expected: Array | None = None
+        self._velocity = np.zeros(NUM_JOINTS)
+        self._clock = self._rate = 0.0
+        self._now = self._dodged = 0.0
+        self._settled = False
+
+    # --- What it follows ---
+
+    def follow(self, solved: Solved) -> None:
+        """Go on with another stack from the next tick on, where the robot is then.
+
+        The end effector's stack is taken from it, and what the whole arm is to avoid; the arm's dodge is made for the
+        robot's own motion.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        reference = self._follower.reference(solved.nominal)
+        with self._lock:
+            before, self._solved = self._solved, solved
+            same = before.stack.transform is solved.stack.transform and before.stack.rays.base is solved.stack.rays.base
+            if not same:
+                self._section = Section(self.robot, reference)
+            if self._ahead is None:
+                return
+            if same or self._aim is Aim.HAND:
+                course = self._ahead.course
+            else:
+                learned = before.nominal.system is solved.nominal.system and self._aim is Aim.GOAL
+                course = self._course(self._ahead.course.at(self._clock), self._image() if learned else None)
+                self._clock = 0.0
+            self._take(course)
+
+    @property
+    def system(self) -> ArmSystem:
+        """The system of eq. (4) whose motion it is."""
+        with self._lock:
+            transform = self._ahead.dodge.transform if self._ahead is not None else Identity(NUM_JOINTS)
+            return ArmSystem(self._solved.stack.system, self._section, transform)
+
+    # --- What happens to it ---
+
+    def go(self) -> None:
+        """Go to the goal from here."""
+        self._set_out(Aim.GOAL)
+
+    def home(self, start: int) -> None:
+        """Go straight to the start of a rollout, counted from 0, around what is in the way."""
+        with self._lock:
+            self._home = start
+            self._set_out(Aim.HOME)
+
+    def hold(self, place: ArrayLike) -> None:
+        """Take the hand to a place (3,), metres, and stay there until `release`, giving way to obstacles."""
+        with self._lock:
+            if self._ahead is None:
+                return
+            q = self._ahead.course.at(self._clock)
+            begin, end = self.robot.end_effector(q), np.asarray(place, float)
+            u = np.linspace(0, 1, 2 + int(np.linalg.norm(end - begin) / 0.02))
+            path = begin + u[:, None] * (end - begin)
+            joints = self._arm.limits.inside(track(self.robot, path, q, reference=self._section.reference).q)
+            seconds = max(float(np.linalg.norm(end - begin)) / HOLDING_SPEED, 0.02)
+            self._held(Course(seconds * u, joints, path))
+
+    def displace(self, q: ArrayLike) -> None:
+        """Shove the robot towards a posture (6,), rad; it goes on from there."""
+        with self._lock:
+            if self._ahead is None:
+                return
+            begin = self._ahead.course.at(self._clock)
+            end = self._arm.limits.inside(self._ahead.dodge.transform.forward(self._arm.limits.inside(np.asarray(q))))
+            u = np.linspace(0, 1, 9)
+            joints = begin + (u * u * (3 - 2 * u))[:, None] * (end - begin)
+            self._held(Course(SHOVE_SECONDS * u, joints, self.robot.end_effector(joints)), released=True)
+
+    def release(self) -> None:
+        """Let go of the hand: it goes on to where it was going."""
+        with self._lock:
+            if self._aim is Aim.HAND:
+                self._set_out(self._then)
+
+    # --- What it does ---
+
+    def step(self, q: ArrayLike, dt: float) -> Array:
+        """The joint velocities (6,), rad/s, for the next `dt` seconds of a robot at `q` (6,), rad.
+
+        Raises:
+            ValueError: q is not six finite angles, or dt is not above 0.
+        """
+        q = np.asarray(q, float)
+        if q.shape != (NUM_JOINTS,) or not np.isfinite(q).all():
+            raise ValueError(f"q: found {q}; accepted: {NUM_JOINTS} finite angles, rad")
+        if not 0 < dt < np.inf:
+            raise ValueError(f"dt: found {dt}; accepted: seconds, more than 0")
+        with self._lock:
+            self._now += dt
+            if self._expected is None or np.abs(q - self._expected).max() > MOVED:
+                self._anchor(q)
+            ahead = self._advance(q, dt)
+            before = ahead.at(self._clock)
+            self._clock = min(self._clock + self._rate * ahead.pace(self._clock) * dt, ahead.course.end)
+            wanted = (ahead.at(self._clock) - before) / dt + self._closing(before - q, dt)
+            self._velocity = self._within_limits(q, wanted, dt)
+            self._expected = q + dt * self._velocity
+            return self._velocity.copy()
+
+    @property
+    def phase(self) -> Phase:
+        """What it is doing."""
+        ahead = self._ahead
+        if ahead is None:
+            return Phase.RESTING
+        if not ahead.dodge.cleared:
+            return Phase.TOUCHED
+        if self._aim is Aim.HAND:
+            return Phase.HELD
+        if not self._settled:
+            return Phase.HOMING if self._aim is Aim.HOME else Phase.MOVING
+        moved = np.linalg.norm((ahead.p[-1] - ahead.course.q[-1]) * LEVERS)
+        return Phase.ASIDE if moved > ASIDE else Phase.RESTING
+
+    @property
+    def ahead(self) -> Array:
+        """(K, 6) the postures ahead, from where its motion is now on, rad."""
+        with self._lock:
+            if self._ahead is None:
+                return np.empty((0, NUM_JOINTS))
+            later = self._ahead.p[self._ahead.times > self._clock]
+            return np.concatenate([self._ahead.at(self._clock)[None], later])
+
+    def _advance(self, q: Array, dt: float) -> Ahead:
+        """The motion ahead, and its rate for this tick."""
+        ahead = self._ahead
+        assert ahead is not None
+        if not self._settled and self._clock >= ahead.course.end:
+            if self._aim is Aim.HAND and self._then is not Aim.HAND and self._released:
+                self._set_out(self._then)
+            else:
+                self._settled = True
+                self._take(ahead.course)  # what was in the way of the motion need not be in that of its end
+            ahead = self._ahead
+            assert ahead is not None
+        behind = np.abs(ahead.at(self._clock) - q).max() / GAP
+        target = 1 / (1 + behind**2) if ahead.dodge.cleared else 0.0
+        self._rate += float(np.clip(target - self._rate, -dt / RAMP, dt / RAMP))
+        return ahead
+
+    def _closing(self, gap: Array, dt: float) -> Array:
+        """Velocities (6,) that close a gap (6,)."""
+        size = np.abs(gap)
+        fastest = np.sqrt(2 * BRAKING_SHARE * self.acceleration * size)
+        return np.sign(gap) * np.minimum(min(STIFFNESS, 0.5 / dt) * size, fastest)
+
+    def _within_limits(self, q: Array, wanted: Array, dt: float) -> Array:
+        """The velocities nearest to those wanted that all limits allow."""
+        braking = 2 * BRAKING_SHARE * self.acceleration
+        highest = np.sqrt(braking * np.maximum(self.robot.upper - q - dt * np.maximum(self._velocity, 0), 0))
+        lowest = -np.sqrt(braking * np.maximum(q + dt * np.minimum(self._velocity, 0) - self.robot.lower, 0))
+        change = self.acceleration * dt
+        velocity = np.clip(np.clip(wanted, lowest, highest), self._velocity - change, self._velocity + change)
+        return np.clip(velocity, -self.robot.velocity_limits, self.robot.velocity_limits)
+
+    # --- The motion ahead ---
+
+    def _anchor(self, q: Array) -> None:
+        """Begin at a posture (6,) that nobody foresaw."""
+        known = self._ahead.dodge if self._ahead is not None else NO_DODGE
+        inside = self._arm.limits.inside(q)
+        shadow = known.transform.forward(inside)
+        if self._aim is Aim.HAND:
+            course = _resting(shadow, self.robot.end_effector(shadow))
+        else:
+            course = self._course(shadow)
+        self._clock, self._settled = 0.0, False
+        self._take(course, known)
+        assert self._ahead is not None
+        avoidance = self._solved.scenario.arm_avoidance
+        if avoidance is not None and lack(self._arm, self._ahead.p, avoidance).max() > ROUNDING:
+            self._take(course)  # it was made for another motion
+
+    def _set_out(self, aim: Aim) -> None:
+        with self._lock:
+            self._aim, self._settled, self._released = aim, False, False
+            if self._ahead is not None:
+                course = self._course(self._ahead.course.at(self._clock))
+                self._clock = 0.0
+                self._take(course)
+
+    _released = False
+
+    def _held(self, course: Course, *, released: bool = False) -> None:
+        if self._aim is not Aim.HAND:
+            self._then = self._aim
+        self._aim, self._settled, self._released = Aim.HAND, False, released
+        self._clock = 0.0
+        self._take(course)
+
+    def _image(self) -> Array:
+        """The base coordinates (3,) at which the motion is."""
+        assert self._ahead is not None
+        course = self._ahead.course
+        return np.array([np.interp(self._clock, course.times, z) for z in course.z.T])
+
+    def _take(self, course: Course, known: Dodge | None = None) -> None:
+        """Follow a course from the clock on, around what is in the way."""
+        before = self._ahead.dodge if self._ahead is not None else NO_DODGE
+        first = max(int(np.searchsorted(course.times, self._clock, side="right")) - 1, 0)
+        first = min(first, len(course.times) - 2)
+        q = self._arm.limits.inside(course.q[first:])
+        if known is None:
+            hosts = np.concatenate([course.at(self._clock)[None], q[1:]])
+            hosts = hosts[-1:] if self._clock >= course.end else hosts[:: max(1, len(hosts) // NUM_HOSTS)]
+            turn = TURNING * (self._now - self._dodged)
+            known = dodge(self._arm, hosts, self._solved.scenario.arm_avoidance, before, turn)
+            self._dodged = self._now
+        p = known.transform.inverse(q)
+        self._ahead = Ahead(course, known, p, first, VELOCITY_SHARE * self.robot.velocity_limits)
+
+    def _course(self, q: Array, z: Array | None = None) -> Course:
+        """The undisturbed motion from a posture (6,), or from base coordinates `z` (3,), to where it is to go."""
+        stack, nominal = self._solved.stack, self._solved.nominal
+        if self._aim is Aim.HOME:
+            outer: list[Diffeomorphism] = [applied.made.transform for applied in stack.built]
+            transform = Chain(outer) if outer else Identity(3)
+            start = transform.forward(nominal.starts[self._home % len(nominal.starts)])
+            base = Attractor(start, stack.rays.base.speed, stack.rays.base.smoothing)
+            system = DiffeomorphicSystem(transform, base)
+        else:
+            system = stack.system
+        return _towards(system, self._section, self.robot.lower, q, z)
+
+
+def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Array, z: Array | None) -> Course:
+    robot, base = section.robot, system.base
+    z0 = system.transform.forward(robot.end_effector(q)) if z is None else z
+    if np.linalg.norm(z0 - base.goal) < ARRIVED:
+        z0 = base.goal
+        times, fractions, path = np.array([0.0, 1.0]), np.ones(2), system.transform.inverse(np.stack([z0, z0]))
+    else:
+        rays = Rays(z0[None], base)
+        bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
+        times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
+    joints = track(robot, path, section.reference, reference=section.reference).q
+    joints = joints + np.where(np.isinf(lower), 2 * np.pi * np.round((q - joints[0]) / (2 * np.pi)), 0.0)
+    if np.linalg.norm(z0 - base.goal) == 0:  # time to converge
+        times = CONVERGENCE * np.linspace(0, 12, NUM_SAMPLES)
+        joints, fractions = np.repeat(joints[:1], NUM_SAMPLES, axis=0), np.ones(NUM_SAMPLES)
+    joints = joints + (q - joints[0]) * np.exp(-times / CONVERGENCE)[:, None]
+    return Course(times, joints, base.goal + (1 - fractions)[:, None] * (z0 - base.goal))
+
+
+def _resting(q: Array, hand: Array) -> Course:
+    return Course(np.array([0.0, 1e-2]), np.stack([q, q]), np.stack([hand, hand]))
