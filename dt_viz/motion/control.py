@@ -37,6 +37,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.dodging import NO_DODGE, Dodge, dodge, lack
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
+from dt_viz.transforms.base import ArmAvoidance
 
 ACCELERATION = 4.0
 """Limit of the joints' acceleration, rad/s². The JACO's manual names none; this one takes a joint to its limit of
@@ -131,6 +132,18 @@ class Ahead:
         return float(self._pace[min(max(segment, 0), len(self._pace) - 1)])
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """How to go on with another stack."""
+
+    solved: Solved
+    section: Section
+    begins: Ahead | None
+    """The motion that it goes on from."""
+    ahead: Ahead | None
+    """None where that has to wait for the state at which it is taken."""
+
+
 class Controller:
     """A robot's state and what it follows; `step` is for one thread, `follow` and the rest may come from another."""
 
@@ -170,21 +183,35 @@ class Controller:
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        reference = self._follower.reference(solved.nominal)
+        self.take(self.prepared(solved))
+
+    def prepared(self, solved: Solved) -> Prepared:
+        """Work out how to go on with another stack, while ticks go on; see `follow`."""
+        section = Section(self.robot, self._follower.reference(solved.nominal))
         with self._lock:
-            before, self._solved = self._solved, solved
-            same = before.stack.transform is solved.stack.transform and before.stack.rays.base is solved.stack.rays.base
-            if not same:
-                self._section = Section(self.robot, reference)
+            before, begins, clock = self._solved, self._ahead, self._clock
+            turn = TURNING * (self._now - self._dodged)
+        if begins is None or not _alike(before, solved):
+            return Prepared(solved, section, None, None)
+        avoidance = solved.scenario.arm_avoidance
+        return Prepared(solved, section, begins, self._around(begins.course, clock, avoidance, begins.dodge, turn))
+
+    def take(self, prepared: Prepared) -> None:
+        """Go on with what was prepared from the next tick on; what does not fit any more is worked out again."""
+        with self._lock:
+            before, solved = self._solved, prepared.solved
+            self._solved, self._section = solved, prepared.section
             if self._ahead is None:
                 return
-            if same or self._aim is Aim.HAND:
-                course = self._ahead.course
+            if prepared.ahead is not None and self._ahead is prepared.begins:
+                self._ahead, self._dodged = prepared.ahead, self._now
+            elif self._aim is Aim.HAND or _alike(before, solved):
+                self._take(self._ahead.course)
             else:
                 learned = before.nominal.system is solved.nominal.system and self._aim is Aim.GOAL
                 course = self._course(self._ahead.course.at(self._clock), self._image() if learned else None)
-                self._clock = 0.0
-            self._take(course)
+                self._clock, self._settled = 0.0, False
+                self._take(course)
 
     @property
     def system(self) -> ArmSystem:
@@ -360,17 +387,25 @@ class Controller:
     def _take(self, course: Course, known: Dodge | None = None) -> None:
         """Follow a course from the clock on, around what is in the way."""
         before = self._ahead.dodge if self._ahead is not None else NO_DODGE
-        first = max(int(np.searchsorted(course.times, self._clock, side="right")) - 1, 0)
-        first = min(first, len(course.times) - 2)
-        q = self._arm.limits.inside(course.q[first:])
         if known is None:
-            hosts = np.concatenate([course.at(self._clock)[None], q[1:]])
-            hosts = hosts[-1:] if self._clock >= course.end else hosts[:: max(1, len(hosts) // NUM_HOSTS)]
-            turn = TURNING * (self._now - self._dodged)
-            known = dodge(self._arm, hosts, self._solved.scenario.arm_avoidance, before, turn)
-            self._dodged = self._now
-        p = known.transform.inverse(q)
-        self._ahead = Ahead(course, known, p, first, VELOCITY_SHARE * self.robot.velocity_limits)
+            turn, avoidance = TURNING * (self._now - self._dodged), self._solved.scenario.arm_avoidance
+            self._ahead, self._dodged = self._around(course, self._clock, avoidance, before, turn), self._now
+        else:
+            self._ahead = self._imaged(course, self._clock, known)
+
+    def _around(
+        self, course: Course, clock: float, avoidance: ArmAvoidance | None, before: Dodge, turn: float
+    ) -> Ahead:
+        """The motion ahead on a course, with a dodge that is made for it."""
+        later = course.q[course.times > clock]
+        hosts = np.concatenate([course.at(clock)[None], later[:: max(1, len(later) // NUM_HOSTS)]])
+        return self._imaged(course, clock, dodge(self._arm, hosts, avoidance, before, turn))
+
+    def _imaged(self, course: Course, clock: float, known: Dodge) -> Ahead:
+        """The motion ahead on a course, with a dodge."""
+        first = int(np.clip(np.searchsorted(course.times, clock, side="right") - 1, 0, len(course.times) - 2))
+        p = known.transform.inverse(self._arm.limits.inside(course.q[first:]))
+        return Ahead(course, known, p, first, VELOCITY_SHARE * self.robot.velocity_limits)
 
     def _course(self, q: Array, z: Array | None = None) -> Course:
         """The undisturbed motion from a posture (6,), or from base coordinates `z` (3,), to where it is to go."""
@@ -384,6 +419,11 @@ class Controller:
         else:
             system = stack.system
         return _towards(system, self._section, self.robot.lower, q, z)
+
+
+def _alike(solved: Solved, other: Solved) -> bool:
+    """Whether the end effector's stacks are the same."""
+    return solved.stack.transform is other.stack.transform and solved.stack.rays.base is other.stack.rays.base
 
 
 def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Array, z: Array | None) -> Course:
