@@ -42,5 +42,5 @@ def interruptible(checkpoint: Checkpoint) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """To be called between steps that take milliseconds: does what `interruptible` was given, outside of it nothing."""
+    """Call the function given to `interruptible`, if inside one; to be used between steps that take milliseconds."""
     _current.get()()

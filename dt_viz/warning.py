@@ -1,4 +1,4 @@
-"""Why a result is not to be trusted: values, so that what follows from them is decided by their kind."""
+"""Warnings about results, as values: their kind decides which warning hides which."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 ARM = "Arm"
-"""Source of warnings about the arm that is shown, which concern nobody who hides it."""
+"""Source of warnings about the shown arm, which are left out while it is hidden."""
 
 
 class Kind(Enum):
-    """What is wrong."""
+    """Kind of a problem."""
 
     IMITATION = auto()
     """The demonstrations were not learned as they are."""
@@ -28,11 +28,11 @@ class Kind(Enum):
     GOAL_MISSED = auto()
     """The motions end beside the goal."""
     MISPLACED = auto()
-    """A transform is where it cannot do what it is for."""
+    """A transform stands at a place where it has no effect."""
     OFF_PLANE = auto()
     """A bias point of a drawing lies before or behind the drawing's plane."""
     UNREACHED = auto()
-    """A transform does not lead every motion where it is to."""
+    """A transform does not lead every motion to its place."""
     TARGET_MISSED = auto()
     """A motion gives way to an obstacle and passes beside a bias point."""
     UNSAMPLED = auto()
@@ -46,9 +46,9 @@ class Kind(Enum):
     ARM_BLOCKED = auto()
     """The arm finds no way around an obstacle."""
     ROLLOUT_ENTERS = auto()
-    """On some rollout the arm, which avoids as a whole, enters an obstacle."""
+    """The arm, avoiding as a whole, enters an obstacle on some rollout."""
     ARM_TOO_NEAR = auto()
-    """On some rollout the arm, which avoids as a whole, keeps less than the margin from an obstacle."""
+    """The arm, avoiding as a whole, keeps less than the margin from an obstacle on some rollout."""
     ARM_ENTERS = auto()
     """The arm that is shown enters an obstacle."""
     ARM_HITS_ITSELF = auto()
@@ -68,13 +68,13 @@ class Kind(Enum):
     NOT_FALLING = auto()
     """Certificate: the Lyapunov value does not fall."""
     OFF_MOTION = auto()
-    """Certificate: what is shown is no image of the base motion."""
+    """Certificate: the shown motion is no image of the base motion."""
     OTHER_ENDS = auto()
-    """Certificate: motions do not begin or end where they are to."""
+    """Certificate: motions do not begin at their starts or do not end at their goal."""
     OTHER_TIMES = auto()
     """Certificate: times are not those of the motion."""
     OTHER_CLEARANCE = auto()
-    """Certificate: the clearance is not the one that is said."""
+    """Certificate: the clearance differs from the reported one."""
     HAND_BESIDE = auto()
     """Certificate: the hand of the arm is not on its rollout."""
     OTHER_DELAY = auto()
@@ -89,27 +89,27 @@ CONSEQUENCES: Mapping[Kind, frozenset[Kind]] = {
     Kind.PATH_MISSED: frozenset({Kind.HAND_BESIDE}),
     Kind.ROLLOUT_ENTERS: frozenset({Kind.ARM_ENTERS}),
 }
-"""Kinds of warnings that say no more once their cause is said."""
+"""Kinds of warnings that are hidden by a warning of their cause."""
 
 
 @dataclass(frozen=True)
 class MotionWarning:
-    """One reason why a result is not to be trusted."""
+    """One problem of a result."""
 
     kind: Kind
     text: str
-    """A whole sentence without capital letter and full stop."""
+    """Sentence without capital letter and full stop."""
     source: str = ""
-    """Name of the transform that it is about, or `ARM`; empty if it is about the motion as a whole."""
+    """Name of the transform concerned, or `ARM`; empty for the motion as a whole."""
 
     def __str__(self) -> str:
         return self.text
 
 
 def told(warnings: Iterable[MotionWarning]) -> tuple[MotionWarning, ...]:
-    """The warnings that are to be told: each once, and none that is a consequence of another.
+    """Return the warnings without repetitions and without consequences of others.
 
-    A consequence is about what its cause is about, or about the motion as a whole.
+    A consequence has the source of its cause, or concerns the motion as a whole.
     """
     unique = tuple(dict.fromkeys(warnings))
     return tuple(
@@ -123,5 +123,5 @@ def told(warnings: Iterable[MotionWarning]) -> tuple[MotionWarning, ...]:
 
 
 def in_millimetres(length: float) -> str:
-    """A length in metres, in words."""
+    """Format a length, metres."""
     return f"{1e3 * length:.0f} mm" if length >= 0.01 else f"{1e3 * length:.2g} mm"

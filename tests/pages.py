@@ -1,12 +1,32 @@
-"""Stand-ins for what a page is given: a frame without a motion, and a session that only keeps the scenario."""
+"""Stand-ins for what a page is given, such as a frame without a motion, and for a page that no browser shows."""
 
+import asyncio
+import contextlib
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
+import viser  # noqa: TID251 - a page that no browser shows
+from scenes import biases, changing
+from viser import _messages as messages  # noqa: TID251
+from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
+
+from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
+from dt_viz.engine.session import Session
+from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.certificates import Certificates
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.bias import BiasPoint
+from dt_viz.ui.controls import Control
+from dt_viz.ui.panel.bindings import Bindings
+from dt_viz.ui.visitor import Visitor
+
+MIDDLE = (0.1, -0.5, 0.4)
+CLIENT = cast(Any, 0)
 
 
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:
@@ -25,6 +45,140 @@ def frame_of(scenario: Scenario, **changes: Any) -> Frame:
         "certificates": Certificates(0.01),
     }
     return Frame(scenario=scenario, **(given | changes))
+
+
+class NoFrames:
+    """An engine that has no frames: nothing here is about motions."""
+
+    def task(self, name):
+        return TASKS[name]()
+
+    def frames(self, *_what):
+        return iter(())
+
+
+class Page:
+    """A visitor's page on a server that nobody looks at, and what a browser may send to it."""
+
+    def __init__(self, server: viser.ViserServer, robot: Any) -> None:
+        self.gui, self.scene = server.gui, server.scene
+        self.camera = SimpleNamespace(position=np.array([0.8, -1.6, 0.8]), look_at=np.zeros(3), fov=0.75)
+        self.client = SimpleNamespace(
+            client_id=0,
+            gui=server.gui,
+            scene=server.scene,
+            camera=self.camera,
+            atomic=contextlib.nullcontext,
+            flush=lambda: None,
+            add_notification=lambda *_what, **_how: None,
+            get_render=lambda *_size, **_how: np.zeros((2, 2, 4), np.uint8),
+            send_file_download=lambda *_what, **_how: None,
+        )
+        self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
+        self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
+        titles = {name: entry.title for name, entry in TASKS.items()}
+        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, titles, "draw_s")
+        self.session = self.visitor.session
+
+    @property
+    def inputs(self) -> list[Any]:
+        """All but those whose value nobody reads."""
+        inputs = self.gui._gui_input_handle_from_uuid.values()
+        return [handle for handle in inputs if not isinstance(handle, GuiProgressBarHandle)]
+
+    @property
+    def gizmos(self) -> dict[str, Any]:
+        return self.scene._handle_from_transform_controls_name
+
+    @property
+    def nodes(self) -> dict[str, Any]:
+        return self.scene._handle_from_node_name
+
+    def run(self, *handling) -> None:
+        """Handle messages as viser does: what raises ends the handling of that message only."""
+
+        async def one_after_the_other():
+            for coroutine in handling:
+                with contextlib.suppress(Exception):
+                    await coroutine
+
+        asyncio.run(one_after_the_other())
+        self.session.wait_idle(10)
+
+    def claim(self, handle: Any, value: Any) -> None:
+        if isinstance(value, viser.UploadedFile):  # an upload can be sent to any input
+            handle._impl.value = value
+            event = viser.GuiEvent(cast(Any, self.client), CLIENT, handle)
+            self.run(*(cb(event) for cb in handle._impl.update_cb))
+        else:
+            self.run(
+                self.gui._handle_gui_updates(CLIENT, messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+            )
+
+    def move(self, name: str, position: Any, wxyz: Any = (1.0, 0.0, 0.0, 0.0)) -> None:
+        self.run(
+            self.scene._handle_transform_controls_drag_start(CLIENT, messages.TransformControlsDragStartMessage(name)),
+            self.scene._handle_transform_controls_updates(
+                CLIENT, messages.TransformControlsUpdateMessage(name, wxyz, position)
+            ),
+            self.scene._handle_transform_controls_drag_end(CLIENT, messages.TransformControlsDragEndMessage(name)),
+        )
+
+    def drag(self, name: str, start: Any, end: Any, phase: Any = "update") -> None:
+        at = {
+            "start_position": start,
+            "start_screen_pos": (0.5, 0.5),
+            "end_position": end,
+            "end_screen_pos": (0.5, 0.5),
+        }
+        message = messages.SceneNodeDragMessage(
+            phase=phase, name=name, instance_index=None, button="left", modifier=None, **at
+        )
+        self.run(self.scene._handle_node_drag(CLIENT, message))
+
+    def busy(self, **view: Any) -> Scenario:
+        """A scenario in which most controls are shown, and most things stand in the scene."""
+        task = TASKS["draw_s"]()
+        obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
+        avoidance = {"space": "both", "duration": 0.5, "integration": Integration("rk4", 8)}
+        layers = biases(BiasPoint(MIDDLE, radius=0.1, strength=0.5))
+        self.session.edit(
+            "test",
+            **changing(self.session.scenario, obstacles=obstacles, layers=layers, **avoidance),
+            starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
+            view=View(generator=True, click_to_start=True, **view),
+        )
+        assert task.name == "draw_s"
+        return self.session.scenario
+
+
+class Bound(Bindings):
+    """Bindings whose inputs are found by their label, connected to a session that adopts each edit."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__()
+        self._inputs: dict[str, list[SimpleNamespace]] = {}
+        self.edited = Edited(scenario, self)
+        self.connect(cast(Session, self.edited))
+
+    def input(self, handle: Any, read: Any, change: Any) -> Control:
+        control = super().input(handle, read, change)
+        self._inputs.setdefault(handle.label, []).append(SimpleNamespace(control=control, read=read, change=change))
+        return control
+
+    def inputs(self, label: str | None = None, *, visible: bool) -> list[SimpleNamespace]:
+        """Those with this label, or all."""
+        found = [item for items in self._inputs.values() for item in items] if label is None else self._inputs[label]
+        return [item for item in found if item.control.handle.visible == visible]
+
+    def __getitem__(self, label: str) -> SimpleNamespace:
+        """The visible input with this label."""
+        (found,) = self.inputs(label, visible=True)
+        return found
+
+    def set(self, label: str, value: Any) -> None:
+        """Edit the scenario as this input does."""
+        self.edited.edit(label, **self[label].change(self.edited.scenario, value))
 
 
 class Edited:

@@ -326,7 +326,7 @@ def misplaced(warnings):
 @pytest.mark.parametrize(
     ("place", "words"), [((0.6, 0.1, 0.0), "the point is on the goal"), ((-0.6, 0.1, 0.0), "the point is on a start")]
 )
-def test_a_misplaced_bias_point_is_doubted(place, words):
+def test_a_misplaced_bias_point_is_warned_of(place, words):
     built = BiasPoint(place, radius=0.2).build(straight(0.1, tolerance=1e-6))
     (text,) = misplaced(built.warnings)
     assert text.startswith(f"Bias 1: {words}")
@@ -340,12 +340,12 @@ def test_a_misplaced_bias_point_is_doubted(place, words):
         ((0.0, -0.4, 0.3), None),
     ],
 )
-def test_a_bias_point_where_the_hand_cannot_be_is_doubted(engine, place, words):
+def test_a_bias_point_out_of_reach_is_warned_of(engine, place, words):
     frame = next(engine.frames(avoiding("lift_box", layers=biases(BiasPoint(place, strength=0.0)))))
     assert misplaced(frame.certificates.warnings) == ([] if words is None else [f"Bias 1: {words}"])
 
 
-def test_a_target_off_the_plane_of_a_drawing_is_doubted(nominal):
+def test_a_target_off_the_plane_of_a_drawing_is_warned_of(nominal):
     g = nominal("draw_s")
     x, _, z = g.bundle.positions[100]
     point = BiasPoint((float(x), -0.45, float(z)), plane=PLANE)
@@ -354,7 +354,7 @@ def test_a_target_off_the_plane_of_a_drawing_is_doubted(nominal):
     assert "5 cm before or behind the plane" in text
 
 
-def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(nominal):
+def test_a_target_behind_the_goal_is_warned_of_and_the_goal_stays(nominal):
     g = nominal("drop_pots")
     point = BiasPoint((0.0, -0.52, 0.14))
     solution = biased(g, point, precision=LIVE)
@@ -364,7 +364,7 @@ def test_a_target_behind_the_goal_is_doubted_and_the_goal_stays(nominal):
         np.testing.assert_allclose(path[-1], g.goal, atol=1e-3)
 
 
-def test_a_region_over_another_target_is_doubted():
+def test_a_region_over_another_target_is_warned_of():
     point, other = BiasPoint((0.0, 0.0, 0.0), radius=0.3), (0.1, 0.1, 0.0)
     assert not misplaced(point.build(straight(0.1)).warnings)
     (text,) = misplaced(point.build(straight(0.1, targets=(other,))).warnings)

@@ -246,7 +246,7 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     session.edit("test", **changing(session.scenario, avoids=False))
     (sphere,) = session.scenario.obstacles
     click_button(page, "Box")
-    wait_until(lambda: [item.has_handles for item in pictures.items] == [False, True], "the box and its handles")
+    wait_until(lambda: [item.handles.shown for item in pictures.items] == [False, True], "the box and its handles")
     before = np.array(session.scenario.obstacles[1].position)
     boxed = session.scenario.obstacles
 
@@ -270,7 +270,7 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
 
     x, y = project(visitor, sphere.position)
     page.mouse.click(x - 18, y + 14)
-    wait_until(lambda: [item.has_handles for item in pictures.items] == [True, False], "the sphere to be selected")
+    wait_until(lambda: [item.handles.shown for item in pictures.items] == [True, False], "the sphere to be selected")
     press(page.locator("input[value='1: sphere']").first)
     press(page.get_by_role("option", name="2: box"))
     wait_until(lambda: session.scenario.selected == 1, "the box to be selected")
@@ -296,7 +296,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     assert isinstance(mesh, MeshObstacle) and mesh.size == pytest.approx(0.15)
 
     pictures = visitor.pictures.obstacles
-    wait_until(lambda: [item.has_handles for item in pictures.items] == [True], "its handles")
+    wait_until(lambda: [item.handles.shown for item in pictures.items] == [True], "its handles")
     (picture,) = pictures.items
     angles = itertools.cycle((0.8, 0.65, 0.5))  # where one try hits another handle the next does not
     arc = 0.65 * picture.gizmo.scale  # the handles that turn are quarters of circles between the arrows

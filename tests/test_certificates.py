@@ -55,7 +55,7 @@ def both(*fractions):
 @pytest.mark.parametrize(
     "transform", [Identity(3), Flow(field(0.3), 0.5, 20), Flow(field(0.3), 0.5, 6, implicit_euler, euler)]
 )
-def test_a_healthy_stack_gets_its_certificates_and_no_warning(transform):
+def test_a_sound_stack_gets_its_certificates_and_no_warning(transform):
     known = certificates_of(transform)
     assert known.min_det_jacobian is not None and known.min_det_jacobian > 0
     assert known.round_trip_error is not None and known.round_trip_error < 1e-6

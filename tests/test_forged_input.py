@@ -1,31 +1,21 @@
 """What a page sends, forged: each control, gizmo and node of a visitor's page, through viser's own handlers."""
 
-import asyncio
-import contextlib
 import dataclasses
 import inspect
 import math
 import threading
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import frame_of
-from scenes import biases, changing
+from pages import CLIENT, MIDDLE, Page, frame_of
 from viser import _messages as messages  # noqa: TID251
-from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
-from dt_viz.engine.engine import Engine
-from dt_viz.flows.diffeomorphisms import Integration
-from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
-from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui import controls, gestures
 from dt_viz.ui.scene import handles
-from dt_viz.ui.visitor import Visitor
 
 BORDERS = {controls.__name__, gestures.__name__, handles.__name__}
 UPLOAD = viser.GuiUploadButtonHandle
@@ -43,113 +33,6 @@ PLACES = [
     ("a", "b", "c"),
 ]
 TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0), None, "wxyz"]
-MIDDLE = (0.1, -0.5, 0.4)
-CLIENT = cast(Any, 0)
-
-
-class NoFrames:
-    """An engine that has no frames: nothing here is about motions."""
-
-    def task(self, name):
-        return TASKS[name]()
-
-    def frames(self, *_what):
-        return iter(())
-
-
-class Page:
-    """A visitor's page on a server that nobody looks at, and what a browser may send to it."""
-
-    def __init__(self, server: viser.ViserServer, robot: Any) -> None:
-        self.gui, self.scene = server.gui, server.scene
-        self.camera = SimpleNamespace(position=np.array([0.8, -1.6, 0.8]), look_at=np.zeros(3), fov=0.75)
-        self.client = SimpleNamespace(
-            client_id=0,
-            gui=server.gui,
-            scene=server.scene,
-            camera=self.camera,
-            atomic=contextlib.nullcontext,
-            flush=lambda: None,
-            add_notification=lambda *_what, **_how: None,
-            get_render=lambda *_size, **_how: np.zeros((2, 2, 4), np.uint8),
-            send_file_download=lambda *_what, **_how: None,
-        )
-        self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
-        self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
-        titles = {name: entry.title for name, entry in TASKS.items()}
-        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, titles, "draw_s")
-        self.session = self.visitor.session
-
-    @property
-    def inputs(self) -> list[Any]:
-        """All but those whose value nobody reads."""
-        inputs = self.gui._gui_input_handle_from_uuid.values()
-        return [handle for handle in inputs if not isinstance(handle, GuiProgressBarHandle)]
-
-    @property
-    def gizmos(self) -> dict[str, Any]:
-        return self.scene._handle_from_transform_controls_name
-
-    @property
-    def nodes(self) -> dict[str, Any]:
-        return self.scene._handle_from_node_name
-
-    def run(self, *handling) -> None:
-        """Handle messages as viser does: what raises ends the handling of that message only."""
-
-        async def one_after_the_other():
-            for coroutine in handling:
-                with contextlib.suppress(Exception):
-                    await coroutine
-
-        asyncio.run(one_after_the_other())
-        self.session.wait_idle(10)
-
-    def claim(self, handle: Any, value: Any) -> None:
-        if isinstance(value, viser.UploadedFile):  # an upload can be sent to any input
-            handle._impl.value = value
-            event = viser.GuiEvent(cast(Any, self.client), CLIENT, handle)
-            self.run(*(cb(event) for cb in handle._impl.update_cb))
-        else:
-            self.run(
-                self.gui._handle_gui_updates(CLIENT, messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
-            )
-
-    def move(self, name: str, position: Any, wxyz: Any = (1.0, 0.0, 0.0, 0.0)) -> None:
-        self.run(
-            self.scene._handle_transform_controls_drag_start(CLIENT, messages.TransformControlsDragStartMessage(name)),
-            self.scene._handle_transform_controls_updates(
-                CLIENT, messages.TransformControlsUpdateMessage(name, wxyz, position)
-            ),
-            self.scene._handle_transform_controls_drag_end(CLIENT, messages.TransformControlsDragEndMessage(name)),
-        )
-
-    def drag(self, name: str, start: Any, end: Any, phase: Any = "update") -> None:
-        at = {
-            "start_position": start,
-            "start_screen_pos": (0.5, 0.5),
-            "end_position": end,
-            "end_screen_pos": (0.5, 0.5),
-        }
-        message = messages.SceneNodeDragMessage(
-            phase=phase, name=name, instance_index=None, button="left", modifier=None, **at
-        )
-        self.run(self.scene._handle_node_drag(CLIENT, message))
-
-    def busy(self, **view: Any) -> Scenario:
-        """A scenario in which most controls are shown, and most things stand in the scene."""
-        task = TASKS["draw_s"]()
-        obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
-        avoidance = {"space": "both", "duration": 0.5, "integration": Integration("rk4", 8)}
-        layers = biases(BiasPoint(MIDDLE, radius=0.1, strength=0.5))
-        self.session.edit(
-            "test",
-            **changing(self.session.scenario, obstacles=obstacles, layers=layers, **avoidance),
-            starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
-            view=View(generator=True, click_to_start=True, **view),
-        )
-        assert task.name == "draw_s"
-        return self.session.scenario
 
 
 @pytest.fixture(scope="module")

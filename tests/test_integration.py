@@ -51,7 +51,7 @@ def test_what_euler_loses_there_and_back_is_said_in_millimetres(steps):
     assert f"{1e-3 * lost:.2g} mm" in small.text
 
 
-def test_a_step_that_folds_is_said_and_enough_steps_are_not_doubted():
+def test_a_step_that_folds_is_warned_of_and_enough_steps_are_not():
     coarse, fine = Integration("euler", 1), Integration("rk4", 50)
     folding, exact = coarse.of(Flow(field(2.0), 1.0)), fine.of(Flow(field(), 1.0))
     folds, inexact = integration_warnings("It", folding, coarse, folding.inverse(Y), Y)
@@ -95,7 +95,7 @@ def of_kind(certificates, *kinds):
 
 
 @pytest.mark.parametrize(("duration", "folds"), [(None, True), (0.1, False)])
-def test_euler_in_few_steps_is_doubted_while_the_hand_moves_and_certificates_agree(engine, initial, duration, folds):
+def test_euler_in_few_steps_is_warned_of_during_a_drag_and_certificates_agree(engine, initial, duration, folds):
     scenario = changed(initial("draw_s"), integration=Integration("euler", 3), duration=duration)
     live, last = certified(engine, scenario)
     kinds = [Kind.FOLDS, Kind.INEXACT_INVERSE] if folds else [Kind.INEXACT_INVERSE]

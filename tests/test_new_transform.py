@@ -6,19 +6,17 @@ from typing import Any, ClassVar, cast  # noqa: F401 - of the README's example
 
 import numpy as np
 import pytest
-from pages import Edited
+from pages import Bound
 from scenes import avoiding, changed
 
 import dt_viz
 from dt_viz.engine.frame import Stage
-from dt_viz.engine.session import Session
 from dt_viz.flows.diffeomorphisms import Flow  # noqa: F401
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
 from dt_viz.transforms import registry
 from dt_viz.transforms.base import Built, MotionBelow, Number, Setting, Transform  # noqa: F401
-from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.transforms import TransformsPanel, addable
+from dt_viz.ui.panel.transforms import add, add_transform_controls, addable
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,9 @@ def scenario(request, engine, initial, monkeypatch):
     """The kind is looked up and added as the page does."""
     monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))  # the one line
     plain = initial("lift_box")
-    twirl = registry.by_title()["Twirl"].beside(surroundings(engine.task("lift_box"), plain))
+    twirl = next(kind for kind in registry.KINDS if kind.title == "Twirl").beside(
+        surroundings(engine.task("lift_box"), plain)
+    )
     stack, name = with_added(plain, twirl)
     scenario = replace(plain, stack=stack)
     if request.param[1] == name:
@@ -93,20 +93,12 @@ def test_it_turns_motions_as_it_says_and_not_when_it_is_off(engine, scenario):
 
 def test_the_page_offers_it_and_has_its_controls(server, monkeypatch):
     monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))
-    session, bound = Edited(avoiding("lift_box")), {}
-
-    def bind(handle, read, change):
-        control = Control(handle)
-        bound[handle.label] = control, read, change
-        return control
-
-    panel = TransformsPanel(server.gui, bind, later=lambda work: work())
-    panel.connect(cast(Session, session))
-    panel.add(addable()["Twirl"])
-    panel.adopt(session.scenario)
-    assert panel._add.options == ("Bias", "Twirl")
-    control, read, change = bound["Angle [rad]"]
-    assert control.handle.visible and read(session.scenario) == 0.8
-    session.edit("Angle [rad]", **change(session.scenario, -0.5))
+    bound = Bound(avoiding("lift_box"))
+    session: Any = bound.edited
+    add_transform_controls(server.gui, bound, later=lambda work: work())
+    assert list(addable()) == ["Bias", "Twirl"]
+    add(session, addable()["Twirl"])
+    assert bound["Angle [rad]"].control.value == 0.8
+    bound.set("Angle [rad]", -0.5)
     assert [layer.name for layer in session.scenario.stack] == ["Twirl 1", "Avoidance"]
     assert cast(Any, session.scenario.stack[0].transform).angle == -0.5

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dt_viz.obstacles.files import MAX_BYTES, MAX_FACES, ShapeError, load_cloud, load_mesh, read_cloud, read_mesh
+from dt_viz.obstacles.files import MAX_BYTES, MAX_FACES, ShapeError, read_cloud, read_mesh
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle
 
 FORMATS = ("stl", "obj", "ply", "glb")
@@ -62,12 +62,6 @@ class TestMeshes:
         np.testing.assert_allclose(loaded.solid.bounds.mean(axis=0), 0, atol=1e-6)
         obstacle = MeshObstacle((0.3, 0.0, 0.0), loaded.solid)
         np.testing.assert_allclose(obstacle.signed_distance(np.array([0.3, 0.0, 0.2])), 0.175, atol=2e-3)
-
-    def test_from_a_path(self, tmp_path):
-        (tmp_path / "a.stl").write_bytes(exported(BOX, "stl"))
-        assert load_mesh(tmp_path / "a.stl").solid == read_mesh(exported(BOX, "stl"), "a.stl").solid
-        with pytest.raises(ShapeError, match="no such file"):
-            load_mesh(tmp_path / "b.stl")
 
     def test_text_stl(self):
         assert len(read_mesh(exported(BOX, "stl_ascii"), "a.stl").solid.faces) == 12
@@ -235,10 +229,6 @@ class TestClouds:
         obstacle = CloudObstacle((0.0, 0.0, 0.0), loaded.cloud)
         assert obstacle.signed_distance(np.zeros(3)) < -0.03
         assert obstacle.signed_distance(np.array([0.15, 0.0, 0.0])) > 0.05
-
-    def test_from_a_path(self, tmp_path):
-        (tmp_path / "a.csv").write_bytes(table(POINTS, LABELS))
-        assert load_cloud(tmp_path / "a.csv").cloud == read_cloud(table(POINTS, LABELS), "a.csv").cloud
 
     def test_millimetres(self):
         content = npz(points=1e3 * POINTS, labels=LABELS)

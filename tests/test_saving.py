@@ -6,7 +6,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import hostile
 import numpy as np
@@ -212,7 +212,7 @@ def test_numbers_that_make_no_sense_are_refused_where_they_are_written():
         (lambda: dt.Sphere((0.0, 0.0, 0.0), diameter=-0.1), "diameter: found -0.1"),
         (lambda: dt.Box((0.0, 0.0, 0.0), (0.1, 0.0, 0.1)), "sizes: found 0"),
         (lambda: dt.Cylinder((0.0, 0.0, 0.0), height=float("inf")), "height: found inf"),
-        (lambda: SHAPED[3].resized(-1.0), "scale"),
+        (lambda: cast(Any, SHAPED[3]).resized(-1.0), "scale"),
     ):
         with pytest.raises(ValueError, match=words):
             make()

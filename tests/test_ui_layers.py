@@ -26,8 +26,9 @@ from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
-from dt_viz.ui.panel.panel import CHANGED, COMPUTING, PLOTS, VIEW_LABELS, Panel, hint, status_html
+from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS, Panel
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
+from dt_viz.ui.panel.status import CHANGED, COMPUTING, hint, status_html
 from dt_viz.ui.playback import at_moment
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import PEDESTAL
@@ -213,7 +214,7 @@ def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
     fresh, stale = colours(()), colours(("the obstacle touches the base",))
     assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
     np.testing.assert_array_equal(colours(()), fresh)
-    starts = rollouts._starts
+    starts = rollouts.starts
     rollouts.draw(replace(frame(blocked=("no way",)), task=TASKS["draw_s"](), rollouts=paths))
     np.testing.assert_array_equal(np.reshape(starts.colors, (-1, 3))[0], palette.STALE)
     colours(())
@@ -296,21 +297,21 @@ def test_the_status_of_another_task_is_pale_and_says_what_is_done(server):
     said = {s.task: replace(frame(scenario=s), task=TASKS[s.task]()) for s in (scenario, other)}
     panel.adopt(scenario)
     panel.report(said["draw_s"], PACE)
-    settled = panel._status.content
-    assert COMPUTING not in settled and said["draw_s"].task.hint in html.unescape(panel._hint.content)
+    settled = panel.status.content
+    assert COMPUTING not in settled and said["draw_s"].task.hint in html.unescape(panel.hint.content)
     panel.adopt(other)
     for _ in range(2):
-        waiting = panel._status.content
+        waiting = panel.status.content
         assert COMPUTING in waiting and f"opacity:0.3;filter:grayscale(1)'>{settled}" in waiting
-        assert said["draw_s"].task.hint not in html.unescape(panel._hint.content)
+        assert said["draw_s"].task.hint not in html.unescape(panel.hint.content)
         panel.report(said["draw_s"], PACE)  # what was under way when it was chosen
     panel.report(said["lift_box"], PACE)
-    assert COMPUTING not in panel._status.content
-    assert said["lift_box"].task.hint in html.unescape(panel._hint.content)
+    assert COMPUTING not in panel.status.content
+    assert said["lift_box"].task.hint in html.unescape(panel.hint.content)
     panel.adopt(scenario)
-    assert COMPUTING in panel._status.content
+    assert COMPUTING in panel.status.content
     panel.fail(ValueError("nothing comes"))
-    assert COMPUTING not in panel._status.content
+    assert COMPUTING not in panel.status.content
     panel.close()
     server.gui.reset()
 
@@ -338,15 +339,15 @@ def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(serv
     panel.connect(cast(Session, session))
     panel.adopt(session.scenario)
     panel.report(replace(frame(scenario=session.scenario), task=TASKS["draw_s"]()), PACE)
-    settled = panel._status.content, panel._hint.content
-    panel._begin(lambda session, name: session.choose_task(name), chosen)
-    assert COMPUTING in panel._status.content and session.asked == []
+    settled = panel.status.content, panel.hint.content
+    panel._begin(lambda session, name: session.choose_task(name), cast(Session, session), chosen)
+    assert COMPUTING in panel.status.content and session.asked == []
     session.may.set()
     assert panel._beginnings.wait_idle(30)
     assert session.asked == [chosen]
-    assert (COMPUTING not in panel._status.content) == settles
-    assert ((panel._status.content, panel._hint.content) == settled) == settles
-    assert panel._notice.visible == (chosen == "push_box")
+    assert (COMPUTING not in panel.status.content) == settles
+    assert ((panel.status.content, panel.hint.content) == settled) == settles
+    assert panel.notice.visible == (chosen == "push_box")
     panel.close()
     server.gui.reset()
 
@@ -393,7 +394,7 @@ def test_two_samples_at_one_time_give_a_finite_speed():
 
 def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(server):
     plots = JointPlots(server.gui, ROBOT)
-    plots.draw(motion())
+    plots.follow(motion())
     assert len(plots.angles.data[0]) != NUM_SAMPLES
     plots.visible = True
     assert all(len(column) == NUM_SAMPLES for plot in (plots.angles, plots.speeds) for column in plot.data)
@@ -404,10 +405,10 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
     np.testing.assert_allclose(limits, np.sort(np.degrees(finite)))
     assert (plots.speeds.data[7] == 100).all()
     before = plots.angles.data
-    plots.draw(None)
+    plots.follow(None)
     assert plots.angles.data is before
     plots.visible = False
-    plots.draw(motion(seconds=9.0))
+    plots.follow(motion(seconds=9.0))
     assert plots.angles.data is before
 
 
@@ -416,10 +417,10 @@ def test_plots_are_drawn_only_while_shown_with_the_limits_of_limited_joints(serv
 
 def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
     panel = panel_of(server)
-    handles = [bound.control.handle for bound in panel._bound]
-    box = {handle.label: handle for handle in handles if handle.label in VIEW_LABELS.values()}
-    of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints._folder, box[VIEW_LABELS["health_plots"]]]
-    of_tab += [panel.health._folder, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
+    handles = server.gui._gui_input_handle_from_uuid.values()
+    box = {handle.label: handle for handle in handles if getattr(handle, "label", "") in VIEW_LABELS.values()}
+    of_tab = [box[VIEW_LABELS["joint_plots"]], panel.joints.node, box[VIEW_LABELS["health_plots"]]]
+    of_tab += [panel.health.node, *(box[text] for name, text in VIEW_LABELS.items() if name not in PLOTS)]
     orders = [handle.order for handle in of_tab]
     assert orders == sorted(orders)
     assert len({handle._impl.parent_container_id for handle in of_tab}) == 1
@@ -453,7 +454,7 @@ def test_what_is_refused_is_said_beside_the_panel_too(server):
     panel = panel_of(server, notify=lambda *told: said.append(told))
     panel.fail(DemonstrationError("file.csv", "points", "3", "at least 20"))
     ((text, colour),) = said
-    assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel._notice.content)
+    assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel.notice.content)
     assert colour[0] > 2 * max(colour[1:])  # red
 
 

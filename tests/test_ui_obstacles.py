@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import trimesh
-from pages import Edited
+from pages import Bound
 from scenes import avoiding, changing
 
 from dt_viz.arm.collision import NOTHING, CollisionReport, Nearest
@@ -21,9 +21,8 @@ from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.scenario.scenario import MAX_OBSTACLES, View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.obstacles import SHAPES, ObstaclePanel, name_of, with_room
-from dt_viz.ui.panel.panel import _clearance, _collision_rows
+from dt_viz.ui.panel.obstacles import SHAPES, ObstaclePanel, add, delete, duplicate, name_of, with_room
+from dt_viz.ui.panel.status import clearance_text, collision_rows
 from dt_viz.ui.scene.handles import in_slice
 from dt_viz.ui.scene.obstacles import Obstacles, shaded
 from dt_viz.ui.scene.slice_layers import OccupancySlice
@@ -77,7 +76,7 @@ def test_what_is_resized_is_not_sent_again(shown):
 @pytest.mark.parametrize(("selected", "expected"), [(0, [1, 0, 0]), (1, [0, 1, 0]), (2, [0, 0, 1]), (7, [0, 0, 1])])
 def test_only_the_selected_obstacle_has_handles_and_none_in_a_picture(shown, selected, expected):
     def handles():
-        return [int(item.has_handles) for item in shown.items]
+        return [int(item.handles.shown) for item in shown.items]
 
     shown.adopt(scenario(*ALL, selected=selected))
     assert handles() == expected
@@ -121,30 +120,22 @@ def test_what_is_dragged_stays_in_the_slice_and_under_the_pointer():
 
 @pytest.fixture
 def opened(server):
-    controls = {}
-
-    def bind(handle, read, change):
-        controls.setdefault(handle.label, []).append(SimpleNamespace(handle=handle, read=read, change=change))
-        return Control(handle)
-
-    said = []
-    panel = ObstaclePanel(server.gui, bind, lambda text, wrong: said.append((text, wrong)), later=lambda work: work())
-    session: Any = Edited(scenario(BALL), panel)
-    panel.connect(session)
-    yield SimpleNamespace(panel=panel, session=session, controls=controls, said=said)
+    bound, said = Bound(scenario(BALL)), []
+    panel = ObstaclePanel(server.gui, bound, lambda text, wrong: said.append((text, wrong)), later=lambda work: work())
+    yield SimpleNamespace(panel=panel, session=cast(Any, bound.edited), bound=bound, said=said)
     server.gui.reset()
 
 
 def test_what_is_added_is_selected_stands_apart_and_is_a_step_for_undo(opened):
     for number, shape in enumerate(SHAPES.values(), start=1):
         before = opened.session.scenario.obstacles
-        opened.panel.add(shape)
+        add(opened.session, shape)
         *others, added = opened.session.scenario.obstacles
         assert tuple(others) == before
         assert added.moved((0.0, 0.0, 0.0), added.wxyz) == shape
         assert opened.session.scenario.selected == number == opened.session.steps
     assert len(opened.session.scenario.obstacles) == MAX_OBSTACLES
-    opened.panel.add(BALL)
+    add(opened.session, BALL)
     assert len(opened.session.scenario.obstacles) == MAX_OBSTACLES
 
 
@@ -161,19 +152,19 @@ def test_a_new_obstacle_is_near_the_motion_but_covers_no_end_of_it(task, shape):
 
 def test_deleting_and_duplicating_act_on_the_selected_obstacle(opened):
     opened.session.edit("", **changing(opened.session.scenario, obstacles=ALL), view=View(selected=1))
-    opened.panel.duplicate()
+    duplicate(opened.session)
     assert opened.session.scenario.obstacles[:3] == ALL
     copy = opened.session.scenario.obstacles[3]
     assert copy.moved(BOX.position, copy.wxyz) == BOX
     opened.session.edit("", view=View(selected=1))
-    opened.panel.delete()
+    delete(opened.session)
     assert opened.session.scenario.obstacles == (BALL, TUBE, copy)
     for _ in range(4):
-        opened.panel.delete()
+        delete(opened.session)
     assert opened.session.scenario.obstacles == ()
-    opened.panel.duplicate()
+    duplicate(opened.session)
     assert opened.session.scenario.obstacles == ()
-    opened.panel.add(BALL)
+    add(opened.session, BALL)
     assert len(opened.session.scenario.obstacles) == 1
 
 
@@ -191,12 +182,12 @@ SIZES = [
 @pytest.mark.parametrize(("selected", "label", "expected"), SIZES)
 def test_the_sizes_are_those_of_the_selected_obstacle(opened, selected, label, expected):
     opened.session.edit("", **changing(opened.session.scenario, obstacles=SIZED), view=View(selected=selected))
-    (control,) = (c for c in opened.controls[label] if c.handle.visible)
-    changed = replace(opened.session.scenario, **control.change(opened.session.scenario, 20.0))
+    opened.bound.set(label, 20.0)
+    changed = opened.session.scenario
     assert changed.obstacles == (*SIZED[:selected], expected, *SIZED[selected + 1 :])
-    assert control.read(changed) == 20.0
-    hidden = [c for controls in opened.controls.values() for c in controls if not c.handle.visible]
-    assert hidden and all(c.change(changed, 7.0) == {} for c in hidden)
+    assert opened.bound[label].control.value == 20.0
+    hidden = opened.bound.inputs(visible=False)
+    assert hidden and all(item.change(changed, 7.0) == {} for item in hidden)
 
 
 def test_a_file_that_is_uploaded_becomes_an_obstacle(opened):
@@ -273,11 +264,11 @@ def test_a_file_in_another_unit_is_read_in_that_once_it_is_asked_for(opened):
     ((text, wrong),) = opened.said
     assert not wrong  # it is a question
     assert text == "ball.stl seems to be in millimetres: 80 × 80 × 80 units. Read it in millimetres?"
-    assert opened.panel._again.visible and opened.panel._again.label == "Read it in millimetres"
+    assert opened.panel.again.visible and opened.panel.again.label == "Read it in millimetres"
     opened.panel.load_again()
     *_, added = opened.session.scenario.obstacles
     assert added.size == pytest.approx(0.08, abs=1e-3)
-    assert not opened.panel._again.visible and opened.panel._unit.value == "millimetres"
+    assert not opened.panel.again.visible and opened.panel.unit.value == "millimetres"
     opened.panel.load_again()
     assert len(opened.session.scenario.obstacles) == 2 and len(opened.said) == 1
 
@@ -287,7 +278,7 @@ def test_a_size_that_no_unit_makes_sensible_is_an_error(opened, size):
     opened.panel.load(stl(BALL_MESH.copy().apply_scale(size)), "ball.stl", 1.0)
     ((text, wrong),) = opened.said
     assert wrong and "; accepted: a largest side of 0.01 m to 1 m" in text
-    assert not opened.panel._again.visible
+    assert not opened.panel.again.visible
 
 
 def test_a_file_whose_visitor_has_left_becomes_no_obstacle(opened):
@@ -320,9 +311,9 @@ def test_obstacles_are_called_by_number_and_shape():
 
 
 def test_the_status_says_that_there_is_no_obstacle():
-    assert _clearance(float(Union().signed_distance(np.zeros((4, 3))).min()), whole_arm=False) == "no obstacle"
+    assert clearance_text(float(Union().signed_distance(np.zeros((4, 3))).min()), whole_arm=False) == "no obstacle"
     report = CollisionReport(NOTHING, None, Nearest(0.034, ("hand",), 4.0))
-    assert _collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
+    assert collision_rows(report, "–")[0] == ("Arm to obstacle", "no obstacle")
 
 
 # --- The learned occupancy ---

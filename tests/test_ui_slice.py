@@ -2,12 +2,11 @@
 
 import io
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from pages import frame_of
+from pages import Bound, frame_of
 from PIL import Image
 from scenes import avoiding, changed
 
@@ -70,7 +69,7 @@ def test_one_thing_at_a_time_has_handles_and_none_in_a_picture(scene):
     for moving in (True, False):
         for each in (picture, obstacles, biases):
             each.adopt(seen(move_slice=moving))
-        assert obstacles.items[0].has_handles is not moving
+        assert obstacles.items[0].handles.shown is not moving
     picture.adopt(seen(move_slice=True))
     with picture.without_handles():
         assert picture.gizmo.opacity == 0 and picture.visible
@@ -88,7 +87,7 @@ def test_arrows_and_streamlines_show_what_they_are_given(scene):
     shown = frame(pictures=Pictures(field=FieldPicture(points, velocities), streamlines=(line, line + 1.0)))
     arrows.draw(shown)
     streams.draw(shown)
-    np.testing.assert_allclose(arrows._arrows.node.points.mean(axis=1), points, atol=1e-6)
+    np.testing.assert_allclose(arrows.arrows.node.points.mean(axis=1), points, atol=1e-6)
     np.testing.assert_allclose(streams.lines.node.points[:6, 0], line[:-1], atol=1e-6)
     heads = streams.heads.node.points
     assert len(heads) == 2
@@ -229,38 +228,31 @@ def test_a_saved_picture_is_white_behind_or_transparent():
 
 @pytest.fixture
 def opened(server):
-    controls = {}
-
-    def bind(handle, read, change):
-        controls[handle.label] = SimpleNamespace(handle=handle, read=read, change=change)
-
-    panel, session = SlicePanel(server.gui, bind), SimpleNamespace(scenario=SCENARIO)
-    session.edit = lambda _name, **changes: setattr(session, "scenario", replace(session.scenario, **changes))
-    panel.connect(cast(Any, session))
-    return panel, session, controls
+    bound = Bound(SCENARIO)
+    yield SlicePanel(server.gui, bound), bound
+    server.gui.reset()
 
 
 def test_the_colour_is_one_choice(opened):
-    _, _, controls = opened
-    colour = controls["Colour"]
+    _, bound = opened
     for name in ("None", "det J", "Lyapunov value", "Learned occupancy"):
-        scenario = replace(SCENARIO, **colour.change(SCENARIO, name))
-        assert colour.read(scenario) == name
-    assert controls["Move the slice"].change(SCENARIO, True)["view"] == View(move_slice=True)
+        bound.set("Colour", name)
+        assert bound["Colour"].read(bound.edited.scenario) == name
+    assert bound["Move the slice"].change(SCENARIO, True)["view"] == View(move_slice=True)
 
 
 def test_the_panel_says_what_the_colours_mean_and_what_is_not_in_them(opened):
-    panel, _, _ = opened
-    panel.adopt(SCENARIO)
+    panel, bound = opened
+    bound.adopt(SCENARIO)
     assert not (panel.key.visible or panel.note.visible or panel.back.visible)
-    panel.adopt(seen(colour="det", slice=POSE))
-    panel.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))
+    bound.adopt(seen(colour="det", slice=POSE))
+    bound.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))
     assert panel.key.visible and "det J" in panel.key.content and panel.back.visible
-    panel.adopt(seen(colour="occupancy"))
-    panel.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))  # on its way when another was chosen
+    bound.adopt(seen(colour="occupancy"))
+    bound.report(frame(pictures=Pictures(colour=picture_of(np.ones((4, 5))))))  # on its way when another was chosen
     assert panel.legend == OCCUPANCY and "Learned occupancy" in panel.key.content
-    panel.adopt(changed(SCENARIO, space="cspace"))
+    bound.adopt(changed(SCENARIO, space="cspace"))
     assert panel.note.visible and WHOLE_ARM_NOTE in panel.note.content
     assert panel.legend is None and not panel.key.visible
-    panel.adopt(changed(SCENARIO, space="cspace", avoids=False))
+    bound.adopt(changed(SCENARIO, space="cspace", avoids=False))
     assert not panel.note.visible

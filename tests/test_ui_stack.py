@@ -5,20 +5,17 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from pages import Edited, frame_of
+from pages import Bound, Edited, frame_of
 from scenes import avoiding, beside, biases, changed
 
-from dt_viz.engine.session import Session
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, selected
 from dt_viz.scenario.tasks import POTS, TASKS
 from dt_viz.transforms.bias import BiasPoint
-from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.stack import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, legend_html, rows
-from dt_viz.ui.panel.transform_settings import durations
-from dt_viz.ui.panel.transforms import TransformsPanel
+from dt_viz.ui.panel.stack import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, durations, legend_html, press, rows
+from dt_viz.ui.panel.transforms import add, add_transform_controls, delete
 from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.levels import LevelRollouts
 from dt_viz.ui.scene.pots import Pots, surface
@@ -71,56 +68,58 @@ def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done
 
 @pytest.fixture
 def panel(server):
-    panel, session = StackPanel(server.gui, lambda handle, *_: Control(handle)), Edited(SCENARIO)
-    panel.connect(cast(Session, session))
-    return panel, session
+    bound = Bound(SCENARIO)
+    yield StackPanel(server.gui, bound), bound
+    server.gui.reset()
+
+
+@pytest.fixture
+def session():
+    return cast(Any, Edited(SCENARIO))
 
 
 @pytest.mark.parametrize("name", ["Bias 1", "Bias 2", AVOIDANCE, IMITATION])
-def test_a_row_switches_its_transform_off_and_on_again(panel, name):
-    panel, session = panel
-    panel.press(name, ON)
+def test_a_row_switches_its_transform_off_and_on_again(session, name):
+    press(session, name, ON)
     assert session.scenario != SCENARIO
     row = listed(session.scenario)[name]
     assert row.buttons[0] == OFF and (name == IMITATION or SEE not in row.buttons)
-    panel.press(name, OFF)
+    press(session, name, OFF)
     assert session.scenario == SCENARIO
 
 
-def test_rows_move_their_transform_outwards_and_inwards(panel):
-    panel, session = panel
-    panel.press("Bias 2", "↑")
+def test_rows_move_their_transform_outwards_and_inwards(session):
+    press(session, "Bias 2", "↑")
     assert tuple(layer.name for layer in session.scenario.stack) == ("Bias 1", AVOIDANCE, "Bias 2")
-    panel.press("Bias 1", "↑")
+    press(session, "Bias 1", "↑")
     assert tuple(layer.name for layer in session.scenario.stack) == (AVOIDANCE, "Bias 1", "Bias 2")
-    panel.press(AVOIDANCE, "↑")
-    panel.press(AVOIDANCE, "↑")
+    press(session, AVOIDANCE, "↑")
+    press(session, AVOIDANCE, "↑")
     assert session.scenario == SCENARIO
 
 
-def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(panel):
-    panel, session = panel
+def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(session):
     assert legend_html(SCENARIO) == ""
     for name in (IMITATION, "Bias 1"):
-        panel.press(name, SEE)
+        press(session, name, SEE)
         assert session.scenario.view.level == name
         assert [row.name for row in listed(session.scenario).values() if SEEN in row.buttons] == [name]
     assert "bias 1" in legend_html(session.scenario)
-    panel.press("Bias 1", SEEN)
-    panel.press(BASE, SEE)
+    press(session, "Bias 1", SEEN)
+    press(session, BASE, SEE)
     assert session.scenario.view == View(base=True, tuned="Bias 1")  # and its settings stay in sight
 
 
 def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
-    panel, _ = panel
-    panel.adopt(SCENARIO)
-    panel.report(frame())
-    shown = [handle.label for handle in panel._rows if handle.visible]
+    panel, bound = panel
+    bound.adopt(SCENARIO)
+    bound.report(frame())
+    shown = [handle.label for handle in panel.rows if handle.visible]
     assert shown == ["Avoidance, t 0.40", "Bias 2", "Bias 1, strength 0.80", IMITATION, BASE]
-    panel.adopt(changed(SCENARIO, layers=(), obstacles=()))
-    assert [handle.label for handle in panel._rows if handle.visible] == [IMITATION, BASE]
-    panel.adopt(SCENARIO)
-    assert len(panel._rows) == 5
+    bound.adopt(changed(SCENARIO, layers=(), obstacles=()))
+    assert [handle.label for handle in panel.rows if handle.visible] == [IMITATION, BASE]
+    bound.adopt(SCENARIO)
+    assert len(panel.rows) == 5
 
 
 def test_the_selected_level_is_drawn_and_named(scene):
@@ -146,8 +145,8 @@ def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
     seen = replace(SCENARIO, view=View(level="Bias 2"))
     for goal, marked in ((2.0, False), (2.1, True), (2.0, False)):
         picture.draw(frame(seen, level=2, goal=np.full(3, goal)))
-        assert picture._end.visible == marked
-        np.testing.assert_array_equal(picture._end.position, np.full(3, 2.0))
+        assert picture.end.visible == marked
+        np.testing.assert_array_equal(picture.end.position, np.full(3, 2.0))
 
 
 # --- Bias points ---
@@ -176,37 +175,28 @@ def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(
     assert not any(item.gizmo.visible for item in picture.items)
 
 
-def transforms_panel(gui, bind=lambda handle, *_: Control(handle)):
-    return TransformsPanel(gui, bind, later=lambda work: work())
-
-
-def test_bias_points_are_added_changed_and_deleted(server):
-    panel, session = transforms_panel(server.gui), Edited(changed(SCENARIO, layers=()))
-    panel.connect(cast(Session, session))
+def test_bias_points_are_added_changed_and_deleted():
+    session: Any = Edited(changed(SCENARIO, layers=()))
     for _ in range(BiasPoint.most + 1):
-        panel.adopt(session.scenario)
-        panel.add(BiasPoint)
+        add(session, BiasPoint)
     points = anchored(session.scenario)
     assert len(points) == BiasPoint.most
     assert selected(session.scenario) == list(points)[-1]
-    panel.adopt(session.scenario)
     session.edit("select", view=View(bias="Bias 2"))
-    panel.delete()
+    delete(session)
     assert list(anchored(session.scenario)) == ["Bias 1", "Bias 3", "Bias 4"]
     for _ in range(4):
-        panel.delete()
-        panel.adopt(session.scenario)
+        delete(session)
     assert beside(session.scenario) == ()
 
 
 def test_the_panel_shows_what_auto_chose(server):
-    controls = []
-    panel = transforms_panel(server.gui, lambda handle, *_: controls.append(Control(handle)) or controls[-1])
-    panel.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
-    panel.report(frame())
-    shown = {control.handle.label: control for control in controls if control.handle.visible}
-    assert shown["Radius [cm]"].value == 20.0
-    assert shown["Radius [cm]"].handle.disabled
+    bound = Bound(SCENARIO)
+    add_transform_controls(server.gui, bound, later=lambda work: work())
+    bound.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
+    bound.report(frame())
+    radius = bound["Radius [cm]"].control
+    assert radius.value == 20.0 and radius.handle.disabled
 
 
 # --- Pots ---

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from pages import frame_of
+from pages import Bound, frame_of
 from scenes import avoiding, biases, changing
 
 from dt_viz.arm.collision import CollisionReport, Nearest
@@ -19,10 +19,9 @@ from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, anchored
 from dt_viz.transforms.bias import BiasPoint
-from dt_viz.ui.controls import Control
 from dt_viz.ui.panel import warp as warp_module
-from dt_viz.ui.panel.panel import status_html
-from dt_viz.ui.panel.transform_settings import TransformSettings, learned_html
+from dt_viz.ui.panel.status import status_html
+from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
 from dt_viz.ui.panel.warp import WarpPlayer
 from dt_viz.warning import Kind
 
@@ -39,41 +38,25 @@ def frame(scenario=SCENARIO, **changes):
     return frame_of(scenario, **(given | changes))
 
 
-class Controls:
-    """The settings, and what was bound, by label; it acts on a scenario as the panel does."""
-
-    def __init__(self, gui):
-        self.bound: dict[str, Any] = {}
-        self.scenario = SCENARIO
-        self.settings = TransformSettings(gui, self.bind, 0)
-        self.adopt(SCENARIO)
-
-    def bind(self, handle, read, change):
-        control = Control(handle)
-        self.bound[handle.label] = control, read, change
-        return control
-
-    def adopt(self, scenario):
-        self.scenario = scenario
-        self.settings.adopt(scenario)
-        for control, read, _ in self.bound.values():
-            control.value = read(scenario)
-
-    def set(self, label, value):
-        self.adopt(replace(self.scenario, **self.bound[label][2](self.scenario, value)))
-
-    @property
-    def visible(self):
-        return {control.handle.label for control, *_ in self.bound.values() if control.handle.visible}
-
-    def value(self, label):
-        return self.bound[label][0].value
+@pytest.fixture
+def notes():
+    """HTML elements of the settings."""
+    return []
 
 
 @pytest.fixture
-def controls(server):
-    yield Controls(server.gui)
+def controls(server, notes, monkeypatch):
+    add_html = server.gui.add_html
+    monkeypatch.setattr(server.gui, "add_html", lambda *what, **how: notes.append(add_html(*what, **how)) or notes[-1])
+    bound = Bound(SCENARIO)
+    add_transform_settings(server.gui, bound, 0)
+    bound.adopt(SCENARIO)
+    yield bound
     server.gui.reset()
+
+
+def visible(bound):
+    return {item.control.handle.label for item in bound.inputs(visible=True)}
 
 
 STRENGTH = {"Settings of", "Strength: auto", "Strength t", "Integrator"}
@@ -81,50 +64,52 @@ FLOW = {"Settings of", "Flow time: auto", "Flow time t", "Integrator"}
 
 
 def test_only_what_the_chosen_transform_has_is_shown(controls):
-    assert controls.visible == FLOW | {"Avoid with", "Generator", "Reach T"}  # the outermost is the avoidance
+    assert visible(controls) == FLOW | {"Avoid with", "Generator", "Reach T"}  # the outermost is the avoidance
     controls.set("Settings of", "Bias 1")
-    assert controls.visible == STRENGTH  # as the paper calls the t of a bias point
+    assert visible(controls) == STRENGTH  # as the paper calls the t of a bias point
     controls.set("Integrator", "Euler (the paper's)")
-    assert controls.visible == STRENGTH | {"Steps"}
+    assert visible(controls) == STRENGTH | {"Steps"}
     controls.set("Settings of", AVOIDANCE)
-    assert controls.visible == FLOW | {"Avoid with", "Generator", "Reach T"}
+    assert visible(controls) == FLOW | {"Avoid with", "Generator", "Reach T"}
     controls.set("Settings of", IMITATION)
-    assert controls.visible == {"Settings of", "Learn"}
-    assert controls.settings._note.visible
+    assert visible(controls) == {"Settings of", "Learn"}
 
 
 def test_settings_change_the_transform_that_they_are_shown_for(controls):
     controls.set("Settings of", "Bias 1")
     controls.set("Integrator", "Euler (the paper's)")
     controls.set("Steps", 3)
-    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).integration == Integration("euler", 3)
-    assert controls.scenario.avoidance == SCENARIO.avoidance
+    assert cast(BiasPoint, anchored(controls.edited.scenario)["Bias 1"]).integration == Integration("euler", 3)
+    assert controls.edited.scenario.avoidance == SCENARIO.avoidance
     controls.set("Settings of", AVOIDANCE)
-    assert (controls.value("Integrator"), controls.value("Steps")) == ("auto", 8)
+    assert (controls["Integrator"].control.value, controls.inputs("Steps", visible=True)) == ("auto", [])
     controls.set("Reach T", 9.0)
-    assert controls.scenario.avoidance.temperature == 9.0
+    assert controls.edited.scenario.avoidance.temperature == 9.0
 
 
 def test_a_duration_by_hand_goes_on_from_what_auto_chose(controls):
     for name, label, chosen in ((AVOIDANCE, "Flow time", 0.4), ("Bias 1", "Strength", 0.8)):
         controls.set("Settings of", name)
-        controls.settings.report(frame(controls.scenario))
-        slider = controls.bound[f"{label} t"][0]
+        controls.report(frame(controls.edited.scenario))
+        slider, before = controls[f"{label} t"].control, controls.edited.scenario
         assert slider.handle.disabled and slider.value == chosen
-        assert controls.bound[f"{label} t"][2](controls.scenario, 1.5) == {}  # it is `auto` that chooses
+        controls.set(f"{label} t", 1.5)
+        assert controls.edited.scenario == before  # it is `auto` that chooses
         controls.set(f"{label}: auto", False)
         assert not slider.handle.disabled and slider.value == chosen
         controls.set(f"{label} t", 1.5)
-    assert controls.scenario.avoidance.duration == 1.5
-    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).strength == 1.5
+    assert controls.edited.scenario.avoidance.duration == 1.5
+    assert cast(BiasPoint, anchored(controls.edited.scenario)["Bias 1"]).strength == 1.5
     controls.set("Strength: auto", True)
-    assert cast(BiasPoint, anchored(controls.scenario)["Bias 1"]).strength is None
+    assert cast(BiasPoint, anchored(controls.edited.scenario)["Bias 1"]).strength is None
 
 
-def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choose(controls):
-    controls.settings.report(frame())
-    assert "3 flows of 4 Euler steps" in controls.settings._note.content
-    assert "nothing to choose" in controls.settings._note.content
+def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choose(controls, notes):
+    (note,) = notes
+    controls.report(frame())
+    assert not note.visible
+    controls.set("Settings of", IMITATION)
+    assert note.visible and "3 flows of 4 Euler steps" in note.content and "nothing to choose" in note.content
     assert "One flow of 12 Euler steps" in learned_html((12,))
     assert "straight" in learned_html(())
 

@@ -115,7 +115,7 @@ def test_what_auto_chose_for_the_full_stack_stays_and_is_worked_out_once(new_eng
     assert len(solved) == 3
 
 
-def test_where_the_warp_passes_through_the_obstacle_that_is_told_and_not_doubted(engine):
+def test_a_warp_through_the_obstacle_is_told_and_not_warned_of(engine):
     for space in ("task", "cspace"):
         scenario = changed(stacked(engine, "draw_s", space=space, warp=0.1), layers=())
         *_, frame = engine.frames(scenario)

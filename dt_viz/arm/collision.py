@@ -89,7 +89,7 @@ class CollisionReport:
 
     @property
     def warnings(self) -> tuple[MotionWarning, ...]:
-        """What is wrong."""
+        """Warnings about collisions and small distances."""
         found = []
         if self.depth > 0:
             text = f"{self.obstacle.links[0]} enters the obstacle by {1e3 * self.depth:.0f} mm"

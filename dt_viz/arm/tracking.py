@@ -26,7 +26,7 @@ DIRECTION_WEIGHT = 1.5
 """Weight w_d of the hand's direction (unit vectors) against joint angles (rad). Much above 2, the best posture stops
 being unique and tracked joints jump between wrist postures."""
 ASKED_DIRECTION_WEIGHT = 40.0
-"""That weight where inverse kinematics is given a direction: it chooses one posture and need not be continuous."""
+"""Weight w_d where inverse kinematics is given a direction: it chooses one posture and need not be continuous."""
 LIMIT_WEIGHT = 50.0
 """Weight of the springs before the joint limits, against 1 for staying near the reference."""
 LIMIT_MARGIN = 0.15

@@ -50,7 +50,7 @@ class Source:
 
     path: Path
     demonstrations: tuple[Demonstration, ...]
-    """In metres."""
+    """Demonstrations in metres."""
     unit: float
     """Metres for one unit of the file."""
 

@@ -1,1 +1,1 @@
-"""From demonstrations to a stable motion."""
+"""Learning of stable motions from demonstrations."""

@@ -57,7 +57,7 @@ class Demonstration:
     Attributes:
         times: shape ``(T,)``, seconds, strictly increasing from 0.
         positions: shape ``(T, d)``, metres, d is 2 or 3, in the frame of the task.
-        name: what to call it in the page and in messages.
+        name: name on the page and in messages.
     """
 
     times: np.ndarray

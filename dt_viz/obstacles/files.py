@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
-from dt_viz.files.checks import check_at_most, checked_suffix, read_bytes, real_numbers
+from dt_viz.files.checks import check_at_most, checked_suffix, real_numbers
 from dt_viz.files.glb import read_glb
 from dt_viz.files.meshes import read_obj, read_stl
 from dt_viz.files.npz import NpzFile
@@ -96,20 +96,6 @@ class LoadedCloud:
     """Descriptions, for the page, of what was left out."""
 
 
-def load_mesh(path: str | Path, *, scale: float = 1.0) -> LoadedMesh:
-    """Read a closed mesh from a file.
-
-    Args:
-        path: an STL, OBJ, PLY or GLB file.
-        scale: metres for one unit of the file.
-
-    Raises:
-        ShapeError: there is no such file, it cannot be read, is not what its suffix says, or holds no closed mesh of
-            a sensible size. Nothing else is raised, whatever the file holds.
-    """
-    return read_mesh(_content(path), path, scale=scale)
-
-
 def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> LoadedMesh:
     """Read a closed mesh from the bytes of a file, such as one uploaded from the browser.
 
@@ -119,7 +105,8 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> Load
         scale: metres for one unit of the file.
 
     Raises:
-        ShapeError: as :func:`load_mesh`.
+        ShapeError: the file is not what its suffix says, or holds no closed mesh of a sensible size. Nothing else is
+            raised, whatever the file holds.
     """
     source = Path(source)
     suffix = _suffix(content, source, MESH_SUFFIXES, scale)
@@ -145,20 +132,6 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> Load
     return LoadedMesh(solid, source.stem, notes)
 
 
-def load_cloud(path: str | Path, *, scale: float = 1.0) -> LoadedCloud:
-    """Read a point cloud from a file.
-
-    Args:
-        path: a PLY, npz or CSV file; see the module's docstring.
-        scale: metres for one unit of the file.
-
-    Raises:
-        ShapeError: there is no such file, it cannot be read, is not what its suffix says, or holds no points that
-            make a solid of a sensible size. Nothing else is raised, whatever the file holds.
-    """
-    return read_cloud(_content(path), path, scale=scale)
-
-
 def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> LoadedCloud:
     """Read a point cloud from the bytes of a file, such as one uploaded from the browser.
 
@@ -168,7 +141,8 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
         scale: metres for one unit of the file.
 
     Raises:
-        ShapeError: as :func:`load_cloud`.
+        ShapeError: the file is not what its suffix says, or holds no points that make a solid of a sensible size.
+            Nothing else is raised, whatever the file holds.
     """
     source = Path(source)
     suffix = _suffix(content, source, CLOUD_SUFFIXES, scale)
@@ -192,11 +166,6 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
     if not depth > 0:
         raise ShapeError(source, "points", "nothing that has an inside", "points that something occupies")
     return LoadedCloud(cloud, source.stem, tuple(notes))
-
-
-def _content(path: str | Path) -> bytes:
-    with parsing(ShapeError, path, "path", "a readable file"):
-        return read_bytes(Path(path), MAX_BYTES)
 
 
 def _suffix(content: bytes, source: Path, accepted: tuple[str, ...], scale: float) -> str:

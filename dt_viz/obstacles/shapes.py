@@ -56,6 +56,12 @@ def as_point(v: Array) -> Point:
     return x, y, z
 
 
+def as_quaternion(v: Array) -> Quaternion:
+    """Convert an array (4,) to a tuple."""
+    w, x, y, z = (float(c) for c in v)
+    return w, x, y, z
+
+
 class Obstacle(Protocol):
     """A solid somewhere in the world: an immutable value, cheap to move."""
 

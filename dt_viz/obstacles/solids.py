@@ -15,16 +15,11 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
+from trimesh.triangles import closest_point
 
 from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.triangles import (
-    check_triangles,
-    closest_on_triangles,
-    grid_nodes,
-    inside_of_grid,
-    surface_samples,
-)
+from dt_viz.obstacles.triangles import check_triangles, grid_nodes, inside_of_grid, surface_samples
 from dt_viz.properties import cached_property
 
 SMALLEST = 1e-9
@@ -251,7 +246,7 @@ class _Surface:
         """Find the triangles (N,) nearest to points `s` (N, 3), and the points (N, 3) on them."""
         _, found = self._tree.query(s, k=min(NUM_NEAREST, self._tree.n))
         owners = self._owner[np.reshape(found, (len(s), -1))]  # (N, K)
-        points = np.stack([closest_on_triangles(s, self._triangles[owner]) for owner in owners.T], axis=1)
+        points = np.stack([closest_point(self._triangles[owner], s) for owner in owners.T], axis=1)
         best = np.arange(len(s)), ((points - s[:, None]) ** 2).sum(axis=2).argmin(axis=1)
         return owners[best], points[best]
 
@@ -272,7 +267,7 @@ class _Surface:
         owner, points = owner[tuple(to)], points[tuple(to)]
         for _ in range(NUM_ROUNDS):
             _hand_on(owner, points, nodes.reshape(*shape, 3))
-            points = closest_on_triangles(nodes, self._triangles[owner.ravel()]).reshape(*shape, 3)
+            points = closest_point(self._triangles[owner.ravel()], nodes).reshape(*shape, 3)
             self._walk(owner.reshape(-1), points.reshape(-1, 3), nodes, WALK_CELLS * cell)
         return np.linalg.norm(points - nodes.reshape(*shape, 3), axis=-1)
 
@@ -291,7 +286,7 @@ class _Surface:
         far = np.flatnonzero(step**2 > 1e-4 * squared)
         aside *= (WALK * np.minimum(1, longest / np.maximum(step, 1e-300)))[:, None]
         new = self._owner[self._tree.query(points[far] + aside[far])[1]]
-        reached = closest_on_triangles(nodes[far], self._triangles[new])
+        reached = closest_point(self._triangles[new], nodes[far])
         nearer = ((reached - nodes[far]) ** 2).sum(axis=1) < squared[far]
         owner[far[nearer]], points[far[nearer]] = new[nearer], reached[nearer]
 

@@ -28,37 +28,6 @@ def check_triangles(vertices: Array, faces: Indices) -> None:
     check_finite(vertices, "vertices", lambda row: f"in vertex {row + 1}")
 
 
-def closest_on_triangles(s: Array, triangles: Array) -> Array:
-    """Find the point (N, 3) of each triangle (N, 3, 3) nearest to its point `s` (N, 3) (Ericson, 2005, 5.1.5)."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    ab, ac = b - a, c - a
-    pa, pb, pc = s - a, s - b, s - c
-
-    def dot(u: Array, v: Array) -> Array:
-        return np.einsum("ij,ij->i", u, v)
-
-    d1, d2, d3, d4, d5, d6 = dot(ab, pa), dot(ac, pa), dot(ab, pb), dot(ac, pb), dot(ab, pc), dot(ac, pc)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        total = va + vb + vc
-        v, w = vb / total, vc / total
-        on_bc = (va <= 0) & (d4 >= d3) & (d5 >= d6)
-        t = np.nan_to_num((d4 - d3) / ((d4 - d3) + (d5 - d6)))
-        v, w = np.where(on_bc, 1 - t, v), np.where(on_bc, t, w)
-        on_ac = (vb <= 0) & (d2 >= 0) & (d6 <= 0)
-        v, w = np.where(on_ac, 0, v), np.where(on_ac, np.nan_to_num(d2 / (d2 - d6)), w)
-        on_ab = (vc <= 0) & (d1 >= 0) & (d3 <= 0)
-        v, w = np.where(on_ab, np.nan_to_num(d1 / (d1 - d3)), v), np.where(on_ab, 0, w)
-    for corner, at in (
-        ((d6 >= 0) & (d5 <= d6), (0, 1)),
-        ((d3 >= 0) & (d4 <= d3), (1, 0)),
-        ((d1 <= 0) & (d2 <= 0), (0, 0)),
-    ):
-        v, w = np.where(corner, at[0], v), np.where(corner, at[1], w)
-    v, w = np.nan_to_num(v), np.nan_to_num(w)  # a triangle without area
-    return a + v[:, None] * ab + w[:, None] * ac
-
-
 def surface_samples(triangles: Array, spacing: float) -> tuple[Array, Indices]:
     """Spread points over triangles (F, 3, 3), about `spacing` apart, at least one on each; also return their owners."""
     longest = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).argmax(axis=1)

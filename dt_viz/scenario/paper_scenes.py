@@ -20,30 +20,30 @@ from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
 
 BOTTLE = (0.07, 0.24)
-"""Diameter and height, metres."""
+"""Diameter and height of the bottle, metres."""
 CUBE = 0.10
-"""Edge, metres."""
+"""Edge of the cube, metres."""
 CLOVER_RADIUS, CLOVER_THICKNESS = 0.06, 0.06
-"""Mean radius and half the thickness, metres."""
+"""Mean radius and half the thickness of the clover, metres."""
 CLOVER_LOBES = 0.4
-"""How far its three lobes stand out, relative to the mean radius."""
+"""Height of the clover's three lobes, relative to the mean radius."""
 NUM_LABELS = 4000
-"""Of the clover."""
+"""Number of labelled points of the clover."""
 STROKE_SPHERE = 0.10
 """Diameter of the sphere in the strokes of fig. 5, metres."""
 STROKE_TEMPERATURE = 2.0
-"""There: its field ends soon, so that the rest of the letter stays."""
+"""T of that sphere: its field ends soon, so that the rest of the letter stays."""
 STROKE_PLACES = {"draw_w": 0.20}
-"""Where it stands, as a fraction of the letter's length, if not where the task has its obstacle: in the middle of the W
-the arm would have to give way to it along the other strokes, too."""
+"""Places of that sphere, as fractions of the letter's length, other than the task's obstacle position: in the middle of
+the W the arm would have to give way to it along the other strokes, too."""
 J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
-"""Of the two points beside the J: fraction of its length, and metres to the right and up as seen from the front."""
+"""Places of the two points beside the J: fraction of its length, and offset to the right and up, metres."""
 ARM_ONLY = {"field": False}
-"""Where only the whole arm gives way: the vector field is the hand's, and goes through the obstacle."""
+"""View of scenes where only the whole arm gives way: the hand's vector field leads through the obstacle."""
 HAND_ONLY = {"arm": False}
-"""Where only the path of the hand gives way: the fingers would be in the obstacle."""
+"""View of scenes where only the path of the hand gives way: the fingers would be in the obstacle."""
 ABOVE = 0.16
-"""Metres over a pot's opening where the object is let go, as the demonstrations do over the centre pot."""
+"""Height over a pot's opening at which the object is released, metres, as in the demonstrations."""
 
 
 @dataclass(frozen=True)
@@ -53,19 +53,19 @@ class PaperScene:
     name: str
     title: str
     line: str
-    """What to see."""
+    """Line that says what to see."""
     task: str
     """Name of its task."""
     make: Callable[[Task], Scenario]
     view: Mapping[str, Any] = field(default_factory=dict)
-    """What is to be seen of it: fields of `View`."""
+    """Fields of `View` that differ from the defaults."""
 
     def scenario(self, task: Task) -> Scenario:
-        """The scenario for its task."""
+        """Return the scenario for its task."""
         return replace(self.make(task), scene=self.name, view=replace(View(), **self.view))
 
     def is_changed(self, scenario: Scenario, task: Task) -> bool:
-        """Whether obstacles, layers or how they act are not the scene's any more."""
+        """Return whether the stack differs from the scene's own."""
         own, followed = _own(self.name, task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
         return not scenario.moves_like(replace(own, warp=scenario.warp, **followed))
 
@@ -93,7 +93,7 @@ def _cube_in_the_letter(task: Task) -> Scenario:
 
 
 def in_clover(s: Array) -> Mask:
-    """Whether the points `s` (N, 3), metres, lie in a clover of three leaves around the y axis: smooth, not convex."""
+    """Return whether points `s` (N, 3), metres, lie in a clover of three leaves around the y axis, which is smooth."""
     turn = np.arctan2(s[:, 2], s[:, 0])
     radius = CLOVER_RADIUS * (1 + CLOVER_LOBES * np.cos(3 * turn))
     return (s[:, 0] ** 2 + s[:, 2] ** 2) / radius**2 + (s[:, 1] / CLOVER_THICKNESS) ** 2 < 1
@@ -101,7 +101,7 @@ def in_clover(s: Array) -> Mask:
 
 @lru_cache(maxsize=1)
 def clover() -> Cloud:
-    """Points labelled by whether they lie in a clover: all that is known of it."""
+    """Return points labelled by whether they lie in the clover."""
     half = np.array([1 + CLOVER_LOBES, 0, 1 + CLOVER_LOBES]) * CLOVER_RADIUS + [0, CLOVER_THICKNESS, 0]
     return Cloud(*sample_labels(in_clover, -half, half, NUM_LABELS, np.random.default_rng(0)))
 
@@ -127,7 +127,7 @@ def _two_points(task: Task) -> Scenario:
 
 
 def release(pot: Pot) -> Point:
-    """Where an object that is to fall into this pot is let go, metres."""
+    """Return the place where an object is released to fall into this pot, metres."""
     x, y, z = pot.opening
     return x, y, z + ABOVE
 
@@ -171,7 +171,7 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "cloud",
             "Fig. 3 (b): labelled points in the S",
-            "All that is known of the clover: which points lie in it (dark). Strokes leave what is learned from them.",
+            "Known of the clover is only which points lie in it (dark). Strokes leave the occupancy learned from them.",
             "draw_s",
             _cloud_in_the_letter,
             view=HAND_ONLY | {"colour": "occupancy", "field": False, "demonstrations": False},
@@ -209,10 +209,10 @@ SCENES: Mapping[str, PaperScene] = {
         ),
     )
 }
-"""By name, in the order of the figures."""
+"""Scenes by name, in the order of the figures."""
 
 
 @lru_cache(maxsize=64)
 def _own(name: str, task: Task) -> Scenario:
-    """The scenario of a scene; a page asks for it with each frame."""
+    """Return the scenario of a scene; a page asks for it with each frame."""
     return SCENES[name].scenario(task)

@@ -13,18 +13,17 @@ from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import ArmAvoidance, Transform
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
-"""What is shown as colour on the slice: det J of the stack, its Lyapunov value, or what the occupancy maps believe."""
+"""Quantity shown as colour on the slice: det J of the stack, its Lyapunov value, or the learned occupancy."""
 SLICE_COLOURS: tuple[SliceColour, ...] = ("none", "det", "lyapunov", "occupancy")
 
 MIN_DIAMETER, MAX_DIAMETER = 0.04, 0.30
-"""Metres."""
+"""Smallest and largest diameter of an obstacle, metres."""
 MAX_OBSTACLES = 5
-"""In the page: each costs time while a hand moves."""
+"""Largest number of obstacles on the page; each costs time during a drag."""
 MAX_STARTS = 36
-"""Added ones, in the page."""
+"""Largest number of added starts on the page."""
 MAX_MARGIN = 0.05
-"""Metres."""
-
+"""Largest margin, metres."""
 
 COMPUTED_VIEWS = ("field", "streamlines", "generator", "grid", "base", "health_plots")
 """Fields of `View` whose pictures are computed only while they are shown."""
@@ -32,7 +31,7 @@ COMPUTED_VIEWS = ("field", "streamlines", "generator", "grid", "base", "health_p
 
 @dataclass(frozen=True)
 class View:
-    """How a result is looked at; changing it moves nothing. Pictures that are computed are so only while shown."""
+    """View of a result; changing it moves nothing. Pictures of `COMPUTED_VIEWS` are computed only while shown."""
 
     demonstrations: bool = True
     rollouts: bool = True
@@ -43,9 +42,9 @@ class View:
     streamlines: bool = False
     """Motions through places all over the slice."""
     slice: SlicePose | None = None
-    """Where the slice lies; None is where the task has it."""
+    """Pose of the slice; None is the task's."""
     move_slice: bool = False
-    """Whether the slice has handles, instead of what else may have some."""
+    """Whether the slice has handles, instead of obstacles and bias points."""
     colour: SliceColour = "none"
     arm: bool = True
     ghost_arm: bool = False
@@ -60,11 +59,11 @@ class View:
     """Lyapunov value, distance to the demonstration and clearance along the rollout that the arm follows."""
     table: bool = True
     selected: int = 0
-    """The obstacle that has handles; the last one if there are fewer."""
+    """Number of the obstacle that has handles; if there are fewer, the last one has."""
     generator: bool = False
     """Arrows of the learned generator, the vector field whose flow is ψ."""
     generator_layer: int = 0
-    """Which of the flows that ψ is composed of; 1 is what ψ applies first, 0 their mean over time."""
+    """Number of the flow of ψ that is shown: 1 is applied first; 0 is the mean of all over time."""
     grid: bool = False
     """The warped grid: lines of base space seen through ψ⁻¹."""
     base: bool = False
@@ -74,14 +73,14 @@ class View:
     playing: bool = True
     """Whether the arm moves along its rollout."""
     speed: float = 1.0
-    """Of the playback, times real time."""
+    """Speed of the playback, relative to real time."""
     bias: str = ""
     """Name of the bias point that the panel changes and that has the handles."""
     tuned: str = ""
     """Name of the transform of the stack whose settings the panel shows; the outermost if empty."""
     level: str = ""
-    """Name of the level of the stack whose manifold is shown: its rollouts beside those of the whole stack, and all
-    that lies on the slice. The whole stack if empty."""
+    """Name of the level of the stack whose rollouts are shown beside those of the whole stack, and whose pictures are
+    on the slice; the whole stack if empty."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ class Layer:
     transform: Transform
     on: bool = True
     name: str = ""
-    """Name on the page, which no other layer of the stack has."""
+    """Name on the page, unique in the stack."""
 
 
 AVOIDING = (Layer(Avoidance(), name=Avoidance.title),)
@@ -100,7 +99,7 @@ AVOIDING = (Layer(Avoidance(), name=Avoidance.title),)
 
 @dataclass(frozen=True)
 class Scenario:
-    """All that a picture depends on: the same scenario always gives the same frame."""
+    """All choices that a frame depends on: equal scenarios give equal frames."""
 
     task: str
     stack: tuple[Layer, ...] = AVOIDING
@@ -115,7 +114,7 @@ class Scenario:
     arm_rollout: int = 0
     """Number of the rollout that the arm follows: those from the task's starts come first, then those from `starts`."""
     scene: str = ""
-    """Name of the scene of the paper that it began as, if any."""
+    """Name of the paper's scene that it began as, if any."""
     view: View = field(default_factory=View)
 
     @property
@@ -130,9 +129,9 @@ class Scenario:
 
     @property
     def arm_avoidance(self) -> ArmAvoidance | None:
-        """What the whole arm avoids in configuration space; None where only the end effector gives way.
+        """Avoidance by the whole arm in configuration space; None where only the end effector gives way.
 
-        Where several layers ask for it, all their obstacles are avoided, in the way of the outermost.
+        Where several layers ask for one, all their obstacles are avoided, with the settings of the outermost.
         """
         asked = [layer.transform.arm_avoidance for layer in self.stack if layer.on]
         avoidances = [avoidance for avoidance in asked if avoidance is not None]
@@ -172,19 +171,19 @@ class Scenario:
         return replace(self, view=View(), arm_rollout=0, scene="")
 
     def moves_like(self, other: Scenario) -> bool:
-        """Whether both give the same motion, however it is looked at."""
+        """Return whether both give the same motion, however it is viewed."""
         return replace(self, view=other.view) == other
 
     def learns_like(self, other: Scenario) -> bool:
-        """Whether both need the same fit."""
+        """Return whether both need the same fit."""
         return (self.task, self.objective) == (other.task, other.objective)
 
     def begins_like(self, other: Scenario) -> bool:
-        """Whether both are of one task, learned likewise, and of one scene: the others are small steps away."""
+        """Return whether both have the same task, fit and scene, so that one is a small edit of the other."""
         return self.learns_like(other) and self.scene == other.scene
 
     def computes_like(self, other: Scenario) -> bool:
-        """Whether a frame of `other` holds all that this needs."""
+        """Return whether a frame of `other` holds all that this scenario needs."""
         before, after = other.view, self.view
         shows_no_more = all(getattr(before, name) or not getattr(after, name) for name in COMPUTED_VIEWS)
         same_layer = not after.generator or after.generator_layer == before.generator_layer

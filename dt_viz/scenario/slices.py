@@ -8,17 +8,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import Point, Quaternion, rotation
+from dt_viz.obstacles.shapes import Point, Quaternion, as_point, as_quaternion, rotation
 
 
 @dataclass(frozen=True)
 class SlicePose:
-    """Where a slice lies: a value, whatever the size of the slice."""
+    """Pose of a slice, whatever its size."""
 
     position: Point
-    """Of its centre, metres."""
+    """Position of the centre, metres."""
     wxyz: Quaternion
-    """Turns x, y and z into its first axis, its second axis and its normal."""
+    """Quaternion that turns x, y and z into its first axis, second axis and normal."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Slice:
     """The rectangle on which a picture of the vector field is drawn."""
 
     centre: Array
-    """(3,), metres."""
+    """(3,) centre, metres."""
     axes: Array
     """(3, 2) orthonormal columns."""
     half_size: tuple[float, float]
-    """Metres."""
+    """Half the sizes along the axes, metres."""
 
     @property
     def normal(self) -> Array:
@@ -39,20 +39,19 @@ class Slice:
 
     @property
     def pose(self) -> SlicePose:
-        """Where it lies."""
-        x, y, z = (float(c) for c in self.centre)
+        """Pose of the slice."""
         frame = np.column_stack([self.axes, self.normal])
-        i, j, k, w = (float(c) for c in Rotation.from_matrix(frame).as_quat())
-        return SlicePose((x, y, z), (w, i, j, k))
+        wxyz = np.roll(Rotation.from_matrix(frame).as_quat(), 1)
+        return SlicePose(as_point(self.centre), as_quaternion(wxyz))
 
     def posed(self, pose: SlicePose | None) -> Slice:
-        """This rectangle elsewhere; None leaves it where it is."""
+        """Return this rectangle at another pose; None leaves it where it is."""
         if pose is None:
             return self
         return replace(self, centre=np.array(pose.position), axes=rotation(pose.wxyz)[:, :2])
 
     def lies_like(self, other: Slice) -> bool:
-        """Whether both are the same rectangle."""
+        """Return whether both are the same rectangle."""
         same_place = np.array_equal(self.centre, other.centre) and np.array_equal(self.axes, other.axes)
         return same_place and self.half_size == other.half_size
 
@@ -80,7 +79,7 @@ class Slice:
 
 
 def level_line(points: Array, values: Array) -> Array:
-    """Where a function that is linear between lattice points is zero.
+    """Find the zero lines of a function that is linear between lattice points.
 
     Args:
         points: (n, m, 3) of the lattice.

@@ -15,26 +15,26 @@ from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import Surroundings, Transform
 
 IMITATION, WHOLE_ARM = "Imitation", "Whole arm"
-"""Names of the transforms below and above the stack: what was learned, and the avoidance in configuration space."""
+"""Names of the transforms below and above the stack: the learned one, and the avoidance in configuration space."""
 
 Stack = tuple[Layer, ...]
 
 
 def place_of(scenario: Scenario, name: str) -> int | None:
-    """Place in the stack of the layer of this name, and of the one whose obstacles the whole arm avoids."""
+    """Return the place in the stack of the layer of this name; `WHOLE_ARM` is the layer of the page's obstacles."""
     if name == WHOLE_ARM:
         name = avoidance_layer(scenario).name
     return next((k for k, layer in enumerate(scenario.stack) if layer.name == name), None)
 
 
 def avoidance_layer(scenario: Scenario) -> Layer:
-    """The layer that the page's obstacles belong to; one that is off and has none if the stack has no such layer."""
+    """Return the layer that the page's obstacles belong to; without one, an empty layer that is off."""
     none = Layer(scenario.avoidance, on=False, name=Avoidance.title)
     return next((layer for layer in scenario.stack if layer.transform is scenario.avoidance), none)
 
 
 def transform_of(scenario: Scenario, name: str) -> Transform | None:
-    """The transform of the layer of this name, see `place_of`; None if there is none."""
+    """Return the transform of the layer of this name, see `place_of`; None if there is none."""
     place = place_of(scenario, name)
     return None if place is None else scenario.stack[place].transform
 
@@ -45,7 +45,7 @@ def with_transform(scenario: Scenario, name: str, transform: Transform) -> Stack
 
 
 def with_avoidance(scenario: Scenario, **changes: Any) -> Stack:  # noqa: ANN401 - the fields of Avoidance
-    """The stack with fields of the avoidance replaced that the page's obstacles belong to; added if there is none."""
+    """Return the stack with fields of the page's avoidance replaced; it is added if there is none."""
     layer = avoidance_layer(scenario)
     after = replace(scenario.avoidance, **changes)
     if place_of(scenario, layer.name) is None:
@@ -59,7 +59,7 @@ def _changed(scenario: Scenario, name: str, **changes: Any) -> Stack:  # noqa: A
 
 
 def with_added(scenario: Scenario, transform: Transform) -> tuple[Stack, str]:
-    """The stack with one transform more, outermost but for those that stay so, and the name that it got."""
+    """Return the stack with one more transform, below those that stay outermost, and its name."""
     taken, title = {layer.name for layer in scenario.stack}, transform.title
     names = (title if transform.most == 1 else f"{title} {k}" for k in range(1, len(taken) + 2))
     name = next(name for name in names if name not in taken)
@@ -81,7 +81,7 @@ def switched(scenario: Scenario, name: str) -> Stack:
 
 
 def shifted(scenario: Scenario, name: str, steps: int) -> Stack:
-    """The stack with the layer of this name moved outwards by so many places of those that are listed, or inwards."""
+    """Return the stack with a layer moved by `steps` places of those that are listed, outwards if positive."""
     order = list(listed(scenario))
     k = order.index(name)
     order.insert(min(max(k + steps, 0), len(order) - 1), order.pop(k))
@@ -90,7 +90,7 @@ def shifted(scenario: Scenario, name: str, steps: int) -> Stack:
 
 
 def as_fresh(scenario: Scenario, fresh: Scenario) -> Stack:
-    """The stack of a fresh scenario of another task, its obstacles and their avoidance as they are in this one."""
+    """Return the stack of a fresh scenario of another task, with this scenario's obstacles and their avoidance."""
     kept = zip(fresh.obstacles, scenario.obstacles, strict=False)
     moved = tuple(had.moved(there.position, had.wxyz) for there, had in kept)
     avoidance, own = avoidance_layer(fresh), avoidance_layer(scenario)
@@ -137,7 +137,7 @@ def selected(scenario: Scenario) -> str | None:
 
 
 def plane_of(task: Task) -> tuple[Point, Point] | None:
-    """The plane of a drawing, in which it is biased; None of a task in space."""
+    """Return the plane of a drawing, in which it is biased; None for a task in space."""
     if task.demonstrations[0].dimension != 2:
         return None
     u, v = task.slice.axes.T
@@ -145,7 +145,7 @@ def plane_of(task: Task) -> tuple[Point, Point] | None:
 
 
 def surroundings(task: Task, scenario: Scenario) -> Surroundings:
-    """What a transform that is added finds."""
+    """Return the surroundings of a transform that is added."""
     mean = np.mean([resample_by_arc_length(path, 201) for path in task.paths], axis=0)
     anchors = tuple(transform.anchor for transform in anchored(scenario).values() if transform.anchor is not None)
     return Surroundings(mean, plane_of(task), scenario.obstacle, anchors)

@@ -1,4 +1,4 @@
-"""Where added motions begin: places on the slice, one by one or in a grid."""
+"""Starts of added motions: places on the slice, one by one or in a grid."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from dt_viz.scenario.scenario import MAX_STARTS, Scenario
 from dt_viz.scenario.slices import Slice
 
 GRID = (4, 4)
-"""Starts of a grid along the slice's first and second axis."""
+"""Number of starts of a grid along the slice's first and second axis."""
 INNER = 0.8
 """Part of the slice that a grid covers."""
 APART = 0.02
-"""Metres: a place nearer than this to another start is taken."""
+"""Smallest distance between starts, metres."""
 MIN_HEIGHT = 0.02
-"""Height of a start above the table, metres."""
+"""Smallest height of a start above the table, metres."""
 SHOULDER = (0.0, 0.0, 0.28)
 """Place of the arm's shoulder, metres."""
 REACH = 0.95
-"""Distance from the shoulder beyond which the hand gets nowhere, metres."""
+"""Largest distance of a start from the shoulder, metres."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of starts, and what was left out of it."""
+    """A grid of starts, and the numbers of places left out."""
 
     starts: tuple[Point, ...]
-    """All of the scenario's, the new ones last."""
+    """Starts of the scenario, the new ones last."""
     num_blocked: int = 0
-    """Places at or inside an obstacle, or where the arm is that is to avoid it."""
+    """Number of places at or inside an obstacle, or where the arm that avoids it would touch it."""
     num_far: int = 0
-    """Places where the hand cannot be."""
+    """Number of places that the hand cannot reach."""
 
 
 def struck(area: Slice, origin: Array, direction: Array) -> Array | None:
-    """Where a ray meets the slice, (3,), metres; None if it misses the rectangle.
+    """Return the place (3,), metres, where a ray meets the slice; None if it misses the rectangle.
 
     Args:
         area: the slice.
-        origin: (3,) of the ray, metres.
-        direction: (3,) of the ray.
+        origin: (3,) origin of the ray, metres.
+        direction: (3,) direction of the ray.
     """
     slope = float(direction @ area.normal)
     if abs(slope) < 1e-9:
@@ -55,13 +55,13 @@ def struck(area: Slice, origin: Array, direction: Array) -> Array | None:
 
 
 def with_start(scenario: Scenario, place: Array) -> tuple[Point, ...]:
-    """The scenario's starts with one more at `place` (3,), metres, if there is room for it."""
+    """Return the scenario's starts with one more at `place` (3,), metres, if there is room for it."""
     taken = len(scenario.starts) >= MAX_STARTS or _is_taken(scenario.starts, place)
     return scenario.starts if taken else (*scenario.starts, as_point(place))
 
 
 def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Point, ...]:
-    """The scenario's starts with one of them at `place` (3,), metres; unchanged if it has gone."""
+    """Return the scenario's starts with one of them moved to `place` (3,), metres; unchanged if it was removed."""
     starts = list(scenario.starts)
     if index < len(starts):
         starts[index] = as_point(place)
@@ -69,10 +69,10 @@ def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Poin
 
 
 def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array]) -> Grid:
-    """The scenario's starts with a grid over the slice, without places where no motion can begin.
+    """Return the scenario's starts with a grid over the slice, without places where no motion can begin.
 
     Args:
-        scenario: with obstacles and starts.
+        scenario: scenario with obstacles and starts.
         area: the slice.
         arm_room: distance (N,) of the arm from the obstacles with its hand at places (N, 3), metres; asked where the
             whole arm avoids them.
@@ -94,7 +94,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
 
 
 def followed(scenario: Scenario, num_demonstrated: int) -> int:
-    """Number of the start whose rollout the arm follows, counted round: the same one when starts are added."""
+    """Return the number of the start whose rollout the arm follows, counted round: the same when starts are added."""
     return scenario.arm_rollout % (num_demonstrated + len(scenario.starts))
 
 

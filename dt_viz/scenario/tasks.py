@@ -24,7 +24,7 @@ DRAWING_CENTRE = np.array([0.0, -0.50, 0.42])
 DRAWING_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
 """Columns: right, up, and out of the plane towards the viewer."""
 DRAWING_SIZE = 0.40
-"""Metres: larger of width and height of a drawing that comes in other units."""
+"""Larger of width and height, metres, to which a drawing in other units is scaled."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class Pot:
     """An open pot on the table."""
 
     x: float
-    """Of its axis, metres."""
+    """Position of the axis, metres."""
     y: float
     radius: float = 0.055
-    """Of its opening, metres."""
+    """Radius of the opening, metres."""
     height: float = 0.10
-    """Of its rim above the table, metres."""
+    """Height of the rim above the table, metres."""
 
     @property
     def opening(self) -> tuple[float, float, float]:
@@ -45,18 +45,18 @@ class Pot:
         return self.x, self.y, self.height
 
     def catches(self, position: Array) -> bool:
-        """Whether what is let go at `position` (3,), metres, falls into it."""
+        """Return whether an object released at `position` (3,), metres, falls into it."""
         x, y, z = (float(c) for c in position)
         return z > self.height and float(np.hypot(x - self.x, y - self.y)) < self.radius
 
 
 POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
-"""Of `drop_pots`: left, centre and right for whoever faces the robot."""
+"""Pots of `drop_pots`: left, centre and right as seen facing the robot."""
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Demonstrations of one motion and where in the world they belong.
+    """Demonstrations of one motion, placed in the world.
 
     A point u (k,) of the demonstrations is the world point origin + scale·axes·u; a drawing has k = 2.
     """
@@ -64,7 +64,7 @@ class Task:
     name: str
     title: str
     hint: str
-    """One line that says what to try."""
+    """Line that says what to try."""
     demonstrations: tuple[Demonstration, ...]
     origin: Array
     """(3,), metres."""
@@ -75,16 +75,16 @@ class Task:
     camera: tuple[tuple[float, float, float], tuple[float, float, float]]
     """Position and look-at, metres."""
     obstacle_position: tuple[float, float, float]
-    """Where the obstacle first stands, metres."""
+    """First position of the obstacle, metres."""
     pots: tuple[Pot, ...] = ()
-    """That stand on the table, from left to right."""
+    """Pots on the table, from left to right."""
 
     def to_world(self, points: Array) -> Array:
-        """World points (*B, 3) of points (*B, k) of the demonstrations."""
+        """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""
         return self.origin + self.scale * (points @ self.axes[:, : points.shape[-1]].T)
 
     def system(self, imitation: Imitation) -> DiffeomorphicSystem:
-        """The motion learned from the demonstrations, as a system in the world, metres and seconds."""
+        """Return the motion learned from the demonstrations, as a system in the world, metres and seconds."""
         return DiffeomorphicSystem(
             Placed(imitation.transform, self.origin, self.axes, self.scale),
             imitation.base.placed(self.origin, self.axes[:, : imitation.base.dim], self.scale),
@@ -108,7 +108,7 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """A task to choose from. Calling it gives the task, and raises DemonstrationError if its file cannot be used."""
+    """A task to choose. Calling it gives the task; raises DemonstrationError if its file cannot be used."""
 
     title: str
     load: Callable[[], Task]
@@ -190,7 +190,7 @@ def drop_pots() -> Task:
         scale=1.0,
         slice=Slice(paths.mean(axis=(0, 1)), np.stack([[1.0, 0.0, 0.0], down], axis=1), (0.30, 0.24)),
         camera=((0.62, -1.58, 0.90), (0.06, -0.38, 0.24)),
-        obstacle_position=(0.0, -0.58, 0.36),  # beyond: where the hand comes from there is the arm, once it is there
+        obstacle_position=(0.0, -0.58, 0.36),  # beyond the pots: on the other side it would meet the arm
         pots=POTS,
     )
 
@@ -198,16 +198,16 @@ def drop_pots() -> Task:
 def drawing_task(
     name: str, title: str, hint: str, demonstrations: tuple[Demonstration, ...], obstacle_at: float = 0.5
 ) -> Task:
-    """A task from 2-D demonstrations, on the vertical plane before the robot.
+    """Return a task from 2-D demonstrations, on the vertical plane before the robot.
 
     Drawings between a half and the whole of `DRAWING_SIZE` keep their size; others are scaled to it.
 
     Args:
-        name: of the task.
-        title: for the page.
-        hint: what to try.
-        demonstrations: of one drawing.
-        obstacle_at: where on the mean drawing the obstacle first stands, as a fraction of its length.
+        name: name of the task.
+        title: title on the page.
+        hint: line that says what to try.
+        demonstrations: demonstrations of one drawing.
+        obstacle_at: first place of the obstacle on the mean drawing, as a fraction of its length.
     """
     points = np.concatenate([d.positions for d in demonstrations])
     lower, upper = points.min(axis=0), points.max(axis=0)
@@ -232,7 +232,7 @@ def drawing_task(
 
 
 def lasa_tasks(folder: Path) -> dict[str, TaskEntry]:
-    """One drawing task for each .mat file of a folder with the LASA handwriting data, read when it is chosen.
+    """Return a drawing task for each .mat file of a folder with the LASA handwriting data, read when it is chosen.
 
     Raises:
         DemonstrationError: if the folder cannot be read or holds no .mat file.
@@ -253,7 +253,7 @@ def _lasa_task(name: str, path: Path) -> Task:
 def _on_mean_path(
     demonstrations: tuple[Demonstration, ...], to_world: Callable[[Array], Array], fraction: float
 ) -> tuple[float, float, float]:
-    """World point at a fraction of the length of the mean demonstration."""
+    """Return the world point at a fraction of the length of the mean demonstration."""
     mean = np.mean([resample_by_arc_length(d.positions, 101) for d in demonstrations], axis=0)
     x, y, z = to_world(mean[round(100 * fraction)])
     return float(x), float(y), float(z)

@@ -31,9 +31,9 @@ from dt_viz.transforms.base import (
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
 Space = Literal["task", "cspace", "both"]
-"""What avoids the obstacles: the end effector (sec. 4.4), the whole arm in configuration space (sec. 4.5), or both."""
+"""Space of the avoidance: that of the end effector (sec. 4.4), configuration space (sec. 4.5), or both."""
 SPACE_NAMES: Mapping[Space, str] = {"task": "End effector", "cspace": "Whole arm", "both": "Both"}
-"""Names of these."""
+"""Names on the page of who avoids."""
 GENERATOR_NAMES: Mapping[Generator, str] = {
     "free-space": "Free space (−∇log(1−p))",
     "probability": "Probability (∇p, the paper's)",
@@ -43,27 +43,27 @@ MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
 MAX_MANUAL_DURATION = 2.0
 """Longest flow time that can be chosen by hand."""
 MAX_DURATION = 2.5
-"""Longest flow that is tried to clear an obstacle: a motion that still collides runs through the flow's centre."""
+"""Longest flow time that is tried: a motion that still collides runs through the flow's centre."""
 SNAPSHOT = 0.05
-"""Flow time between two looks at the clearance. The field turns points around in about ten of them, so one RK4 step is
-off by micrometres; between the last two the duration is interpolated."""
+"""Interval of flow time between two checks of the clearance, one RK4 step. The field turns points around in about ten
+of them, so a step is off by micrometres; between the last two checks the duration is interpolated."""
 TOLERANCE = 1e-5
-"""Of the integration up to the duration that is known to be needed, metres a step."""
+"""Tolerance of a step of the integration up to the duration that is known to be needed, metres."""
 NUM_DEEPEST = 8
-"""Samples of each rollout that the duration is chosen for at first."""
+"""Number of samples of each rollout that the duration is chosen for at first."""
 TINY = 1e-12
-"""Metres between samples that are the same."""
+"""Smallest distance between samples that counts as a step, metres."""
 ROUNDING = 1e-6
-"""Metres that do not count: a motion may end on the surface."""
+"""Depth that counts as rounding, metres: a motion may end on the surface."""
 ACCEPTED_MARGIN = 0.9
-"""Part of the margin that a sample between the checked ones may keep."""
+"""Smallest part of the margin that samples between the checked ones may keep."""
 BESIDE = 1e-3
-"""Metres inside that still are beside the obstacle where its surface is only nearly known, and by which a motion may go
-deeper than its covered start before that counts."""
+"""Depth that still counts as beside an obstacle, metres, since its surface is only nearly known; also the depth below
+its covered start that a motion may reach."""
 NUM_DIRECTIONS, MAX_STEPS_OUT = 360, 200
-"""Number of directions of a plane in which a way out of obstacles is looked for, and of steps on it."""
+"""Number of directions of a plane in which a way out of obstacles is searched, and largest number of steps."""
 SHORTEST = 1e-4
-"""Length of the shortest of these steps, metres: by so much a way may lead farther than to the surface."""
+"""Smallest of these steps, metres; bounds the overshoot beyond the surface."""
 TAIL = 2.0
 """Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
 place: such a path arrives at up to 60° from the straight way out."""
@@ -78,12 +78,12 @@ class Avoidance(Transform):
     """
 
     obstacles: tuple[Obstacle, ...]
-    """All are avoided together; there may be none."""
+    """Obstacles that are avoided together; there may be none."""
     space: Space
-    """What gives way."""
+    """Who gives way: the end effector, the whole arm, or both."""
     generator: Generator
     temperature: float
-    """T of the occupancy potential: higher reaches farther and bends more gently."""
+    """T of the occupancy potential; a higher one reaches farther and bends more gently."""
     margin: float
     """Clearance that the automatic flow time keeps, metres."""
     duration: float | None
@@ -99,7 +99,9 @@ class Avoidance(Transform):
     stays_outermost: ClassVar[bool] = True
     yields_goal: ClassVar[bool] = True
     settings: ClassVar[tuple[Setting, ...]] = (
-        Choice("space", "Avoid with", SPACE_NAMES, "what gives way: the hand's path, or the arm by its joint angles"),
+        Choice(
+            "space", "Avoid with", SPACE_NAMES, "who gives way: the path of the hand, or the arm by its joint angles"
+        ),
         Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
         Number(
             "temperature",
@@ -121,7 +123,7 @@ class Avoidance(Transform):
             0.5,
             automatic=True,
             of_flow=True,
-            hint="the shortest flow that does what the transform is for",
+            hint="auto: the shortest flow that clears the obstacles by the margin",
         ),
         FlowIntegration(),
     )
@@ -182,7 +184,7 @@ class Avoidance(Transform):
         return field if self.plane is None else InPlane(field, axes_of(self.plane)[:, :2])
 
     def _nearest_free(self, goal: Array) -> Array:
-        """The place (3,) where motions end whose goal (3,) is covered, metres; in the plane, if the flow acts there."""
+        """Return the nearest free place (3,) to a covered goal (3,), metres; in the plane, if the flow acts there."""
         obstacle = self.avoided
         if self.plane is None or obstacle.signed_distance(goal) >= 0:
             return obstacle.nearest_free(goal)
@@ -197,10 +199,10 @@ class Avoidance(Transform):
         return goal + length.min() * directions[length.argmin()]
 
     def build(self, motion: MotionBelow) -> Built:
-        """See `Transform`. The automatic flow time is the shortest that clears all that can be cleared.
+        """See `Transform`. The automatic flow time is the shortest that clears all avoidable samples of this motion.
 
-        That is, of this motion. The ends of the next one are moved by this flow, and its flow time only grows from one
-        attempt to the next: where a start or goal is close to the obstacle it may end up longer than needed.
+        The flow also moves the ends of the next attempt's motion, and the flow time only grows from one attempt to the
+        next: where a start or goal is close to the obstacle it may end up longer than needed.
         """
         obstacle = self.avoided
         field = self._field()
@@ -209,7 +211,7 @@ class Avoidance(Transform):
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
         duration, hopeless = self.duration, False
         if duration is None:
-            # the deepest samples leave last, or nearly so; where they did not tell the whole story, take all
+            # the deepest samples leave last, or nearly so; if they were not enough at the last attempt, take all
             depth = np.where(self._avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
             if motion.at_least:
                 points = motion.positions[np.isfinite(depth)]
@@ -218,7 +220,7 @@ class Avoidance(Transform):
                 points = np.concatenate([_deepest(motion, depth), crests])
             margin = self._kept_margin(motion)
             duration = clearing_duration(field, obstacle, points, margin, at_least=motion.at_least)
-            # where the exact flow is clear for longer already, more time is not what a coarse one lacks
+            # a coarse flow that is not clear after the time of the exact one needs more steps, not more time
             hopeless = duration is None or (self.integration.by_hand and 0 < duration <= motion.at_least)
             if duration is None:
                 duration = MAX_DURATION
@@ -237,7 +239,7 @@ class Avoidance(Transform):
         return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, {"duration": duration})
 
     def satisfied(self, motion: MotionBelow) -> bool:
-        """Whether all that can be cleared keeps (almost) the margin, where that is to be seen to."""
+        """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""
         if self.duration is not None:
             return True
         distance = self.avoided.signed_distance(motion.positions[self._avoidable(motion)])
@@ -249,7 +251,7 @@ class Avoidance(Transform):
             return ()
         kept = self.smallest_kept(motion)
         covered = any(warning.kind is Kind.GOAL_COVERED for warning in made.warnings)
-        # where a goal is covered, what ends nearly on the surface is beside it
+        # motions to a covered goal end beside it, nearly on the surface
         if kept < (-BESIDE if covered else -ROUNDING):
             return (motion.warning(Kind.ENTERS, f"a motion enters the obstacle by {in_millimetres(-kept)}"),)
         if satisfied or np.isinf(kept):
@@ -260,10 +262,10 @@ class Avoidance(Transform):
         return (motion.warning(Kind.TOO_NEAR, text),)
 
     def smallest_kept(self, motion: MotionBelow) -> float:
-        """Smallest distance from the obstacle of what the stack could keep out of it, metres, negative inside.
+        """Return the smallest distance of avoidable samples from the obstacle, metres, negative inside.
 
-        Of a motion that starts inside, what is deeper than its start counts, too; of one that was to end beside a
-        covered goal, all up to its end. Infinite if nothing counts.
+        Samples deeper than a covered start count, too, and for a covered goal all samples up to the end. Infinite if
+        nothing counts.
         """
         obstacle, motion = self.avoided, replace(motion, keeps_goal=False)
         distance, at_start = obstacle.signed_distance(motion.positions), obstacle.signed_distance(motion.starts)
@@ -271,7 +273,7 @@ class Avoidance(Transform):
         return float(distance[self._avoidable(motion) | deeper].min(initial=np.inf))
 
     def _kept_margin(self, motion: MotionBelow) -> float:
-        """The clearance to keep, metres: the margin, or what start and goal leave of it."""
+        """Return the clearance to keep, metres: the margin, or less where a free start or goal is nearer."""
         obstacle = self.avoided
         ends = motion.starts[~_blocked(obstacle, motion)]
         if motion.keeps_goal:
@@ -280,10 +282,10 @@ class Avoidance(Transform):
         return max(0.0, float(room))
 
     def _avoidable(self, motion: MotionBelow) -> Mask:
-        """(N,) bool: samples that a transform can keep out of the obstacle.
+        """Return which samples (N,) can be kept out of the obstacle.
 
-        Not the first ones of a motion that starts inside it, until it keeps the margin. If it covers the goal, not the
-        last ones either, as near to the end as the way to where motions end instead is short.
+        Excluded are the first samples of a motion that starts inside, until it keeps the margin; and, if the goal is
+        covered, the last samples, within `TAIL` distances from the end to where motions end instead.
         """
         obstacle = self.avoided
         distance = obstacle.signed_distance(motion.positions)
@@ -308,21 +310,21 @@ class Avoidance(Transform):
 
 
 def _blocked(obstacle: Union, motion: MotionBelow) -> Mask:
-    """(R,) bool: which rollouts start inside the obstacle."""
+    """Return which rollouts (R,) start inside the obstacle."""
     return obstacle.signed_distance(motion.starts) < 0
 
 
 def _deepest(motion: MotionBelow, depth: Array) -> Array:
-    """(M, 3) the deepest few samples of each rollout; `depth` (N,), metres, is infinite for those that do not count."""
+    """Return the deepest samples (M, 3) of each rollout; `depth` (N,), metres, is infinite for excluded ones."""
     order = np.lexsort([depth, motion.index])
     rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
     return motion.positions[order[(rank < NUM_DEEPEST) & np.isfinite(depth[order])]]
 
 
 def _crests(motion: MotionBelow, depth: Array, field: VectorField, margin: float) -> Array:
-    """(M, 3) places between the samples of the rollouts where the field stops leading onwards and starts leading back.
+    """Find places (M, 3) between samples of the rollouts at which the field turns from leading onwards to leading back.
 
-    The field is a gradient, or nearly so: its potential is largest there, and what is there leaves last.
+    The field is a gradient, or nearly so: its potential is largest there, and points there leave last.
     """
     s, step = motion.positions, np.diff(motion.positions, axis=0)
     near, same = depth < margin, np.diff(motion.index) == 0
@@ -340,10 +342,10 @@ def _crests(motion: MotionBelow, depth: Array, field: VectorField, margin: float
 def clearing_duration(
     field: VectorField, obstacle: Union | Obstacle, points: Array, margin: float, *, at_least: float = 0.0
 ) -> float | None:
-    """The shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
+    """Find the shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
 
     γ is a one-parameter group, so one integration with snapshots passes every duration on its way; and occupancy falls
-    along the reverse flow, so what is clear stays clear and can be left behind.
+    along the reverse flow, so points that are clear stay clear and can be dropped.
 
     Args:
         field: generator of the flow.

@@ -1,4 +1,4 @@
-"""What every transform has in common: a value that is built into one diffeomorphism (sec. 4.1).
+"""Base class of the transforms: values that are built into one diffeomorphism each (sec. 4.1).
 
 A new kind of transform is one file with a subclass of `Transform`, and one line in `dt_viz.transforms.registry`.
 """
@@ -28,9 +28,9 @@ class MotionBelow:
     """The motion one level down, which a transform is to change."""
 
     starts: Array
-    """(R, 3) where the robot starts, metres."""
+    """(R, 3) starts, metres."""
     goal: Array
-    """(3,) where the motions end, metres."""
+    """(3,) goal of the motions, metres."""
     index: Indices
     """(N,) which rollout a sample belongs to."""
     positions: Array
@@ -40,13 +40,13 @@ class MotionBelow:
     tolerance: float = 2e-9
     """Tolerance of a step of the transform's flow, metres."""
     at_least: float = 0.0
-    """Flow time to start from where it is chosen automatically: what an earlier attempt needed."""
+    """Lower bound of an automatic flow time: what an earlier attempt needed."""
     above: Diffeomorphism | None = None
     """ψ from the top of the stack to the manifold of the transform, as far as it has been built."""
     top: Array | None = None
     """(N, 3) the same samples at the top of the stack, where the robot moves, metres; None before it is built."""
     keeps_goal: bool = True
-    """Whether transforms that do not mean to move the goal leave it where it is, or may move it after all."""
+    """Whether transforms that are not meant to move the goal must keep it."""
     num_demonstrated: int | None = None
     """Number of rollouts, the first ones, that have a demonstration; None is all. The others begin anywhere."""
     targets: tuple[Point, ...] = ()
@@ -54,7 +54,7 @@ class MotionBelow:
 
     @property
     def demonstrated(self) -> MotionBelow:
-        """The rollouts that have a demonstration, only."""
+        """The motion without rollouts that have no demonstration."""
         num = self.num_demonstrated
         if num is None or num == len(self.starts):
             return self
@@ -64,26 +64,26 @@ class MotionBelow:
         return replace(self, starts=self.starts[:num], **samples)
 
     def warning(self, kind: Kind, text: str) -> MotionWarning:
-        """A warning about the transform that this motion is changed by."""
+        """Return a warning about the transform that changes this motion."""
         return MotionWarning(kind, text, self.name)
 
 
 @dataclass(frozen=True)
 class Built:
-    """A transform made for a motion."""
+    """A transform built for a motion."""
 
     transform: Diffeomorphism
     """ψ, from the manifold with the transform to the one without."""
     duration: float
     """t of its flow."""
     goal: Array
-    """(3,) where motions with the transform are to end, metres: `MotionBelow.goal` if it is to stay, else its image
-    under ψ⁻¹."""
+    """(3,) goal of motions with the transform, metres: `MotionBelow.goal` if that is to stay, else its image under
+    ψ⁻¹."""
     hopeless: bool = False
-    """Whether no flow time does what is wanted, so that trying again is of no use."""
+    """Whether no flow time does what is wanted, so that another attempt is useless."""
     warnings: tuple[MotionWarning, ...] = ()
     integration: Integration = AUTO
-    """Integration of its flow; one chosen by hand is checked for what it costs."""
+    """Integration of its flow; the error of one chosen by hand is checked."""
     chosen: Mapping[str, float] = field(default_factory=dict, compare=False)
     """Values that were chosen automatically, by the transform's fields."""
 
@@ -102,7 +102,7 @@ class Number:
     initial: float
     """Value of the slider before there is one."""
     scale: float = 1.0
-    """Units of the slider for one of the field's."""
+    """Units of the slider in one unit of the field."""
     automatic: bool = False
     """Whether a switch beside the slider sets the field to None, which leaves the choice to the transform."""
     of_flow: bool = False
@@ -142,7 +142,7 @@ Setting = Number | Switch | Choice | FlowIntegration
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known where a transform is added."""
+    """The world around a transform that is added."""
 
     mean_path: Array
     """(T, 3) the mean demonstration, evenly sampled, metres."""
@@ -155,7 +155,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class ArmAvoidance:
-    """What the whole arm is to avoid in configuration space, and how (sec. 4.5)."""
+    """Avoidance by the whole arm in configuration space (sec. 4.5)."""
 
     obstacle: Union
     generator: Generator = "free-space"
@@ -169,7 +169,7 @@ class ArmAvoidance:
 
 
 def axes_of(plane: tuple[Point, Point] | None) -> Array:
-    """Orthonormal columns (3, 3), those of a plane first, if there is one."""
+    """Return orthonormal columns (3, 3), those of a plane first, if there is one."""
     if plane is None:
         return np.eye(3)
     u, v = np.asarray(plane)
@@ -180,12 +180,12 @@ _Transform = TypeVar("_Transform", bound="Transform")
 
 
 class Transform(ABC):
-    """A kind of transform that can be stacked; subclasses are frozen dataclasses, compared by what they are made of."""
+    """A kind of transform that can be stacked; subclasses are frozen dataclasses, compared by their fields."""
 
     title: ClassVar[str] = ""
     """Name on the page; numbered where there may be more than one."""
     hint: ClassVar[str] = ""
-    """What the button that adds one is explained by."""
+    """Explanation of the button that adds one."""
     most: ClassVar[int] = 4
     """Largest number in a stack of the page."""
     settings: ClassVar[tuple[Setting, ...]] = ()
@@ -195,24 +195,24 @@ class Transform(ABC):
     stays_outermost: ClassVar[bool] = False
     """Whether transforms that are added go below it."""
     yields_goal: ClassVar[bool] = False
-    """Whether motions may end elsewhere where it finds no way with the goal kept."""
+    """Whether motions may end elsewhere if it finds no way that keeps the goal."""
 
     @abstractmethod
     def build(self, motion: MotionBelow) -> Built:
-        """The diffeomorphism for this motion."""
+        """Build the diffeomorphism for this motion."""
 
     def satisfied(self, motion: MotionBelow) -> bool:
-        """Whether the samples of `motion`, taken after the transform, behave as wanted."""
+        """Return whether the samples of `motion`, taken after the transform, behave as wanted."""
         return True
 
     @property
     def acts(self) -> bool:
-        """Whether it changes the end effector's motion at all; else it is left out of the stack."""
+        """Whether it changes the end effector's motion; if not it is left out of the stack."""
         return True
 
     @property
     def arm_avoidance(self) -> ArmAvoidance | None:
-        """What the whole arm is to avoid in configuration space, if anything."""
+        """Avoidance by the whole arm that it asks for, if any."""
         return None
 
     @property
@@ -222,7 +222,7 @@ class Transform(ABC):
 
     @property
     def anchor(self) -> Point | None:
-        """The place that it leads motions to and by which it is dragged, metres."""
+        """Place that it leads motions to and by which it is dragged, metres."""
         return None
 
     @property
@@ -236,7 +236,7 @@ class Transform(ABC):
         return None
 
     def anchored(self: _Transform, place: Point) -> _Transform:
-        """The same transform with its anchor elsewhere."""
+        """Return the same transform with its anchor at `place`, metres."""
         return self
 
     @property
@@ -245,41 +245,41 @@ class Transform(ABC):
         return False
 
     def in_plane(self: _Transform, plane: tuple[Point, Point]) -> _Transform:
-        """The same transform, acting along a plane only, given by two orthonormal vectors."""
+        """Return the same transform, acting only along a plane, given by two orthonormal vectors."""
         return self
 
     def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
-        """Warnings about what it wants and does not get.
+        """Return warnings about wishes of the transform that are not met.
 
         Args:
-            motion: the samples at the top of the stack.
-            made: what it was built into.
-            satisfied: whether `satisfied` says so.
+            motion: samples at the top of the stack.
+            made: result of `build`.
+            satisfied: result of `satisfied`.
         """
         if satisfied or (made.hopeless and made.warnings):
             return ()
         return (motion.warning(Kind.UNREACHED, f"{motion.name}: not every motion does what it asks for"),)
 
     def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
-        """Warnings about what the avoidance of obstacles takes from it again.
+        """Return warnings about wishes that are no longer met because obstacles are avoided.
 
         Args:
-            motion: the motions that are shown, of the end effector.
-            made: what it was built into; it was satisfied then.
-            who: moves, in words.
+            motion: shown motions of the end effector.
+            made: result of `build`, which was satisfied.
+            who: name of who gives way, for the text.
         """
         return ()
 
     @classmethod
     def beside(cls: type[_Transform], surroundings: Surroundings) -> _Transform:
-        """The transform that the page adds."""
+        """Return the transform that the page adds."""
         return cls()
 
 
 def start_warnings(
     which: Indices, num_demonstrated: int, kind: Kind, how: str, source: str = ""
 ) -> list[MotionWarning]:
-    """Warnings about starts, counted from 0, the task's first, that are all `how`; empty if it is none."""
+    """Return warnings that the starts `which`, counted from 0, the task's first, are `how`; empty without any."""
     said = []
     for numbers, of in ((which[which < num_demonstrated], ""), (which[which >= num_demonstrated], "added ")):
         counted = ", ".join(str(k + 1 - (num_demonstrated if of else 0)) for k in numbers)

@@ -31,50 +31,50 @@ from dt_viz.transforms.base import (
 from dt_viz.warning import Kind, MotionWarning
 
 NUM_SAMPLES = 400
-"""Unit vectors sampled in one octant of the region, or quadrant of the disc; the others are its mirror images."""
+"""Number of unit vectors sampled in one octant of the region, or quadrant of the disc; the others mirror them."""
 KERNEL_WIDTH = 0.4
-"""Of the regression, in radii: the unit vectors are singular at the target, the core where the fit smooths them is
-about as wide."""
+"""Kernel width of the regression, in radii; about the size of the core in which it smooths the unit vectors, which are
+singular at the target."""
 REGULARISATION = 1e-3
 PLATEAU = 0.5
-"""Part of the radius from which on the field fades out."""
+"""Part of the radius beyond which the field fades out."""
 
 AIM = 0.009
-"""Metres from the target by which `auto` lets the motions pass."""
+"""Largest distance from the target at which `auto` lets the motions pass, metres, at the checked samples."""
 ACCEPTED = 0.010
-"""Metres by which they may pass, between the samples that the duration was chosen for."""
+"""Largest accepted distance from the target, metres, also between those samples."""
 MAX_DURATION = 4.0
-"""Longest flow that is tried: what has not arrived after it hardly lies in the region."""
+"""Longest flow time that is tried: a point that has not arrived by then hardly lies in the region."""
 LONG = 1.5
-"""Flow after which a motion that has not arrived, and whose start or goal is still its nearest place, never does."""
+"""Flow time by which a motion arrives, or never does if its start or goal is still nearest to the target."""
 SNAPSHOT = 0.1
-"""Flow time between two looks at the distance: less than half of what a point at the target takes to halve it."""
+"""Interval of flow time between two checks of the distance: less than half of the time that halves it."""
 LARGE, SMALL = 2.5, 1.5
-"""Of the distance of the farthest motion: the `auto` radius, and the one down to which it shrinks to leave starts and
+"""Largest and smallest `auto` radius, relative to the distance of the farthest motion; it shrinks to leave starts and
 goal outside. On a straight path, these turn the motion by up to 30° and 90° on two centimetres."""
 MIN_RADIUS = 0.10
-"""Metres, of the `auto` radius."""
+"""Lower bound of the `auto` radius, metres."""
 SMALLER = 1.25
-"""Of the distance: where starts or goal do lie in the region, the motion below ends farther away the larger it is, and
-the radius may not grow with that."""
+"""Smallest `auto` radius of later attempts, relative to that distance: a region with starts or goal in it moves the
+motion below farther away, and the radius must not grow with that."""
 OVERSHOOT = 2.0
-"""Times the longer duration that another attempt needs."""
+"""Factor by which the next attempt prolongs the duration beyond what the last one needed."""
 STEP = 2.2
-"""Flow time of a step of the flow, for each fourth root of a metre of tolerance. The field is mild everywhere, so RK4
+"""Step of the flow, in flow time, for each fourth root of a metre of tolerance. The field is mild everywhere, so RK4
 with equal steps is quicker here than steps of each point's own length, and there and back it errs less."""
 MAX_TARGET_MISS = 0.013
-"""Metres by which motions that avoid may miss the target before it is said: a centimetre, and what the arm's joints,
-interpolated between samples, are off by while a hand moves."""
+"""Largest distance by which avoiding motions may miss the target without a warning, metres: a centimetre, and the
+error of the arm's joints, interpolated between samples, during a drag."""
 PLACED_BESIDE = 0.08
-"""Metres from the mean path at which a new bias point is placed."""
+"""Distance of a new bias point from the mean path, metres."""
 APART = 0.25
-"""Metres that it keeps from other bias points, where that is possible: regions are about that large."""
+"""Wanted distance of a new bias point from the others, metres: about the size of a region."""
 ROOM = 0.04
-"""Metres that it keeps from obstacles."""
+"""Distance of a new bias point from obstacles, metres."""
 PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
 """Places along the mean path, as fractions of its length, beside which new bias points are placed."""
 SMALLEST_REGION, LARGEST_REGION = 0.04, 0.40
-"""Radius of a region that can be chosen on the page, metres."""
+"""Smallest and largest radius of a region that can be chosen on the page, metres."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class BiasPoint(Transform):
             15.0,
             scale=100.0,
             automatic=True,
-            hint="of the region that it acts in; auto: by how far the motion is away",
+            hint="radius of the region in which it acts; auto: from the distance of the motion",
         ),
         Switch("moves_goal", "Moves the goal", "motions end here instead of at the goal"),
         Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True, of_flow=True),
@@ -357,13 +357,13 @@ def unit_field(dim: int) -> RegionField:
 
 
 def _too_small(radius: float, distance: float) -> str:
-    """What there is to say of a region from which not all motions arrive."""
+    """Describe why not all motions arrive from the region."""
     sizes = f"the region of {100 * radius:.0f} cm is too small: a motion is {100 * distance:.0f} cm from the target"
     return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
 
 
 def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Mask]:
-    """Where each rollout, as a polyline, comes closest to the target.
+    """Find where each rollout, as a polyline, comes closest to the target.
 
     Returns:
         (R, 3) these places, metres, and (R,) whether they are the rollout's start or goal.

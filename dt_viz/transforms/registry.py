@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import Transform
 from dt_viz.transforms.bias import BiasPoint
@@ -13,8 +11,3 @@ KINDS: tuple[type[Transform], ...] = (
     BiasPoint,
 )
 """All kinds of transforms. A new one is a line here."""
-
-
-def by_title() -> Mapping[str, type[Transform]]:
-    """The kinds by the name that the page gives them."""
-    return {kind.title: kind for kind in KINDS}

@@ -37,7 +37,7 @@ class Origin:
 
     scheme: str
     host: str
-    """In lower case; an IPv6 address without brackets."""
+    """Host in lower case; an IPv6 address without brackets."""
     port: int
 
     @classmethod

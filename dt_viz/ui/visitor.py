@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -14,14 +15,13 @@ from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.motion.pushing import Pushed
-from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.panel.panel import Panel
-from dt_viz.ui.panel.push import PushedPath
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import ArmPicture
@@ -30,17 +30,18 @@ from dt_viz.ui.scene.carried import Carried
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
 from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.pushed_path import PushedPath
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.starts import Starts
 
 FIELD_OF_VIEW = 0.75
-"""Vertical, rad."""
+"""Vertical field of view, rad."""
 NOTICE_SECONDS = 12.0
-"""That a notification stays, unless it is closed."""
+"""Time after which a notification closes by itself, seconds."""
 
 
 def initial_scenario(engine: Engine, task: str) -> Scenario:
-    """The scenario that a task begins with. Raises what `Engine.task` raises."""
+    """Return the scenario that a task begins with. Raises what `Engine.task` raises."""
     scenario = Scenario(task)
     sphere = Sphere(engine.task(task).obstacle_position)
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
@@ -55,15 +56,15 @@ class Visitor:
         """Build the page and start computing.
 
         Args:
-            client: the visitor.
-            engine: used by this visitor only.
-            robot: to draw.
-            titles: of the tasks, by name.
-            task: the first task's name.
+            client: connection of the visitor.
+            engine: engine of this visitor only.
+            robot: robot to draw.
+            titles: titles of the tasks, by name.
+            task: name of the first task.
         """
         self.client = client
         self.shown: Frame | None = None
-        """The frame that was drawn last."""
+        """The last drawn frame."""
         client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
@@ -100,14 +101,14 @@ class Visitor:
         with self.client.atomic():
             self.pictures.draw(frame)
             self.carried.stand(frame.task.pots)
-            if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then it is where it was
+            if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then the arm stays where it was
                 self.arm.stale = bool(frame.blocked) or self.pictures.stale
         if frame.stage is not Stage.ROLLOUTS:
             if self.pushed_path.is_of_another(frame.scenario):
                 self._playback.end_detour()
             self._playback.follow(frame.arm)
             self.grip.draw(frame)
-            if not self.grip.ball.visible:  # in a drag: nobody says any more that it ends
+            if not self.grip.ball.visible:  # a drag of the ball ends without an event
                 self._playback.let_go()
             self._panel.report(frame, pace)
         self.client.flush()
@@ -138,7 +139,7 @@ class Visitor:
         self._panel.cancelled(task)
 
     def _look_at(self, task: Task) -> None:
-        """Put the camera where the task wants it."""
+        """Move the camera to the task's view."""
         self.client.camera.position, self.client.camera.look_at = task.camera
         self.client.camera.fov = FIELD_OF_VIEW
 
@@ -147,44 +148,40 @@ class Visitor:
             self._look_at(self.shown.task)
 
     def close(self) -> None:
-        """The visitor has left: stop all threads."""
+        """Stop all threads: the visitor has left."""
         self._panel.close()
         self.session.close()
         self._playback.close()
 
-    def _obstacle_moved(self, index: int, position: Array, wxyz: Array, phase: str) -> None:
+    @contextmanager
+    def _dragging(self, phase: str) -> Iterator[Scenario]:
+        """Take the edits of a drag together for undo; yields the scenario to edit."""
         if phase == "start":
             self.session.begin_gesture()
-        x, y, z = (float(c) for c in position)
-        w, i, j, k = (float(c) for c in wxyz)
-        obstacles = list(self.session.scenario.obstacles)
-        if index < len(obstacles):  # or it was deleted a moment ago
-            obstacles[index] = obstacles[index].moved((x, y, z), (w, i, j, k))
-            stack = with_avoidance(self.session.scenario, obstacles=tuple(obstacles))
-            self.session.edit(f"obstacle {index}", stack=stack)
+        yield self.session.scenario
         if phase == "end":
             self.session.end_gesture()
+
+    def _obstacle_moved(self, index: int, position: Array, wxyz: Array, phase: str) -> None:
+        with self._dragging(phase) as scenario:
+            obstacles = list(scenario.obstacles)
+            if index < len(obstacles):  # or it was deleted a moment ago
+                obstacles[index] = obstacles[index].moved(as_point(position), as_quaternion(wxyz))
+                self.session.edit(f"obstacle {index}", stack=with_avoidance(scenario, obstacles=tuple(obstacles)))
 
     def _obstacle_selected(self, index: int) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, selected=index))
 
     def _anchor_moved(self, name: str, position: Array, phase: str) -> None:
-        if phase == "start":
-            self.session.begin_gesture()
-        scenario = self.session.scenario
-        transform = transform_of(scenario, name)
-        if transform is not None:  # or it was deleted a moment ago
-            moved = with_transform(scenario, name, transform.anchored(as_point(position)))
-            self.session.edit(name, stack=moved)
-        if phase == "end":
-            self.session.end_gesture()
+        with self._dragging(phase) as scenario:
+            transform = transform_of(scenario, name)
+            if transform is not None:  # or it was deleted a moment ago
+                moved = transform.anchored(as_point(position))
+                self.session.edit(name, stack=with_transform(scenario, name, moved))
 
     def _start_moved(self, index: int, position: Array, phase: str) -> None:
-        if phase == "start":
-            self.session.begin_gesture()
-        self.session.edit(f"start {index}", starts=with_moved_start(self.session.scenario, index, position))
-        if phase == "end":
-            self.session.end_gesture()
+        with self._dragging(phase) as scenario:
+            self.session.edit(f"start {index}", starts=with_moved_start(scenario, index, position))
 
     def _start_chosen(self, index: int) -> None:
         if index < len(self.session.scenario.starts):  # or it was removed a moment ago
@@ -200,14 +197,9 @@ class Visitor:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
 
     def _slice_moved(self, position: Array, wxyz: Array, phase: str) -> None:
-        if phase == "start":
-            self.session.begin_gesture()
-        x, y, z = (float(c) for c in position)
-        w, i, j, k = (float(c) for c in wxyz)
-        pose = SlicePose((x, y, z), (w, i, j, k))
-        self.session.edit("slice", view=replace(self.session.scenario.view, slice=pose))
-        if phase == "end":
-            self.session.end_gesture()
+        with self._dragging(phase) as scenario:
+            pose = SlicePose(as_point(position), as_quaternion(wxyz))
+            self.session.edit("slice", view=replace(scenario.view, slice=pose))
 
     def _push(self) -> None:
         if self._playback.q is not None:

@@ -11,20 +11,22 @@ from dt_viz.motion.profiles import Profiles
 from dt_viz.ui.panel.plots import LOOK, SMALL, columns
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import css
+from dt_viz.ui.scene.picture import Shown
 
 HEIGHT = 130
-"""Of a plot, pixels."""
+"""Height of a plot, pixels."""
 _MILLIMETRES = 1e3
 
 
-class HealthPlots:
-    """A folder with three plots and a table: the shown motion beside what it would be without any behaviour."""
+class HealthPlots(Shown):
+    """A folder with three plots and a table: the shown motion beside the one without avoidance and biases."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         """Make the folder, hidden."""
         self._drawn: Profiles | None = None
-        self._folder = gui.add_folder("Health", visible=False)
-        with self._folder:
+        folder = gui.add_folder("Health", visible=False)
+        super().__init__(folder)
+        with folder:
             self.table = gui.add_html("")
             gui.add_html(_legend())
             self.lyapunov = _plot(gui, "Lyapunov value, of its start’s", palette.LEVEL)
@@ -32,16 +34,6 @@ class HealthPlots:
             self.distance = _plot(gui, "", palette.ROLLOUT)
             self._whose = gui.add_html("")
             self.clearance = _plot(gui, "", palette.GOAL, zero=True)
-
-    @property
-    def visible(self) -> bool:
-        """Whether the folder is shown."""
-        return self._folder.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        if visible != self._folder.visible:
-            self._folder.visible = visible
 
     def draw(self, profiles: Profiles | None) -> None:
         """Show these profiles; None leaves what is there."""
@@ -64,7 +56,7 @@ class HealthPlots:
 
 
 def table_html(profiles: Profiles) -> str:
-    """Fréchet distance and M.C.D. of both motions, side by side."""
+    """Return a table of the Fréchet distance and M.C.D. of both motions."""
     shown, without = profiles.shown, profiles.undisturbed
     bounded = bool(np.isfinite(shown.clearance).all())
     rows = (
@@ -86,7 +78,7 @@ def _length(metres: float | None) -> str:
 
 
 def _plot(gui: viser.GuiApi, title: str, colour: tuple[int, int, int], *, zero: bool = False) -> viser.GuiUplotHandle:
-    """A plot of a pair of curves along the path, below its title."""
+    """Add a plot of a pair of curves along the path, below its title."""
     if title:
         gui.add_html(_title(title))
     series = [

@@ -17,13 +17,14 @@ from dt_viz.engine.session import Session
 from dt_viz.files import ply
 from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.files import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Later
-from dt_viz.ui.controls import Control
+from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.reading import Reader
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
@@ -33,42 +34,50 @@ SHAPES: Mapping[str, Obstacle] = {
     "Cube (fig. 3a)": Box(ORIGIN, (0.12, 0.12, 0.12)),
     "Box": Box(ORIGIN, (0.16, 0.10, 0.06)),
 }
-"""What can be added, by its button."""
+"""Shapes that can be added, by the name of their button."""
 ASIDE = 0.4
-"""Of its inner radius, by which a new obstacle stands beside the motion: dead ahead no side is the shorter one."""
+"""Offset of a new obstacle from the motion, in its inner radii: dead ahead no side is the shorter one."""
 MIN_SIZE, MAX_SIZE = 0.03, 0.40
-"""Of a box along one axis, and of a cylinder's height, metres."""
+"""Smallest and largest side of a box, and height of a cylinder, metres."""
 FORMATS = ", ".join(dict.fromkeys(suffix[1:] for suffix in (*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
 NONE: str = "none"
 
-Bind = Callable[[Any, Callable[[Scenario], Any], Callable[[Scenario, Any], dict[str, Any]]], Control]
-"""Ties a control to the scenario; see `Panel`."""
 Shape = type[Obstacle] | UnionType
-"""What an obstacle may be."""
+"""Type of an obstacle, or several."""
 
 
 class ObstaclePanel:
     """The folder "Obstacles" of one visitor's panel."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Bind, say: Callable[[str, bool], None], later: Later) -> None:
-        """Build the controls; they act once `connect` has given them a session.
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, say: Callable[[str, bool], None], later: Later) -> None:
+        """Build the controls.
 
         Args:
-            gui: of the visitor.
-            bind: ties a control to the scenario.
-            say: shows a text for a while, and whether it is about an error.
+            gui: controls of the visitor.
+            bindings: bindings of the visitor's panel.
+            say: shows a text for a while, given whether it is about an error.
             later: does work beside the server's event loop.
         """
-        self._bind, self._say = bind, say
-        self._session: Session | None = None
-        self._sizes: list[tuple[Control, Shape]] = []
-        self._refused: tuple[bytes, str, str] | None = None  # content and name of a file, and the unit it may be in
+        self._bindings, self._say = bindings, say
+        self._refused: tuple[bytes, str, str] | None = None
+        """Content and name of a file that was refused for its size, and the unit that would fit."""
         self._reader = Reader(lambda: say("Another visitor's file is being read; yours is read after it.", False))
         with gui.add_folder("Obstacles"):
-            hint = "the one with handles; or click it in the scene"
-            self._choice = Control(gui.add_dropdown("Selected", (NONE,), hint=hint), self._select)
-            self._add = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
-            self._change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected one")
+            hint = "the obstacle with handles; a click in the scene selects one, too"
+            choice = gui.add_dropdown("Selected", (NONE,), hint=hint)
+            bindings.properties(choice, options=_names)
+            bindings.input(
+                choice,
+                lambda s: _names(s)[s.selected or 0],
+                lambda s, name: {"view": replace(s.view, selected=choice.options.index(name))},
+            )
+            group = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
+            bindings.properties(group, visible=_has_room)  # groups of buttons cannot be disabled
+            bindings.on(group, lambda session, name: later(partial(add, session, SHAPES[name])))
+            change = gui.add_button_group("Change", ("Duplicate", "Delete"), hint="the selected obstacle")
+            bindings.properties(change, visible=lambda s: bool(s.obstacles))
+            changes = {"Duplicate": duplicate, "Delete": delete}
+            bindings.on(change, lambda session, name: later(partial(changes[name], session)))
             diameters = 100 * MIN_DIAMETER, 100 * MAX_DIAMETER, 0.5, 15.0
             for shape in (Sphere, Cylinder):
                 self._size(
@@ -104,64 +113,27 @@ class ObstaclePanel:
                 lambda o: o.size,
                 lambda o, size: o.resized(size),
             )
-            bind(
+            bindings.input(
                 gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
                 lambda s: round(100 * s.avoidance.margin, 3),
                 lambda s, value: {"stack": with_avoidance(s, margin=value / 100)},
             )
             with gui.add_folder("From a file", expand_by_default=False):
-                self._unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
+                self.unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
                 hint = f"{FORMATS}; a mesh must be closed; a csv of points begins with x,y,z or x,y,z,occupied"
                 self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
-                self._again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
+                bindings.properties(self._upload, visible=_has_room)
+                self.again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
 
         @self._upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:
             file = self._upload.value
-            self._begin(partial(self.load, file.content, file.name, UNITS[self._unit.value]))
+            self._begin(partial(self.load, file.content, file.name, UNITS[self.unit.value]))
 
-        Control(self._again, lambda _clicked: self._begin(self.load_again))
-        Control(self._add, lambda name: later(partial(self.add, SHAPES[name])))
-        Control(self._change, lambda name: later({"Duplicate": self.duplicate, "Delete": self.delete}[name]))
-
-    def connect(self, session: Session) -> None:
-        """Let the controls edit this session."""
-        self._session = session
-
-    def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's obstacles; what is tied by `bind` shows itself."""
-        options = tuple(f"{k}: {name_of(obstacle)}" for k, obstacle in enumerate(scenario.obstacles, 1)) or (NONE,)
-        if self._choice.handle.options != options:
-            self._choice.handle.options = options
-        self._choice.value = options[scenario.selected or 0]
-        chosen = _selected(scenario)
-        for control, shape in self._sizes:
-            if control.handle.visible != isinstance(chosen, shape):
-                control.handle.visible = isinstance(chosen, shape)
-        for group, useful in (
-            (self._add, len(scenario.obstacles) < MAX_OBSTACLES),
-            (self._upload, len(scenario.obstacles) < MAX_OBSTACLES),
-            (self._change, chosen is not None),
-        ):
-            if group.visible != useful:  # groups of buttons cannot be disabled
-                group.visible = useful
-
-    def _select(self, name: str) -> None:
-        if self._session is not None and name != NONE:
-            index = self._choice.handle.options.index(name)
-            self._session.edit("select", view=replace(self._session.scenario.view, selected=index))
-
-    def add(self, obstacle: Obstacle) -> None:
-        """Put another obstacle, turned as it is, where there is room on the motion, and select it."""
-        session = self._session
-        if session is None or len(session.scenario.obstacles) >= MAX_OBSTACLES:
-            return
-        before = session.scenario.obstacles
-        added = with_room(obstacle, before, session.task)
-        self._replace((*before, added), selected=len(before))
+        on_press(self.again, lambda: self._begin(self.load_again))
 
     def close(self) -> None:
-        """The visitor has left: stop reading."""
+        """Stop reading: the visitor has left."""
         self._reader.close()
 
     def _begin(self, load: Callable[[], None]) -> None:
@@ -184,13 +156,13 @@ class ObstaclePanel:
         """Add what the file holds that was refused for its size, in the unit that was suggested."""
         if self._refused is not None:
             content, name, unit = self._refused
-            self._unit.value = unit
+            self.unit.value = unit
             self.load(content, name, UNITS[unit])
 
     def _load(self, content: bytes, name: str, scale: float) -> None:
         self._refused = None
         try:
-            if self._session is not None and len(self._session.scenario.obstacles) >= MAX_OBSTACLES:
+            if not _has_room(self._bindings.session.scenario):
                 raise ShapeError(
                     name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
                 )
@@ -199,36 +171,16 @@ class ObstaclePanel:
         except SizeError as error:
             if error.unit is not None:
                 self._refused = content, name, error.unit
-                self._again.label = f"Read it in {error.unit}"
+                self.again.label = f"Read it in {error.unit}"
             self._say(error.question or str(error), error.question is None)
         except ShapeError as error:
             self._say(str(error), True)
         else:
-            self.add(obstacle)
+            add(self._bindings.session, obstacle)
             if notes:
                 self._say(f"{name}: {'; '.join(notes)}", False)
         finally:
-            self._again.visible = self._refused is not None
-
-    def duplicate(self) -> None:
-        """Add another one like the selected obstacle."""
-        chosen = None if self._session is None else _selected(self._session.scenario)
-        if chosen is not None:
-            self.add(chosen)
-
-    def delete(self) -> None:
-        """Take the selected obstacle out."""
-        if self._session is not None and (index := self._session.scenario.selected) is not None:
-            before = self._session.scenario.obstacles
-            self._replace((*before[:index], *before[index + 1 :]), selected=max(0, index - 1))
-
-    def _replace(self, obstacles: Sequence[Obstacle], selected: int) -> None:
-        """One step for undo."""
-        session = self._session
-        if session is not None:
-            view = replace(session.scenario.view, selected=selected)
-            session.edit("obstacles", stack=with_avoidance(session.scenario, obstacles=tuple(obstacles)), view=view)
-            session.end_gesture()
+            self.again.visible = self._refused is not None
 
     def _size(
         self,
@@ -237,11 +189,11 @@ class ObstaclePanel:
         read: Callable[[Any], float],
         change: Callable[[Any, float], Obstacle],
     ) -> None:
-        """Tie a slider [cm] to a size of the selected obstacle, metres, while that has this shape."""
+        """Bind a slider [cm] to a size of the selected obstacle, metres, while that has this shape."""
 
         def shown(scenario: Scenario) -> float:
             chosen = _selected(scenario)
-            return round(100 * read(chosen), 3) if isinstance(chosen, shape) else control.value
+            return round(100 * read(chosen), 3) if isinstance(chosen, shape) else KEEP
 
         def changed(scenario: Scenario, value: float) -> dict[str, Any]:
             chosen = _selected(scenario)
@@ -251,9 +203,45 @@ class ObstaclePanel:
             changed = (*before[:index], change(chosen, value / 100), *before[index + 1 :])
             return {"stack": with_avoidance(scenario, obstacles=changed)}
 
-        handle.visible = False
-        control = self._bind(handle, shown, changed)
-        self._sizes.append((control, shape))
+        self._bindings.properties(handle, visible=lambda s: isinstance(_selected(s), shape))
+        self._bindings.input(handle, shown, changed)
+
+
+def add(session: Session, obstacle: Obstacle) -> None:
+    """Put another obstacle, turned as it is, where there is room on the motion, and select it."""
+    before = session.scenario.obstacles
+    if _has_room(session.scenario):
+        _replace(session, (*before, with_room(obstacle, before, session.task)), selected=len(before))
+
+
+def duplicate(session: Session) -> None:
+    """Add another obstacle like the selected one."""
+    chosen = _selected(session.scenario)
+    if chosen is not None:
+        add(session, chosen)
+
+
+def delete(session: Session) -> None:
+    """Delete the selected obstacle."""
+    index, before = session.scenario.selected, session.scenario.obstacles
+    if index is not None:
+        _replace(session, (*before[:index], *before[index + 1 :]), selected=max(0, index - 1))
+
+
+def _replace(session: Session, obstacles: tuple[Obstacle, ...], selected: int) -> None:
+    """Replace the obstacles, as one step for undo."""
+    view = replace(session.scenario.view, selected=selected)
+    session.edit("obstacles", stack=with_avoidance(session.scenario, obstacles=obstacles), view=view)
+    session.end_gesture()
+
+
+def _names(scenario: Scenario) -> tuple[str, ...]:
+    """Return the numbers and shapes of the obstacles."""
+    return tuple(f"{k}: {name_of(obstacle)}" for k, obstacle in enumerate(scenario.obstacles, 1)) or (NONE,)
+
+
+def _has_room(scenario: Scenario) -> bool:
+    return len(scenario.obstacles) < MAX_OBSTACLES
 
 
 def _selected(scenario: Scenario) -> Obstacle | None:
@@ -261,18 +249,18 @@ def _selected(scenario: Scenario) -> Obstacle | None:
 
 
 def name_of(obstacle: Obstacle) -> str:
-    """As the panel calls it."""
+    """Return the name of its shape on the panel."""
     if isinstance(obstacle, Box) and len(set(obstacle.sizes)) == 1:
         return "cube"
     return type(obstacle).__name__.removesuffix("Obstacle").lower()
 
 
 def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[str, ...]]:
-    """The obstacle that a file holds, around the origin, and what is to be said about it.
+    """Return the obstacle that a file holds, around the origin, and notes about it for the page.
 
     Args:
         content: all bytes of the file.
-        name: of the file; its suffix says what it is. A PLY without faces is a point cloud.
+        name: name of the file; its suffix says what it is. A PLY without faces is a point cloud.
         scale: metres for one unit of the file.
 
     Raises:
@@ -294,7 +282,7 @@ def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[
 
 
 def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obstacle:
-    """The obstacle beside the mean demonstration, where that is farthest from its ends and other obstacles."""
+    """Return the obstacle beside the mean demonstration, where that is farthest from its ends and other obstacles."""
     mean = task.mean_path
     ends = np.concatenate([task.starts, mean[-1:]])
     room = np.linalg.norm(mean[:, None] - ends, axis=-1).min(axis=1)
@@ -302,5 +290,5 @@ def with_room(obstacle: Obstacle, others: Sequence[Obstacle], task: Task) -> Obs
     best = int(room.argmax())
     along = mean[min(best + 1, 100)] - mean[max(best - 1, 0)]
     aside = np.cross(along, np.cross(*task.slice.axes.T))
-    x, y, z = (float(c) for c in mean[best] + ASIDE * obstacle.depth * aside / max(float(np.linalg.norm(aside)), 1e-12))
-    return obstacle.moved((x, y, z), obstacle.wxyz)
+    aside /= max(float(np.linalg.norm(aside)), 1e-12)
+    return obstacle.moved(as_point(mean[best] + ASIDE * obstacle.depth * aside), obstacle.wxyz)

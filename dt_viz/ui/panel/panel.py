@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import viser
 
-from dt_viz.arm.collision import SELF_REACH, CollisionReport
 from dt_viz.arm.robot import Robot
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
@@ -22,6 +20,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
 from dt_viz.ui.panel.plots import JointPlots
@@ -29,13 +28,12 @@ from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
 from dt_viz.ui.panel.starts import StartsPanel
-from dt_viz.ui.panel.transforms import TransformsPanel
+from dt_viz.ui.panel.status import AMBER, COMPUTING, PALE, RED, SMALL, TWO_LINES, alarm, hint, sentence, status_html
+from dt_viz.ui.panel.transforms import add_transform_controls
 from dt_viz.ui.scene.arm_layers import NUM_ARMS
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
-from dt_viz.ui.scene.palette import css
 from dt_viz.ui.scene.picture import Colour
-from dt_viz.warning import ARM, Kind
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -55,12 +53,12 @@ VIEW_LABELS: Mapping[str, str] = {
     "generator": "Learned generator",
 }
 PLOTS = {"joint_plots", "health_plots"}
-"""Those of them that are in the panel, not in the scene."""
+"""Fields of `View` whose pictures are in the panel, not in the scene."""
 VIEW_HINTS: Mapping[str, str] = {
     "field": "on the slice: longer and darker is faster",
     "streamlines": "motions from all over the slice: exact, as images of straight rays",
     "ghost": "what was learned, without obstacles and bias points",
-    "ghost_arm": "where it would be at the same moment; left out where both are in one place",
+    "ghost_arm": "at the same moment; links that coincide are left out",
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
     "joint_plots": "angles and speeds over time, with their limits",
@@ -68,15 +66,7 @@ VIEW_HINTS: Mapping[str, str] = {
 }
 _NO_SCENE = "–"
 MAX_FLOWS = 3
-"""That ψ is composed of, for a start: each picture brings its own number."""
-
-
-@dataclass(frozen=True)
-class _Bound:
-    """A control and how it reads the scenario."""
-
-    control: Control
-    read: Callable[[Scenario], Any]
+"""Number of flows that ψ is composed of until a picture of the generator brings its own."""
 
 
 class Panel:
@@ -94,46 +84,44 @@ class Panel:
         """Build the controls; they act once `connect` has given them a session.
 
         Args:
-            gui: of the visitor.
-            titles: of the tasks, by name.
-            robot: whose joints are plotted.
+            gui: controls of the visitor.
+            titles: titles of the tasks, by name.
+            robot: robot whose joints are plotted.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
-            notify: says something in a colour where it is seen however far the panel is scrolled.
-            look_home: puts the camera back to where the task wants it.
+            notify: shows a text in a colour beside the panel, however far that is scrolled.
+            look_home: moves the camera back to the task's view.
         """
         self._notify, self._look_home = notify, look_home
         self._gui = gui
-        self._session: Session | None = None
         self._titles = dict(titles)
-        self._bound: list[_Bound] = []
-        self._notice = gui.add_html("", visible=False)
+        self._bindings = Bindings()
+        self.notice = gui.add_html("", visible=False)
         self._noticed: Scenario | None = None
         self._shows = self._waits = False
-        """Whether a frame was reported at all, and whether another task or scene is computed than that of the last."""
+        """Whether a frame has been reported, and whether another task or scene than its own is being computed."""
         self._reported: Scenario | None = None
         self._settled = "", ""
-        """Hint and status of the scenario reported last."""
+        """Hint and status of the last reported scenario."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
-        self._adopted: Scenario | None = None
-        self._status = gui.add_html("")
+        self.status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
 
-        on_press(self._cancel, self._cancel_learning)
+        self._bindings.on(self._cancel, lambda session, _pressed: session.cancel())
         self._build_task()
         tabs = gui.add_tab_group()
         self._chores = Chores(self.fail)
         later = self._chores.later
         with tabs.add_tab("World"):
             self._obstacles = ObstaclePanel(
-                gui, self._bind, lambda text, wrong: self._say(text, *(_RED if wrong else _AMBER)), later
+                gui, self._bindings, lambda text, wrong: self._say(text, *(RED if wrong else AMBER)), later
             )
-            self._transforms = TransformsPanel(gui, self._bind, later)
-            self._starts = StartsPanel(gui, self._bind, lambda text: self._say(text, *_AMBER), later)
+            add_transform_controls(gui, self._bindings, later)
+            StartsPanel(gui, self._bindings, lambda text: self._say(text, *AMBER), later)
         with tabs.add_tab("Stack"):
-            self._stack = StackPanel(gui, self._bind)
+            self._stack = StackPanel(gui, self._bindings)
         with tabs.add_tab("Show"):
-            self._slice = SlicePanel(gui, self._bind)
+            self._slice = SlicePanel(gui, self._bindings)
             self._build_plots(robot)
             self._build_view()
         with tabs.add_tab("Arm"):
@@ -143,15 +131,10 @@ class Panel:
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
-        self._session = session
-        self._obstacles.connect(session)
-        self._transforms.connect(session)
-        self._starts.connect(session)
-        self._stack.connect(session)
-        self._slice.connect(session)
+        self._bindings.connect(session)
 
     def close(self) -> None:
-        """The visitor has left: stop what plays, and what is read."""
+        """Stop playing and reading: the visitor has left."""
         self._obstacles.close()
         self._stack.close()
         self._saver.close()
@@ -160,127 +143,86 @@ class Panel:
 
     @property
     def legend(self) -> Legend | None:
-        """Of the colours on the slice."""
+        """Legend of the colours on the slice."""
         return self._slice.legend
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
-        self._adopted = scenario
-        self._obstacles.adopt(scenario)
-        self._transforms.adopt(scenario)
-        self._stack.adopt(scenario)
-        self._slice.adopt(scenario)
-        self.push.adopt(scenario)
-        for bound in self._bound:
-            bound.control.value = bound.read(scenario)
-        self._flow.handle.visible = scenario.view.generator
-        self.joints.visible = scenario.view.joint_plots
-        self.health.visible = scenario.view.health_plots
-        self._play.label = "Pause" if scenario.view.playing else "Play"
+        self._bindings.adopt(scenario)
         if self._reported is not None and not self._reported.begins_like(scenario):
             self._wait()
 
     def report(self, frame: Frame, pace: Pace) -> None:
-        """Show how the rebuild went and how far its result is to be trusted."""
+        """Show the speed of the rebuild, its warnings and its certificates."""
         if frame.stage is Stage.ROLLOUTS:
             return  # the next stage is a few milliseconds away
-        if self._adopted is not None and not frame.scenario.begins_like(self._adopted):
+        adopted = self._bindings.scenario
+        if adopted is not None and not frame.scenario.begins_like(adopted):
             return  # another task or scene was chosen meanwhile
         self._reported, self._shows, self._waits = frame.scenario, True, False
         self._learned()
         if self._noticed is not None and frame.scenario != self._noticed:
-            self._notice.visible, self._noticed = False, None
+            self.notice.visible, self._noticed = False, None
         self._give_hint(hint(frame))
-        self._transforms.report(frame)
-        self._stack.report(frame)
-        self._slice.report(frame)
-        self.joints.draw(frame.arm)
+        self._bindings.report(frame)
+        self.joints.follow(frame.arm)
         self.health.draw(frame.profiles)
-        self.push.report(frame)
-        _set_max(self._rollout.handle, len(frame.task.demonstrations) + len(frame.scenario.starts))
-        if frame.pictures.generator is not None:
-            _set_max(self._flow.handle, frame.pictures.generator.num_flows)
         self._settled = hint(frame), status_html(frame, pace)
-        self._status.content = self._settled[1]
+        self.status.content = self._settled[1]
 
     def _wait(self) -> None:
-        """Say that another task or scene is computed than the one reported last, whose status is pale."""
+        """Show that another task or scene is being computed; the status of the last one turns pale."""
         if not self._waits:
             self._waits = True
             self._give_hint("")
-            said = f"<div style='{_SMALL}'>{COMPUTING}</div>"
-            self._status.content = f"{said}<div style='{_PALE}'>{self._settled[1]}</div>"
+            said = f"<div style='{SMALL}'>{COMPUTING}</div>"
+            self.status.content = f"{said}<div style='{PALE}'>{self._settled[1]}</div>"
 
     def _settle(self) -> None:
-        """Nothing is computed that would be reported: show the status of what is shown, if that is adopted."""
+        """Stop waiting for a report; show the last frame's status again if it is of the adopted task and scene."""
         if self._waits:
             self._waits = False
-            stays = self._reported and self._adopted and self._reported.begins_like(self._adopted)
-            said, self._status.content = self._settled if stays else ("", "")
+            adopted = self._bindings.scenario
+            stays = self._reported and adopted and self._reported.begins_like(adopted)
+            said, self.status.content = self._settled if stays else ("", "")
             self._give_hint(said)
 
     def _give_hint(self, text: str) -> None:
-        said = f"<div style='{_SMALL};min-height:{_TWO_LINES}'>{html.escape(text)}</div>"
-        if self._hint.content != said:
-            self._hint.content = said
+        self.hint.content = f"<div style='{SMALL};min-height:{TWO_LINES}'>{html.escape(text)}</div>"
 
     def learning(self, fraction: float, message: str) -> None:
-        """Show how far learning a task is."""
+        """Show the progress of learning a task."""
         self._bar.visible = self._cancel.visible = True
         self._bar.value = 100 * fraction
-        self._status.content = f"<div style='{_SMALL}'>Learning the motion: {html.escape(message)}</div>"
+        self.status.content = f"<div style='{SMALL}'>Learning the motion: {html.escape(message)}</div>"
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
         self._settle()
         expected = isinstance(error, DataError | ImitationError)
-        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *_RED)
+        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *RED)
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
-        if self._shows and self._adopted is not None:
-            instead = f"This is “{self._titles[self._adopted.task]}” as before."
+        adopted = self._bindings.scenario
+        if self._shows and adopted is not None:
+            instead = f"This is “{self._titles[adopted.task]}” as before."
         else:
             instead = "Choose another task, or move the obstacle to start again."
-        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *_AMBER)
+        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *AMBER)
 
     def _say(self, text: str, colour: Colour, background: Colour) -> None:
-        """Say something that stays until the next scenario is shown, and for a while beside the panel."""
+        """Show a text until the next scenario is shown, and for a while beside the panel."""
         self._learned()
-        self._notify(_sentence(text), colour)
-        self._notice.content, self._notice.visible = _alarm(text, colour, background), True
-        self._noticed = self._adopted
+        self._notify(sentence(text), colour)
+        self.notice.content, self.notice.visible = alarm(text, colour, background), True
+        self._noticed = self._bindings.scenario
 
     def _learned(self) -> None:
-        """Nothing is being learned any more."""
+        """Hide the progress of learning."""
         if self._bar.visible:
             self._bar.visible = self._cancel.visible = False
-            self._status.content = ""
-
-    def _edit(self, gesture: str, **changes: Any) -> None:
-        if self._session is not None:
-            self._session.edit(gesture, **changes)
-
-    def _bind(
-        self, handle: Any, read: Callable[[Scenario], Any], change: Callable[[Scenario, Any], Mapping[str, Any]]
-    ) -> Control:
-        """Tie a control to the scenario: `read` gives its value, `change` the fields that a new value replaces."""
-
-        def act(value: Any) -> None:
-            if self._session is not None:
-                self._edit(handle.label, **change(self._session.scenario, value))
-
-        return self._tie(handle, read, act)
-
-    def _tie(self, handle: Any, read: Callable[[Scenario], Any], act: Callable[[Any], None]) -> Control:
-        """Have a control show what `read` gives, and `act` on new values."""
-        control = Control(handle, act)
-        self._bound.append(_Bound(control, read))
-        return control
-
-    def _cancel_learning(self) -> None:
-        if self._session is not None:
-            self._session.cancel()
+            self.status.content = ""
 
     def _build_task(self) -> None:
         names = {title: name for name, title in self._titles.items()}
@@ -288,10 +230,10 @@ class Panel:
         def choose(session: Session, title: str) -> None:
             session.choose_task(names[title])
 
-        self._tie(
+        self._bindings.choice(
             self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
         )
-        self._hint = self._gui.add_html("")
+        self.hint = self._gui.add_html("")
         scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
 
         def load(session: Session, title: str) -> None:
@@ -300,67 +242,66 @@ class Panel:
             else:
                 session.load(scenes[title].task, prepared(scenes[title]))
 
-        self._tie(
-            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="of the paper, one click each"),
+        self._bindings.choice(
+            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
             partial(self._begin, load),
         )
-        Control(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+        self._bindings.on(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
 
-    def _begin(self, begin: Callable[[Session, str], None], title: str) -> None:
-        """Begin a task or a scene; where that cannot be, say why and stay."""
-        if self._session is not None:
-            self._wait()
-            self._beginnings.submit(partial(self._begun, begin, self._session, title))
+    def _begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
+        """Begin a task or a scene; if that fails, show why and stay."""
+        self._wait()
+        self._beginnings.submit(partial(self._begun, begin, session, title))
 
     def _begun(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         begin(session, title)
         if self._reported is not None and self._reported.begins_like(session.scenario):
-            self._settle()  # it was chosen again before it was left
+            self._settle()  # the shown task was chosen again before it was left
 
     def _stay(self, error: Exception) -> None:
         self.fail(error)
-        if self._session is not None:
-            self.adopt(self._session.scenario)
+        self._bindings.restore()
 
-    def _travel(self, button: str) -> None:
-        session = self._session
-        if session is not None:
-            {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
-            if button == "Reset":
-                self._look_home()
+    def _travel(self, session: Session, button: str) -> None:
+        {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
+        if button == "Reset":
+            self._look_home()
 
     def _build_arm(self) -> None:
         gui = self._gui
-        self._play = gui.add_button("Pause")
-
-        on_press(self._play, self._play_or_pause)
-        self._bind(
+        play = gui.add_button("Pause")
+        self._bindings.properties(play, label=lambda s: "Pause" if s.view.playing else "Play")
+        self._bindings.on(play, _play_or_pause)
+        self._bindings.input(
             gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
             lambda s: s.view.speed,
             lambda s, value: {"view": replace(s.view, speed=value)},
         )
-        self.push = PushButton(gui)
-        self._rollout = self._bind(
-            gui.add_slider("Follows rollout", 1, 8, 1, 1),
-            lambda s: s.arm_rollout + 1,
-            lambda _s, value: {"arm_rollout": int(value) - 1},
-        )
+        self.push = PushButton(gui, self._bindings)
+        followed = gui.add_slider("Follows rollout", 1, 8, 1, 1)
+        self._bindings.properties(followed, max=self._num_rollouts)
+        self._bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})
 
-    def _play_or_pause(self) -> None:
-        if self._session is not None:
-            view = self._session.scenario.view
-            self._edit("play", view=replace(view, playing=not view.playing))
+    def _num_rollouts(self, _scenario: Scenario) -> int:
+        frame = self._bindings.frame
+        return KEEP if frame is None else len(frame.task.demonstrations) + len(frame.scenario.starts)
+
+    def _num_flows(self, _scenario: Scenario) -> int:
+        picture = None if self._bindings.frame is None else self._bindings.frame.pictures.generator
+        return KEEP if picture is None else picture.num_flows
 
     def _build_plots(self, robot: Robot) -> None:
-        """Each right under its checkbox, high up in the tab, to be seen when they open."""
+        """Build the plots, each under its checkbox, high up in the tab, to be seen when they open."""
         self._build_checkbox("joint_plots")
         self.joints = JointPlots(self._gui, robot)
+        self._bindings.properties(self.joints, visible=lambda s: s.view.joint_plots)
         self._build_checkbox("health_plots")
         self.health = HealthPlots(self._gui)
+        self._bindings.properties(self.health, visible=lambda s: s.view.health_plots)
 
     def _build_checkbox(self, name: str) -> None:
-        self._bind(
+        self._bindings.input(
             self._gui.add_checkbox(VIEW_LABELS[name], getattr(View(), name), hint=VIEW_HINTS.get(name)),
             lambda s: getattr(s.view, name),
             lambda s, value: {"view": replace(s.view, **{name: value})},
@@ -370,16 +311,11 @@ class Panel:
         for name in VIEW_LABELS:
             if name not in PLOTS:
                 self._build_checkbox(name)
-        self._flow = self._bind(
-            self._gui.add_slider(
-                "Of flow",
-                0,
-                MAX_FLOWS,
-                1,
-                0,
-                visible=False,
-                hint="ψ is several flows, 1 is the first; 0: their mean",
-            ),
+        hint = "ψ is several flows, 1 is the first; 0: their mean"
+        flow = self._gui.add_slider("Of flow", 0, MAX_FLOWS, 1, 0, visible=False, hint=hint)
+        self._bindings.properties(flow, visible=lambda s: s.view.generator, max=self._num_flows)
+        self._bindings.input(
+            flow,
             lambda s: s.view.generator_layer,
             lambda s, value: {"view": replace(s.view, generator_layer=int(value))},
         )
@@ -396,13 +332,13 @@ class Panel:
         on_press(save, lambda: self._saver.request(resolution.value, transparent.value))
 
 
-def _set_max(slider: Any, value: int) -> None:
-    if slider.max != value:
-        slider.max = value
+def _play_or_pause(session: Session, _pressed: bool) -> None:
+    view = session.scenario.view
+    session.edit("play", view=replace(view, playing=not view.playing))
 
 
 def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
-    """The scene's scenario for its task, once what takes seconds to draw of it is there."""
+    """Return a function that makes the scene's scenario, with the surfaces of its obstacles, which take seconds."""
 
     def scenario(task: Task) -> Scenario:
         begun = scene.scenario(task)
@@ -411,134 +347,3 @@ def prepared(scene: PaperScene) -> Callable[[Task], Scenario]:
         return begun
 
     return scenario
-
-
-COMPUTING = "Computing the motion…"
-CHANGED = "The scene is changed. “Reset” brings it back as it was."
-WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
-HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
-OF_MESHES = frozenset({Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE})
-"""Kinds of warnings about what the arm's meshes come near to."""
-_BLUE = ((29, 79, 124), (232, 241, 250))
-_GREEN = ((0, 92, 66), (230, 245, 239))
-_AMBER = ((138, 75, 0), (255, 244, 224))
-_RED = ((179, 38, 30), (253, 236, 234))
-_PALE = "opacity:0.3;filter:grayscale(1)"
-_TWO_LINES, _WARNING = "2.7em", "2.6em"
-_SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
-
-
-def hint(frame: Frame) -> str:
-    """What to try in the task, or to see in the scene of the paper."""
-    scene = SCENES.get(frame.scenario.scene)
-    if scene is None:
-        return frame.task.hint
-    return CHANGED if scene.is_changed(frame.scenario, frame.task) else scene.line
-
-
-def status_html(frame: Frame, pace: Pace) -> str:
-    """The status line: speed, clearance, certificates, and every warning."""
-    known, scenario = frame.certificates, frame.scenario
-    hides_arm = not (scenario.view.arm or scenario.view.onion)
-    # what is not known after the last stage never will be
-    unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
-    off = "–" if frame.blocked else "off"
-    whole_arm = scenario.arm_avoidance is not None
-    rows = (
-        ("Rebuild", _rebuild(pace)),
-        ("Clearance", off if frame.blocked else _clearance(known.clearance, whole_arm=whole_arm)),
-        *(_collision_rows(None, "arm hidden") if hides_arm else _collision_rows(known.collision, unknown)),
-        *_duration_rows(frame, off),
-        ("Smallest det J", unknown if known.min_det_jacobian is None else f"{known.min_det_jacobian:.2g}"),
-        ("There and back", unknown if known.round_trip_error is None else _tiny(known.round_trip_error)),
-        ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[known.lyapunov_falls]),
-    )
-    cells = "".join(
-        f"<tr style='vertical-align:top'><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
-        f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
-        for name, value in rows
-    )
-    seen = [warning for warning in known.warnings if not (hides_arm and warning.source == ARM)]
-    hand_only = scenario.avoids and not whole_arm
-    warnings = [f"{w}{HAND_ONLY}" if hand_only and w.kind is Kind.ARM_ENTERS else str(w) for w in seen]
-    of_motion = any(warning.kind not in OF_MESHES for warning in seen)
-    if known.clearance < 0 and scenario.avoids and scenario.warp == 1 and not (of_motion or frame.blocked):
-        warnings.insert(0, "the motions go through the obstacle at this flow time")
-    blocked = ""
-    if frame.blocked:
-        blocked = _alarm(f"no motion: {'; '.join(map(str, frame.blocked))}. What is shown is the last good one.", *_RED)
-    warp = "" if scenario.warp == 1 or frame.blocked else _alarm(WARP_HINT.format(scenario.warp), *_BLUE)
-    said = warp + "".join(_alarm(warning, *_AMBER) for warning in warnings)
-    if not (said or blocked) and frame.stage is Stage.CERTIFIED:
-        said = _alarm("every check holds", *_GREEN)
-    # its room stays while checks are made, so that what is below does not jump under the pointer
-    return f"{blocked}<table style='{_SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{said}</div>"
-
-
-def _rebuild(pace: Pace) -> str:
-    """How fast it goes."""
-    rate = f" · {pace.rate:.0f} frames/s" if pace.rate > 1 else ""
-    return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
-
-
-def _tiny(length: float) -> str:
-    """A length in metres that should be next to nothing."""
-    return f"{1e3 * length:.0e} mm" if 0 < length < 1e-4 else f"{1e3 * length:.1f} mm"
-
-
-def _clearance(clearance: float, *, whole_arm: bool) -> str:
-    whose = "body points" if whole_arm else "end effector"
-    return "no obstacle" if clearance == float("inf") else f"{1e3 * clearance:.1f} mm, {whose}"
-
-
-def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
-    """T of the flows: of the avoidance, and of the transforms that call it otherwise."""
-    hand, strengths = None, []
-    for layer, duration in zip(frame.scenario.stack, frame.durations, strict=False):
-        if duration is None:
-            continue
-        if layer.transform.most == 1:
-            hand = duration
-        else:
-            strengths.append(f"{duration:.2f} {layer.name}")
-    both = hand is not None and frame.arm_duration is not None
-    parts = ((hand, " hand" if both else ""), (frame.arm_duration, " arm"))
-    flow_time = " · ".join(f"{t:.2f}{whose}" for t, whose in parts if t is not None)
-    times = (("Flow time t", flow_time or off),) if flow_time or not strengths else ()
-    return (*times, *((("Strength", " · ".join(strengths)),) if strengths else ()))
-
-
-def _collision_rows(report: CollisionReport | None, unknown: str) -> tuple[tuple[str, str], ...]:
-    """What the arm's meshes come near to."""
-    if report is None:
-        obstacle = itself = table = unknown
-    else:
-        obstacle = "no obstacle"
-        if report.obstacle.links:
-            obstacle = _distance(report.obstacle.distance, "enters by", report.obstacle.links)
-        itself = f"over {1e3 * SELF_REACH:.0f} mm"
-        if report.itself is not None:
-            itself = _distance(report.itself.distance, "touches", report.itself.links)
-        table = _distance(report.table.distance, "below by", report.table.links)
-    return ("Arm to obstacle", obstacle), ("Arm to itself", itself), ("Arm to table", table)
-
-
-def _distance(distance: float, otherwise: str, links: tuple[str, ...]) -> str:
-    """A distance in metres, and of which links; `otherwise` says what one below zero means."""
-    size = f"{1e3 * abs(distance):.0f} mm"
-    if distance <= 0:
-        size = f"{otherwise} {size}" if distance < 0 else otherwise
-    return f"{size}, {' – '.join(links)}"
-
-
-def _sentence(text: str) -> str:
-    """The text with a capital letter, unless it begins with the name of a file."""
-    return text if "." in text.split(" ", 1)[0] else text[:1].upper() + text[1:]
-
-
-def _alarm(text: str, colour: Colour, background: Colour) -> str:
-    return (
-        "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
-        f"border-left:3px solid {css(colour)};color:{css(colour)};background:{css(background)}'>"
-        f"{html.escape(_sentence(text))}</div>"
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,30 +15,31 @@ from dt_viz.engine.engine import ArmMotion
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import css
+from dt_viz.ui.scene.picture import Following
 
 NUM_SAMPLES = 80
-"""Of each curve: what is sent in a drag stays small."""
+"""Number of samples of a curve, few enough to be sent during a drag."""
 MAX_SPEED = 200
-"""Percent of a joint's limit that the plot shows at most: a joint that leaps would press all others to the ground."""
+"""Largest speed in the plot, percent of the joint's limit: a joint that leaps would flatten all other curves."""
 HEIGHT = 170
-"""Of a plot, pixels."""
+"""Height of a plot, pixels."""
 SMALL = "font-size:0.75em;line-height:1.3;padding:0.2em 0.9em 0"
 
 
 @dataclass(frozen=True)
 class JointCurves:
-    """What the plots show."""
+    """Curves of the plots."""
 
     times: Array
-    """(N,) seconds, evenly spaced."""
+    """(N,) even times, seconds."""
     angles: Array
-    """(N, 6) degrees, unwrapped."""
+    """(N, 6) joint angles, degrees, unwrapped."""
     speeds: Array
-    """(N, 6) of the velocity limits, percent."""
+    """(N, 6) joint speeds, percent of the velocity limits."""
 
 
 def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> JointCurves:
-    """Curves of a motion; a speed is the largest around its moment, so that no peak is lost between two samples."""
+    """Compute the curves; a speed is the largest around its moment, so that no peak is lost between two samples."""
     times = np.linspace(motion.times[0], motion.times[-1], num)
     angles = np.stack([np.interp(times, motion.times, angle) for angle in np.degrees(motion.q).T], axis=1)
     steps = np.maximum(np.diff(motion.times), 1e-9)
@@ -50,21 +50,19 @@ def joint_curves(motion: ArmMotion, robot: Robot, num: int = NUM_SAMPLES) -> Joi
     return JointCurves(times, angles, speeds)
 
 
-class JointPlots:
-    """A folder with both plots; they are drawn only while shown."""
+class JointPlots(Following):
+    """A folder with both plots."""
 
     def __init__(self, gui: viser.GuiApi, robot: Robot) -> None:
         """Make the folder, hidden."""
         self._robot = robot
-        self._motion: ArmMotion | None = None
-        self._drawn: ArmMotion | None = None
-        self._drawing = threading.Lock()  # whoever switches them on is not who computes
         limited = [j for j in range(NUM_JOINTS) if np.isfinite(robot.lower[j])]
         self._limits = np.degrees(np.stack([robot.lower[limited], robot.upper[limited]], axis=1)).ravel()
         bounded = [css(palette.JOINTS[j]) for j in limited for _ in range(2)]
         blank = (np.zeros(2),)
-        self._folder = gui.add_folder("Joints", visible=False)
-        with self._folder:
+        folder = gui.add_folder("Joints", visible=False)
+        super().__init__(folder)
+        with folder:
             gui.add_html(_legend())
             gui.add_html(f"<div style='{SMALL}'>Angle [°]; dashed: limits</div>")
             self.angles = gui.add_uplot(
@@ -79,32 +77,8 @@ class JointPlots:
                 **LOOK,
             )
 
-    def draw(self, motion: ArmMotion | None) -> None:
-        """Show this motion; None leaves what is there."""
-        self._motion = motion or self._motion
-        if self._folder.visible:
-            self._catch_up()
-
-    @property
-    def visible(self) -> bool:
-        """Whether the folder is shown."""
-        return self._folder.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        if visible != self._folder.visible:
-            self._folder.visible = visible
-            if visible:
-                self._catch_up()
-
-    def _catch_up(self) -> None:
-        with self._drawing:
-            motion = self._motion
-            if motion is not None and motion is not self._drawn:
-                self._drawn = motion
-                self._plot(joint_curves(motion, self._robot))
-
-    def _plot(self, curves: JointCurves) -> None:
+    def _show(self, motion: ArmMotion) -> None:
+        curves = joint_curves(motion, self._robot)
         limits = np.tile(self._limits, (NUM_SAMPLES, 1))
         self.angles.data = columns(curves.times, curves.angles, limits)
         speeds, limit = np.minimum(curves.speeds, MAX_SPEED), np.full((NUM_SAMPLES, 1), 100.0)
@@ -112,7 +86,7 @@ class JointPlots:
 
 
 def columns(*arrays: Array) -> tuple[NDArray[np.float64], ...]:
-    """What uPlot takes: all columns of arrays (N,) and (N, k), one after the other."""
+    """Split arrays (N,) and (N, k) into the columns that uPlot takes."""
     return tuple(np.column_stack(arrays).T.astype(np.float64))
 
 

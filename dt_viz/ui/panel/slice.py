@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import viser
 
-from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
-from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario
-from dt_viz.ui.controls import on_press
+from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario, SliceColour
+from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_of
 
-COLOUR_LABELS: Mapping[str, str] = {
+COLOUR_LABELS: Mapping[SliceColour, str] = {
     "none": "None",
     "det": "det J",
     "lyapunov": "Lyapunov value",
@@ -26,13 +24,12 @@ _SMALL = "font-size:0.8em;line-height:1.4;padding:0.1em 0.9em 0.4em;opacity:0.85
 
 
 class SlicePanel:
-    """What the user chooses for the slice."""
+    """The controls of the slice, with a legend of its colours."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Callable[..., Any]) -> None:
-        """Build the controls; `bind` ties one to the scenario, see `Panel`."""
-        self._session: Session | None = None
-        self._colour = "none"
-        bind(
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Build the controls."""
+        self._bindings = bindings
+        bindings.input(
             gui.add_checkbox(
                 "Move the slice", False, hint="handles that move and tilt the plane of arrows and colours"
             ),
@@ -40,48 +37,41 @@ class SlicePanel:
             lambda s, value: {"view": replace(s.view, move_slice=value)},
         )
         self.back = gui.add_button("Back to the task's slice", visible=False)
-
-        on_press(self.back, self._put_back)
-
-        bind(
-            gui.add_dropdown("Colour", tuple(COLOUR_LABELS.values()), hint="of the slice"),
+        bindings.properties(self.back, visible=lambda s: s.view.slice is not None)
+        bindings.on(self.back, _put_back)
+        names = {label: name for name, label in COLOUR_LABELS.items()}
+        bindings.input(
+            gui.add_dropdown("Colour", tuple(names), hint="quantity shown on the slice"),
             lambda s: COLOUR_LABELS[s.view.colour],
-            lambda s, value: {
-                "view": replace(s.view, colour=next(name for name, label in COLOUR_LABELS.items() if label == value))
-            },
+            lambda s, label: {"view": replace(s.view, colour=names[label])},
         )
         self.legend: Legend | None = None
-        """Of the colours that are shown."""
+        """Legend of the colours that are shown."""
         self.key = gui.add_html("", visible=False)
+        bindings.show(self._legend_of, self._explain)
         self.note = gui.add_html(f"<div style='{_SMALL}'>{WHOLE_ARM_NOTE}</div>", visible=False)
+        bindings.properties(self.note, visible=_lacks_whole_arm)
 
-    def connect(self, session: Session) -> None:
-        """Let the controls edit this session."""
-        self._session = session
-
-    def _put_back(self) -> None:
-        if self._session is not None:
-            self._session.edit("slice", view=replace(self._session.scenario.view, slice=None))
-            self._session.end_gesture()
-
-    def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's choices."""
-        view = scenario.view
-        self._colour = view.colour
-        self.back.visible = view.slice is not None
-        shown = view.colour != "none" or view.field or view.streamlines or view.grid
-        self.note.visible = shown and scenario.arm_avoidance is not None and bool(scenario.obstacles)
-        if view.colour in {"none", "occupancy"}:
-            self._explain(OCCUPANCY if view.colour == "occupancy" else None)
-
-    def report(self, frame: Frame) -> None:
-        """Show the legend of the colours that are shown."""
-        picture = frame.pictures.colour
-        if picture is not None and picture.what == self._colour:  # or another was chosen meanwhile
-            self._explain(legend_of(picture))
+    def _legend_of(self, scenario: Scenario) -> Legend | None:
+        """Return the legend of the view's colours; `KEEP` until their picture is there."""
+        colour, frame = scenario.view.colour, self._bindings.frame
+        if colour in {"none", "occupancy"}:
+            return OCCUPANCY if colour == "occupancy" else None
+        picture = None if frame is None else frame.pictures.colour
+        return legend_of(picture) if picture is not None and picture.what == colour else KEEP
 
     def _explain(self, legend: Legend | None) -> None:
         self.legend = legend
-        text = legend.html if legend else ""
-        if self.key.content != text:
-            self.key.content, self.key.visible = text, bool(text)
+        self.key.content, self.key.visible = legend.html if legend else "", legend is not None
+
+
+def _put_back(session: Session, _pressed: bool) -> None:
+    session.edit("slice", view=replace(session.scenario.view, slice=None))
+    session.end_gesture()
+
+
+def _lacks_whole_arm(scenario: Scenario) -> bool:
+    """Whether the slice shows something that the whole arm's avoidance would change."""
+    view = scenario.view
+    shown = view.colour != "none" or view.field or view.streamlines or view.grid
+    return shown and scenario.arm_avoidance is not None and bool(scenario.obstacles)

@@ -12,23 +12,32 @@ import viser
 from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, levels, listed, place_of, shifted, switched, tunable
-from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.settings import Bind
-from dt_viz.ui.panel.transform_settings import TransformSettings, durations, flow_time_of
+from dt_viz.scenario.stack import (
+    IMITATION,
+    WHOLE_ARM,
+    levels,
+    listed,
+    place_of,
+    shifted,
+    switched,
+    transform_of,
+    tunable,
+)
+from dt_viz.ui.panel.bindings import Bindings
+from dt_viz.ui.panel.transform_settings import add_transform_settings
 from dt_viz.ui.panel.warp import WarpControls
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.levels import manifold
 
 BASE = "Base attractor"
 BELOW = 1e9
-"""Order of what stands below the rows in their folder."""
+"""Order of the controls below the rows in their folder."""
 ON, OFF, UP, DOWN, SEE, SEEN = "● on", "○ off", "↑", "↓", "see", "● seen"
 
 
 @dataclass(frozen=True)
 class Row:
-    """One transform as the list shows it."""
+    """Row of the list: a transform with its buttons."""
 
     name: str
     label: str
@@ -38,89 +47,67 @@ class Row:
 class StackPanel:
     """The stack, a row for each transform."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Bind) -> None:
-        """Build an empty list, the warp and the settings; they act once `connect` has given them a session."""
-        self._gui = gui
-        self._session: Session | None = None
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Build an empty list, the warp and the settings."""
+        self._gui, self._bindings = gui, bindings
         self._folder = gui.add_folder("Stack, the outermost on top")
-        self._rows: list[Any] = []
+        self.rows: list[Any] = []
         self._shown: tuple[Row, ...] = ()
-        self._scenario: Scenario | None = None
-        self._durations: dict[str, float | None] = {}
         with self._folder:
-            self._warp = WarpControls(gui, bind, BELOW)
-            self._settings = TransformSettings(gui, bind, BELOW + 2)
-        self._legend = gui.add_html("", visible=False)  # at the end: it comes and goes, and would move what is below
-
-    def connect(self, session: Session) -> None:
-        """Let the rows edit this session."""
-        self._session = session
-        self._warp.connect(session)
+            self._warp = WarpControls(gui, bindings, BELOW)
+            add_transform_settings(gui, bindings, BELOW + 2)
+        bindings.show(self._wanted, self._show)
+        legend = gui.add_html(
+            "", visible=False
+        )  # at the end: it appears and disappears, which would move controls below it
+        bindings.properties(legend, content=legend_html, visible=lambda s: bool(legend_html(s)))
 
     def close(self) -> None:
-        """Stop what plays."""
+        """Stop playing."""
         self._warp.close()
 
-    def adopt(self, scenario: Scenario) -> None:
-        """Show the scenario's stack."""
-        self._scenario = scenario
-        self._show(rows(scenario, self._durations))
-        text = legend_html(scenario)
-        if self._legend.content != text:
-            self._legend.content, self._legend.visible = text, bool(text)
-        self._settings.adopt(scenario)
-
-    def report(self, frame: Frame) -> None:
-        """Show which durations were chosen."""
-        self._durations = durations(frame)
-        if self._scenario is not None:
-            self._show(rows(self._scenario, self._durations))
-        self._settings.report(frame)
+    def _wanted(self, scenario: Scenario) -> tuple[Row, ...]:
+        frame = self._bindings.frame
+        return rows(scenario, {} if frame is None else durations(frame))
 
     def _show(self, wanted: tuple[Row, ...]) -> None:
         """Reuse the rows that there are, from the top; those that are not needed are hidden."""
         self._shown = wanted
-        while len(self._rows) < len(wanted):
-            self._add_row(wanted[len(self._rows)])
-        for k, handle in enumerate(self._rows):
-            if k < len(wanted):
-                if handle.label != wanted[k].label:
-                    handle.label = wanted[k].label
-                if handle.options != wanted[k].buttons:
-                    handle.options = wanted[k].buttons
-            if handle.visible != (k < len(wanted)):
-                handle.visible = k < len(wanted)
+        while len(self.rows) < len(wanted):
+            self._add_row(wanted[len(self.rows)])
+        for handle, row in zip(self.rows, wanted, strict=False):
+            handle.label, handle.options, handle.visible = row.label, row.buttons, True
+        for handle in self.rows[len(wanted) :]:
+            handle.visible = False
 
     def _add_row(self, row: Row) -> None:
-        k = len(self._rows)
+        k = len(self.rows)
         with self._folder:
             handle = self._gui.add_button_group(row.label, row.buttons)
-        self._rows.append(handle)
+        self.rows.append(handle)
 
-        def pressed(button: str) -> None:
+        def pressed(session: Session, button: str) -> None:
             if k < len(self._shown):
-                self.press(self._shown[k].name, button)
+                press(session, self._shown[k].name, button)
 
-        Control(handle, pressed)
+        self._bindings.on(handle, pressed)
 
-    def press(self, name: str, button: str) -> None:
-        """Do what a button of the row of this name does."""
-        session = self._session
-        if session is None:
-            return
-        changes = _ACTIONS[button](session.scenario, name)
-        session.edit(f"{name} {button}", **changes)
-        session.end_gesture()
+
+def press(session: Session, name: str, button: str) -> None:
+    """Do what a button of the row of this name does."""
+    session.edit(f"{name} {button}", **_ACTIONS[button](session.scenario, name))
+    session.end_gesture()
 
 
 def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row, ...]:
-    """The list from the top down, with the durations that the last frame had."""
+    """Return the rows from the top down, with the durations of the last frame."""
     on = {layer.name for layer in scenario.stack if layer.on}
     seen, order, rows = levels(scenario), listed(scenario), []
     for k, name in enumerate(order):
         moves = (UP,) * (k < len(order) - 1) + (DOWN,) * (k > 0)
         look = (_look(scenario, name),) * (name in seen)
-        label = _label(name, durations.get(name), flow_time_of(scenario, name))
+        transform = transform_of(scenario, name)
+        label = _label(name, durations.get(name), "t" if transform is None else transform.flow_time)
         rows.append(Row(name, label, (ON if name in on else OFF, *moves, *look)))
     place = place_of(scenario, WHOLE_ARM)
     if WHOLE_ARM in tunable(scenario) and place is not None:
@@ -131,8 +118,14 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row
     return (*reversed(rows), imitation, base)
 
 
+def durations(frame: Frame) -> dict[str, float | None]:
+    """Return t of the flow of each transform, by name; None where it is off."""
+    layers = zip(frame.scenario.stack, frame.durations, strict=False)
+    return {**{layer.name: duration for layer, duration in layers}, WHOLE_ARM: frame.arm_duration}
+
+
 def legend_html(scenario: Scenario) -> str:
-    """Which lines are those of the selected level; nothing if none is shown."""
+    """Return a legend of the selected level's lines; empty if none is selected."""
     if scenario.view.level not in levels(scenario):
         return ""
     swatch = (

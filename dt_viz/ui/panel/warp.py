@@ -5,20 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 import viser
 
 from dt_viz.engine.session import Session
-from dt_viz.ui.controls import Control
+from dt_viz.ui.panel.bindings import Bindings
 
 SECONDS = 5.0
-"""That playing takes."""
+"""Duration of playing."""
 STEP = 0.05
-"""Seconds between two edits: as many a second as a dragged slider sends."""
+"""Interval of the edits, seconds, as of a dragged slider."""
 PLAY, STOP = "0 → 1", "Stop"
 NAME = "Warp"
-"""Of the slider, and so of the gesture for undo."""
+"""Name of the slider, and of its gesture for undo."""
 
 
 class WarpPlayer:
@@ -28,8 +27,8 @@ class WarpPlayer:
         """Wait to be started.
 
         Args:
-            changed: told when it begins to play and when it ends.
-            seconds: that it takes.
+            changed: called with True when playing begins and with False when it ends.
+            seconds: duration of playing.
         """
         self._changed = changed
         self._seconds = seconds
@@ -42,7 +41,7 @@ class WarpPlayer:
         return self._thread is not None and self._thread.is_alive()
 
     def toggle(self, session: Session) -> None:
-        """Begin, or stop where it is."""
+        """Start to play, or stop at the current warp."""
         if self.playing:
             self._stop.set()
         else:
@@ -60,7 +59,7 @@ class WarpPlayer:
         self._changed(True)
         session.begin_gesture()
         began, mine = time.monotonic(), None
-        while mine is None or session.scenario.moves_like(mine):  # else somebody else has taken hold
+        while mine is None or session.scenario.moves_like(mine):  # else the user edits something
             warp = min(1.0, (time.monotonic() - began) / self._seconds)
             session.edit(NAME, warp=round(warp, 3))
             mine = session.scenario
@@ -73,33 +72,23 @@ class WarpPlayer:
 class WarpControls:
     """The slider and the button that plays it."""
 
-    def __init__(self, gui: viser.GuiApi, bind: Any, order: float) -> None:  # noqa: ANN401 - `Bind` of the panel
-        """Build them; they act once `connect` has given them a session.
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings, order: float) -> None:
+        """Build them.
 
         Args:
-            gui: of the visitor, in the folder that they go into.
-            bind: ties the slider to the scenario.
-            order: of the first of them in the folder.
+            gui: controls of the visitor, in the folder that they go into.
+            bindings: bindings of the visitor's panel.
+            order: order of the first of them in the folder.
         """
-        self._session: Session | None = None
         self._player = WarpPlayer(self._show)
-        hint = "for how much of its time each flow runs: at 0 motions are straight and so is space, at 1 all is done"
-        bind(
+        hint = "part of its time that each flow runs: at 0 motions and space are straight, at 1 the stack is complete"
+        bindings.input(
             gui.add_slider(NAME, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint),
             lambda s: s.warp,
             lambda _s, value: {"warp": value},
         )
         self._play = gui.add_button_group("Play warp", (PLAY,), order=order + 1)
-
-        Control(self._play, lambda _button: self._toggle())
-
-    def _toggle(self) -> None:
-        if self._session is not None:
-            self._player.toggle(self._session)
-
-    def connect(self, session: Session) -> None:
-        """Let them edit this session."""
-        self._session = session
+        bindings.on(self._play, lambda session, _button: self._player.toggle(session))
 
     def _show(self, playing: bool) -> None:
         self._play.options = (STOP,) if playing else (PLAY,)

@@ -6,6 +6,7 @@ A ring is around the region that it acts in. In a drawing the handles move it in
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 
 import numpy as np
 import viser
@@ -23,22 +24,22 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.handles import Dragged, Handles
 
 BALL_RADIUS = 0.011
-"""Of the marker, metres."""
+"""Radius of the marker, metres."""
 HANDLE_SCALE = 0.11
-"""Metres that the handles stick out, about."""
+"""Approximate size of the handles, metres."""
 RING_WIDTH = 1.6
-"""Pixels."""
+"""Thickness of the rings' lines, pixels."""
 MAX_ANCHORS = sum(kind.most for kind in KINDS if kind.most > 1)
 """Largest number of transforms that may have a place."""
 NUM_SEGMENTS = 96
-"""Of a ring."""
+"""Number of segments of a ring."""
 
 Moved = Callable[[str, Array, str], None]
-"""Told which transform was moved, by name, its position (3,), metres, and the phase of the drag."""
+"""Callback with the name of a transform, its new position (3,), metres, and the phase of the drag."""
 
 
 class AnchorPicture:
-    """One transform's place, hung on a gizmo: the browser moves both together, without asking the server."""
+    """Marker at a transform's place, a child of a gizmo; the browser moves both, without the server."""
 
     def __init__(
         self,
@@ -51,14 +52,14 @@ class AnchorPicture:
         """Hidden until `adopt` gives it a transform.
 
         Args:
-            scene: of the visitor.
-            number: of this picture, from 0.
-            moved: told of each new position.
-            selected: told that it was clicked or taken hold of.
-            along: how far (3,) an event drags what it has grabbed, metres.
+            scene: scene of the visitor.
+            number: number of this picture, from 0.
+            moved: called with each new position.
+            selected: called when it is clicked or grabbed.
+            along: returns the shift (3,) by an event of a drag, metres.
         """
         self.name = ""
-        """Of the transform."""
+        """Name of the transform."""
         node = f"/bias/{number}"
         self.gizmo = scene.add_transform_controls(
             node, line_width=3.0, disable_rotations=True, depth_test=False, visible=False
@@ -74,7 +75,6 @@ class AnchorPicture:
             thickness_units="screen",
             visible=False,
         )
-        self._flat = True
         self._label = scene.add_label(
             f"{node}/label",
             "",
@@ -96,47 +96,36 @@ class AnchorPicture:
         gestures.on_click(self.ball, lambda: selected(self.name))
 
     def adopt(self, name: str, transform: Transform, *, on: bool, selected: bool) -> None:
-        """Stand where the transform does, unless that is where the browser has put it already."""
+        """Move to the transform's place, unless the browser has moved there already."""
         assert transform.anchor is not None
         plane = transform.anchor_plane
         self.handles.stand(transform.anchor, viser.transforms.SO3.from_matrix(axes_of(plane)).wxyz)
         flat = plane is not None
-        if self.gizmo.active_axes[2] == flat:
-            self.gizmo.active_axes = (True, True, not flat)
-        if self._flat != flat:
-            self._flat, self.region.points = flat, _rings(flat=flat)
+        self.gizmo.active_axes = (True, True, not flat)
+        self.region.points = _rings(flat=flat)
         self.name = name
-        label = f"{name.lower()}: goal" if transform.ends_motions else name.lower()
-        if self._label.text != label:
-            self._label.text = label
-        colour = palette.BIAS if on else palette.STALE
-        if tuple(self.ball.color) != colour:
-            self.ball.color = colour
-            self.region.colors = np.array(palette.REGION if on else palette.STALE, dtype=np.uint8)
+        self._label.text = f"{name.lower()}: goal" if transform.ends_motions else name.lower()
+        self.ball.color = palette.BIAS if on else palette.STALE
+        self.region.colors = np.array(palette.REGION if on else palette.STALE, dtype=np.uint8)
         self.handles.show(selected)
-        if not self.gizmo.visible:
-            self.gizmo.visible = True
+        self.gizmo.visible = True
 
     def show_region(self, transform: Transform, used: float | None) -> None:
-        """Show how far it acts: the radius that was used, or the one asked for; nothing while neither is known."""
+        """Show the region of the transform: the radius used, or the one it asks for; nothing while neither is known."""
         radius = used or transform.region
-        shown = radius is not None
-        if shown:
-            scale = (radius, radius, radius)
-            if self.region.scale != scale:
-                self.region.scale = scale
-        if self.region.visible != shown:
-            self.region.visible = shown
+        if radius is not None:
+            self.region.scale = (radius, radius, radius)
+        self.region.visible = radius is not None
 
     def hide(self) -> None:
-        """There is no such transform."""
+        """Hide the marker: there is no such transform."""
         self.name = ""
-        if self.gizmo.visible:
-            self.gizmo.visible = False
+        self.gizmo.visible = False
 
 
+@lru_cache(maxsize=2)
 def _rings(*, flat: bool) -> Array:
-    """Segments (K, 2, 3) of a circle of radius 1 in the plane of the first two axes, or in those of any two."""
+    """Return segments (K, 2, 3) of a unit circle in the plane of the first two axes, or of one in each such plane."""
     turn = np.linspace(0, 2 * np.pi, NUM_SEGMENTS + 1)
     circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
     circles = [circle] if flat else [np.roll(circle, shift, axis=1) for shift in range(3)]
@@ -158,7 +147,7 @@ class Anchors(Dragged):
         return [item.handles for item in self.items]
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: the regions, and the slice to be dragged in."""
+        """See `Picture`: shows the regions, and remembers the slice for drags."""
         super().draw(frame)
         layers = zip(frame.scenario.stack, frame.chosen_values, strict=False)
         radii = {layer.name: chosen.get("radius") for layer, chosen in layers}

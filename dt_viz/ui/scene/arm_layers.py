@@ -18,7 +18,7 @@ from dt_viz.scenario.scenario import View
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import PEDESTAL, ArmPicture, GhostArm
 from dt_viz.ui.scene.links import light_shells
-from dt_viz.ui.scene.picture import Picture, Shown, rgb
+from dt_viz.ui.scene.picture import Following, Picture, Shown, rgb
 
 NUM_ARMS = 6
 """Number of arms along the motion, start and goal included."""
@@ -43,7 +43,7 @@ def arms_along(robot: Robot, motion: ArmMotion, num: int = NUM_ARMS) -> Array:
     return np.stack([np.interp(places, samples, angle) for angle in motion.q.T], axis=1)
 
 
-class Onion(Picture):
+class Onion(Following, Picture):
     """Several arms along the motion, from faint at its start to strong at its end; a drag sends only their poses."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
@@ -65,24 +65,12 @@ class Onion(Picture):
             )
             for index, shell in list(enumerate(light_shells(robot.joint_names)))[PEDESTAL:]
         )
-        self._motion: ArmMotion | None = None
-        self._drawn: ArmMotion | None = None
-        self._drawing = threading.Lock()  # it is switched on by another thread than the one that computes
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        self._motion = frame.arm or self._motion
-        if self.visible:
-            self._catch_up()
+        self.follow(frame.arm)
 
-    def _catch_up(self) -> None:
-        with self._drawing:
-            motion = self._motion
-            if motion is not None and motion is not self._drawn:
-                self._drawn = motion
-                self._place(motion)
-
-    def _place(self, motion: ArmMotion) -> None:
+    def _show(self, motion: ArmMotion) -> None:
         rotations, origins = self._robot.forward_kinematics(arms_along(self._robot, motion))
         wxyzs = transforms.SO3.from_matrix(rotations).wxyz
         for joint, link in enumerate(self.links, start=PEDESTAL - 1):

@@ -14,16 +14,16 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Lines, Picture
 
 LABEL_GAP = 0.03
-"""Above the slice, metres."""
+"""Height of the label above the slice, metres."""
 
 
 class LevelRollouts(Picture):
-    """What the motions would be without what is stacked on the selected level, and the name of its manifold."""
+    """Rollouts of the selected level, without the transforms stacked on it, and the name of its manifold."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/level", show_axes=False, visible=False))
         self.lines = Lines(scene, "/level/rollouts", palette.LEVEL, 0.0052)
-        self._end = scene.add_frame("/level/end", show_axes=False, visible=False)
+        self.end = scene.add_frame("/level/end", show_axes=False, visible=False)
         scene.add_icosphere("/level/end/ball", radius=0.009, color=palette.LEVEL)
         scene.add_label(
             "/level/end/label", "its end", position=(0.0, 0.0, 0.02), anchor="bottom-center", font_screen_scale=0.8
@@ -32,28 +32,22 @@ class LevelRollouts(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        shown = frame.level is not None
         if frame.level is not None:
             paths = frame.levels[frame.level]
             self.lines.show(paths, colour=palette.STALE if frame.blocked else None)
             self._mark(paths[0][-1], frame.goal)
-            area, text = frame.slice, manifold(frame.scenario)
-            if self.label.text != text:
-                self.label.text = text
+            self.label.text, area = manifold(frame.scenario), frame.slice
             self.label.position = area.centre + np.array([0.0, 0.0, np.ptp(area.border[:, 2]) / 2 + LABEL_GAP])
-        if self._node.visible != shown:
-            self._node.visible = shown
+        self.visible = frame.level is not None
 
     def _mark(self, end: Array, goal: Array) -> None:
         """Mark the end (3,) of the motions unless it is the goal (3,), metres."""
-        self._end.position = end
-        elsewhere = bool(np.linalg.norm(end - goal) > MAX_GOAL_MISS)
-        if self._end.visible != elsewhere:
-            self._end.visible = elsewhere
+        self.end.position = end
+        self.end.visible = bool(np.linalg.norm(end - goal) > MAX_GOAL_MISS)
 
 
 def manifold(scenario: Scenario) -> str:
-    """What the manifold of the level that the view shows is called."""
+    """Return the name of the manifold of the level that the view shows."""
     level = scenario.view.level
     if level == IMITATION:
         return "manifold of the imitation" if scenario.imitation else "base attractor: straight motions"

@@ -21,22 +21,22 @@ from dt_viz.ui.scene.handles import Dragged, Handles
 from dt_viz.ui.scene.links import simplified
 
 HANDLE_SCALE = 0.2
-"""Metres that the handles stick out, about."""
+"""Approximate size of the handles, metres."""
 OPACITY, OPACITY_FAINT, OPACITY_OPENED = 0.8, 0.3, 0.12
-"""The path that an obstacle blocks shines through; more so while it is not avoided, and most while its map is shown."""
+"""Opacities of an obstacle: avoided, not avoided, and while its map is shown."""
 CREASE = 0.6
 """Angle between neighbouring faces above which their edge is drawn sharp, rad."""
 MAX_FACES = 30_000
-"""That are drawn in full."""
+"""Largest number of faces of a mesh that is drawn in full."""
 FINEST = 0.035
-"""Size of what is left of a larger mesh, in radii."""
+"""Size of the cells in which a larger mesh's vertices are merged, in radii of the obstacle."""
 
 Moved = Callable[[int, Array, Array, str], None]
-"""Told which obstacle was moved, its position (3,), metres, and quaternion (4,), and the phase of the drag."""
+"""Callback with the index of an obstacle, its new position (3,), metres, quaternion (4,), and the phase of the drag."""
 
 
 class ObstaclePicture:
-    """One obstacle, hung on a gizmo: the browser moves both together, without asking the server."""
+    """One obstacle, a child of a gizmo; the browser moves both, without the server."""
 
     def __init__(
         self,
@@ -49,11 +49,11 @@ class ObstaclePicture:
         """Draw nothing yet.
 
         Args:
-            scene: of the visitor.
-            index: in the scenario.
-            moved: told of each new pose.
-            selected: told that this obstacle was clicked.
-            along: how far (3,) an event drags what it has grabbed, metres.
+            scene: scene of the visitor.
+            index: index of the obstacle in the scenario.
+            moved: called with each new pose.
+            selected: called with the index when the obstacle is clicked or grabbed.
+            along: returns the shift (3,) by an event of a drag, metres.
         """
         self.gizmo = scene.add_transform_controls(f"/obstacles/{index}", line_width=3.0, depth_test=False)
         self.handles = Handles(self.gizmo, HANDLE_SCALE)
@@ -75,19 +75,14 @@ class ObstaclePicture:
         gestures.on_drag(self.mesh, dragged)
         gestures.on_click(self.mesh, partial(selected, index))
 
-    @property
-    def has_handles(self) -> bool:
-        """Whether handles are shown."""
-        return self.handles.shown
-
     def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool, opened: bool) -> None:
-        """Look like the obstacle and stand where it does, unless that is where the browser has put it already.
+        """Show the obstacle where it stands; a pose that the browser has already is not sent to it.
 
         Args:
-            obstacle: to show.
+            obstacle: obstacle to show.
             selected: whether it has handles.
             avoided: whether motions avoid it.
-            opened: whether its nearer half is left out, to show what is inside.
+            opened: whether its front faces are left out, to show the inside.
         """
         self.handles.stand(obstacle.position, obstacle.wxyz)
         look, scale = unscaled(obstacle.moved((0.0, 0.0, 0.0)))
@@ -95,16 +90,11 @@ class ObstaclePicture:
             self._look = look
             self.mesh.vertices, self.mesh.faces = shaded(look)
             self.gizmo.disable_rotations = isinstance(look, Sphere)
-        if self.mesh.scale != scale:
-            self.mesh.scale = scale
+        self.mesh.scale = scale
         self.handles.scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
         self.handles.show(selected)
-        side = "back" if opened else "front"
-        if self.mesh.side != side:
-            self.mesh.side = side
-        opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
-        if self.mesh.opacity != opacity:
-            self.mesh.opacity = opacity
+        self.mesh.side = "back" if opened else "front"
+        self.mesh.opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
 
     def remove(self) -> None:
         """Take it out of the scene."""
@@ -118,15 +108,15 @@ class Obstacles(Dragged):
         """Begin with none.
 
         Args:
-            scene: of the visitor.
-            moved: told of a new pose of one of them; the phase is "start", "update" or "end".
-            selected: told which one the user has clicked or taken hold of.
+            scene: scene of the visitor.
+            moved: called with each new pose of one of them.
+            selected: called with the index of one that is clicked or grabbed.
         """
         super().__init__(scene.add_frame("/obstacles", show_axes=False))
         self._scene = scene
         self._moved, self._selected = moved, selected
         self.items: list[ObstaclePicture] = []
-        """In the order of the scenario."""
+        """Pictures of the obstacles, in the order of the scenario."""
 
     @property
     def handles(self) -> Iterable[Handles]:
@@ -150,14 +140,14 @@ class Obstacles(Dragged):
 
 
 def unscaled(obstacle: Obstacle) -> tuple[Obstacle, float]:
-    """The obstacle as its triangles are kept, and by how much the browser is to scale them."""
+    """Return the obstacle with the triangles that are sent, and the scale that the browser gives them."""
     if isinstance(obstacle, MeshObstacle | CloudObstacle):
         return replace(obstacle, scale=1.0), obstacle.scale
     return obstacle, 1.0
 
 
 def shaded(obstacle: Obstacle) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Vertices (V, 3), metres, and faces (F, 3) of its surface, with vertices of their own along sharp edges."""
+    """Return vertices (V, 3), metres, and faces (F, 3) of its surface; sharp edges have vertices for each side."""
     mesh = trimesh.Trimesh(*obstacle.surface(), process=False)
     if len(mesh.faces) > MAX_FACES:
         mesh = simplified(mesh, FINEST * obstacle.radius)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from dt_viz.engine.engine import ArmMotion
 from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
@@ -18,25 +20,52 @@ Colour = tuple[int, int, int]
 
 
 class Shown:
-    """A part of the scene under one node, which can be hidden."""
+    """A part of the page under one node, which can be hidden."""
 
-    def __init__(self, node: viser.SceneNodeHandle) -> None:
-        self._node = node
+    def __init__(self, node: Any) -> None:  # noqa: ANN401 - a node of the scene, or a folder of the panel
+        self.node = node
 
     @property
     def visible(self) -> bool:
         """Whether it is shown."""
-        return self._node.visible
+        return self.node.visible
 
     @visible.setter
     def visible(self, visible: bool) -> None:
-        if visible != self._node.visible:
-            self._node.visible = visible  # first, so that a frame that comes meanwhile is drawn
+        if visible != self.node.visible:
+            self.node.visible = visible  # first, so that a frame that comes meanwhile is drawn
             if visible:
                 self._catch_up()
 
     def _catch_up(self) -> None:
         """Draw what was left out while it was hidden; most parts need nothing."""
+
+
+class Following(Shown, ABC):
+    """A part of the page that is drawn from the newest motion, only while it is shown."""
+
+    def __init__(self, node: Any) -> None:  # noqa: ANN401 - a node of the scene, or a folder of the panel
+        super().__init__(node)
+        self._motion: ArmMotion | None = None
+        self._drawn: ArmMotion | None = None
+        self._drawing = threading.Lock()  # it is switched on by another thread than the one that computes
+
+    def follow(self, motion: ArmMotion | None) -> None:
+        """Show this motion; None leaves what is there."""
+        self._motion = motion or self._motion
+        if self.visible:
+            self._catch_up()
+
+    def _catch_up(self) -> None:
+        with self._drawing:
+            motion = self._motion
+            if motion is not None and motion is not self._drawn:
+                self._drawn = motion
+                self._show(motion)
+
+    @abstractmethod
+    def _show(self, motion: ArmMotion) -> None:
+        """Draw a motion."""
 
 
 class Picture(Shown, ABC):

@@ -31,20 +31,20 @@ from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlic
 from dt_viz.ui.scene.starts import Starts
 
 BOLD, THIN = 0.0048, 0.0026
-"""Of the rollouts of the whole stack, metres: by themselves, and beside those of a level."""
+"""Thickness of the whole stack's rollouts, metres: by themselves, and beside those of a level."""
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
-"""Labels of where the demonstrations end: if motions end there, and if they do not."""
+"""Labels of the demonstrations' end: where motions end there, and where they end elsewhere."""
 ADDED = 0.0022
 """Thickness of rollouts from added starts, metres."""
 OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
-"""What the view shows of a motion, and nothing says that it may be of another one: rollouts are grey then."""
+"""Fields of `View` whose pictures are hidden while there is no motion: unlike the rollouts they cannot turn grey."""
 OF_A_TASK = {"demonstrations", "ghost"}
-"""The same of what belongs to a task or a scene."""
+"""Fields of `View` whose pictures are hidden while another task or scene is being computed."""
 COMPUTING = "computing"
 
 
 class Demonstrations(Picture):
-    """What was shown to the robot, thin."""
+    """The demonstrations, as thin lines."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._lines = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018)
@@ -59,7 +59,7 @@ class Demonstrations(Picture):
 
 
 class Rollouts(Picture):
-    """What the robot will do, bold, with a dot at each start; thin and pale beside those of a level of the stack.
+    """The rollouts, bold, with a dot at each start; thin and pale beside those of a level of the stack.
 
     Motions that begin at added starts are thin.
     """
@@ -68,7 +68,7 @@ class Rollouts(Picture):
         self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, BOLD)
         super().__init__(self.lines.node)
         self.added = Lines(scene, "/rollouts/added", palette.ROLLOUT, ADDED)
-        self._starts = scene.add_point_cloud(
+        self.starts = scene.add_point_cloud(
             "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
         )
 
@@ -83,11 +83,9 @@ class Rollouts(Picture):
                 lines.show(paths, colour=palette.ROLLOUT_BESIDE)
             else:
                 lines.show(paths, chosen)
-        thickness = BOLD if frame.level is None else THIN
-        if self.lines.node.thickness != thickness:
-            self.lines.node.thickness = thickness
-        self._starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
-        self._starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
+        self.lines.node.thickness = BOLD if frame.level is None else THIN
+        self.starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
+        self.starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
 
 
 class Ghost(Picture):
@@ -106,7 +104,7 @@ class Ghost(Picture):
 
 
 class Goal(Picture):
-    """Where the motions should end, and a second ball where they do if something covers the goal."""
+    """The goal as a ball, and a second ball where motions end if something covers the goal."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._goal = scene.add_frame("/goal", show_axes=False)
@@ -123,14 +121,11 @@ class Goal(Picture):
         self._goal.position = frame.goal
         self._end.position = frame.reached
         elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)
-        text = OLD_GOAL if elsewhere else GOAL
-        if self.label.text != text:
-            self.label.text = text
-        # a transform that moves the goal says so itself
+        self.label.text = OLD_GOAL if elsewhere else GOAL
+        # the marker of a transform that moves the goal says so
         goals = [to.anchor for to in anchored(frame.scenario).values() if to.anchor is not None and to.ends_motions]
         marked = any(np.linalg.norm(frame.reached - goal) < BALL_RADIUS for goal in goals)
-        if self._end.visible != (elsewhere and not marked):
-            self._end.visible = elsewhere and not marked
+        self._end.visible = elsewhere and not marked
 
 
 class Table(Picture):
@@ -152,7 +147,7 @@ class Table(Picture):
 
 
 def set_lights(scene: viser.SceneApi) -> None:
-    """Lights that look the same on the screen and in an exported picture, which has no environment map."""
+    """Set lights that look the same on the screen and in an exported picture, which has no environment map."""
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map(hdri=None)
     scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(214, 208, 200), intensity=1.8)
@@ -174,7 +169,7 @@ class ScenePictures:
         slice_moved: SliceMoved,
         starts: Starts,
     ) -> None:
-        """Build the scene of this robot; the others are told what the user does, see their pictures."""
+        """Build the scene of this robot; the callbacks are those of the pictures."""
         set_lights(scene)
         self.obstacles = Obstacles(scene, moved, selected)
         self.anchors = Anchors(scene, anchor_moved, anchor_selected)
@@ -202,12 +197,12 @@ class ScenePictures:
             "onion": Onion(scene, robot),
         }
         self._view, self._blocked = View(), False
-        self._showing = threading.Lock()  # whoever changes the view is not who draws
+        self._showing = threading.Lock()  # views change on another thread than the one that draws
         self._drawing = threading.Lock()
         self._frame: Frame | None = None
         self._adopted: Scenario | None = None
         self._grey = False
-        """Whether it was drawn as `stale`."""
+        """Whether the last frame was drawn as `stale`."""
         function = ColourSlice(scene)
         self._by_colour: dict[str, Picture] = {
             "det": function,
@@ -252,7 +247,7 @@ class ScenePictures:
         with self._showing:
             self._view = scenario.view
             self._show()
-        if self.stale != self._grey:  # who draws at this moment has seen one of both, or is waited for
+        if self.stale != self._grey:  # a thread that is drawing has seen the new scenario, or is waited for
             with self._drawing:
                 if self._frame is not None:
                     self._draw(self._frame)

@@ -41,14 +41,14 @@ class FieldArrows(Picture):
     """The vector field on the slice; faster arrows are longer and darker."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._arrows = Arrows(scene, "/field", palette.ARROW_SLOW, palette.ARROW_FAST, ARROW_LENGTH)
-        super().__init__(self._arrows.node)
+        self.arrows = Arrows(scene, "/field", palette.ARROW_SLOW, palette.ARROW_FAST, ARROW_LENGTH)
+        super().__init__(self.arrows.node)
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
         field = frame.pictures.field
         if field is not None:
-            self._arrows.show(field.points, field.velocities)
+            self.arrows.show(field.points, field.velocities)
 
 
 class Streamlines(Picture):

@@ -87,7 +87,7 @@ class Starts(Picture):
         self._slice: Slice | None = None
         self._clicks = Clicks(scene, self.click)
         self.items: list[StartBall] = []
-        """In the order of the scenario."""
+        """Pictures of the starts, in the order of the scenario."""
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`: remembers the slice; starts without a motion are grey."""

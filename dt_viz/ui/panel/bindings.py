@@ -1,0 +1,130 @@
+"""Bindings of the panel to a session: what the page shows of a scenario, and how its inputs edit it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from dt_viz.engine.frame import Frame
+from dt_viz.engine.session import Session
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.ui.controls import Control
+
+KEEP: Any = object()
+"""Value of a binding that leaves what is shown as it is."""
+
+
+@dataclass
+class _Binding:
+    read: Callable[[Scenario], Any]
+    put: Callable[[Any], None]
+    last: Any = KEEP
+    """Value that was read last."""
+    of_frame: bool = False
+    """Whether a frame was looked at for it, so that the next one may change it."""
+
+
+class Bindings:
+    """All bindings of one visitor's panel.
+
+    Each reads a value from the adopted scenario and the last frame, and shows it where it differs from what it read
+    before. So an edit is shown on the controls that it changes, and nowhere else: what a browser has moved meanwhile
+    stays as it is.
+    """
+
+    def __init__(self) -> None:
+        self.scenario: Scenario | None = None
+        """The scenario adopted last."""
+        self._frame: Frame | None = None
+        self._looked = False
+        """Whether the binding that is being read has looked at the frame."""
+        self._session: Session | None = None
+        self._bindings: list[_Binding] = []
+        self._showing = threading.Lock()  # edits are adopted by one thread, frames reported by another
+
+    @property
+    def frame(self) -> Frame | None:
+        """The frame reported last; bindings that look at it are read again with the next one."""
+        self._looked = True
+        return self._frame
+
+    @property
+    def session(self) -> Session:
+        """The session that inputs act on, once they do."""
+        assert self._session is not None
+        return self._session
+
+    def connect(self, session: Session) -> None:
+        """Let the inputs act on this session."""
+        self._session = session
+
+    def show(self, read: Callable[[Scenario], Any], put: Callable[[Any], None]) -> None:
+        """Call `put` with each new value that `read` gives."""
+        self._bindings.append(_Binding(read, put))
+
+    def properties(self, handle: Any, **read: Callable[[Scenario], Any]) -> None:  # noqa: ANN401 - handles of all kinds
+        """Assign the properties of a handle what their functions read."""
+        for name, value in read.items():
+            self.show(value, partial(setattr, handle, name))
+
+    def input(
+        self,
+        handle: Any,  # noqa: ANN401
+        read: Callable[[Scenario], Any],
+        change: Callable[[Scenario, Any], Mapping[str, Any]],
+    ) -> Control:
+        """Bind an input: `read` gives its value, `change` the fields of the scenario that a new value replaces."""
+        return self.choice(
+            handle, read, lambda session, value: session.edit(handle.label, **change(session.scenario, value))
+        )
+
+    def choice(
+        self,
+        handle: Any,  # noqa: ANN401
+        read: Callable[[Scenario], Any],
+        act: Callable[[Session, Any], None],
+    ) -> Control:
+        """Bind an input whose new values do more than to edit the scenario."""
+        control = self.on(handle, act)
+        self.properties(control, value=read)
+        return control
+
+    def on(self, handle: Any, act: Callable[[Session, Any], None]) -> Control:  # noqa: ANN401
+        """Call `act`, which must only submit, with each new value of an input, or press of a button."""
+
+        def acts(value: Any) -> None:  # noqa: ANN401
+            if self._session is not None:
+                act(self._session, value)
+
+        return Control(handle, acts)
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show what is new in a scenario."""
+        with self._showing:
+            self.scenario = scenario
+            self._show(self._bindings)
+
+    def report(self, frame: Frame) -> None:
+        """Show what is new in a frame."""
+        with self._showing:
+            self._frame = frame
+            self._show([binding for binding in self._bindings if binding.of_frame])
+
+    def restore(self) -> None:
+        """Show the adopted scenario on all inputs, also on those that a browser has moved in vain."""
+        with self._showing:
+            for binding in self._bindings:
+                binding.last = KEEP
+            self._show(self._bindings)
+
+    def _show(self, bindings: Sequence[_Binding]) -> None:
+        if self.scenario is not None:
+            for binding in bindings:
+                self._looked = False
+                value, last = binding.read(self.scenario), binding.last
+                binding.last, binding.of_frame = value, self._looked
+                if value is not KEEP and (last is KEEP or value != last):
+                    binding.put(value)

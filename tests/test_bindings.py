@@ -1,0 +1,110 @@
+"""What goes out to a browser after an edit: what it changes, and not what the browser itself has moved."""
+
+from dataclasses import replace
+
+import pytest
+import viser  # noqa: TID251 - looks at the messages to a browser
+from pages import MIDDLE, Bound, Page, frame_of
+from scenes import avoiding
+from viser import _messages as messages  # noqa: TID251
+
+from dt_viz.scenario.scenario import View
+from dt_viz.ui.controls import Control
+from dt_viz.ui.panel.bindings import KEEP
+from dt_viz.ui.scene.handles import Handles
+
+SCENARIO = avoiding("draw_s", ())
+
+
+@pytest.fixture(scope="module")
+def page(server, robot):
+    page = Page(server, robot)
+    page.visitor.pictures.slice.draw(frame_of(page.busy(), task=page.session.task))
+    yield page
+    page.visitor.close()
+
+
+@pytest.fixture
+def sent(server, monkeypatch):
+    """Messages to the browser, but for those that are for others only, as viser has on the server's own page."""
+    sent, queue = [], server._websock_server.queue_message
+
+    def queued(message):
+        queue(message)
+        if message.excluded_self_client is None:
+            sent.append(message)
+
+    monkeypatch.setattr(server._websock_server, "queue_message", queued)
+    return sent
+
+
+@pytest.fixture(params=[False, True], ids=["", "echoing"])
+def echoes(request, monkeypatch):
+    """Whether the page is one that echoes: what stands somewhere is put there again, and so is what has a value."""
+    if request.param:
+        monkeypatch.setattr(Handles, "stand", lambda self, *_pose: self._put_back())
+        monkeypatch.setattr(Control, "value", property(lambda self: self._value, lambda self, _value: self._put_back()))
+    return request.param
+
+
+@pytest.mark.parametrize("name", ["/obstacles/2", "/bias/0", "/slice"])
+def test_a_gizmo_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, sent, echoes, name):
+    page.session.edit("select", view=replace(page.session.scenario.view, selected=2, move_slice=name == "/slice"))
+    page.move(name, MIDDLE)
+    before = page.session.scenario
+    sent.clear()
+    page.move(name, (0.12, -0.52, 0.41))
+    assert page.session.scenario != before
+    assert bool(sent) == echoes
+
+
+def is_enabled(handle):
+    return handle.visible and not handle.disabled
+
+
+def test_an_input_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, sent, echoes):
+    page.session.edit("select", view=replace(page.session.scenario.view, selected=0))
+    moved = []
+    for handle in page.inputs:
+        if isinstance(handle, viser.GuiSliderHandle) and is_enabled(handle):
+            value = handle.min if handle.value != handle.min else handle.min + handle.step
+        elif isinstance(handle, viser.GuiCheckboxHandle) and is_enabled(handle):
+            value = not handle.value
+        else:
+            continue
+        before = page.session.scenario
+        sent.clear()
+        page.claim(handle, value)
+        told = [m for m in sent if isinstance(m, messages.GuiUpdateMessage) and m.uuid == handle._impl.uuid]
+        if page.session.scenario != before:
+            moved.append(handle.label)
+            assert bool([m for m in told if "value" in m.updates]) == echoes, handle.label
+    assert len(moved) > 20
+
+
+def test_an_edit_leaves_alone_what_a_browser_has_moved_meanwhile(server, sent):
+    bound, slider = Bound(SCENARIO), server.gui.add_slider("Warp", 0.0, 1.0, 0.01, 1.0)
+    bound.input(slider, lambda s: s.warp, lambda _s, value: {"warp": value})
+    bound.adopt(SCENARIO)
+    slider._impl.value = 0.3  # by a browser, whose edit comes next
+    sent.clear()
+    bound.edited.edit("view", view=View(grid=True))
+    assert slider.value == 0.3 and not sent
+    bound.edited.edit("Warp", warp=0.3)
+    assert slider.value == 0.3 and not sent
+    bound.edited.edit("Warp", warp=0.5)
+    assert slider.value == 0.5 and len(sent) == 1
+    slider._impl.value = 0.9  # in vain
+    bound.restore()
+    assert slider.value == 0.5
+    server.gui.reset()
+
+
+def test_what_is_not_known_is_kept_until_a_frame_tells_it(server):
+    bound, shown = Bound(SCENARIO), []
+    bound.show(lambda _s: KEEP if bound.frame is None else bound.frame.seconds, shown.append)
+    bound.adopt(SCENARIO)
+    assert shown == []
+    for seconds in (0.1, 0.1, 0.2):
+        bound.report(frame_of(SCENARIO, seconds=seconds))
+    assert shown == [0.1, 0.2]
