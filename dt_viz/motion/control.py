@@ -170,7 +170,7 @@ class Controller:
         self._velocity = np.zeros(NUM_JOINTS)
         self._clock = self._rate = 0.0
         self._now = self._dodged = 0.0
-        self._settled = False
+        self._settled = self._released = False
 
     # --- What it follows ---
 
@@ -369,8 +369,6 @@ class Controller:
                 self._clock = 0.0
                 self._take(course)
 
-    _released = False
-
     def _held(self, course: Course, *, released: bool = False) -> None:
         if self._aim is not Aim.HAND:
             self._then = self._aim
@@ -423,7 +421,9 @@ class Controller:
 
 def _alike(solved: Solved, other: Solved) -> bool:
     """Whether the end effector's stacks are the same."""
-    return solved.stack.transform is other.stack.transform and solved.stack.rays.base is other.stack.rays.base
+    parts, others = (Chain([each.stack.transform]).parts for each in (solved, other))
+    same = len(parts) == len(others) and all(a is b for a, b in zip(parts, others, strict=True))
+    return same and solved.stack.rays.base is other.stack.rays.base
 
 
 def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Array, z: Array | None) -> Course:
@@ -436,7 +436,8 @@ def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Arr
         rays = Rays(z0[None], base)
         bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
-    joints = track(robot, path, section.reference, reference=section.reference).q
+    # from the end, which is near the reference, backwards: the beginning may be far from the section's branch
+    joints = track(robot, path[::-1], section.reference, reference=section.reference).q[::-1]
     joints = joints + np.where(np.isinf(lower), 2 * np.pi * np.round((q - joints[0]) / (2 * np.pi)), 0.0)
     if np.linalg.norm(z0 - base.goal) == 0:  # time to converge
         times = CONVERGENCE * np.linspace(0, 12, NUM_SAMPLES)
