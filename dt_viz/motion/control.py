@@ -54,6 +54,10 @@ MOVED = 3e-3
 """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
 CONVERGENCE = 0.5
 """Time constant τ of the convergence to the section, seconds."""
+CONVERGED = 1e-5
+"""Distance from the section, rad, that counts as none."""
+SETTLING = 0.1
+"""Spacing of the samples, seconds, in which a robot that has arrived still converges."""
 NUM_SAMPLES = 80
 """Samples of the motion ahead."""
 NUM_HOSTS = 40
@@ -430,19 +434,20 @@ def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Arr
     robot, base = section.robot, system.base
     z0 = system.transform.forward(robot.end_effector(q)) if z is None else z
     if np.linalg.norm(z0 - base.goal) < ARRIVED:
-        z0 = base.goal
-        times, fractions, path = np.array([0.0, 1.0]), np.ones(2), system.transform.inverse(np.stack([z0, z0]))
+        times, fractions, path = np.zeros(1), np.ones(1), system.transform.inverse(base.goal[None])
     else:
         rays = Rays(z0[None], base)
         bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
     # from the end, which is near the reference, backwards: the beginning may be far from the section's branch
     joints = track(robot, path[::-1], section.reference, reference=section.reference).q[::-1]
-    joints = joints + np.where(np.isinf(lower), 2 * np.pi * np.round((q - joints[0]) / (2 * np.pi)), 0.0)
-    if np.linalg.norm(z0 - base.goal) == 0:  # time to converge
-        times = CONVERGENCE * np.linspace(0, 12, NUM_SAMPLES)
-        joints, fractions = np.repeat(joints[:1], NUM_SAMPLES, axis=0), np.ones(NUM_SAMPLES)
-    joints = joints + (q - joints[0]) * np.exp(-times / CONVERGENCE)[:, None]
+    turns = np.where(np.isinf(lower), np.round((q - joints[0]) / (2 * np.pi)), 0.0)
+    offset = q - joints[0] - 2 * np.pi * turns
+    converged = CONVERGENCE * np.log(max(float(np.abs(offset).max()) / CONVERGED, 1.0))
+    longer = times[-1] + np.arange(SETTLING, max(converged - times[-1], SETTLING) + SETTLING / 2, SETTLING)
+    times = np.concatenate([times, longer])
+    joints, fractions = (np.concatenate([part, np.repeat(part[-1:], len(longer), 0)]) for part in (joints, fractions))
+    joints = joints + 2 * np.pi * turns + offset * np.exp(-times / CONVERGENCE)[:, None]
     return Course(times, joints, base.goal + (1 - fractions)[:, None] * (z0 - base.goal))
 
 
