@@ -53,11 +53,6 @@ TICK = 0.01
 """Seconds between two ticks."""
 STACK_PERIOD = 0.03
 """Shortest time between the beginnings of two stacks, seconds."""
-LEAD = 0.10
-"""Time for which the sphere's place is extrapolated beyond that at which a stack is ready, seconds: the joints need it
-to reach the speed at which the way out moves."""
-ROOM_PER_SPEED = 0.10
-"""Growth of the margin with the sphere's speed, m per m/s."""
 HALF_LENGTH = 0.40
 """Half the length of a sphere's path, metres."""
 WIGGLE, WAVELENGTH = 0.04, 0.5
@@ -136,12 +131,12 @@ class InTheLoop:
     """The controller, with stacks that are late."""
 
     def __init__(self, bench: Bench, crossing: Crossing, delays: Array | None, *, anticipates: bool) -> None:
-        self._bench, self._anticipates, self._delays = bench, anticipates, delays
-        self.controller = Controller(bench.follower, bench.solved)
+        self._bench, self._delays = bench, delays
+        blind = {} if anticipates else {"lead": 0.0, "room": 0.0}
+        self.controller = Controller(bench.follower, bench.solved, **blind)
         self.controller.home(crossing.start)
         self._pending: Any = None
         self._ready, self._next, self._went, self._present = 0.0, 0.0, False, True
-        self._last = STACK_PERIOD
 
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
         """See `Arm`."""
@@ -154,15 +149,14 @@ class InTheLoop:
         present = t < crossing.gone
         if self._pending is None and t >= self._next and run.q[1:] and (present or self._present):
             self._present = present
-            obstacle = self._expected(t, crossing) if present else ()
-            solved = self._bench.around(obstacle, self._margin(crossing))
+            solved = self._bench.around(self._bench.sphere(crossing.at(t)) if present else ())
             began = time.thread_time()
             self._pending = self.controller.prepared(solved)
-            self._last = time.thread_time() - began
+            delay = time.thread_time() - began
             if self._delays is not None and len(run.delays) < len(self._delays):
-                self._last = float(self._delays[len(run.delays)])
-            run.delays.append(self._last)
-            self._ready, self._next = t + self._last, t + STACK_PERIOD
+                delay = float(self._delays[len(run.delays)])
+            run.delays.append(delay)
+            self._ready, self._next = t + delay, t + STACK_PERIOD
         began = time.thread_time()
         velocity = self.controller.step(q, TICK)
         run.ticks.append(time.thread_time() - began)
@@ -173,17 +167,6 @@ class InTheLoop:
     def resting(self) -> bool:
         """See `Arm`."""
         return self._went and not self._present and self.controller.phase is Phase.RESTING
-
-    def _margin(self, crossing: Crossing) -> float:
-        return self._bench.margin + (ROOM_PER_SPEED * crossing.speed if self._anticipates else 0.0)
-
-    def _expected(self, t: float, crossing: Crossing) -> Sphere:
-        """The sphere where it will be, by its last two places."""
-        place = crossing.at(t)
-        if self._anticipates:
-            velocity = (place - crossing.at(t - TICK)) / TICK if t >= TICK else np.zeros(3)
-            place = place + (self._last + LEAD) * velocity
-        return Sphere(as_point(place), self._bench.diameter)
 
 
 class Bench:
@@ -201,9 +184,14 @@ class Bench:
         self.goal = self.solved.nominal.goal
         self.starts = self.section.postures(self.solved.nominal.starts[:, None])[:, 0]
 
-    def around(self, obstacle: Sphere | tuple[()], margin: float) -> Solved:
+    def sphere(self, place: Array) -> Sphere:
+        """The sphere with its centre at a place (3,), metres."""
+        return Sphere(as_point(place), self.diameter)
+
+    def around(self, obstacle: Sphere | tuple[()]) -> Solved:
         """The stack with the sphere somewhere; that of the end effector is the same everywhere."""
-        return replace(self.solved, scenario=avoiding(self._task, Avoidance(obstacle, space="cspace", margin=margin)))
+        avoidance = Avoidance(obstacle, space="cspace", margin=self.margin)
+        return replace(self.solved, scenario=avoiding(self._task, avoidance))
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
@@ -231,7 +219,7 @@ def crossings(bench: Bench, speed: float, runs: int, seed: int) -> Iterator[tupl
             at = int(rng.uniform(0.25, 0.75) * len(hand))
             path = _path(hand[at] + rng.normal(scale=0.02, size=3), rng)
             length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-            sphere = Sphere(as_point(path[0]), bench.diameter)
+            sphere = bench.sphere(path[0])
             room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - bench.diameter / 2
             if (
                 path[:, 2].min() >= bench.diameter / 2 + TABLE_ROOM
@@ -276,7 +264,7 @@ def smallest_distance(bench: Bench, run: Run) -> float:
     model, best = load_collision_model(), np.inf
 
     def measured(joints: Array, place: Array) -> float:
-        return float(model.obstacle_distance(joints[None], Sphere(as_point(place), bench.diameter))[0][0])
+        return float(model.obstacle_distance(joints[None], bench.sphere(place))[0][0])
 
     for k in np.argsort(gaps.min(axis=1)):  # the spheres cover the meshes: their distances are lower bounds
         if gaps[k].min() >= best:
@@ -306,7 +294,7 @@ class _Field:
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
         """See `Arm`."""
         if t >= self._next - TICK / 2:
-            sphere = Sphere(as_point(crossing.at(t)), self._bench.diameter) if t < crossing.gone else None
+            sphere = self._bench.sphere(crossing.at(t)) if t < crossing.gone else None
             self._wanted = self._at(q, sphere) if t >= crossing.begins else self._away(q, sphere)
             self._next += self._period
         limits = self._bench.robot.velocity_limits
@@ -371,7 +359,7 @@ class Stepped(_Field):
 
     def _at(self, q: Array, sphere: Sphere | None) -> Array:
         bench = self._bench
-        self._dodging.follow(bench.around(() if sphere is None else sphere, bench.margin))
+        self._dodging.follow(bench.around(() if sphere is None else sphere))
         self._dodging.step(q, self._period)
         system: ArmSystem = self._dodging.system
         return system.velocity(bench.follower.whole_arm.limits.inside(q))

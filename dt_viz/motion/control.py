@@ -34,10 +34,10 @@ from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
+from dt_viz.motion.anticipation import NOTHING_SEEN, STALE, Sighting
 from dt_viz.motion.dodging import NO_DODGE, Dodge, dodge, lack
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
-from dt_viz.transforms.base import ArmAvoidance
 
 ACCELERATION = 4.0
 """Limit of the joints' acceleration, rad/s². The JACO's manual names none; this one takes a joint to its limit of
@@ -62,6 +62,13 @@ NUM_SAMPLES = 80
 """Samples of the motion ahead."""
 NUM_HOSTS = 40
 """Samples of it that the dodge is made for."""
+LEAD = 0.13
+"""Time by which moving obstacles are anticipated, seconds: that until a stack takes over, and until the joints have the
+speed at which the way out moves."""
+ROOM = 0.1
+"""Growth of the margin with an obstacle's speed, m per m/s."""
+PASSING = 0.25
+"""Way of a moving obstacle, metres, after which it counts as having passed: what the robot does later is not dodged."""
 TURNING = 2.0
 """Rate at which the way out of an obstacle turns, rad/s."""
 HOLDING_SPEED = 0.25
@@ -142,6 +149,7 @@ class Prepared:
 
     solved: Solved
     section: Section
+    sighting: Sighting
     begins: Ahead | None
     """The motion that it goes on from."""
     ahead: Ahead | None
@@ -151,22 +159,27 @@ class Prepared:
 class Controller:
     """A robot's state and what it follows; `step` is for one thread, `follow` and the rest may come from another."""
 
-    def __init__(self, follower: Follower, solved: Solved, acceleration: float = ACCELERATION) -> None:
+    def __init__(
+        self, follower: Follower, solved: Solved, acceleration: float = ACCELERATION, lead: float = LEAD, room: float = ROOM
+    ) -> None:
         """Take an arm and the stack that it follows first; its state is that of the first `step`.
 
         Args:
             follower: the arm.
             solved: as in `follow`.
             acceleration: limit for all joints, rad/s².
+            lead: time by which moving obstacles are anticipated, seconds.
+            room: growth of the margin with their speed, m per m/s.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
         self.robot = follower.robot
-        self.acceleration = acceleration
+        self.acceleration, self.lead, self.room = acceleration, lead, room
         self._arm, self._follower = follower.whole_arm, follower
         self._lock = threading.RLock()
         self._solved = solved
+        self._sighting = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0)
         self._section = Section(self.robot, follower.reference(solved.nominal))
         self._aim, self._home, self._then = Aim.GOAL, 0, Aim.GOAL
         self._ahead: Ahead | None = None
@@ -195,16 +208,17 @@ class Controller:
         with self._lock:
             before, begins, clock = self._solved, self._ahead, self._clock
             turn = TURNING * (self._now - self._dodged)
+            sighting = self._sighting.then(solved.scenario.arm_avoidance, self._now)
         if begins is None or not _alike(before, solved):
-            return Prepared(solved, section, None, None)
-        avoidance = solved.scenario.arm_avoidance
-        return Prepared(solved, section, begins, self._around(begins.course, clock, avoidance, begins.dodge, turn))
+            return Prepared(solved, section, sighting, None, None)
+        ahead = self._around(begins.course, clock, sighting, begins.dodge, turn)
+        return Prepared(solved, section, sighting, begins, ahead)
 
     def take(self, prepared: Prepared) -> None:
         """Go on with what was prepared from the next tick on; what does not fit any more is worked out again."""
         with self._lock:
             before, solved = self._solved, prepared.solved
-            self._solved, self._section = solved, prepared.section
+            self._solved, self._section, self._sighting = solved, prepared.section, prepared.sighting
             if self._ahead is None:
                 return
             if prepared.ahead is not None and self._ahead is prepared.begins:
@@ -283,6 +297,10 @@ class Controller:
             self._now += dt
             if self._expected is None or np.abs(q - self._expected).max() > MOVED:
                 self._anchor(q)
+            assert self._ahead is not None
+            if self._sighting.speed > 0 and self._now > self._sighting.time + STALE:
+                self._sighting = self._sighting.then(self._sighting.avoidance, self._now)
+                self._take(self._ahead.course)
             ahead = self._advance(q, dt)
             before = ahead.at(self._clock)
             self._clock = min(self._clock + self._rate * ahead.pace(self._clock) * dt, ahead.course.end)
@@ -361,7 +379,7 @@ class Controller:
         self._clock, self._settled = 0.0, False
         self._take(course, known)
         assert self._ahead is not None
-        avoidance = self._solved.scenario.arm_avoidance
+        avoidance = self._sighting.avoidance
         if avoidance is not None and lack(self._arm, self._ahead.p, avoidance).max() > ROUNDING:
             self._take(course)  # it was made for another motion
 
@@ -390,17 +408,18 @@ class Controller:
         """Follow a course from the clock on, around what is in the way."""
         before = self._ahead.dodge if self._ahead is not None else NO_DODGE
         if known is None:
-            turn, avoidance = TURNING * (self._now - self._dodged), self._solved.scenario.arm_avoidance
-            self._ahead, self._dodged = self._around(course, self._clock, avoidance, before, turn), self._now
+            turn = TURNING * (self._now - self._dodged)
+            self._ahead, self._dodged = self._around(course, self._clock, self._sighting, before, turn), self._now
         else:
             self._ahead = self._imaged(course, self._clock, known)
 
-    def _around(
-        self, course: Course, clock: float, avoidance: ArmAvoidance | None, before: Dodge, turn: float
-    ) -> Ahead:
+    def _around(self, course: Course, clock: float, sighting: Sighting, before: Dodge, turn: float) -> Ahead:
         """The motion ahead on a course, with a dodge that is made for it."""
-        later = course.q[course.times > clock]
+        speed = sighting.speed
+        within = clock + (PASSING / speed if speed > 0 else np.inf)
+        later = course.q[(course.times > clock) & (course.times <= within)]
         hosts = np.concatenate([course.at(clock)[None], later[:: max(1, len(later) // NUM_HOSTS)]])
+        avoidance = sighting.expected(self.lead, self.room)
         return self._imaged(course, clock, dodge(self._arm, hosts, avoidance, before, turn))
 
     def _imaged(self, course: Course, clock: float, known: Dodge) -> Ahead:
