@@ -10,6 +10,8 @@ from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 NUM_DIRECTIONS = 128
 SIDEWAYS = 2.0
 """Relative extra cost of a direction along the motion against one across it: it would bend the path sharply."""
+CAUGHT_UP, SLOW = 4.0, 0.05
+"""Relative extra cost of a direction along a fast obstacle's velocity, and the speed, m/s, at which it is half of it."""
 TABLE_WEIGHT = 3.0
 """Cost of each metre by which an escape leads below the table, against a metre of detour."""
 ON_THE_WAY = 0.10
@@ -21,7 +23,14 @@ SELECTIVITY = 0.03
 
 
 def escape_directions(
-    points: Array, radius: Array, tangents: Array, obstacle: Obstacle, margin: float = 0.0, *, num: int = 3
+    points: Array,
+    radius: Array,
+    tangents: Array,
+    obstacle: Obstacle,
+    margin: float = 0.0,
+    *,
+    num: int = 3,
+    velocity: Array | None = None,
 ) -> list[Array]:
     """Find directions in which the arm can escape, the one with the least detour first.
 
@@ -35,6 +44,8 @@ def escape_directions(
         obstacle: obstacle to escape from.
         margin: required clearance, metres.
         num: largest number of directions.
+        velocity: (3,) the obstacle's, m/s; None where it rests. Whoever runs away along it is caught up with, and then
+            on the wrong side.
 
     Returns:
         Unit vectors (3,), one for each distinct escape.
@@ -55,6 +66,8 @@ def escape_directions(
     below = np.maximum(-(height + shift * directions[:, 2:]), 0).max(axis=1)
     parallel = np.abs(directions @ tangents.T).mean(axis=1)
     cost = detour * (1 + SIDEWAYS * parallel) + TABLE_WEIGHT * below
+    if velocity is not None and (speed := float(np.linalg.norm(velocity))) > 0:
+        cost = cost * (1 + CAUGHT_UP * speed / (speed + SLOW) * np.abs(directions @ velocity) / speed)
 
     found: list[Array] = []
     while len(found) < num and np.isfinite(cost).any():

@@ -50,6 +50,9 @@ STIFFNESS = 10.0
 """Rate at which a small gap closes, 1/s."""
 GAP = 0.05
 """Gap of a joint, rad, at which the motion goes on at half its pace."""
+LOST, LOOKING = 0.15, 0.3
+"""Gap of a joint, rad, from which on the robot begins anew where it is, since the way to where it should be may lead
+through the obstacle; and shortest time between two such beginnings, seconds."""
 MOVED = 3e-3
 """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
 CONVERGENCE = 0.5
@@ -186,7 +189,7 @@ class Controller:
         self._expected: Array | None = None
         self._velocity = np.zeros(NUM_JOINTS)
         self._clock = self._rate = 0.0
-        self._now = self._dodged = 0.0
+        self._now = self._dodged = self._began = 0.0
         self._settled = self._released = False
 
     # --- What it follows ---
@@ -296,7 +299,7 @@ class Controller:
         with self._lock:
             self._now += dt
             if self._expected is None or np.abs(q - self._expected).max() > MOVED:
-                self._anchor(q)
+                self._anchor(q, self._ahead.dodge if self._ahead is not None else NO_DODGE)
             assert self._ahead is not None
             if self._sighting.speed > 0 and self._now > self._sighting.time + STALE:
                 self._sighting = self._sighting.then(self._sighting.avoidance, self._now)
@@ -345,7 +348,12 @@ class Controller:
                 self._take(ahead.course)  # what was in the way of the motion need not be in that of its end
             ahead = self._ahead
             assert ahead is not None
-        behind = np.abs(ahead.at(self._clock) - q).max() / GAP
+        gap = np.abs(ahead.at(self._clock) - q).max()
+        if gap > LOST and self._now > self._began + LOOKING and self._aim is not Aim.HAND:
+            self._anchor(q, NO_DODGE)
+            self._began, ahead = self._now, self._ahead
+            gap = np.abs(ahead.at(self._clock) - q).max()
+        behind = gap / GAP
         target = 1 / (1 + behind**2) if ahead.dodge.cleared else 0.0
         self._rate += float(np.clip(target - self._rate, -dt / RAMP, dt / RAMP))
         return ahead
@@ -367,9 +375,8 @@ class Controller:
 
     # --- The motion ahead ---
 
-    def _anchor(self, q: Array) -> None:
-        """Begin at a posture (6,) that nobody foresaw."""
-        known = self._ahead.dodge if self._ahead is not None else NO_DODGE
+    def _anchor(self, q: Array, known: Dodge) -> None:
+        """Begin at a posture (6,) that nobody foresaw, as the image of another under a dodge."""
         inside = self._arm.limits.inside(q)
         shadow = known.transform.forward(inside)
         if self._aim is Aim.HAND:
@@ -420,7 +427,7 @@ class Controller:
         later = course.q[(course.times > clock) & (course.times <= within)]
         hosts = np.concatenate([course.at(clock)[None], later[:: max(1, len(later) // NUM_HOSTS)]])
         avoidance = sighting.expected(self.lead, self.room)
-        return self._imaged(course, clock, dodge(self._arm, hosts, avoidance, before, turn))
+        return self._imaged(course, clock, dodge(self._arm, hosts, avoidance, sighting.velocities, before, turn))
 
     def _imaged(self, course: Course, clock: float, known: Dodge) -> Ahead:
         """The motion ahead on a course, with a dodge."""

@@ -44,13 +44,16 @@ class Dodge:
 NO_DODGE = Dodge(Identity(NUM_JOINTS))
 
 
-def dodge(arm: WholeArm, q: Array, avoidance: ArmAvoidance | None, before: Dodge, turn: float) -> Dodge:
+def dodge(
+    arm: WholeArm, q: Array, avoidance: ArmAvoidance | None, velocities: Array, before: Dodge, turn: float
+) -> Dodge:
     """Make the flow that clears the motion ahead.
 
     Args:
         arm: whose body points are to be clear.
         q: (N, 6) postures of the undisturbed motion ahead, in their order, rad.
         avoidance: what is to be avoided, and by how much.
+        velocities: (P, 3) of the obstacles, m/s.
         before: whose ways out are gone on with.
         turn: largest angle by which a way out turns away from that before, rad.
     """
@@ -64,8 +67,8 @@ def dodge(arm: WholeArm, q: Array, avoidance: ArmAvoidance | None, before: Dodge
     tangents = np.gradient(hand, axis=0) if len(q) > 1 else np.zeros_like(hand)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     directions = tuple(
-        _direction(arm, points, tangents, part, avoidance.margin, way, turn)
-        for part, way in zip(parts, known, strict=True)
+        _direction(arm, points, tangents, part, velocity, avoidance.margin, way, turn)
+        for part, velocity, way in zip(parts, velocities, known, strict=True)
     )
     reach = REACH_PER_TEMPERATURE * avoidance.temperature
     fields = tuple(
@@ -82,7 +85,14 @@ def dodge(arm: WholeArm, q: Array, avoidance: ArmAvoidance | None, before: Dodge
 
 
 def _direction(
-    arm: WholeArm, points: Array, tangents: Array, part: Obstacle, margin: float, before: Array | None, turn: float
+    arm: WholeArm,
+    points: Array,
+    tangents: Array,
+    part: Obstacle,
+    velocity: Array,
+    margin: float,
+    before: Array | None,
+    turn: float,
 ) -> Array | None:
     """The way out of one obstacle (3,); None where no body point (P, 3, N) comes too near it."""
     distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.body.radius[:, None]
@@ -91,8 +101,9 @@ def _direction(
     if not len(near):
         return None
     bent = np.flatnonzero(clearance < BESIDE)
+    compared = points[:, :, near[:: max(1, len(near) // NUM_COMPARED)]]
     best, *_ = escape_directions(
-        points[:, :, near[:: max(1, len(near) // NUM_COMPARED)]], arm.body.radius, tangents[bent], part, margin, num=1
+        compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity
     )
     return best if before is None else _turned(before, best, turn)
 
