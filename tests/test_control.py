@@ -1,4 +1,4 @@
-"""The robot in the loop: it follows eq. (4) exactly while nothing changes, and stays within its limits whatever does."""
+"""The robot in the loop: it follows eq. (4) exactly while nothing changes, and stays within limits whatever does."""
 
 from dataclasses import replace
 
@@ -209,7 +209,7 @@ class TestDisturbances:
 
     def test_the_hand_is_held_and_let_go(self, scene):
         robot = Robot(scene.controller(), scene.start).run(1.0)
-        place = scene.middle + [0.0, 0.0, 0.08]
+        place = scene.middle + np.array([0.0, 0.0, 0.08])
         robot.controller.hold(place)
         robot.run(3)
         assert robot.phases[-1] is Phase.HELD

@@ -11,7 +11,7 @@ NUM_DIRECTIONS = 128
 SIDEWAYS = 2.0
 """Relative extra cost of a direction along the motion against one across it: it would bend the path sharply."""
 CAUGHT_UP, SLOW = 4.0, 0.05
-"""Relative extra cost of a direction along a fast obstacle's velocity, and the speed, m/s, at which it is half of it."""
+"""Relative extra cost of a direction along a fast obstacle's velocity, and the speed, m/s, of half that cost."""
 TABLE_WEIGHT = 3.0
 """Cost of each metre by which an escape leads below the table, against a metre of detour."""
 ON_THE_WAY = 0.10

@@ -344,9 +344,7 @@ class Potential(_Field):
         for point, joint, push in zip(points, body.joint, wanted, strict=True):
             if push.any():
                 lever = cross(chain.axes[:, 2], (point[:, None] - chain.origins))[: joint + 1, :, 0]
-                total[: joint + 1] += np.linalg.solve(
-                    lever @ lever.T + 0.05 * np.eye(joint + 1), lever @ push
-                )
+                total[: joint + 1] += np.linalg.solve(lever @ lever.T + 0.05 * np.eye(joint + 1), lever @ push)
         return total
 
 
@@ -383,7 +381,9 @@ def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".npz")
-    bench = Bench(Engine(tasks, FitStore(default_cache_folder()), load_jaco()), task.name, options.diameter, options.margin)
+    bench = Bench(
+        Engine(tasks, FitStore(default_cache_folder()), load_jaco()), task.name, options.diameter, options.margin
+    )
     recorded = np.load(options.delays) if options.delays is not None else {}
     kinds: dict[str, Callable[[Crossing, int], Arm]] = {
         "": lambda crossing, i: InTheLoop(
@@ -412,7 +412,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 HEADER = (
-    "", "without contact", "clearance mm", "goal reached", "velocity", "acceleration", "time lost s", "tick ms", "stack ms",
+    "", "without contact", "clearance mm", "goal reached", "velocity", "acceleration",
+    "time lost s", "tick ms", "stack ms",
 )  # fmt: skip
 
 

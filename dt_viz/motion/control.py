@@ -53,7 +53,7 @@ GAP = 0.05
 LOST, LOOKING = 0.15, 0.3
 """Gap of a joint, rad, from which on the robot begins anew where it is, since the way to where it should be may lead
 through the obstacle; and shortest time between two such beginnings, seconds."""
-MOVED = 3e-3
+MOVED = 5e-3
 """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
 CONVERGENCE = 0.5
 """Time constant τ of the convergence to the section, seconds."""
@@ -163,7 +163,12 @@ class Controller:
     """A robot's state and what it follows; `step` is for one thread, `follow` and the rest may come from another."""
 
     def __init__(
-        self, follower: Follower, solved: Solved, acceleration: float = ACCELERATION, lead: float = LEAD, room: float = ROOM
+        self,
+        follower: Follower,
+        solved: Solved,
+        acceleration: float = ACCELERATION,
+        lead: float = LEAD,
+        room: float = ROOM,
     ) -> None:
         """Take an arm and the stack that it follows first; its state is that of the first `step`.
 
@@ -300,11 +305,11 @@ class Controller:
             self._now += dt
             if self._expected is None or np.abs(q - self._expected).max() > MOVED:
                 self._anchor(q, self._ahead.dodge if self._ahead is not None else NO_DODGE)
-            assert self._ahead is not None
             if self._sighting.speed > 0 and self._now > self._sighting.time + STALE:
                 self._sighting = self._sighting.then(self._sighting.avoidance, self._now)
-                self._take(self._ahead.course)
-            ahead = self._advance(q, dt)
+                self._take(self._begun.course)
+            self._advance(q, dt)
+            ahead = self._begun
             before = ahead.at(self._clock)
             self._clock = min(self._clock + self._rate * ahead.pace(self._clock) * dt, ahead.course.end)
             wanted = (ahead.at(self._clock) - before) / dt + self._closing(before - q, dt)
@@ -336,27 +341,29 @@ class Controller:
             later = self._ahead.p[self._ahead.times > self._clock]
             return np.concatenate([self._ahead.at(self._clock)[None], later])
 
-    def _advance(self, q: Array, dt: float) -> Ahead:
-        """The motion ahead, and its rate for this tick."""
-        ahead = self._ahead
-        assert ahead is not None
-        if not self._settled and self._clock >= ahead.course.end:
-            if self._aim is Aim.HAND and self._then is not Aim.HAND and self._released:
+    @property
+    def _begun(self) -> Ahead:
+        """The motion ahead, after the first tick."""
+        assert self._ahead is not None
+        return self._ahead
+
+    def _advance(self, q: Array, dt: float) -> None:
+        """Begin what is due at a tick, and change the rate of the motion towards what the gap allows."""
+        if not self._settled and self._clock >= self._begun.course.end:
+            if self._released:
                 self._set_out(self._then)
             else:
                 self._settled = True
-                self._take(ahead.course)  # what was in the way of the motion need not be in that of its end
-            ahead = self._ahead
-            assert ahead is not None
-        gap = np.abs(ahead.at(self._clock) - q).max()
-        if gap > LOST and self._now > self._began + LOOKING and self._aim is not Aim.HAND:
+                self._take(self._begun.course)  # what was in the way of the motion need not be in that of its end
+        if self._behind(q) > LOST and self._now > self._began + LOOKING and self._aim is not Aim.HAND:
             self._anchor(q, NO_DODGE)
-            self._began, ahead = self._now, self._ahead
-            gap = np.abs(ahead.at(self._clock) - q).max()
-        behind = gap / GAP
-        target = 1 / (1 + behind**2) if ahead.dodge.cleared else 0.0
+            self._began = self._now
+        target = 1 / (1 + (self._behind(q) / GAP) ** 2) if self._begun.dodge.cleared else 0.0
         self._rate += float(np.clip(target - self._rate, -dt / RAMP, dt / RAMP))
-        return ahead
+
+    def _behind(self, q: Array) -> float:
+        """The largest gap of a joint, rad."""
+        return float(np.abs(self._begun.at(self._clock) - q).max())
 
     def _closing(self, gap: Array, dt: float) -> Array:
         """Velocities (6,) that close a gap (6,)."""
@@ -377,17 +384,13 @@ class Controller:
 
     def _anchor(self, q: Array, known: Dodge) -> None:
         """Begin at a posture (6,) that nobody foresaw, as the image of another under a dodge."""
-        inside = self._arm.limits.inside(q)
-        shadow = known.transform.forward(inside)
-        if self._aim is Aim.HAND:
-            course = _resting(shadow, self.robot.end_effector(shadow))
-        else:
-            course = self._course(shadow)
+        shadow = known.transform.forward(self._arm.limits.inside(q))
+        resting = self._aim is Aim.HAND
+        course = _resting(shadow, self.robot.end_effector(shadow)) if resting else self._course(shadow)
         self._clock, self._settled = 0.0, False
         self._take(course, known)
-        assert self._ahead is not None
         avoidance = self._sighting.avoidance
-        if avoidance is not None and lack(self._arm, self._ahead.p, avoidance).max() > ROUNDING:
+        if avoidance is not None and lack(self._arm, self._begun.p, avoidance).max() > ROUNDING:
             self._take(course)  # it was made for another motion
 
     def _set_out(self, aim: Aim) -> None:
@@ -407,8 +410,7 @@ class Controller:
 
     def _image(self) -> Array:
         """The base coordinates (3,) at which the motion is."""
-        assert self._ahead is not None
-        course = self._ahead.course
+        course = self._begun.course
         return np.array([np.interp(self._clock, course.times, z) for z in course.z.T])
 
     def _take(self, course: Course, known: Dodge | None = None) -> None:

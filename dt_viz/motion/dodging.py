@@ -102,9 +102,7 @@ def _direction(
         return None
     bent = np.flatnonzero(clearance < BESIDE)
     compared = points[:, :, near[:: max(1, len(near) // NUM_COMPARED)]]
-    best, *_ = escape_directions(
-        compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity
-    )
+    best, *_ = escape_directions(compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity)
     return best if before is None else _turned(before, best, turn)
 
 
