@@ -120,6 +120,10 @@ class Course:
         """Time at which it ends, seconds."""
         return float(self.times[-1])
 
+    def before(self, clock: float) -> int:
+        """Number of the last sample up to a time, with another one after it."""
+        return int(np.clip(np.searchsorted(self.times, clock, side="right") - 1, 0, len(self.times) - 2))
+
     def at(self, clock: float) -> Array:
         """The posture (6,) at a time."""
         return np.array([np.interp(clock, self.times, joint) for joint in self.q.T])
@@ -128,10 +132,10 @@ class Course:
 class Ahead:
     """The motion ahead: the image of a course under ψ_q⁻¹, slowed down to the joints' limits."""
 
-    def __init__(self, course: Course, dodge: Dodge, p: Array, first: int, limits: Array) -> None:
-        """Take the images p (K', 6) of the samples of the course from the `first` on."""
+    def __init__(self, course: Course, dodge: Dodge, p: Array, limits: Array) -> None:
+        """Take the images p (K', 6) of the last K' samples of the course, rad."""
         self.course, self.dodge, self.p = course, dodge, p
-        self.times = course.times[first:]
+        self.times = course.times[-len(p) :]
         slowed = within_velocity_limits(self.times, p, limits)
         self._pace = np.diff(self.times) / np.maximum(np.diff(slowed), 1e-12)
         self._curve = CubicHermiteSpline(self.times, p, np.gradient(p, self.times, axis=0))
@@ -420,22 +424,18 @@ class Controller:
             turn = TURNING * (self._now - self._dodged)
             self._ahead, self._dodged = self._around(course, self._clock, self._sighting, before, turn), self._now
         else:
-            self._ahead = self._imaged(course, self._clock, known)
+            p = known.transform.inverse(self._arm.limits.inside(course.q))
+            self._ahead = Ahead(course, known, p, VELOCITY_SHARE * self.robot.velocity_limits)
 
     def _around(self, course: Course, clock: float, sighting: Sighting, before: Dodge, turn: float) -> Ahead:
         """The motion ahead on a course, with a dodge that is made for it."""
-        speed = sighting.speed
-        within = clock + (PASSING / speed if speed > 0 else np.inf)
-        later = course.q[(course.times > clock) & (course.times <= within)]
-        hosts = np.concatenate([course.at(clock)[None], later[:: max(1, len(later) // NUM_HOSTS)]])
+        first, speed = course.before(clock), sighting.speed
+        times = course.times[first:]
+        hosts = times <= max(clock + (PASSING / speed if speed > 0 else np.inf), times[1])
+        hosts[2:] &= np.arange(2, len(times)) % max(1, int(hosts.sum()) // NUM_HOSTS) == 0
         avoidance = sighting.expected(self.lead, self.room)
-        return self._imaged(course, clock, dodge(self._arm, hosts, avoidance, sighting.velocities, before, turn))
-
-    def _imaged(self, course: Course, clock: float, known: Dodge) -> Ahead:
-        """The motion ahead on a course, with a dodge."""
-        first = int(np.clip(np.searchsorted(course.times, clock, side="right") - 1, 0, len(course.times) - 2))
-        p = known.transform.inverse(self._arm.limits.inside(course.q[first:]))
-        return Ahead(course, known, p, first, VELOCITY_SHARE * self.robot.velocity_limits)
+        known, p = dodge(self._arm, course.q[first:], hosts, avoidance, sighting.velocities, before, turn)
+        return Ahead(course, known, p, VELOCITY_SHARE * self.robot.velocity_limits)
 
     def _course(self, q: Array, z: Array | None = None) -> Course:
         """The undisturbed motion from a posture (6,), or from base coordinates `z` (3,), to where it is to go."""

@@ -16,9 +16,9 @@ import numpy as np
 from dt_viz.arm.cspace import REACH_PER_TEMPERATURE, WholeArmField
 from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS
-from dt_viz.arm.whole_arm import BESIDE, COARSE_STEP, MAX_DURATION, NUM_COMPARED, OVERSHOOT, SNAPSHOT, WholeArm
+from dt_viz.arm.whole_arm import BESIDE, COARSE_STEP, MAX_DURATION, NUM_COMPARED, OVERSHOOT, WholeArm
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
-from dt_viz.flows.fields import Array, Sum, VectorField
+from dt_viz.flows.fields import Array, Mask, Sum, VectorField
 from dt_viz.flows.integrators import rk4
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.transforms.base import ArmAvoidance
@@ -45,26 +45,36 @@ NO_DODGE = Dodge(Identity(NUM_JOINTS))
 
 
 def dodge(
-    arm: WholeArm, q: Array, avoidance: ArmAvoidance | None, velocities: Array, before: Dodge, turn: float
-) -> Dodge:
+    arm: WholeArm,
+    q: Array,
+    hosts: Mask,
+    avoidance: ArmAvoidance | None,
+    velocities: Array,
+    before: Dodge,
+    turn: float,
+) -> tuple[Dodge, Array]:
     """Make the flow that clears the motion ahead.
 
     Args:
         arm: whose body points are to be clear.
         q: (N, 6) postures of the undisturbed motion ahead, in their order, rad.
+        hosts: (N,) bool: those that are to be clear.
         avoidance: what is to be avoided, and by how much.
         velocities: (P, 3) of the obstacles, m/s.
         before: whose ways out are gone on with.
         turn: largest angle by which a way out turns away from that before, rad.
+
+    Returns:
+        The dodge, and the images (N, 6) of the postures, rad.
     """
+    q = arm.limits.inside(q)
     if avoidance is None:
-        return NO_DODGE
+        return NO_DODGE, q
     parts = avoidance.obstacle.parts
     known = before.directions if len(before.directions) == len(parts) else (None,) * len(parts)
-    q = arm.limits.inside(q)
-    points = arm.body.of_chain(arm.robot.chain(q.T))
-    hand = arm.robot.end_effector(q)
-    tangents = np.gradient(hand, axis=0) if len(q) > 1 else np.zeros_like(hand)
+    points = arm.body.of_chain(arm.robot.chain(q[hosts].T))
+    hand = arm.robot.end_effector(q[hosts])
+    tangents = np.gradient(hand, axis=0) if len(hand) > 1 else np.zeros_like(hand)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     directions = tuple(
         _direction(arm, points, tangents, part, velocity, avoidance.margin, way, turn)
@@ -77,11 +87,10 @@ def dodge(
         if way is not None
     )
     if not fields:
-        return NO_DODGE
-    field = Sum(fields)
-    duration = _clearing_duration(arm, field, q, avoidance)
-    flow = Flow(field, duration, math.ceil(duration / COARSE_STEP) or 1, sparse=True)
-    return Dodge(Conjugated(flow, arm.limits), directions, duration < MAX_DURATION)
+        return NO_DODGE, q
+    duration, p = _cleared(arm, Sum(fields), q, hosts, avoidance)
+    flow = Flow(Sum(fields), duration, math.ceil(duration / COARSE_STEP) or 1, sparse=True)
+    return Dodge(Conjugated(flow, arm.limits), directions, duration < MAX_DURATION), p
 
 
 def _direction(
@@ -117,17 +126,19 @@ def _turned(before: Array, towards: Array, most: float) -> Array:
     return before if size < 1e-9 else math.cos(angle) * before + math.sin(angle) / size * across
 
 
-def _clearing_duration(arm: WholeArm, field: VectorField, q: Array, avoidance: ArmAvoidance) -> float:
-    """The shortest duration after which the flow has carried postures (N, 6) clear, or `MAX_DURATION`."""
-    duration, state, lacking = 0.0, arm.limits.forward(q), lack(arm, q, avoidance)
-    state, lacking = state[lacking > 0], lacking[lacking > 0]
-    while len(state) and duration < MAX_DURATION:
-        state, _ = rk4(field, state, None, -SNAPSHOT)
-        before, lacking = lacking, lack(arm, arm.limits.inverse(state), avoidance)
-        if (lacking <= 0).all():
-            return duration + SNAPSHOT * float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
-        state, lacking, duration = state[lacking > 0], lacking[lacking > 0], duration + SNAPSHOT
-    return duration
+def _cleared(arm: WholeArm, field: VectorField, q: Array, hosts: Mask, avoidance: ArmAvoidance) -> tuple[float, Array]:
+    """The shortest duration after which the flow has carried the hosts clear, or `MAX_DURATION`, and all images."""
+    duration, state = 0.0, arm.limits.forward(q)
+    lacking = lack(arm, q[hosts], avoidance)
+    while duration < MAX_DURATION and lacking.max() > 0:
+        carried, _ = rk4(field, state, None, -COARSE_STEP)
+        before, lacking = lacking, lack(arm, arm.limits.inverse(carried[hosts]), avoidance)
+        part = 1.0
+        if lacking.max() <= 0:
+            part = float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
+            carried, _ = rk4(field, state, None, -part * COARSE_STEP)
+        state, duration = carried, duration + part * COARSE_STEP
+    return duration, arm.limits.inverse(state)
 
 
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance) -> Array:
