@@ -16,13 +16,15 @@ import numpy as np
 from dt_viz.arm.cspace import REACH_PER_TEMPERATURE, WholeArmField
 from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS
-from dt_viz.arm.whole_arm import BESIDE, COARSE_STEP, MAX_DURATION, NUM_COMPARED, OVERSHOOT, WholeArm
+from dt_viz.arm.whole_arm import BESIDE, COARSE_STEP, MAX_DURATION, OVERSHOOT, WholeArm
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Mask, Sum, VectorField
 from dt_viz.flows.integrators import rk4
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.transforms.base import ArmAvoidance
 
+COMPARED = 16
+"""Number of colliding postures that ways out are compared by."""
 NO_PINS = np.empty((0, NUM_JOINTS))
 OPPOSITE = -0.7
 """Cosine of the angle between a way out and the better one beyond which it turns over the top."""
@@ -110,7 +112,7 @@ def _direction(
     if not len(near):
         return None
     bent = np.flatnonzero(clearance < BESIDE)
-    compared = points[:, :, near[:: max(1, len(near) // NUM_COMPARED)]]
+    compared = points[:, :, near[:: max(1, len(near) // COMPARED)]]
     best, *_ = escape_directions(compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity)
     return best if before is None else _turned(before, best, turn)
 
