@@ -270,9 +270,10 @@ def smallest_distance(bench: Bench, run: Run) -> float:
         if gaps[k].min() >= best:
             break
         best = min(best, measured(q[k], places[k]))
-    # between ticks: neither moves by more than this towards the other
-    travel = np.linalg.norm(np.diff(points, axis=0), axis=2) + 0.2 * np.abs(np.diff(q, axis=0)).sum(axis=1)[:, None]
-    travel = travel.max(axis=1) + np.linalg.norm(np.diff(places, axis=0), axis=1)
+    # between ticks no covering sphere and the obstacle move towards each other by more than both move
+    travel = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1) + np.linalg.norm(
+        np.diff(places, axis=0), axis=1
+    )
     low = np.minimum(gaps[:-1].min(axis=1), gaps[1:].min(axis=1)) - travel / 2
     for k in np.flatnonzero(low < best):
         for u in np.linspace(0, 1, SUBDIVISIONS + 1)[1:-1]:
