@@ -238,7 +238,7 @@ class Controller:
             elif self._aim is Aim.HAND or _alike(before, solved):
                 self._take(self._ahead.course)
             else:
-                learned = before.nominal.system is solved.nominal.system and self._aim is Aim.GOAL
+                learned = before.below.system is solved.below.system and self._aim is Aim.GOAL
                 course = self._course(self._ahead.course.at(self._clock), self._image() if learned else None)
                 self._clock, self._settled = 0.0, False
                 self._take(course)
@@ -370,10 +370,10 @@ class Controller:
         return float(np.abs(self._begun.at(self._clock) - q).max())
 
     def _closing(self, gap: Array, dt: float) -> Array:
-        """Velocities (6,) that close a gap (6,)."""
-        size = np.abs(gap)
+        """Velocities (6,) that close a gap (6,), all joints together, so that the way is straight."""
+        size = float(np.abs(gap).max())
         fastest = np.sqrt(2 * BRAKING_SHARE * self.acceleration * size)
-        return np.sign(gap) * np.minimum(min(STIFFNESS, 0.5 / dt) * size, fastest)
+        return gap * (min(min(STIFFNESS, 0.5 / dt) * size, fastest) / max(size, 1e-12))
 
     def _within_limits(self, q: Array, wanted: Array, dt: float) -> Array:
         """The velocities nearest to those wanted that all limits allow."""
@@ -394,7 +394,7 @@ class Controller:
         self._clock, self._settled = 0.0, False
         self._take(course, known)
         avoidance = self._sighting.avoidance
-        if avoidance is not None and lack(self._arm, self._begun.p, avoidance).max() > ROUNDING:
+        if avoidance is not None and lack(self._arm, self._begun.p, avoidance, course.q[-1]).max() > ROUNDING:
             self._take(course)  # it was made for another motion
 
     def _set_out(self, aim: Aim) -> None:

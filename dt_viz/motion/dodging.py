@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.arm.cspace import REACH_PER_TEMPERATURE, WholeArmField
+from dt_viz.arm.cspace import REACH_PER_TEMPERATURE, WholeArmField, squared_lengths
 from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS
-from dt_viz.arm.whole_arm import BESIDE, COARSE_STEP, MAX_DURATION, OVERSHOOT, WholeArm
+from dt_viz.arm.whole_arm import BESIDE, COARSE_STEP, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Mask, Sum, VectorField
 from dt_viz.flows.integrators import rk4
@@ -90,7 +90,8 @@ def dodge(
     )
     if not fields:
         return NO_DODGE, q
-    duration, p = _cleared(arm, Sum(fields), q, hosts, avoidance)
+    end = None if velocities.any() else q[-1]  # who is after the robot is not to be met with less room
+    duration, p = _cleared(arm, Sum(fields), q, hosts, avoidance, end)
     flow = Flow(Sum(fields), duration, math.ceil(duration / COARSE_STEP) or 1, sparse=True)
     return Dodge(Conjugated(flow, arm.limits), directions, duration < MAX_DURATION), p
 
@@ -128,13 +129,15 @@ def _turned(before: Array, towards: Array, most: float) -> Array:
     return before if size < 1e-9 else math.cos(angle) * before + math.sin(angle) / size * across
 
 
-def _cleared(arm: WholeArm, field: VectorField, q: Array, hosts: Mask, avoidance: ArmAvoidance) -> tuple[float, Array]:
+def _cleared(
+    arm: WholeArm, field: VectorField, q: Array, hosts: Mask, avoidance: ArmAvoidance, end: Array | None
+) -> tuple[float, Array]:
     """The shortest duration after which the flow has carried the hosts clear, or `MAX_DURATION`, and all images."""
     duration, state = 0.0, arm.limits.forward(q)
-    lacking = lack(arm, q[hosts], avoidance)
+    lacking = lack(arm, q[hosts], avoidance, end)
     while duration < MAX_DURATION and lacking.max() > 0:
         carried, _ = rk4(field, state, None, -COARSE_STEP)
-        before, lacking = lacking, lack(arm, arm.limits.inverse(carried[hosts]), avoidance)
+        before, lacking = lacking, lack(arm, arm.limits.inverse(carried[hosts]), avoidance, end)
         part = 1.0
         if lacking.max() <= 0:
             part = float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
@@ -143,6 +146,12 @@ def _cleared(arm: WholeArm, field: VectorField, q: Array, hosts: Mask, avoidance
     return duration, arm.limits.inverse(state)
 
 
-def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance) -> Array:
-    """Metres (N,) by which postures p (N, 6) miss the clearance that is asked for."""
-    return avoidance.margin - OVERSHOOT - arm.clearance(p, avoidance.obstacle)
+def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) -> Array:
+    """Metres (N,) by which postures p (N, 6) miss the clearance that is asked for.
+
+    That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
+    """
+    asked: Array | float = avoidance.margin - OVERSHOOT
+    if end is not None and (room := float(arm.clearance(end[None], avoidance.obstacle)[0]) - ROUNDING) > 0:
+        asked = np.minimum(asked, room + SLOPE * np.sqrt(squared_lengths(p, end[None])[:, 0]))
+    return asked - arm.clearance(p, avoidance.obstacle)
