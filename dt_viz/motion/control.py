@@ -195,7 +195,7 @@ class Controller:
         self._section = Section(self.robot, follower.reference(solved.nominal))
         self._aim, self._home, self._then = Aim.GOAL, 0, Aim.GOAL
         self._ahead: Ahead | None = None
-        self._expected: Array | None = None
+        self._q: Array | None = None
         self._velocity = np.zeros(NUM_JOINTS)
         self._clock = self._rate = 0.0
         self._now = self._dodged = self._began = 0.0
@@ -307,7 +307,7 @@ class Controller:
             raise ValueError(f"dt: found {dt}; accepted: seconds, more than 0")
         with self._lock:
             self._now += dt
-            if self._expected is None or np.abs(q - self._expected).max() > MOVED:
+            if self._q is None or np.abs(q - self._q).max() > MOVED:
                 self._anchor(q, self._ahead.dodge if self._ahead is not None else NO_DODGE)
             if self._sighting.speed > 0 and self._now > self._sighting.time + STALE:
                 self._sighting = self._sighting.then(self._sighting.avoidance, self._now)
@@ -318,23 +318,24 @@ class Controller:
             self._clock = min(self._clock + self._rate * ahead.pace(self._clock) * dt, ahead.course.end)
             wanted = (ahead.at(self._clock) - before) / dt + self._closing(before - q, dt)
             self._velocity = self._within_limits(q, wanted, dt)
-            self._expected = q + dt * self._velocity
+            self._q = q + dt * self._velocity
             return self._velocity.copy()
 
     @property
     def phase(self) -> Phase:
         """What it is doing."""
         ahead = self._ahead
-        if ahead is None:
+        if ahead is None or self._q is None:
             return Phase.RESTING
         if not ahead.dodge.cleared:
             return Phase.TOUCHED
         if self._aim is Aim.HAND:
             return Phase.HELD
-        if not self._settled:
-            return Phase.HOMING if self._aim is Aim.HOME else Phase.MOVING
-        moved = np.linalg.norm((ahead.p[-1] - ahead.course.q[-1]) * LEVERS)
-        return Phase.ASIDE if moved > ASIDE else Phase.RESTING
+        if self._settled and np.linalg.norm((ahead.p[-1] - ahead.course.q[-1]) * LEVERS) > ASIDE:
+            return Phase.ASIDE
+        if self._settled and max(np.abs(self._velocity).max(), self._behind(self._q)) < AT_REST:
+            return Phase.RESTING
+        return Phase.HOMING if self._aim is Aim.HOME else Phase.MOVING
 
     @property
     def ahead(self) -> Array:
