@@ -45,7 +45,7 @@ def changed(scenario, **changes):
 
 def avoiding(task, obstacles=(), **changes):
     """A scenario of a task that avoids obstacles, with these `changing`."""
-    return changed(Scenario(task), obstacles=obstacles, **changes)
+    return changed(Scenario(task), **{"obstacles": obstacles, "space": "task", **changes})
 
 
 def beside(scenario):

@@ -527,11 +527,13 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
 
 def test_who_avoids_is_chosen_in_the_page(visit):
     page, visitor = visit
-    open_tab(page, "Stack")
-    press(page.get_by_role("textbox", name="Avoid with").or_(page.locator("input[value='End effector']")).first)
-    press(page.get_by_role("option", name="Whole arm"))
-    wait_until(lambda: visitor.session.scenario.avoidance.space == "cspace", "the choice to arrive")
-    wait_until(lambda: visitor.shown.scenario.avoidance.space == "cspace", "its picture")
+    assert visitor.session.scenario.avoidance.space == "cspace"
+    press(page.get_by_role("textbox", name="Avoid").or_(page.locator("input[value='Arm']")).first)
+    press(page.get_by_role("option", name="Hand"))
+    wait_until(lambda: visitor.session.scenario.avoidance.space == "task", "the choice to arrive")
+    wait_until(lambda: visitor.shown.scenario.avoidance.space == "task", "its picture")
+    press(page.get_by_role("button", name="Let the whole arm avoid"))
+    wait_until(lambda: visitor.shown.scenario.avoidance.space == "cspace", "the arm to make way again")
 
 
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):

@@ -10,7 +10,7 @@ from dt_viz.arm.tracking import inverse_kinematics, track
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.scenario.tasks import DRAWING_SIZE, POTS, TASKS, lasa_tasks
-from dt_viz.transforms.avoidance import SPACE_NAMES
+from dt_viz.transforms.avoidance import SPACES
 from dt_viz.warning import Kind
 
 
@@ -56,7 +56,7 @@ OTHER_LETTERS = [name for name in TASKS if name.startswith("draw_") and name != 
     [
         pytest.param(name, space, marks=[pytest.mark.slow] * (space != "task" and name in OTHER_LETTERS))
         for name in TASKS
-        for space in SPACE_NAMES
+        for space in SPACES
     ],
 )
 def test_the_obstacle_first_stands_where_hand_and_arm_find_a_way_to_the_goal(name, space, engine, initial):

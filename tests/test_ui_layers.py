@@ -496,10 +496,10 @@ def test_nothing_is_said_against_an_arm_that_is_hidden(view, told):
 
 
 @pytest.mark.parametrize(("space", "hinted"), [("task", True), ("both", False)])
-def test_an_arm_in_the_obstacle_is_told_how_to_give_way(space, hinted):
+def test_where_the_hand_alone_gives_way_that_is_told(space, hinted):
     scenario = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space)
     said = status_html(frame(scenario=scenario, certificates=CLOSE_BY), PACE)
-    assert ("Avoid with" in said) == hinted
+    assert ("only the path of the hand" in said) == hinted
 
 
 @pytest.mark.parametrize(

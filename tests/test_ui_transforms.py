@@ -64,13 +64,13 @@ FLOW = {"Settings of", "Flow time: auto", "Flow time t", "Integrator"}
 
 
 def test_only_what_the_chosen_transform_has_is_shown(controls):
-    assert visible(controls) == FLOW | {"Avoid with", "Generator", "Reach T"}  # the outermost is the avoidance
+    assert visible(controls) == FLOW | {"Generator", "Reach T"}  # the outermost is the avoidance
     controls.set("Settings of", "Bias 1")
     assert visible(controls) == STRENGTH  # as the paper calls the t of a bias point
     controls.set("Integrator", "Euler (the paper's)")
     assert visible(controls) == STRENGTH | {"Steps"}
     controls.set("Settings of", AVOIDANCE)
-    assert visible(controls) == FLOW | {"Avoid with", "Generator", "Reach T"}
+    assert visible(controls) == FLOW | {"Generator", "Reach T"}
     controls.set("Settings of", IMITATION)
     assert visible(controls) == {"Settings of", "Learn"}
 

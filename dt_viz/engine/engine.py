@@ -26,6 +26,7 @@ from dt_viz.motion.nominal import Learned, Nominal
 from dt_viz.motion.pushing import Pushed, pushed
 from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
+from dt_viz.pictures.arm_field import LiftedField
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task, TaskEntry
@@ -269,7 +270,18 @@ class Engine:
     def _pictures(self, scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
         learned = solved.below.learned
         book = self.memo("sketchbook", learned, lambda: _sketchbook(learned), newest=2)
-        return compose.pictures(scenario, solved, book, coarse=coarse)
+        pictures = compose.pictures(scenario, solved, book, coarse=coarse)
+        field, arm, view = pictures.field, solved.arm, scenario.view
+        if field is None or arm is None or view.level:
+            return pictures
+        layers, robot = tuple(layer for _, layer in scenario.active), self.follower.robot
+        lifted = self.memo(
+            "lifted field",
+            (solved.below, layers, view.slice, coarse),
+            lambda: LiftedField.of(field, robot, self.follower.reference(solved.nominal)),
+            newest=2,
+        )
+        return replace(pictures, field=lifted.around(arm.transform, robot))
 
     def _certified(self, frame: Frame, fine: Solved, checkpoint: Checkpoint) -> Certificates:
         with _in_turn(checkpoint):

@@ -15,7 +15,7 @@ from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, lasa_tasks
-from dt_viz.transforms.avoidance import SPACE_NAMES, Avoidance
+from dt_viz.transforms.avoidance import SPACES, Avoidance
 
 
 class InputError(ValueError):
@@ -34,7 +34,7 @@ def add_task(parser: argparse.ArgumentParser) -> None:
 def add_space(parser: argparse.ArgumentParser, default: str = "task") -> None:
     """Add `--space`."""
     what = "what avoids: the end effector (task), the whole arm (cspace), or both (default: %(default)s)"
-    parser.add_argument("--space", choices=tuple(SPACE_NAMES), default=default, help=what)
+    parser.add_argument("--space", choices=SPACES, default=default, help=what)
 
 
 def add_avoidance(parser: argparse.ArgumentParser, space: str) -> None:

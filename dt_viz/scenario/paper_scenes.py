@@ -163,7 +163,7 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "cube",
             "Fig. 3 (a): a cube in the S",
-            "Every stroke leaves the cube, the rest stays. Only the path gives way: avoid with “Both” for the arm.",
+            "Every stroke leaves the cube, the rest stays. Only the path of the hand gives way here.",
             "draw_s",
             _cube_in_the_letter,
             view=HAND_ONLY,

@@ -93,8 +93,8 @@ class Layer:
     """Name on the page, unique in the stack."""
 
 
-AVOIDING = (Layer(Avoidance(), name=Avoidance.title),)
-"""The stack that a scenario begins with."""
+AVOIDING = (Layer(Avoidance(space="cspace"), name=Avoidance.title),)
+"""The stack that a scenario begins with: the whole arm avoids."""
 
 
 @dataclass(frozen=True)

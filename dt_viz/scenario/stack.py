@@ -11,7 +11,7 @@ from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.avoidance import Avoidance, Space
 from dt_viz.transforms.base import Surroundings, Transform
 
 IMITATION, WHOLE_ARM = "Imitation", "Whole arm"
@@ -51,6 +51,13 @@ def with_avoidance(scenario: Scenario, **changes: Any) -> Stack:  # noqa: ANN401
     if place_of(scenario, layer.name) is None:
         return (*scenario.stack, Layer(after, name=layer.name))
     return _changed(scenario, layer.name, transform=after)
+
+
+def avoiding_with(scenario: Scenario, space: Space | None) -> Stack:
+    """Return the stack whose page's avoidance acts in a space; None switches it off."""
+    changes: dict[str, Any] = {} if space is None else {"space": space}
+    stack = with_avoidance(scenario, **changes)
+    return _changed(replace(scenario, stack=stack), avoidance_layer(scenario).name, on=space is not None)
 
 
 def _changed(scenario: Scenario, name: str, **changes: Any) -> Stack:  # noqa: ANN401 - the fields of Layer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -32,8 +32,7 @@ from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
 Space = Literal["task", "cspace", "both"]
 """Space of the avoidance: that of the end effector (sec. 4.4), configuration space (sec. 4.5), or both."""
-SPACE_NAMES: Mapping[Space, str] = {"task": "End effector", "cspace": "Whole arm", "both": "Both"}
-"""Names on the page of who avoids."""
+SPACES: tuple[Space, ...] = get_args(Space)
 GENERATOR_NAMES: Mapping[Generator, str] = {
     "free-space": "Free space (−∇log(1−p))",
     "probability": "Probability (∇p, the paper's)",
@@ -99,9 +98,6 @@ class Avoidance(Transform):
     stays_outermost: ClassVar[bool] = True
     yields_goal: ClassVar[bool] = True
     settings: ClassVar[tuple[Setting, ...]] = (
-        Choice(
-            "space", "Avoid with", SPACE_NAMES, "who gives way: the path of the hand, or the arm by its joint angles"
-        ),
         Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
         Number(
             "temperature",

@@ -20,6 +20,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.panel.avoid import AvoidPanel
 from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
@@ -103,11 +104,13 @@ class Panel:
         self._settled = "", ""
         """Hint and status of the last reported scenario."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
+        avoid = AvoidPanel(gui, self._bindings)
         self.status = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
 
         self._bindings.on(self._cancel, lambda session, _pressed: session.cancel())
+        avoid.add_remedy()
         self._build_task()
         tabs = gui.add_tab_group()
         self._chores = Chores(self.fail)

@@ -15,7 +15,7 @@ from dt_viz.warning import ARM, Kind
 COMPUTING = "Computing the motion…"
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
 WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
-HAND_ONLY = ": only the path of the hand gives way. For the arm: Stack → Avoid with → Both"
+HAND_ONLY = ": only the path of the hand gives way"
 OF_MESHES = frozenset({Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE})
 """Kinds of warnings about collisions of the arm's meshes."""
 BLUE = ((29, 79, 124), (232, 241, 250))
