@@ -40,8 +40,8 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 
 ACCELERATION = 4.0
-"""Limit of the joints' acceleration, rad/s². The JACO's manual names none; this one takes a joint to its limit of
-velocity in about 0.2 s, which is what the arm does when it is driven by velocities."""
+"""Limit of the joints' acceleration, rad/s². The arm's URDF names none; chosen so that joints reach their limits of
+velocity, 0.63 and 0.84 rad/s, within about 0.2 s."""
 VELOCITY_SHARE = 0.85
 """Part of the velocity limits that the motion ahead uses: the rest closes gaps."""
 BRAKING_SHARE = 0.7
