@@ -237,6 +237,23 @@ class TestDisturbances:
         assert scenario.obstacle.signed_distance(hand).min() > 0.01
         assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
 
+    def test_another_posture_to_stay_near_is_taken_gradually(self, scene):
+        class Leaning:
+            """The arm, staying near another posture."""
+
+            robot, whole_arm = scene.engine.follower.robot, scene.engine.follower.whole_arm
+
+            def reference(self, nominal):
+                return scene.engine.follower.reference(nominal) + offset
+
+        offset = np.zeros(6)
+        robot = Robot(Controller(Leaning(), scene.solved), scene.start).run(1.0)  # pyright: ignore[reportArgumentType]
+        offset = np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
+        robot.controller.follow(scene.solved)
+        robot.run(12, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+        assert np.abs(robot.q - scene.lifted.tracked.q[0, -1]).max() > 0.1
+
 
 class TestInput:
     @pytest.mark.parametrize("q", [np.zeros(5), np.full(6, np.nan)])

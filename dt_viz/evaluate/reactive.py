@@ -68,7 +68,7 @@ LONGEST = 30.0
 AT_GOAL = 1e-3
 """Metres from the goal."""
 SUBDIVISIONS = 6
-"""Halvings of a tick in which the smallest distance is looked for."""
+"""Number of parts of a tick at whose borders the smallest distance is looked for."""
 PAPER_PERIOD = 0.05
 """Seconds between two velocities of the paper's controller: 20 Hz."""
 REPULSION = 1.5

@@ -218,10 +218,10 @@ class Controller:
         """Work out how to go on with another stack, while ticks go on; see `follow`."""
         section = Section(self.robot, self._follower.reference(solved.nominal))
         with self._lock:
-            before, begins, clock = self._solved, self._ahead, self._clock
+            begins, clock, alike = self._ahead, self._clock, self._goes_on(solved, section)
             turn = TURNING * (self._now - self._dodged)
             sighting = self._sighting.then(solved.scenario.arm_avoidance, self._now)
-        if begins is None or not _alike(before, solved):
+        if begins is None or not alike:
             return Prepared(solved, section, sighting, None, None)
         ahead = self._around(begins.course, clock, sighting, begins.dodge, turn)
         return Prepared(solved, section, sighting, begins, ahead)
@@ -230,18 +230,27 @@ class Controller:
         """Go on with what was prepared from the next tick on; what does not fit any more is worked out again."""
         with self._lock:
             before, solved = self._solved, prepared.solved
+            alike = self._goes_on(solved, prepared.section)
             self._solved, self._section, self._sighting = solved, prepared.section, prepared.sighting
             if self._ahead is None:
                 return
             if prepared.ahead is not None and self._ahead is prepared.begins:
                 self._ahead, self._dodged = prepared.ahead, self._now
-            elif self._aim is Aim.HAND or _alike(before, solved):
+            elif self._aim is Aim.HAND or alike:
                 self._take(self._ahead.course)
             else:
                 learned = before.below.system is solved.below.system and self._aim is Aim.GOAL
                 course = self._course(self._ahead.course.at(self._clock), self._image() if learned else None)
                 self._clock, self._settled = 0.0, False
                 self._take(course)
+
+    def _goes_on(self, solved: Solved, section: Section) -> bool:
+        """Whether the undisturbed motion is the same with another stack."""
+        before, after = self._solved.stack, solved.stack
+        parts, others = (Chain([stack.transform]).parts for stack in (before, after))
+        same = len(parts) == len(others) and all(a is b for a, b in zip(parts, others, strict=True))
+        same = same and before.rays.base is after.rays.base
+        return same and np.array_equal(self._section.reference, section.reference)
 
     @property
     def system(self) -> ArmSystem:
@@ -450,13 +459,6 @@ class Controller:
         else:
             system = stack.system
         return _towards(system, self._section, self.robot.lower, q, z)
-
-
-def _alike(solved: Solved, other: Solved) -> bool:
-    """Whether the end effector's stacks are the same."""
-    parts, others = (Chain([each.stack.transform]).parts for each in (solved, other))
-    same = len(parts) == len(others) and all(a is b for a, b in zip(parts, others, strict=True))
-    return same and solved.stack.rays.base is other.stack.rays.base
 
 
 def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Array, z: Array | None) -> Course:
