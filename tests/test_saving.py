@@ -81,7 +81,17 @@ def assert_same(a: dt.Motion, b: dt.Motion):
     assert a.certificates() == b.certificates()
 
 
-@pytest.mark.parametrize("name", ["space", "space, velocities", "plane", "plane, velocities", "plain", "a drawing"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "space",
+        pytest.param("space, velocities", marks=pytest.mark.slow),
+        "plane",
+        "plane, velocities",
+        "plain",
+        "a drawing",
+    ],
+)
 def test_a_motion_is_read_back_to_the_last_bit(motions, name, tmp_path):
     motions[name].save(tmp_path / "a.npz")
     again = dt.Motion.load(tmp_path / "a.npz")
@@ -109,7 +119,7 @@ print(digest.hexdigest())
 """
 
 
-@pytest.mark.parametrize("name", ["space", "plane"])
+@pytest.mark.parametrize("name", [pytest.param("space", marks=pytest.mark.slow), "plane"])
 def test_another_process_finds_the_same(motions, name, tmp_path, capsys, monkeypatch):
     path = tmp_path / "a.npz"
     motions[name].save(path)
