@@ -33,6 +33,12 @@ def made(arm, q, avoidance, before=NO_DODGE, turn=0.0, velocities=RESTS):
     return dodge(arm, q, np.ones(len(q), bool), avoidance, velocities, before, turn)
 
 
+def way_out(found):
+    (way,) = found.directions
+    assert way is not None
+    return way
+
+
 def test_all_that_lies_ahead_is_cleared_and_the_end_stays(arm, q):
     avoidance = around(arm, q[50])
     found, p = made(arm, q, avoidance)
@@ -65,13 +71,13 @@ def test_only_hosts_are_cleared(arm, q):
 def test_the_way_out_turns_no_further_than_it_may(arm, q):
     avoidance = around(arm, q[50])
     best, _ = made(arm, q, avoidance)
-    (way,) = best.directions
+    way = way_out(best)
     across = np.cross(way, [0.3, 0.5, 0.8])
     other = type(best)(best.transform, (across / np.linalg.norm(across),))
-    (turned,) = made(arm, q, avoidance, other, turn=0.1)[0].directions
-    assert np.arccos(turned @ other.directions[0]) == pytest.approx(0.1, abs=1e-6)
-    assert turned @ way > other.directions[0] @ way
-    (there,) = made(arm, q, avoidance, other, turn=np.pi)[0].directions
+    turned = way_out(made(arm, q, avoidance, other, turn=0.1)[0])
+    assert np.arccos(turned @ way_out(other)) == pytest.approx(0.1, abs=1e-6)
+    assert turned @ way > way_out(other) @ way
+    there = way_out(made(arm, q, avoidance, other, turn=np.pi)[0])
     np.testing.assert_allclose(there, way, atol=1e-9)
 
 
@@ -88,8 +94,8 @@ def test_images_move_as_gradually_as_the_obstacle(arm, q):
 
 def test_a_moving_obstacle_is_not_run_away_from_along_its_way(arm, q):
     avoidance = around(arm, q[50])
-    (way,) = made(arm, q, avoidance)[0].directions
-    (across,) = made(arm, q, avoidance, velocities=0.2 * way[None])[0].directions
+    way = way_out(made(arm, q, avoidance)[0])
+    across = way_out(made(arm, q, avoidance, velocities=0.2 * way[None])[0])
     assert across @ way < 0.3
 
 
