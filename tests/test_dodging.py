@@ -5,6 +5,7 @@ import pytest
 
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.whole_arm import OVERSHOOT
+from dt_viz.flows.fields import Array
 from dt_viz.motion.dodging import NO_DODGE, dodge
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -29,7 +30,7 @@ def around(arm, posture, offset=(0, 0, 0), diameter=0.15):
     return ArmAvoidance(Union((Sphere(as_point(place), diameter),)), margin=MARGIN)
 
 
-def made(arm, q, avoidance, before=NO_DODGE, turn=0.0, velocities=RESTS):
+def made(arm, q, avoidance, before=NO_DODGE, turn=0.0, velocities: Array = RESTS):
     return dodge(arm, q, np.ones(len(q), bool), avoidance, velocities, before, turn)
 
 
