@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from dt_viz.errors import DataError
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
-    from dt_viz.library import Arm, BlockedError, JointPath, Motion, Path, fit, load_jaco
+    from dt_viz.library import Arm, BlockedError, Controller, JointPath, Motion, Path, fit, load_jaco
     from dt_viz.motion.certificates import Certificates
     from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
     from dt_viz.transforms.avoidance import Avoidance
@@ -33,6 +33,7 @@ __all__ = [
     "BlockedError",
     "Box",
     "Certificates",
+    "Controller",
     "Cylinder",
     "DataError",
     "Demonstration",
@@ -52,7 +53,7 @@ _MODULES = {
     "errors": ("DataError",),
     "flows.diffeomorphisms": ("Integration",),
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
-    "library": ("Arm", "BlockedError", "JointPath", "Motion", "Path", "fit", "load_jaco"),
+    "library": ("Arm", "BlockedError", "Controller", "JointPath", "Motion", "Path", "fit", "load_jaco"),
     "motion.certificates": ("Certificates",),
     "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
     "transforms.avoidance": ("Avoidance",),

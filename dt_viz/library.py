@@ -26,12 +26,13 @@ from dt_viz.flows.systems import CONTROLLER_TOLERANCE, DiffeomorphicSystem
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
 from dt_viz.learning.imitation import fit as fit_imitation
+from dt_viz.motion import control
 from dt_viz.motion.certificates import Certificates, Shown, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned
 from dt_viz.motion.solve import Solved, solve
-from dt_viz.motion.stack import FINE, Solution, build_stack
+from dt_viz.motion.stack import FINE, LIVE, Solution, build_stack
 from dt_viz.properties import cached_property
 from dt_viz.saving import SavedMotion, load_motion, save_motion
 from dt_viz.scenario.scenario import Layer, Scenario
@@ -247,6 +248,48 @@ class Arm:
             )
             for row in rows
         )
+
+
+class Controller(control.Controller):
+    """The joint velocities of an arm in the loop, wherever it is: see `dt_viz.motion.control`.
+
+        controller = dt.Controller(motion, arm)
+        q_velocity = controller.step(q, dt)
+
+    The arm goes to the goal around what the motion avoids by hand, and by the whole arm (`Avoidance(space="cspace")`).
+    """
+
+    def __init__(self, motion: Motion, arm: Arm) -> None:
+        """Take a motion in space, in the frame of the arm's base, and the arm.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motion starts.
+            ValueError: the motion is one in a plane that has no place in space.
+        """
+        super().__init__(arm._follower, _live(motion))
+        self._motion = motion
+
+    @property
+    def motion(self) -> Motion:
+        """What it follows; another one, such as one with its obstacle elsewhere, takes over at the next `step`.
+
+        Raises:
+            UnreachableError, ValueError: as `Controller`.
+        """
+        return self._motion
+
+    @motion.setter
+    def motion(self, motion: Motion) -> None:
+        self.follow(_live(motion))
+        self._motion = motion
+
+
+def _live(motion: Motion) -> Solved:
+    """The stack of a motion in space, as exactly as a controller needs it."""
+    if motion.dimension != NUM_COORDINATES:
+        raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {motion.dimension}")
+    scenario, nominal = motion._scenario, motion._learned.demonstrated
+    return Solved(scenario, nominal, nominal, build_stack(nominal, scenario.active, LIVE))
 
 
 def load_jaco() -> Arm:

@@ -532,8 +532,6 @@ def test_who_avoids_is_chosen_in_the_page(visit):
     press(page.get_by_role("option", name="Hand"))
     wait_until(lambda: visitor.session.scenario.avoidance.space == "task", "the choice to arrive")
     wait_until(lambda: visitor.shown.scenario.avoidance.space == "task", "its picture")
-    press(page.get_by_role("button", name="Let the whole arm avoid"))
-    wait_until(lambda: visitor.shown.scenario.avoidance.space == "cspace", "the arm to make way again")
 
 
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):

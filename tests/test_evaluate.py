@@ -9,6 +9,7 @@ import pytest
 import scipy.io
 from PIL import Image
 
+from dt_viz.arm.collision import load_collision_model
 from dt_viz.engine.frame import Stage
 from dt_viz.evaluate import latency, rollouts
 from dt_viz.evaluate.__main__ import main
@@ -24,7 +25,8 @@ from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 from dt_viz.learning.imitation import ImitationSettings, fit, grown_grid
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, distance_from_path, resample_by_arc_length, rms_at_equal_times
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.motion.control import ACCELERATION
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import lasa_tasks
 
@@ -374,6 +376,36 @@ def test_the_hand_has_room_where_some_orientation_of_it_has(robot):
     )
     assert far > near > 0 > inside
     assert far - near == pytest.approx(0.065, abs=0.01)  # the hand points at the ball, whatever its size
+
+
+# --- reactive ---
+
+
+def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(lasa, tmp_path, robot, capsys):
+    first, second = tmp_path / "first.npz", tmp_path / "second.npz"
+    arguments = ["reactive", "--task", "Hook", "--lasa", str(lasa), "--speed", "0.4", "--runs", "2", "--out"]
+    assert main([*arguments, str(first), "--beside"]) == 0
+    row = capsys.readouterr().out.split("\nin the loop")[1].splitlines()[0].split()
+    with np.load(first) as arrays:
+        closest = []
+        for i in range(2):
+            q, t, places = arrays[f"q_{i}"], arrays[f"t_{i}"], arrays[f"obstacle_{i}"]
+            assert q.shape == (len(t), 6) and places.shape == (len(t), 3) and len(arrays[f"delays_{i}"])
+            velocity = np.diff(q, axis=0, prepend=q[:1]) / 0.01
+            assert (np.abs(velocity) < robot.velocity_limits + 1e-9).all()
+            assert np.abs(np.diff(velocity, axis=0)).max() < ACCELERATION * 0.01 + 1e-9
+            np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1)[:150], 0.004, rtol=0.02)
+            for joints, place in zip(q, places, strict=True):
+                if np.isfinite(place).all():
+                    sphere = Sphere(as_point(place), float(arrays["diameter"]))
+                    closest.append(load_collision_model().obstacle_distance(joints[None], sphere)[0][0])
+            for kind in ("potential_", "stepped_"):
+                assert len(arrays[f"{kind}q_{i}"]) == len(arrays[f"{kind}t_{i}"]) > 100
+        assert float(row[3]) == pytest.approx(1e3 * min(closest), abs=2)  # it looks between ticks, too
+        assert row[:3] == ["2", "of", "2"] and row[4:7] == ["2", "of", "2"]
+        assert main([*arguments, str(second), "--delays", str(first)]) == 0
+        with np.load(second) as again:
+            np.testing.assert_array_equal(again["q_1"], arrays["q_1"])
 
 
 def test_values_may_begin_with_a_minus():

@@ -9,7 +9,7 @@ import pytest
 
 import dt_viz as dt
 from dt_viz.arm.collision import load_collision_model
-from dt_viz.examples import controller, plot
+from dt_viz.examples import arm_controller, controller, plot
 from dt_viz.examples.viser_scene import Scene
 from dt_viz.library import Motion
 from dt_viz.shipped import ASSETS
@@ -173,3 +173,18 @@ def test_the_scene_draws_its_paths_around_the_ball_where_it_stands(server):
     scene.draw()
     assert before.shape != drawn["/path/0"].points.shape or np.abs(before - drawn["/path/0"].points).max() > 0.01
     server.scene.reset()
+
+
+def test_the_arm_in_the_loop_gives_way_to_a_ball_that_crosses_and_arrives(push):
+    arm, model = dt.load_jaco(), load_collision_model()
+    joints, places = arm_controller.run(push, arm)
+    pairs = list(zip(joints, places, strict=True))[::10]
+    balls = [dt.Sphere((x, y, z), diameter=0.15) for _, (x, y, z) in pairs]
+    distances = [model.obstacle_distance(q[None], ball)[0][0] for (q, _), ball in zip(pairs, balls, strict=True)]
+    assert 0.01 < min(distances) < 0.08  # it came near
+    assert np.linalg.norm(arm.robot.end_effector(joints[-1]) - push.goal) < 1e-3
+
+
+def test_a_controller_of_the_arm_refuses_a_drawing_without_a_place_in_space(letter):
+    with pytest.raises(ValueError, match="3 coordinates"):
+        dt.Controller(letter, dt.load_jaco())

@@ -10,6 +10,10 @@ from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 NUM_DIRECTIONS = 128
 SIDEWAYS = 2.0
 """Relative extra cost of a direction along the motion against one across it: it would bend the path sharply."""
+COMING, STRIDE = 1.5, 0.04
+"""Time (s) for which a moving obstacle is in the way also of where it will be, and spacing (m) of these places."""
+FARTHEST = 0.16
+"""Largest distance of these places from where it is, metres."""
 TABLE_WEIGHT = 3.0
 """Cost of each metre by which an escape leads below the table, against a metre of detour."""
 ON_THE_WAY = 0.10
@@ -21,7 +25,14 @@ SELECTIVITY = 0.03
 
 
 def escape_directions(
-    points: Array, radius: Array, tangents: Array, obstacle: Obstacle, margin: float = 0.0, *, num: int = 3
+    points: Array,
+    radius: Array,
+    tangents: Array,
+    obstacle: Obstacle,
+    margin: float = 0.0,
+    *,
+    num: int = 3,
+    velocity: Array | None = None,
 ) -> list[Array]:
     """Find directions in which the arm can escape, the one with the least detour first.
 
@@ -35,12 +46,17 @@ def escape_directions(
         obstacle: obstacle to escape from.
         margin: required clearance, metres.
         num: largest number of directions.
+        velocity: (3,) the obstacle's, m/s; None where it rests. Whoever runs away along it is caught up with.
 
     Returns:
         Unit vectors (3,), one for each distinct escape.
     """
     directions = golden_spiral(NUM_DIRECTIONS, 0.5)
     centres, radii = obstacle.cover()
+    if velocity is not None and (speed := float(np.linalg.norm(velocity))) > 0:
+        ahead = np.arange(0, min(COMING * speed, FARTHEST), STRIDE)
+        centres = (centres + ahead[:, None, None] * velocity / speed).reshape(-1, 3)
+        radii = np.tile(radii, len(ahead))
     offset = points - centres[:, None, :, None]  # (B, P, 3, M)
     squared, sum_of_radii = (offset**2).sum(axis=2), (radii[:, None] + margin + radius)[:, :, None]
     ball, point, sample = np.nonzero(squared < (sum_of_radii + 2 * ON_THE_WAY) ** 2)

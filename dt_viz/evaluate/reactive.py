@@ -1,0 +1,471 @@
+"""Let a sphere cross the motion of the robot in the loop, on random smooth paths, and measure how it dodges.
+
+The sphere's path has its middle at the hand of the undisturbed motion, and the sphere is there when the hand would be.
+Stacks take over as late as computing them took; the file holds these times, and `--delays` of it repeats a run.
+The npz file holds for run i:
+
+``q_i`` (T, 6), ``t_i`` (T,), ``obstacle_i`` (T, 3)
+    joint angles, rad, seconds, and the sphere's centre, metres, at each tick; NaN once it has gone.
+``delays_i`` (S,)
+    seconds that each stack took.
+
+and ``diameter``, metres. With `--beside`, ``potential_q_i`` and ``stepped_q_i`` with their ``_t_i`` and ``_obstacle_i``
+are those of the same arm with a repulsive potential field, and of its field stepped at the paper's 20 Hz.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from dt_viz.arm.arm_system import ArmSystem, Section
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.arm.cspace import REACH_PER_TEMPERATURE
+from dt_viz.arm.robot import NUM_JOINTS, Robot, cross, load_jaco
+from dt_viz.engine.engine import Engine
+from dt_viz.evaluate.options import (
+    add_task,
+    avoiding,
+    chosen_task,
+    positive_number,
+    print_table,
+    ready_to_write,
+    whole_number,
+    write_npz,
+)
+from dt_viz.flows.fields import Array
+from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.metrics import resample_by_arc_length
+from dt_viz.motion.control import ACCELERATION, Controller, Phase
+from dt_viz.motion.following import Follower
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import LIVE
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.transforms.avoidance import Avoidance
+
+TICK = 0.01
+"""Seconds between two ticks."""
+STACK_PERIOD = 0.03
+"""Shortest time between the beginnings of two stacks, seconds."""
+HALF_LENGTH = 0.40
+"""Half the length of a sphere's path, metres."""
+WIGGLE, WAVELENGTH = 0.04, 0.5
+"""Amplitude and length of a path's waves, metres."""
+PEDESTAL_ROOM = 0.10
+"""Distance, metres, that a path keeps from the base and link 1, which no joint moves out of its way."""
+TABLE_ROOM = 0.01
+"""Height of the sphere above the table, metres."""
+START_ROOM = 0.05
+"""Distance of the arm from the sphere at the beginning, metres."""
+LONGEST = 30.0
+"""Seconds after the sphere has gone in which the goal has to be reached."""
+AT_GOAL = 1e-3
+"""Metres from the goal."""
+SUBDIVISIONS = 6
+"""Number of parts of a tick at whose borders the smallest distance is looked for."""
+PAPER_PERIOD = 0.05
+"""Seconds between two velocities of the paper's controller: 20 Hz."""
+REPULSION = 1.5
+"""Velocity of a body point that touches the sphere, m/s, in the potential field."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crossing:
+    """A sphere that crosses a motion."""
+
+    start: int
+    """Rollout that the robot follows."""
+    begins: float
+    """Seconds at which the robot sets out."""
+    path: Array
+    """(N, 3) evenly spaced places of the sphere, metres."""
+    length: float
+    """Metres."""
+    speed: float
+    """m/s."""
+
+    @property
+    def gone(self) -> float:
+        """Seconds after which there is no sphere."""
+        return self.length / self.speed
+
+    def at(self, t: float) -> Array:
+        """(3,) the sphere's centre, metres."""
+        place = np.clip(t / self.gone, 0, 1) * (len(self.path) - 1)
+        return np.array([np.interp(place, np.arange(len(self.path)), axis) for axis in self.path.T])
+
+
+@dataclass
+class Run:
+    """What happened."""
+
+    q: list[Array] = field(default_factory=list)
+    t: list[float] = field(default_factory=list)
+    obstacle: list[Array] = field(default_factory=list)
+    delays: list[float] = field(default_factory=list)
+    ticks: list[float] = field(default_factory=list)
+    """Seconds of processor time of each tick."""
+    phases: set[Phase] = field(default_factory=set)
+
+
+class Arm(Protocol):
+    """What moves the robot."""
+
+    def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
+        """Joint velocities (6,), rad/s, at t."""
+        ...
+
+    @property
+    def resting(self) -> bool:
+        """Whether it is at the goal."""
+        ...
+
+
+class InTheLoop:
+    """The controller, with stacks that are late."""
+
+    def __init__(self, bench: Bench, crossing: Crossing, delays: Array | None, *, anticipates: bool) -> None:
+        self._bench, self._delays = bench, delays
+        blind = {} if anticipates else {"lead": 0.0, "room": 0.0}
+        self.controller = Controller(bench.follower, bench.solved, **blind)
+        self.controller.home(crossing.start)
+        self._pending: Any = None
+        self._ready, self._next, self._went, self._present = 0.0, 0.0, False, True
+
+    def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
+        """See `Arm`."""
+        if not self._went and t >= crossing.begins:
+            self.controller.go()
+            self._went = True
+        if self._pending is not None and t >= self._ready:
+            self.controller.take(self._pending)
+            self._pending = None
+        present = t < crossing.gone
+        if self._pending is None and t >= self._next and run.q[1:] and (present or self._present):
+            self._present = present
+            solved = self._bench.around(self._bench.sphere(crossing.at(t)) if present else ())
+            began = time.thread_time()
+            self._pending = self.controller.prepared(solved)
+            delay = time.thread_time() - began
+            if self._delays is not None and len(run.delays) < len(self._delays):
+                delay = float(self._delays[len(run.delays)])
+            run.delays.append(delay)
+            self._ready, self._next = t + delay, t + STACK_PERIOD
+        began = time.thread_time()
+        velocity = self.controller.step(q, TICK)
+        run.ticks.append(time.thread_time() - began)
+        run.phases.add(self.controller.phase)
+        return velocity
+
+    @property
+    def resting(self) -> bool:
+        """See `Arm`."""
+        return self._went and not self._present and self.controller.phase is Phase.RESTING
+
+
+class Bench:
+    """A task's robot."""
+
+    def __init__(self, engine: Engine, task: str, diameter: float, margin: float) -> None:
+        self.diameter, self.margin = diameter, margin
+        self.follower: Follower = engine.follower
+        self.robot: Robot = engine.follower.robot
+        self._task = engine.task(task)
+        self._solve = lambda scenario: engine.solved(scenario, LIVE)
+        self.scenario = avoiding(self._task, Avoidance((), space="cspace", margin=margin))
+        self.solved: Solved = self._solve(self.scenario)
+        self.section = Section(self.robot, self.follower.reference(self.solved.nominal))
+        self.goal = self.solved.nominal.goal
+        self.starts = self.section.postures(self.solved.nominal.starts[:, None])[:, 0]
+
+    def sphere(self, place: Array) -> Sphere:
+        """The sphere with its centre at a place (3,), metres."""
+        return Sphere(as_point(place), self.diameter)
+
+    def around(self, obstacle: Sphere | tuple[()]) -> Solved:
+        """The stack with the sphere somewhere; that of the end effector is the same everywhere."""
+        avoidance = Avoidance(obstacle, space="cspace", margin=self.margin)
+        return replace(self.solved, scenario=avoiding(self._task, avoidance))
+
+    def undisturbed(self, start: int) -> tuple[Array, Array]:
+        """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
+        controller, q, passed = Controller(self.follower, self.solved), self.starts[start], []
+        while len(passed) < LONGEST / TICK:
+            passed.append(q)
+            q = q + TICK * controller.step(q, TICK)
+            if controller.phase is Phase.RESTING:
+                break
+        joints = np.array(passed)
+        return self.robot.end_effector(joints), joints
+
+
+def crossings(bench: Bench, speed: float, runs: int, seed: int) -> Iterator[tuple[Crossing, float]]:
+    """Spheres that cross, and the seconds that the robot takes without them."""
+    rng, known = np.random.default_rng(seed), {}
+    body, wall = bench.follower.whole_arm, bench.follower.body.on_pedestal
+    pedestal = wall.positions(bench.robot, bench.starts[0])
+    for run in range(runs):
+        start = run % len(bench.starts)
+        if start not in known:
+            known[start] = bench.undisturbed(start)
+        hand, joints = known[start]
+        while True:
+            at = int(rng.uniform(0.25, 0.75) * len(hand))
+            path = _path(hand[at] + rng.normal(scale=0.02, size=3), rng)
+            length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+            sphere = bench.sphere(path[0])
+            room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - bench.diameter / 2
+            if (
+                path[:, 2].min() >= bench.diameter / 2 + TABLE_ROOM
+                and room.min() >= PEDESTAL_ROOM
+                and body.clearance(joints[:1], sphere)[0] >= START_ROOM
+            ):
+                break
+        middle = length / 2 / speed
+        yield Crossing(start, max(middle - at * TICK, 0.0), path, length, speed), TICK * len(hand)
+
+
+def _path(middle: Array, rng: np.random.Generator) -> Array:
+    """A wavy path (N, 3) through a place (3,), evenly sampled."""
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    s, phase = np.linspace(-HALF_LENGTH, HALF_LENGTH, 201), rng.uniform(0, 2 * np.pi)
+    wave = WIGGLE * (np.sin(2 * np.pi * s / WAVELENGTH + phase) - np.sin(phase))
+    return resample_by_arc_length(middle + np.outer(s, axes[:, 0]) + np.outer(wave, axes[:, 1]), 401)
+
+
+def simulated(bench: Bench, crossing: Crossing, arm: Arm) -> Run:
+    """Run an arm until it rests at the goal, or `LONGEST` seconds after the sphere has gone."""
+    run, q = Run(), bench.starts[crossing.start].copy()
+    for k in range(int((crossing.gone + crossing.begins + LONGEST) / TICK)):
+        t = k * TICK
+        run.q.append(q)
+        run.t.append(t)
+        run.obstacle.append(crossing.at(t) if t < crossing.gone else np.full(3, np.nan))
+        if t > max(crossing.gone, crossing.begins) and arm.resting:
+            break
+        q = q + TICK * arm.tick(t, q, crossing, run)
+    return run
+
+
+def smallest_distance(bench: Bench, run: Run) -> float:
+    """Smallest distance of the arm's meshes from the sphere, also between ticks, metres."""
+    q, places, robot = np.array(run.q), np.array(run.obstacle), bench.robot
+    there = np.isfinite(places[:, 0])
+    q, places = q[there], places[there]
+    cover = bench.follower.body
+    points = cover.positions(robot, q)
+    gaps = np.linalg.norm(points - places[:, None], axis=2) - cover.radius - bench.diameter / 2
+    model, best = load_collision_model(), np.inf
+
+    def measured(joints: Array, place: Array) -> float:
+        return float(model.obstacle_distance(joints[None], bench.sphere(place))[0][0])
+
+    for k in np.argsort(gaps.min(axis=1)):  # the spheres cover the meshes: their distances are lower bounds
+        if gaps[k].min() >= best:
+            break
+        best = min(best, measured(q[k], places[k]))
+    # between ticks no covering sphere and the obstacle move towards each other by more than both move
+    travel = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1) + np.linalg.norm(
+        np.diff(places, axis=0), axis=1
+    )
+    low = np.minimum(gaps[:-1].min(axis=1), gaps[1:].min(axis=1)) - travel / 2
+    for k in np.flatnonzero(low < best):
+        for u in np.linspace(0, 1, SUBDIVISIONS + 1)[1:-1]:
+            joints, place = (1 - u) * q[k] + u * q[k + 1], (1 - u) * places[k] + u * places[k + 1]
+            near = np.linalg.norm(cover.positions(robot, joints) - place, axis=1) - cover.radius
+            if near.min() - bench.diameter / 2 < best:
+                best = min(best, measured(joints, place))
+    return best
+
+
+class _Field:
+    """An arm that is given velocities of a field at equal times, within the limits."""
+
+    def __init__(self, bench: Bench, period: float) -> None:
+        self._bench, self._period, self._next = bench, period, 0.0
+        self._wanted, self._velocity = np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS)
+        self._q = np.zeros(NUM_JOINTS)
+
+    def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
+        """See `Arm`."""
+        if t >= self._next - TICK / 2:
+            sphere = self._bench.sphere(crossing.at(t)) if t < crossing.gone else None
+            self._wanted = self._at(q, sphere) if t >= crossing.begins else self._away(q, sphere)
+            self._next += self._period
+        limits = self._bench.robot.velocity_limits
+        wanted = self._wanted * min(1.0, float((limits / np.maximum(np.abs(self._wanted), 1e-9)).min()))
+        change = ACCELERATION * TICK
+        self._velocity = np.clip(wanted, self._velocity - change, self._velocity + change)
+        room = self._bench.robot.lower - q, self._bench.robot.upper - q
+        self._velocity, self._q = np.clip(self._velocity, room[0] / TICK, room[1] / TICK), q
+        return self._velocity
+
+    @property
+    def resting(self) -> bool:
+        """See `Arm`."""
+        missed = np.linalg.norm(self._bench.robot.end_effector(self._q) - self._bench.goal)
+        return bool(missed < AT_GOAL / 10)
+
+    def _at(self, q: Array, sphere: Sphere | None) -> Array:
+        raise NotImplementedError
+
+    def _away(self, q: Array, sphere: Sphere | None) -> Array:
+        return np.zeros(NUM_JOINTS)
+
+
+class Potential(_Field):
+    """The undisturbed motion's velocity plus the repulsion of all body points (Khatib's field)."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench, 2 * TICK)
+        self._hand = bench.solved.stack.system.at_tolerance(1e-5)
+
+    def _at(self, q: Array, sphere: Sphere | None) -> Array:
+        velocity = self._hand.velocity(self._bench.robot.end_effector(q))
+        return self._bench.section.velocities(q, velocity) + self._away(q, sphere)
+
+    def _away(self, q: Array, sphere: Sphere | None) -> Array:
+        if sphere is None:
+            return np.zeros(NUM_JOINTS)
+        robot, body = self._bench.robot, self._bench.follower.whole_arm.body
+        chain = robot.chain(q[:, None])
+        points = body.of_chain(chain)[:, :, 0]
+        offset = points - np.asarray(sphere.position)
+        distance = np.linalg.norm(offset, axis=1)
+        reach = REACH_PER_TEMPERATURE * 6 + self._bench.margin
+        u = np.clip(1 - (distance - body.radius - sphere.radius) / reach, 0, None)
+        force = (u**2)[:, None] * offset / distance[:, None]
+        total, wanted = np.zeros(NUM_JOINTS), force * REPULSION
+        for point, joint, push in zip(points, body.joint, wanted, strict=True):
+            if push.any():
+                lever = cross(chain.axes[:, 2], (point[:, None] - chain.origins))[: joint + 1, :, 0]
+                total[: joint + 1] += np.linalg.solve(lever @ lever.T + 0.05 * np.eye(joint + 1), lever @ push)
+        return total
+
+
+class Stepped(_Field):
+    """Eq. (4) of the newest stack at the posture where the arm is, held for the paper's 20 Hz."""
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__(bench, PAPER_PERIOD)
+        self._dodging = Controller(bench.follower, bench.solved)
+
+    def _at(self, q: Array, sphere: Sphere | None) -> Array:
+        bench = self._bench
+        self._dodging.follow(bench.around(() if sphere is None else sphere))
+        self._dodging.step(q, self._period)
+        system: ArmSystem = self._dodging.system
+        return system.velocity(bench.follower.whole_arm.limits.inside(q))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the subcommand's arguments."""
+    add_task(parser)
+    parser.add_argument("--speed", type=positive_number("m/s", 2), required=True, metavar="V", help="of the sphere")
+    parser.add_argument("--runs", type=whole_number(1), default=20, help="(default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number(0), default=0, help="of the paths (default: %(default)s)")
+    parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
+    parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
+    parser.add_argument("--no-anticipation", action="store_true", help="stacks for where the sphere was seen")
+    parser.add_argument("--beside", action="store_true", help="also a potential field, and stepping at 20 Hz")
+    parser.add_argument("--delays", type=Path, metavar="F.npz", help="of an earlier run, which this repeats")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    tasks, task = chosen_task(options)
+    out = ready_to_write(options.out, ".npz")
+    bench = Bench(
+        Engine(tasks, FitStore(default_cache_folder()), load_jaco()), task.name, options.diameter, options.margin
+    )
+    recorded = np.load(options.delays) if options.delays is not None else {}
+    kinds: dict[str, Callable[[Crossing, int], Arm]] = {
+        "": lambda crossing, i: InTheLoop(
+            bench, crossing, recorded.get(f"delays_{i}"), anticipates=not options.no_anticipation
+        )
+    }
+    if options.beside:
+        kinds |= {"potential_": lambda crossing, _: Potential(bench), "stepped_": lambda crossing, _: Stepped(bench)}
+    arrays: dict[str, Any] = {"diameter": options.diameter}
+    figures: dict[str, list[Figures]] = {kind: [] for kind in kinds}
+    rows = []
+    for i, (crossing, seconds) in enumerate(crossings(bench, options.speed, options.runs, options.seed)):
+        for kind, make in kinds.items():
+            found = simulated(bench, crossing, make(crossing, i))
+            figures[kind].append(Figures.of(bench, crossing, found, seconds))
+            arrays |= {f"{kind}q_{i}": found.q, f"{kind}t_{i}": found.t, f"{kind}obstacle_{i}": found.obstacle}
+            if not kind:
+                arrays[f"delays_{i}"] = found.delays
+                rows.append((str(i), *figures[kind][-1].cells()))
+                print(*rows[-1], " ".join(sorted(p.value for p in found.phases)), flush=True)
+    write_npz(out, **arrays)
+    print(f"\n{task.name}, sphere of {options.diameter:g} m at {options.speed:g} m/s, margin {options.margin:g} m")
+    names = {"": "in the loop", "potential_": "potential field", "stepped_": "stepped at 20 Hz"}
+    print_table(HEADER, [(names[kind], *summary(found)) for kind, found in figures.items()])
+    return 0
+
+
+HEADER = (
+    "", "without contact", "clearance mm", "goal reached", "velocity", "acceleration",
+    "time lost s", "tick ms", "stack ms",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Measurements of one run."""
+
+    distance: float
+    """Smallest, metres, negative inside."""
+    missed: float
+    """Distance of the hand from the goal at the end, metres."""
+    velocity: float
+    """Largest, in limits."""
+    acceleration: float
+    """Largest, in limits."""
+    lost: float
+    """Seconds that it arrived later than without a sphere."""
+    ticks: Array
+    delays: Array
+
+    @classmethod
+    def of(cls, bench: Bench, crossing: Crossing, run: Run, seconds: float) -> Figures:
+        """Measure a run."""
+        q = np.array(run.q)
+        velocity = np.diff(q, axis=0, prepend=q[:1]) / TICK
+        return cls(
+            smallest_distance(bench, run),
+            float(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal)),
+            float((np.abs(velocity) / bench.robot.velocity_limits).max()),
+            float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ACCELERATION),
+            run.t[-1] - crossing.begins - seconds,
+            np.array(run.ticks),
+            np.array(run.delays),
+        )
+
+    def cells(self) -> tuple[str, ...]:
+        """For a table."""
+        return (
+            f"{1e3 * self.distance:.1f}", f"{1e3 * self.missed:.2f}", f"{self.velocity:.3f}",
+            f"{self.acceleration:.3f}", f"{self.lost:.1f}",
+        )  # fmt: skip
+
+
+def summary(found: list[Figures]) -> tuple[str, ...]:
+    """The figures of all runs."""
+    num = len(found)
+    free, reached = sum(f.distance > 0 for f in found), sum(f.missed <= AT_GOAL for f in found)
+    ticks, delays = (np.concatenate([getattr(f, name) for f in found]) for name in ("ticks", "delays"))
+    timed = [f"{1e3 * np.median(t):.2f} ({1e3 * t.max():.0f})" if len(t) else "" for t in (ticks, delays)]
+    return (
+        f"{free} of {num}", f"{1e3 * min(f.distance for f in found):.1f}", f"{reached} of {num}",
+        f"{max(f.velocity for f in found):.3f}", f"{max(f.acceleration for f in found):.3f}",
+        f"{np.median([f.lost for f in found]):.1f} ({max(f.lost for f in found):.1f})", *timed,
+    )  # fmt: skip

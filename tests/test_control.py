@@ -1,0 +1,267 @@
+"""The robot in the loop: it follows eq. (4) exactly while nothing changes, and stays within limits whatever does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import changed
+
+from dt_viz.arm.arm_system import ArmSystem
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.flows.diffeomorphisms import Identity
+from dt_viz.motion.control import ACCELERATION, Controller, Phase
+from dt_viz.motion.stack import LIVE
+from dt_viz.obstacles.shapes import Sphere, as_point
+
+TICK = 0.01
+MARGIN = 0.03
+TIMES = np.linspace(0, 8, 6401)
+
+
+class Robot:
+    """A robot that does what it is told, and remembers."""
+
+    def __init__(self, controller, q):
+        self.controller, self.q = controller, np.array(q, float)
+        self.passed, self.velocities, self.phases = [self.q], [], []
+
+    def tick(self):
+        velocity = self.controller.step(self.q, TICK)
+        self.q = self.q + TICK * velocity
+        self.passed.append(self.q)
+        self.velocities.append(velocity)
+        self.phases.append(self.controller.phase)
+
+    def run(self, seconds, until=None):
+        for _ in range(round(seconds / TICK)):
+            self.tick()
+            if until is not None and self.phases[-1] is until and np.abs(self.velocities[-1]).max() < 1e-3:
+                break
+        return self
+
+    def excess(self):
+        """Largest velocity and acceleration of a joint, in limits."""
+        velocities = np.array([np.zeros(6), *self.velocities])
+        changes = np.abs(np.diff(velocities, axis=0)).max() / TICK
+        return (np.abs(velocities) / self.controller.robot.velocity_limits).max(), changes / ACCELERATION
+
+
+@pytest.fixture(scope="module", name="scene")
+def _scene(engine, initial):
+    return Scene(engine, initial("push_box"))
+
+
+class Scene:
+    """A task, with a sphere somewhere or without one."""
+
+    def __init__(self, engine, scenario):
+        self.engine, self.robot = engine, engine.follower.robot
+        self.scenario = changed(scenario, space="cspace", obstacles=(), margin=MARGIN)
+        self.solved = engine.solved(self.scenario, LIVE)
+        self.lifted = engine.follower.undisturbed(self.solved.nominal)
+        self.start, self.goal = self.lifted.tracked.q[0, 0], self.solved.nominal.goal
+        self.middle = self.robot.end_effector(self.lifted.tracked.q[0, 50])
+
+    def around(self, place, diameter=0.15):
+        sphere = Sphere(as_point(np.asarray(place, float)), diameter)
+        return replace(self.solved, scenario=changed(self.scenario, obstacles=sphere))
+
+    def controller(self, solved=None):
+        return Controller(self.engine.follower, solved or self.solved)
+
+    def missed(self, q):
+        return np.linalg.norm(self.robot.end_effector(q) - self.goal)
+
+
+class TestExactness:
+    @pytest.mark.parametrize("obstacle", [False, True])
+    def test_it_goes_through_the_postures_of_the_exact_rollout(self, scene, obstacle):
+        """Its own pace differs: it starts from rest, and keeps its limits."""
+        controller = scene.controller(scene.around(scene.middle) if obstacle else None)
+        robot = Robot(controller, scene.start)
+        robot.tick()
+        system = controller.system
+        p0 = system.postures(scene.robot.end_effector(scene.start)[None])
+        exact = system.rollout(p0[0], TIMES)
+        robot.run(2.5)
+        passed = np.array(robot.passed)[30:]
+        gaps = np.abs(passed[:, None] - exact).max(axis=2).min(axis=1)
+        assert gaps.max() < 4e-3
+        if obstacle:
+            plain = ArmSystem(system.hand, system.section, Identity(6)).rollout(p0[0], TIMES)
+            assert np.abs(passed[:, None] - plain).max(axis=2).min(axis=1).max() > 0.1
+
+    def test_its_velocity_is_that_of_equation_4_at_the_posture_where_it_is(self, scene):
+        """Which a swapped sign or the stack before would not be."""
+        controller = scene.controller(scene.around(scene.middle))
+        robot = Robot(controller, scene.start).run(1.2)
+        compared = 0
+        for _ in range(8):
+            robot.run(0.1)
+            exact = controller.system.velocity(robot.q)
+            along = exact / np.linalg.norm(exact)
+            velocity = robot.velocities[-1]
+            across = velocity - (velocity @ along) * along
+            assert velocity @ along > 0
+            assert np.linalg.norm(across) < 0.06 * np.linalg.norm(velocity)
+            compared += np.linalg.norm(velocity) > 0.1
+        assert compared >= 6
+
+
+class TestArrival:
+    def test_from_the_start(self, scene):
+        robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)
+        assert robot.phases[-1] is Phase.RESTING and scene.missed(robot.q) < 1e-4
+        assert max(robot.excess()) < 1 + 1e-9
+
+    @pytest.mark.parametrize("seed", range(12))
+    def test_from_postures_beside_the_section(self, scene, seed):
+        """Each converges to the posture that the section has for the goal."""
+        rng = np.random.default_rng(seed)
+        q = scene.engine.follower.whole_arm.limits.inside(scene.start + rng.normal(scale=0.5, size=6))
+        robot = Robot(scene.controller(), q).run(30, until=Phase.RESTING)
+        assert robot.phases[-1] is Phase.RESTING and scene.missed(robot.q) < 1e-3
+        turned = (robot.q - scene.lifted.tracked.q[0, -1]) / (2 * np.pi)
+        turned -= np.where(np.isinf(scene.robot.lower), np.round(turned), 0)
+        np.testing.assert_allclose(turned, 0, atol=2e-3)
+        assert max(robot.excess()) < 1 + 1e-9
+        passed = np.array(robot.passed)
+        assert (passed >= scene.robot.lower).all() and (passed <= scene.robot.upper).all()
+
+    def test_around_a_sphere_that_rests_in_the_way(self, scene):
+        solved = scene.around(scene.middle)
+        robot = Robot(scene.controller(solved), scene.start).run(20, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3
+        near = load_collision_model().nearest_to_obstacle(np.array(robot.passed)[::5], solved.scenario.obstacle)
+        assert near.distance > 0.8 * MARGIN
+
+    def test_and_then_home_and_back(self, scene):
+        robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)
+        robot.controller.home(1)
+        assert robot.controller.phase is Phase.HOMING
+        robot.run(20, until=Phase.RESTING)
+        start = scene.solved.nominal.starts[1]
+        assert np.linalg.norm(scene.robot.end_effector(robot.q) - start) < 1e-3
+        robot.controller.go()
+        robot.run(12, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+
+
+class TestDisturbances:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_limits_hold_under_random_stacks_and_pushes(self, scene, seed):
+        rng = np.random.default_rng(seed)
+        robot = Robot(scene.controller(), scene.start)
+        for _ in range(40):
+            robot.run(rng.uniform(0.02, 0.3))
+            match rng.integers(5):
+                case 0 | 1:
+                    place = scene.robot.end_effector(robot.q) + rng.normal(scale=0.1, size=3)
+                    robot.controller.follow(scene.around(place, rng.uniform(0.04, 0.3)))
+                case 2:
+                    robot.controller.follow(scene.solved)
+                case 3:
+                    robot.controller.displace(robot.q + rng.normal(scale=0.3, size=6))
+                case 4:
+                    robot.controller.hold(scene.middle + rng.normal(scale=0.1, size=3))
+        assert np.isfinite(robot.passed).all()
+        assert max(robot.excess()) < 1 + 1e-9
+        robot.controller.follow(scene.solved)
+        robot.controller.go()
+        robot.run(30, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3
+
+    def test_it_goes_on_from_where_somebody_else_has_moved_it(self, scene):
+        robot = Robot(scene.controller(), scene.start).run(1.5)
+        robot.q = robot.q + np.array([0.1, -0.1, 0.05, 0.2, -0.1, 0.3])
+        place = robot.q
+        robot.run(0.05)
+        assert np.abs(robot.q - place).max() < 0.05  # no way back to where it was
+        robot.run(15, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3
+        assert max(robot.excess()) < 1 + 1e-9
+
+    def test_at_rest_it_steps_aside_and_comes_back(self, scene):
+        robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)
+        model, closest = load_collision_model(), np.inf
+        hand = scene.robot.end_effector(robot.q)
+        for distance in np.linspace(0.25, 0.03, 100):  # 7 cm/s
+            solved = scene.around(hand + distance * np.array([0.0, -0.6, 0.8]))
+            robot.controller.follow(solved)
+            robot.run(0.03)
+            closest = min(closest, model.nearest_to_obstacle(robot.q[None], solved.scenario.obstacle).distance)
+        assert closest > 0.01
+        assert robot.phases[-1] is Phase.ASIDE and scene.missed(robot.q) > 0.02
+        robot.controller.follow(scene.solved)
+        robot.run(5)
+        assert robot.phases[-1] is Phase.RESTING and scene.missed(robot.q) < 1e-3
+        assert max(robot.excess()) < 1 + 1e-9
+
+    def test_a_sphere_dropped_over_the_base_stops_it_and_it_goes_on_when_it_can(self, scene):
+        robot = Robot(scene.controller(), scene.start).run(1.0)
+        robot.controller.follow(scene.around((0, 0, 0.25), 0.3))
+        robot.run(3)
+        assert robot.phases[-1] is Phase.TOUCHED
+        assert np.abs(robot.velocities[-1]).max() < 0.05
+        robot.controller.follow(scene.solved)
+        robot.run(15, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+
+    def test_the_hand_is_held_and_let_go(self, scene):
+        robot = Robot(scene.controller(), scene.start).run(1.0)
+        place = scene.middle + np.array([0.0, 0.0, 0.08])
+        robot.controller.hold(place)
+        robot.run(3)
+        assert robot.phases[-1] is Phase.HELD
+        np.testing.assert_allclose(scene.robot.end_effector(robot.q), place, atol=1e-3)
+        robot.controller.release()
+        robot.run(12, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+
+    def test_a_shove_takes_it_aside_and_it_goes_on_by_itself(self, scene):
+        robot = Robot(scene.controller(), scene.start).run(1.0)
+        aside = robot.q + np.array([0.1, 0.1, -0.1, 0.0, 0.1, 0.0])
+        robot.controller.displace(aside)
+        robot.run(1.0)
+        assert min(np.abs(q - aside).max() for q in robot.passed) < 0.03
+        robot.run(12, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+
+    def test_a_stack_of_the_hand_takes_over_where_the_motion_is(self, scene, engine):
+        """The base coordinates go on, so that the robot comes to the same motion seen through the new stack."""
+        scenario = changed(scene.scenario, space="task", obstacles=Sphere(as_point(scene.middle), 0.1), margin=0.02)
+        robot = Robot(scene.controller(), scene.start).run(1.5)
+        robot.controller.follow(engine.solved(scenario, LIVE))
+        robot.run(15, until=Phase.RESTING)
+        hand = scene.robot.end_effector(np.array(robot.passed))
+        assert scenario.obstacle.signed_distance(hand).min() > 0.01
+        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+
+    def test_another_posture_to_stay_near_is_taken_gradually(self, scene):
+        class Leaning:
+            """The arm, staying near another posture."""
+
+            robot, whole_arm = scene.engine.follower.robot, scene.engine.follower.whole_arm
+
+            def reference(self, nominal):
+                return scene.engine.follower.reference(nominal) + offset
+
+        offset = np.zeros(6)
+        robot = Robot(Controller(Leaning(), scene.solved), scene.start).run(1.0)  # pyright: ignore[reportArgumentType]
+        offset = np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
+        robot.controller.follow(scene.solved)
+        robot.run(12, until=Phase.RESTING)
+        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+        assert np.abs(robot.q - scene.lifted.tracked.q[0, -1]).max() > 0.1
+
+
+class TestInput:
+    @pytest.mark.parametrize("q", [np.zeros(5), np.full(6, np.nan)])
+    def test_a_posture_has_to_be_one(self, scene, q):
+        with pytest.raises(ValueError, match="6 finite angles"):
+            scene.controller().step(q, TICK)
+
+    @pytest.mark.parametrize("dt", [0.0, -1.0, np.nan])
+    def test_time_has_to_pass(self, scene, dt):
+        with pytest.raises(ValueError, match="more than 0"):
+            scene.controller().step(scene.start, dt)

@@ -1,0 +1,112 @@
+"""The dodge of the robot's own motion: it clears what is ahead, and changes gradually."""
+
+import numpy as np
+import pytest
+
+from dt_viz.arm.cspace import LEVERS
+from dt_viz.arm.whole_arm import OVERSHOOT
+from dt_viz.flows.fields import Array
+from dt_viz.motion.dodging import NO_DODGE, dodge
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.union import Union
+from dt_viz.transforms.base import ArmAvoidance
+
+MARGIN = 0.03
+RESTS = np.zeros((1, 3))
+
+
+@pytest.fixture(scope="module", name="arm")
+def _arm(engine):
+    return engine.follower.whole_arm
+
+
+@pytest.fixture(scope="module", name="q")
+def _q(engine, initial):
+    return engine.follower.undisturbed(engine.nominal(initial("push_box"))).tracked.q[0]
+
+
+def around(arm, posture, offset=(0, 0, 0), diameter=0.15):
+    place = arm.robot.end_effector(posture) + np.asarray(offset)
+    return ArmAvoidance(Union((Sphere(as_point(place), diameter),)), margin=MARGIN)
+
+
+def made(arm, q, avoidance, before=NO_DODGE, turn=0.0, velocities: Array = RESTS):
+    return dodge(arm, q, np.ones(len(q), bool), avoidance, velocities, before, turn)
+
+
+def way_out(found):
+    (way,) = found.directions
+    assert way is not None
+    return way
+
+
+def test_all_that_lies_ahead_is_cleared_and_the_end_stays(arm, q):
+    avoidance = around(arm, q[50])
+    found, p = made(arm, q, avoidance)
+    assert found.cleared and arm.clearance(q, avoidance.obstacle).min() < -0.05
+    assert arm.clearance(p, avoidance.obstacle).min() > MARGIN - OVERSHOOT - 1.5e-3
+    np.testing.assert_allclose(p[-1], q[-1], atol=1e-9)
+
+
+def test_images_are_those_of_the_transform_which_is_a_bijection(arm, q):
+    found, p = made(arm, q, around(arm, q[50]))
+    assert np.abs(p - q).max() > 0.1
+    assert np.linalg.norm((found.transform.inverse(arm.limits.inside(q)) - p) * LEVERS, axis=1).max() < 2e-3
+    assert np.linalg.norm((found.transform.forward(p) - q) * LEVERS, axis=1).max() < 3e-3
+
+
+def test_nothing_near_or_nothing_to_avoid_changes_nothing(arm, q):
+    for avoidance in (None, around(arm, q[50], (0, 0, 0.6))):
+        found, p = made(arm, q, avoidance)
+        assert found is NO_DODGE
+        np.testing.assert_array_equal(p, q)
+
+
+def test_only_hosts_are_cleared(arm, q):
+    avoidance = around(arm, q[70], diameter=0.1)
+    hosts = np.arange(len(q)) < 30
+    assert arm.clearance(q[hosts], avoidance.obstacle).min() > MARGIN
+    assert dodge(arm, q, hosts, avoidance, RESTS, NO_DODGE, 0.0)[0] is NO_DODGE
+
+
+def test_the_way_out_turns_no_further_than_it_may(arm, q):
+    avoidance = around(arm, q[50])
+    best, _ = made(arm, q, avoidance)
+    way = way_out(best)
+    across = np.cross(way, [0.3, 0.5, 0.8])
+    other = type(best)(best.transform, (across / np.linalg.norm(across),))
+    turned = way_out(made(arm, q, avoidance, other, turn=0.1)[0])
+    assert np.arccos(turned @ way_out(other)) == pytest.approx(0.1, abs=1e-6)
+    assert turned @ way > way_out(other) @ way
+    there = way_out(made(arm, q, avoidance, other, turn=np.pi)[0])
+    np.testing.assert_allclose(there, way, atol=1e-9)
+
+
+def test_images_move_as_gradually_as_the_obstacle(arm, q):
+    """While it crosses the motion, no posture jumps."""
+    before, last = NO_DODGE, None
+    for x in np.arange(-0.12, 0.0, 0.002):
+        before, p = made(arm, q, around(arm, q[50], (0, x, 0.05)), before, turn=0.02)
+        if last is not None:
+            hand = arm.robot.end_effector(p) - arm.robot.end_effector(last)
+            assert np.linalg.norm(hand, axis=1).max() < 0.03
+        last = p
+
+
+def test_a_moving_obstacle_is_not_run_away_from_along_its_way(arm, q):
+    avoidance = around(arm, q[50])
+    way = way_out(made(arm, q, avoidance)[0])
+    across = way_out(made(arm, q, avoidance, velocities=0.2 * way[None])[0])
+    assert across @ way < 0.3
+
+
+def test_a_free_end_with_less_room_than_the_margin_stays(arm, q):
+    gap = 0.02
+    direction = np.array([0.0, -0.6, 0.8])
+    places = np.linspace(0.05, 0.3, 500)
+    free = [arm.clearance(q[-1:], around(arm, q[-1], d * direction).obstacle)[0] for d in places]
+    avoidance = around(arm, q[-1], places[int(np.argmin(np.abs(np.array(free) - gap)))] * direction)
+    _, p = made(arm, q[[-1, -1]], avoidance)
+    np.testing.assert_allclose(p[-1], q[-1], atol=1e-9)
+    moved = made(arm, q[[-1, -1]], avoidance, velocities=np.array([[0.0, 0.0, -0.1]]))[1]
+    assert np.abs(moved[-1] - q[-1]).max() > 0.01
