@@ -57,6 +57,7 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         level=level_of(scenario, stack),
         goal=nominal.goal,
         reached=reached,
+        num_added=nominal.num_added,
         blocked=(),
         certificates=Certificates(clearance, found=warnings),
         learned_steps=_learned_steps(nominal),

@@ -52,6 +52,8 @@ class Frame:
     blocked: tuple[MotionWarning, ...]
     """Why there is no motion for this scenario; what is shown then is the last one that there was."""
     certificates: Certificates
+    num_added: int = 0
+    """Number of rollouts, the last ones, from added starts."""
     chosen: int | None = 0
     """Index of the rollout that the arm follows: the first one where it cannot begin the one that is asked for;
     None where that begins at an added start."""

@@ -74,7 +74,7 @@ class Rollouts(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        num = len(frame.task.demonstrations)
+        num = len(frame.rollouts) - frame.num_added
         for lines, paths, first in ((self.lines, frame.rollouts[:num], 0), (self.added, frame.rollouts[num:], num)):
             chosen = None if frame.chosen is None else frame.chosen - first
             if frame.blocked:
@@ -100,7 +100,7 @@ class Ghost(Picture):
         """See `Picture`."""
         if frame.ghost is not self._shown:
             self._shown = frame.ghost
-            self._lines.show(frame.ghost[: len(frame.task.demonstrations)])
+            self._lines.show(frame.ghost[: len(frame.ghost) - frame.num_added])
 
 
 class Goal(Picture):
