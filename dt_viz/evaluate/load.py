@@ -71,7 +71,7 @@ Segments = NDArray[np.float32]
 
 
 class Poses:
-    """The poses that the obstacle is dragged to, with the engine's rollouts for each."""
+    """The poses that the obstacle is dragged to, with the engine's rollouts for each: the whole arm avoids, as at first."""
 
     def __init__(self, engine: Engine, task: Task) -> None:
         self._engine, self._task = engine, task
@@ -96,7 +96,7 @@ class Poses:
         return False
 
     def _frames(self, index: int) -> Iterator[Frame]:
-        return self._engine.frames(avoiding(self._task, Avoidance(Sphere(self.positions[index]))))
+        return self._engine.frames(avoiding(self._task, Avoidance(Sphere(self.positions[index]), space="cspace")))
 
     def _segments(self, frame: Frame) -> Segments:
         paths = frame.rollouts[: len(self._task.demonstrations)]
