@@ -71,7 +71,7 @@ Segments = NDArray[np.float32]
 
 
 class Poses:
-    """The poses that the obstacle is dragged to, with the engine's rollouts for each: the whole arm avoids, as at first."""
+    """Poses that the obstacle is dragged to, with the engine's rollouts for each; the whole arm avoids, as at first."""
 
     def __init__(self, engine: Engine, task: Task) -> None:
         self._engine, self._task = engine, task
