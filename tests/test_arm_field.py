@@ -8,6 +8,7 @@ from dt_viz.arm.arm_system import ArmSystem, Section
 from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import FINE
+from dt_viz.obstacles.union import Union
 from dt_viz.pictures.arm_field import LiftedField
 from dt_viz.pictures.slice_fields import FieldPicture
 
@@ -38,7 +39,7 @@ def test_arrows_are_the_hand_s_velocities_of_the_pulled_back_system(scene):
     reference = engine.follower.reference(solved.nominal)
     some = FieldPicture(below.points[::37], below.velocities[::37])
     lifted = LiftedField.of(some, robot, reference)
-    found = lifted.around(solved.arm.transform, robot)
+    found = lifted.around(solved.arm.transform, robot, Union(()))
     system = ArmSystem(solved.stack.system, Section(robot, reference), solved.arm.transform)
     p = system.transform.inverse(lifted.postures[:, 0])
     step = 1e-5
@@ -53,7 +54,7 @@ def test_arrows_are_the_hand_s_velocities_of_the_pulled_back_system(scene):
 def test_without_avoidance_the_field_is_the_one_below_where_the_arm_reaches(scene):
     engine, scenario, below, _ = scene
     robot, reference = engine.follower.robot, engine.follower.reference(engine.nominal(scenario))
-    same = LiftedField.of(below, robot, reference).around(Identity(6), robot)
+    same = LiftedField.of(below, robot, reference).around(Identity(6), robot, Union(()))
     assert len(same.points) == len(below.points)
     np.testing.assert_allclose(same.points, below.points, atol=1e-4)
     np.testing.assert_allclose(same.velocities, below.velocities, atol=0.05 * np.abs(below.velocities).max())

@@ -532,6 +532,11 @@ def test_who_avoids_is_chosen_in_the_page(visit):
     press(page.get_by_role("option", name="Hand"))
     wait_until(lambda: visitor.session.scenario.avoidance.space == "task", "the choice to arrive")
     wait_until(lambda: visitor.shown.scenario.avoidance.space == "task", "its picture")
+    visitor.session.edit("test", view=replace(LIGHT, arm=True))
+    press(page.get_by_role("button", name="Let the whole arm avoid"))
+    wait_until(lambda: visitor.session.scenario.avoidance.space == "cspace", "the whole arm to avoid again")
+    wait_until(lambda: visitor.shown.scenario.avoidance.space == "cspace", "its picture")
+    wait_until(lambda: page.get_by_role("button", name="Let the whole arm avoid").count() == 0, "the button to go")
 
 
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):

@@ -208,6 +208,16 @@ class TestStance:
         assert 0 < len(motions) < 7 and Kind.START_COVERED in kinds(frame.certificates.found)
         assert frame.chosen == 0 and len(frame.rollouts) == len(motions)
 
+    def test_added_starts_stay_the_last_ones_where_one_of_the_task_s_is_left_out(self, engine, initial):
+        scenario = placed(initial("push_box"), around(engine.task("push_box").starts[0], 0.1))
+        added = (0.1, -0.45, 0.3), (0.0, -0.45, 0.35)
+        scenario = replace(scenario, starts=added)
+        frame = next(engine.frames(scenario))
+        assert Kind.START_COVERED in kinds(frame.certificates.found)
+        assert frame.num_added == len(added) < len(frame.rollouts) < 7 + len(added)
+        for path, start in zip(frame.rollouts[-2:], added, strict=True):
+            np.testing.assert_allclose(path[0], start, atol=5e-3)
+
 
 class TestFollowing:
     def test_the_undisturbed_motion_is_lifted_once(self, follower, nominal):

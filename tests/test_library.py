@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,8 +76,27 @@ def test_the_whole_arm_avoids_what_the_joints_are_told_to(push):
         assert (np.diff(joints.times) > 0).all() and joints.error.max() > 0.01
         speed = np.abs(np.diff(joints.q, axis=0)) / np.diff(joints.times)[:, None]
         assert (speed <= arm.robot.velocity_limits * (1 + 1e-9)).all()
-    with pytest.raises(dt.BlockedError, match="goal"):
-        arm.rollouts(push.stack(dt.Avoidance(dt.Sphere(tuple(goal), diameter=0.15), space="cspace")))
+
+
+def blocking(push, place):
+    return push.stack(dt.Avoidance(dt.Sphere(tuple(place), diameter=0.15), space="cspace"))
+
+
+def test_no_motion_of_the_arm_is_returned_unless_all_are(push, monkeypatch):
+    arm, start = dt.load_jaco(), push.rollouts()[0].positions[0]
+    for place, reason in ((push.goal, "goal"), (start, "start")):
+        with pytest.raises(dt.BlockedError, match=reason):
+            arm.rollouts(blocking(push, place))
+    around, avoiding = blocking(push, (0.0, -0.50, 0.22)), arm._follower.whole_arm.avoiding
+    num = len(push.rollouts())
+
+    def never_from_the_third(lifted, *arguments, **options):
+        found = avoiding(lifted, *arguments, **options)
+        return replace(found, stuck=np.array([2])) if lifted.num_hosts == num else found
+
+    monkeypatch.setattr(arm._follower.whole_arm, "avoiding", never_from_the_third)
+    with pytest.raises(dt.BlockedError, match="no way"):
+        arm.rollouts(around)
 
 
 def test_the_arm_does_not_follow_a_drawing_that_has_no_place_in_space(letter):

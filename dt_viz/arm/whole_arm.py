@@ -52,13 +52,13 @@ MAX_ROUNDS = 4
 SLOPE = 0.1
 """Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
 OVERSHOOT = 7e-3
-"""Metres by which the covering spheres stick out of the arm, about: so much less of the margin is asked of them."""
+"""Distance by which the covering spheres stick out of the arm, about, metres: so much less margin is asked of them."""
 MOVED = 5e-3
-"""Metres beside its start where a guest's hand may begin before it is said."""
+"""Distance beside its start at which a guest's hand may begin before it is said, metres."""
 ROUNDING = 1e-3
-"""Metres of clearance that do not count."""
+"""Tolerance of a clearance, metres."""
 MESH_ROUNDING = 0.5e-3
-"""Metres of the meshes' clearance that do not count: between two samples they may come a little nearer."""
+"""Tolerance of the meshes' clearance, metres: between two samples they may come a little nearer."""
 EXTENSION_STEP = 0.03
 """Flow time between two looks at the meshes' clearance."""
 MAX_EXTENSION = 0.15
@@ -89,11 +89,11 @@ class Lift:
     """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
     fractions (N,); None is content with the spline."""
     num_guests: int = 0
-    """How many of the rollouts, the last ones, no avoidance is made for: they are carried along."""
+    """Number of the rollouts, the last ones, that no avoidance is made for: they are carried along."""
 
     @property
     def num_hosts(self) -> int:
-        """How many of the rollouts, the first ones, an avoidance is made for."""
+        """Number of the rollouts, the first ones, that an avoidance is made for."""
         return len(self.fractions) - self.num_guests
 
     @cached_property

@@ -83,4 +83,4 @@ def with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates
         return known
     hosts = range(len(frame.rollouts) - fine.nominal.num_added)
     nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], avoidance.obstacle) for host in hosts]
-    return known.warning(*margin_warnings(scenario, nearest))
+    return known.warning(*margin_warnings(scenario, nearest, fine.nominal.numbers))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,11 +19,18 @@ from dt_viz.motion.following import ArmMotion, Follower, arm_samples, far_starts
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.profiles import Profiles, body_profile, hand_profile
 from dt_viz.motion.solve import Solved
-from dt_viz.motion.stack import Solution, cut_off
+from dt_viz.motion.stack import Applied, Solution, cut_off
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
-from dt_viz.pictures.slice_fields import arrows_and_colour, streamlines
+from dt_viz.pictures.slice_fields import (
+    ARROW_SPACING,
+    Clearance,
+    FieldPicture,
+    Samples,
+    arrows_and_colour,
+    streamlines,
+)
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import levels
 from dt_viz.scenario.starts import followed
@@ -97,17 +105,18 @@ def arm_along(
         UnreachableError: the arm cannot get to where the motions start.
     """
     nominal, times = solved.nominal, frame.times[rollout]
+    number = nominal.numbers[rollout]
     if solved.arm is not None and solved.lifted is not None:
         rows = solved.arm.index == rollout
         q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
-        warnings = follower.warnings(solved.lifted.tracked, rollout)
+        warnings = follower.warnings(solved.lifted.tracked, number)
     else:
         bundle = solved.stack.bundle
         path, fraction = frame.rollouts[rollout], bundle.split(bundle.fraction)[rollout]
         keep = arm_samples(len(path))
         joints = follower.along(nominal, path[keep], before)
         q, times, fraction = joints.q, times[keep], fraction[keep]
-        warnings = follower.warnings(joints, rollout)
+        warnings = follower.warnings(joints, number)
     without = follower.undisturbed_along(nominal, rollout).at(np.zeros(len(fraction), int), fraction)
     return ArmMotion(within_velocity_limits(times, q, follower.robot.velocity_limits), q, without), warnings
 
@@ -138,13 +147,14 @@ def profiles(frame: Frame, solved: Solved, chosen: int, follower: Follower) -> P
     )
 
 
-def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, coarse: bool) -> Pictures:
+def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, arrows: bool, coarse: bool) -> Pictures:
     """The pictures that the view shows, on its slice and of its level.
 
     Args:
         scenario: whose view it is.
         solved: the motion.
         book: makes the pictures of ψ, as far as the motion is warped.
+        arrows: whether the hand's velocities are among them.
         coarse: whether they are to follow a drag.
     """
     nominal, stack, view = solved.below, solved.stack, scenario.view
@@ -152,9 +162,8 @@ def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, coarse: bo
     level = level_of(scenario, stack)
     built = stack.built[:level]
     system = stack.system if level is None else cut_off(nominal, stack, level)
-    # no motion comes to where an obstacle is that is avoided below this level
-    clearance = Union(tuple(part for applied in built for part in applied.transform.avoided.parts)).signed_distance
-    field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=view.field, coarse=coarse)
+    clearance = _clearance(built)
+    field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=arrows, coarse=coarse)
     return Pictures(
         field=field,
         streamlines=streamlines(system, area, clearance, coarse=coarse) if view.streamlines else None,
@@ -164,6 +173,17 @@ def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, coarse: bo
         base=book.base(stack.rays) if view.base else None,
         occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
     )
+
+
+def field(scenario: Scenario, solved: Solved) -> FieldPicture:
+    """The hand's velocities on the view's slice, of the whole stack below the arm's avoidance."""
+    area = solved.below.task.slice.posed(scenario.view.slice)
+    return Samples(solved.stack.system, area, _clearance(solved.stack.built), ARROW_SPACING, jacobian=False).field
+
+
+def _clearance(built: Sequence[Applied]) -> Clearance:
+    """Distance from what these transforms avoid: no motion comes into it."""
+    return Union(tuple(part for applied in built for part in applied.transform.avoided.parts)).signed_distance
 
 
 def _chosen(scenario: Scenario, nominal: Nominal) -> int | None:

@@ -270,18 +270,19 @@ class Engine:
     def _pictures(self, scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
         learned = solved.below.learned
         book = self.memo("sketchbook", learned, lambda: _sketchbook(learned), newest=2)
-        pictures = compose.pictures(scenario, solved, book, coarse=coarse)
-        field, arm, view = pictures.field, solved.arm, scenario.view
-        if field is None or arm is None or view.level:
+        arm, view = solved.arm, scenario.view
+        carried = view.field and arm is not None and not view.level
+        pictures = compose.pictures(scenario, solved, book, arrows=view.field and not carried, coarse=coarse)
+        if arm is None or not carried:
             return pictures
         layers, robot = tuple(layer for _, layer in scenario.active), self.follower.robot
         lifted = self.memo(
             "lifted field",
-            (solved.below, layers, view.slice, coarse),
-            lambda: LiftedField.of(field, robot, self.follower.reference(solved.nominal)),
+            (solved.below, layers, view.slice),
+            lambda: LiftedField.of(compose.field(scenario, solved), robot, self.follower.reference(solved.nominal)),
             newest=2,
         )
-        return replace(pictures, field=lifted.around(arm.transform, robot))
+        return replace(pictures, field=lifted.around(arm.transform, robot, scenario.obstacle))
 
     def _certified(self, frame: Frame, fine: Solved, checkpoint: Checkpoint) -> Certificates:
         with _in_turn(checkpoint):

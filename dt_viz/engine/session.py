@@ -29,14 +29,14 @@ from dt_viz.scenario.tasks import Task
 logger = logging.getLogger(__name__)
 
 GESTURE_PAUSE = 1.0
-"""Seconds without an edit after which the next edit of the same control is a step of its own for undo."""
+"""Time without an edit, seconds, after which the next edit of the same control is a step of its own for undo."""
 MAX_UNDO = 200
 LIVE_PAUSE = 0.05
-"""Seconds between two drawings of field and arm while edits come faster: rollouts are drawn for each that can be."""
+"""Time between two drawings of field and arm while edits come faster, seconds; rollouts are drawn more often."""
 HABITS = ("playing", "speed", "joint_plots", "health_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
-"""Seconds that a scenario must rest before it is refined: while a hand moves, edits come faster."""
+"""Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Pace:
     """How rebuilding goes."""
 
     latency: float
-    """Seconds from the last edit until its live frame was ready."""
+    """Time from the last edit until its live frame was ready, seconds."""
     rate: float
     """Live frames in the last second."""
     num_skipped: int

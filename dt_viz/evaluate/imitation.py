@@ -52,7 +52,7 @@ class Source:
     demonstrations: tuple[Demonstration, ...]
     """Demonstrations in metres."""
     unit: float
-    """Metres for one unit of the file."""
+    """Length of one unit of the file, metres."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ from dt_viz.scenario.tasks import Task
 WITHIN = 0.05
 """Default of the largest distance of an obstacle from the mean demonstration, metres."""
 ALLOWANCE = 1e-3
-"""Metres by which the meshes may come nearer than the margin where it counts as kept."""
+"""Distance, metres, by which the meshes may come nearer than the margin where it counts as kept."""
 SHARP = 90.0
 """Turn over `dt_viz.evaluate.avoidance.TURN_ARC` beyond which it is sharp, degrees."""
 SHAPES = ("sphere", "box", "cylinder")

@@ -50,7 +50,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.transforms.avoidance import Avoidance
 
 TICK = 0.01
-"""Seconds between two ticks."""
+"""Time between two ticks, seconds."""
 STACK_PERIOD = 0.03
 """Shortest time between the beginnings of two stacks, seconds."""
 HALF_LENGTH = 0.40
@@ -64,13 +64,13 @@ TABLE_ROOM = 0.01
 START_ROOM = 0.05
 """Distance of the arm from the sphere at the beginning, metres."""
 LONGEST = 30.0
-"""Seconds after the sphere has gone in which the goal has to be reached."""
+"""Time after the sphere has gone within which the goal has to be reached, seconds."""
 AT_GOAL = 1e-3
-"""Metres from the goal."""
+"""Distance from the goal that counts as reached, metres."""
 SUBDIVISIONS = 6
 """Number of parts of a tick at whose borders the smallest distance is looked for."""
 PAPER_PERIOD = 0.05
-"""Seconds between two velocities of the paper's controller: 20 Hz."""
+"""Time between two velocities of the paper's controller, seconds: 20 Hz."""
 REPULSION = 1.5
 """Velocity of a body point that touches the sphere, m/s, in the potential field."""
 
@@ -82,17 +82,17 @@ class Crossing:
     start: int
     """Rollout that the robot follows."""
     begins: float
-    """Seconds at which the robot sets out."""
+    """Time at which the robot sets out, seconds."""
     path: Array
     """(N, 3) evenly spaced places of the sphere, metres."""
     length: float
-    """Metres."""
+    """Length of the path, metres."""
     speed: float
     """m/s."""
 
     @property
     def gone(self) -> float:
-        """Seconds after which there is no sphere."""
+        """Time after which there is no sphere, seconds."""
         return self.length / self.speed
 
     def at(self, t: float) -> Array:
@@ -110,7 +110,7 @@ class Run:
     obstacle: list[Array] = field(default_factory=list)
     delays: list[float] = field(default_factory=list)
     ticks: list[float] = field(default_factory=list)
-    """Seconds of processor time of each tick."""
+    """Processor times of the ticks, seconds."""
     phases: set[Phase] = field(default_factory=set)
 
 
@@ -338,7 +338,7 @@ class Potential(_Field):
         points = body.of_chain(chain)[:, :, 0]
         offset = points - np.asarray(sphere.position)
         distance = np.linalg.norm(offset, axis=1)
-        reach = REACH_PER_TEMPERATURE * 6 + self._bench.margin
+        reach = REACH_PER_TEMPERATURE * Avoidance().temperature + self._bench.margin
         u = np.clip(1 - (distance - body.radius - sphere.radius) / reach, 0, None)
         force = (u**2)[:, None] * offset / distance[:, None]
         total, wanted = np.zeros(NUM_JOINTS), force * REPULSION
@@ -431,7 +431,7 @@ class Figures:
     acceleration: float
     """Largest, in limits."""
     lost: float
-    """Seconds that it arrived later than without a sphere."""
+    """Time by which it arrived later than without a sphere, seconds."""
     ticks: Array
     delays: Array
 

@@ -11,7 +11,7 @@ import dt_viz as dt
 from dt_viz.shipped import ASSETS
 
 PERIOD = 0.01
-"""Seconds between two commands: 100 Hz."""
+"""Time between two commands, seconds: 100 Hz."""
 SEEN = 4
 """Number of commands between two looks at the ball."""
 BALL, VELOCITY = np.array([0.35, -0.53, 0.20]), np.array([-0.1, 0.0, 0.0])

@@ -14,7 +14,7 @@ import dt_viz as dt
 from dt_viz.shipped import ASSETS
 
 PERIOD = 0.01
-"""Seconds between two commands: 100 Hz."""
+"""Time between two commands, seconds: 100 Hz."""
 PUSH_AT, PUSH = 100, np.array([0.03, 0.0, 0.04])
 """Number of the command at which somebody pushes the hand, and by how much, metres."""
 ARRIVED = 2e-3

@@ -58,7 +58,7 @@ class Attractor:
         return self.goal + shrink[..., None] * offset[..., None, :]
 
     def times_at(self, z0: Array, distances: Array) -> Array:
-        """Seconds, (*B, T), at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of the goal.
+        """Times (*B, T), seconds, at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of it.
 
         Zero where the start is already within the distance.
         """
@@ -67,7 +67,7 @@ class Attractor:
         return self.smoothing / self.speed * (log_sinh(farther / self.smoothing) - log_sinh(distances / self.smoothing))
 
     def arrival_time(self, z0: Array, distance: float) -> Array:
-        """Seconds, (*B,), until the motion from `z0` (*B, d) is within `distance` (metres) of the goal."""
+        """Times (*B,), seconds, until the motion from `z0` (*B, d) is within `distance` (metres) of the goal."""
         return self.times_at(z0, np.full((*z0.shape[:-1], 1), distance))[..., 0]
 
 

@@ -24,7 +24,7 @@ class Sighting:
     """Obstacles at a time."""
 
     time: float
-    """Seconds."""
+    """Time of the sighting, seconds."""
     avoidance: ArmAvoidance | None
     """What is avoided, and how."""
     velocities: Array

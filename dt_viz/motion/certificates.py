@@ -37,13 +37,13 @@ MAX_OFF_TRACKED = 1e-3
 """`MAX_OFF` where the hand follows the motion by the joints: a spline between postures on it leaves up to 1e-5, joints
 at their limits leave more."""
 RESOLVED = 1e-5
-"""Metres in base space between samples up to which whether Φ falls is rounding."""
+"""Distance between samples in base space, metres, up to which whether Φ falls is rounding."""
 MAX_HAND_MISS = 1e-3
 """Distance of the hand of the arm that is shown from its rollout, metres, before it is said."""
 MAX_DELAY_ERROR = 1e-9
-"""Seconds by which the times of the arm may differ from those that its velocity limits ask for."""
+"""Time, seconds, by which the times of the arm may differ from those that its velocity limits ask for."""
 MAX_CLEARANCE_ERROR = 1e-6
-"""Metres by which a clearance may differ from the one that is said."""
+"""Difference of a clearance from the one that is said that is allowed, metres."""
 MAX_ROUND_TRIP = 1e-6
 """Largest ‖ψ⁻¹(ψ(y)) − y‖, metres, that is not said; the workspace is about one metre wide."""
 

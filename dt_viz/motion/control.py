@@ -145,7 +145,7 @@ class Ahead:
         return self._curve(min(max(clock, self.times[0]), self.times[-1]))
 
     def pace(self, clock: float) -> float:
-        """Seconds of the course in a second there, at most 1."""
+        """Pace there, at most 1: seconds of the course in a second."""
         segment = int(np.searchsorted(self.times, clock, side="right")) - 1
         return float(self._pace[min(max(segment, 0), len(self._pace) - 1)])
 

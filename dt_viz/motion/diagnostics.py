@@ -24,9 +24,9 @@ from dt_viz.transforms.base import MotionBelow, start_warnings
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres
 
 MAX_GOAL_MISS = 1e-3
-"""Metres by which motions may end beside the goal before it is said."""
+"""Distance beside the goal at which motions may end before it is said, metres."""
 MARGIN_TOLERANCE = 1e-3
-"""Metres by which the arm's meshes may come nearer to the obstacle than the margin before it is said."""
+"""Distance by which the arm's meshes may come nearer to the obstacle than the margin before it is said, metres."""
 NUM_CHECKED_LIVE = 300
 """Number of samples on which it is computed what an integrator costs that was chosen by hand."""
 
@@ -128,18 +128,22 @@ def target_warnings(solved: Solved, robot: Robot) -> tuple[MotionWarning, ...]:
     )
 
 
-def margin_warnings(scenario: Scenario, nearest: Sequence[Nearest]) -> tuple[MotionWarning, ...]:
+def margin_warnings(
+    scenario: Scenario, nearest: Sequence[Nearest], numbers: Sequence[int]
+) -> tuple[MotionWarning, ...]:
     """Warnings where the arm's meshes keep less than the margin that was asked for.
 
     Args:
         scenario: whose margin it is.
         nearest: of each motion that the whole arm avoids with.
+        numbers: of the starts of these motions, counted from 0.
     """
     kept, avoidance = min(nearest, key=lambda near: near.distance), scenario.arm_avoidance
     asks = avoidance is not None and scenario.warp == 1 and avoidance.duration is None
     if avoidance is None or not asks or kept.distance >= avoidance.margin - MARGIN_TOLERANCE:
         return ()
-    where, asked = f"on rollout {nearest.index(kept) + 1} the arm's {kept.links[0]}", in_millimetres(avoidance.margin)
+    number = numbers[nearest.index(kept)]
+    where, asked = f"on rollout {number + 1} the arm's {kept.links[0]}", in_millimetres(avoidance.margin)
     if kept.distance < 0:
         text = f"{where} enters the obstacle by {-1e3 * kept.distance:.0f} mm; a margin of {asked} was asked for"
         return (MotionWarning(Kind.ROLLOUT_ENTERS, text, ARM),)

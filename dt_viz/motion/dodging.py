@@ -147,7 +147,7 @@ def _cleared(
 
 
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) -> Array:
-    """Metres (N,) by which postures p (N, 6) miss the clearance that is asked for.
+    """Distances (N,), metres, by which postures p (N, 6) miss the clearance that is asked for.
 
     That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
     """

@@ -28,7 +28,7 @@ from dt_viz.warning import ARM, Kind, MotionWarning
 BY_FRACTION = 0.3
 """Part of the even spacing of postures that goes by the fraction of the base ray, not by the length of the path."""
 MAX_TRACKING_ERROR = 1e-3
-"""Metres by which the hand may miss its path before it is said."""
+"""Distance by which the hand may miss its path before it is said, metres."""
 NUM_ARM_SAMPLES = 200
 """Samples of the motion that the arm shows where it follows a path of the end effector."""
 NUM_ON_PATH = 20
@@ -316,13 +316,13 @@ class Follower:
         warnings = far_starts(numbers[far], num, source="") + _touching_starts(numbers[touches], num)
         return nominal.only(np.flatnonzero(~(far | touches)), warnings)
 
-    def warnings(self, joints: JointPath, rollout: int) -> tuple[MotionWarning, ...]:
-        """Why the joints along a rollout, counted from 0, are not to be trusted."""
+    def warnings(self, joints: JointPath, number: int) -> tuple[MotionWarning, ...]:
+        """Why the joints along the rollout from the start of this number, counted from 0, are not to be trusted."""
         warnings = []
         worst = float(joints.error.max())
         if worst > MAX_TRACKING_ERROR:
             because = ", a joint is at its limit" if joints.limits_hit.any() else ""
-            text = f"the arm misses the path of rollout {rollout + 1} by up to {1e3 * worst:.0f} mm{because}"
+            text = f"the arm misses the path of rollout {number + 1} by up to {1e3 * worst:.0f} mm{because}"
             warnings.append(MotionWarning(Kind.PATH_MISSED, text, ARM))
         if joints.damped.any():
             text = "the arm is stretched out or folded on the way: its pseudo-inverse is damped there"

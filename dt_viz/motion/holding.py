@@ -20,7 +20,7 @@ from dt_viz.motion.pushing import Pushed, below, onwards
 from dt_viz.motion.solve import Solved
 
 ARRIVED = 2e-4
-"""Metres from the pointer at which the hand counts as there."""
+"""Distance from the pointer at which the hand counts as there, metres."""
 MAX_STEPS = 8
 """Towards the place below the pointer."""
 LONGEST_STEP = 0.05
@@ -28,7 +28,7 @@ LONGEST_STEP = 0.05
 SHORTER = np.array([1.0, 0.5, 0.2, 0.05])
 """Parts of a step that are tried at once."""
 DIFFERENCE = 1e-3
-"""Metres between the places that the slope is taken from."""
+"""Distance between the places that the slope is taken from, metres."""
 DAMPING = 1e-3
 """Damping of the least-squares step, against the square of the slope, which is 1 far from obstacles."""
 

@@ -109,7 +109,7 @@ class Nominal:
 
     @property
     def task(self) -> Task:
-        """Whose motion it is."""
+        """The task of the demonstrations."""
         return self.learned.task
 
     @property
@@ -119,7 +119,7 @@ class Nominal:
 
     @property
     def system(self) -> DiffeomorphicSystem:
-        """Whose motions the rollouts are."""
+        """The system that the rollouts are motions of."""
         return self.learned.system
 
     @property
@@ -129,12 +129,12 @@ class Nominal:
 
     @property
     def num_demonstrated(self) -> int:
-        """How many of the rollouts have a demonstration: the first ones."""
+        """Number of the rollouts, the first ones, that have a demonstration."""
         return len(self.task.demonstrations)
 
     @property
     def num_added(self) -> int:
-        """How many of the rollouts have none: the last ones."""
+        """Number of the rollouts, the last ones, that have none."""
         return sum(number >= self.num_demonstrated for number in self.numbers)
 
     @property

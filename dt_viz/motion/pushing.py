@@ -21,7 +21,7 @@ from dt_viz.motion.solve import Solved
 from dt_viz.scenario.scenario import Scenario
 
 DISTANCES = (0.06, 0.03, 0.015)
-"""Metres by which the hand is pushed: less where there is no room for more."""
+"""Distance by which the hand is pushed, metres: less where there is no room for more."""
 PUSH_SECONDS = 0.3
 """Duration of a push, if the joints can be as fast."""
 NUM_PUSH_SAMPLES, NUM_SAMPLES = 12, 150
@@ -29,9 +29,9 @@ NUM_PUSH_SAMPLES, NUM_SAMPLES = 12, 150
 NUM_DIRECTIONS = 4
 """Directions that are tried at each distance."""
 TABLE_ROOM = 0.03
-"""Metres above the table that a push leaves to the hand, where the motions themselves leave as much."""
+"""Height above the table that a push leaves to the hand, metres, where the motions themselves leave as much."""
 LOWER = 5e-3
-"""Metres below the lowest motion that do not count."""
+"""Tolerance below the lowest motion, metres."""
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ class Sphere:
     position: Point
     """Centre, metres."""
     diameter: float = 0.15
-    """Metres."""
+    """Diameter, metres."""
 
     def __post_init__(self) -> None:
         check_between("diameter", self.diameter, SMALLEST, LARGEST)
@@ -166,7 +166,7 @@ class Sphere:
 
     @property
     def radius(self) -> float:
-        """Metres."""
+        """Radius, metres."""
         return self.diameter / 2
 
     @property
@@ -272,9 +272,9 @@ class Cylinder(_Turned):
     position: Point
     """Centre, metres."""
     diameter: float = 0.12
-    """Metres."""
+    """Diameter, metres."""
     height: float = 0.2
-    """Metres."""
+    """Height, metres."""
     wxyz: Quaternion = UPRIGHT
 
     def __post_init__(self) -> None:
@@ -417,7 +417,7 @@ class MeshObstacle(_Triangles):
     mesh: Solid
     wxyz: Quaternion = UPRIGHT
     scale: float = 1.0
-    """Metres for one unit of the mesh."""
+    """Length of one unit of the mesh, metres."""
 
     @property
     def solid(self) -> Solid:
@@ -434,7 +434,7 @@ class CloudObstacle(_Triangles):
     cloud: Cloud
     wxyz: Quaternion = UPRIGHT
     scale: float = 1.0
-    """Metres for one unit of the cloud."""
+    """Length of one unit of the cloud, metres."""
 
     @property
     def solid(self) -> Solid:

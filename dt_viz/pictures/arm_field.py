@@ -15,6 +15,7 @@ from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import track
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
+from dt_viz.obstacles.union import Union
 from dt_viz.pictures.slice_fields import FieldPicture
 
 STEP = 4e-3
@@ -50,14 +51,16 @@ class LiftedField:
         reached = tracked.error.max(axis=1) <= MAX_MISS
         return cls(tracked.q[reached], seconds[reached])
 
-    def around(self, transform: Diffeomorphism, robot: Robot) -> FieldPicture:
+    def around(self, transform: Diffeomorphism, robot: Robot, obstacle: Union) -> FieldPicture:
         """Carry the arrows along by the whole arm's avoidance.
 
         Args:
             transform: ψ_q.
             robot: the arm.
+            obstacle: what is avoided: ψ_q was made for the motions, and may leave arrows far from them in it.
         """
         limits = JointLimits(robot.lower, robot.upper)
         p = transform.inverse(limits.inside(self.postures.reshape(-1, NUM_JOINTS)))
         begin, end = np.moveaxis(robot.end_effector(p).reshape(-1, 2, 3), 1, 0)
-        return FieldPicture(begin, (end - begin) / self.seconds[:, None])
+        free = obstacle.signed_distance(begin) > 0
+        return FieldPicture(begin[free], ((end - begin) / self.seconds[:, None])[free])

@@ -98,6 +98,11 @@ class Samples:
             return np.linalg.solve(self.jacobians, f)[..., 0]
         return self.system.transform.inverse_tangents(self.images, f)[1][..., 0]
 
+    @property
+    def field(self) -> FieldPicture:
+        """The velocities at the free points."""
+        return FieldPicture(self.points, self.velocities)
+
     def spread(self, values: Array) -> Array:
         """Return values (N,) on the whole lattice (n, m), NaN in the blocked region."""
         spread = np.full(self.free.shape, np.nan)
@@ -116,7 +121,7 @@ def arrows_and_colour(
     field, samples = None, None
     if arrows or (function and coarse):
         samples = Samples(system, area, clearance, ARROW_SPACING, jacobian=det and coarse)
-        field = FieldPicture(samples.points, samples.velocities) if arrows else None
+        field = samples.field if arrows else None
     if not function:
         return field, None
     if samples is None or not coarse:

@@ -38,8 +38,6 @@ STROKE_PLACES = {"draw_w": 0.20}
 the W the arm would have to give way to it along the other strokes, too."""
 J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
 """Places of the two points beside the J: fraction of its length, and offset to the right and up, metres."""
-ARM_ONLY = {"field": False}
-"""View of scenes where only the whole arm gives way: the hand's vector field leads through the obstacle."""
 HAND_ONLY = {"arm": False}
 """View of scenes where only the path of the hand gives way: the fingers would be in the obstacle."""
 ABOVE = 0.16
@@ -150,7 +148,6 @@ SCENES: Mapping[str, PaperScene] = {
             "The whole arm gives way to the bottle, and still dips before it lifts.",
             "lift_box",
             _bottle_in_the_way,
-            view=ARM_ONLY,
         ),
         PaperScene(
             "push",
@@ -158,7 +155,6 @@ SCENES: Mapping[str, PaperScene] = {
             "The whole arm gives way to the bottle, and still ends where the demonstrations do.",
             "push_box",
             _bottle_in_the_way,
-            view=ARM_ONLY,
         ),
         PaperScene(
             "cube",
