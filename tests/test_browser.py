@@ -13,9 +13,9 @@ from PIL import Image
 from scenes import beside, changing
 
 import dt_viz.learning.store
-from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.metrics import maximum_collision_distance
+from dt_viz.motion.control import Phase
 from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.scenario import View
@@ -495,12 +495,12 @@ ARM_LAYERS = {  # the layer's label in the page, its field of View, and which pi
 
 def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
     page, visitor = visit
-    session, plain = visitor.session, View(playing=False, field=False, ghost=False)
+    session, plain = visitor.session, View(playing=False, replay=True, field=False, ghost=False)
     session.edit("test", view=plain)
     wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
     q = visitor.shown.arm.q[50]
     apart = ArmMotion(np.array([0.0, 1.0]), np.stack([q, q]), np.stack([q, q]) + 0.6 * np.eye(6)[0])
-    visitor._playback.hold(apart, lambda: None)
+    visitor._playback.replay.motion = apart
     wait_until(lambda: np.array_equal(visitor._playback.q, q), "the arm to be posed")
     open_tab(page, "Show")
     until_drawn(visitor)
@@ -574,23 +574,23 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
         lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion without obstacle"
     )
     assert visitor.grip.ball.visible
-    robot, before = load_jaco(), visitor._hand()
+    before = visitor._hand()
 
     def from_the_ball():
         x, y = project(visitor, before)
         return (x, y), (x - 50, y - 40)
 
-    drag_until(page, visitor, lambda: visitor.pushed_path.pushed is not None, lambda: None, from_the_ball)
-    wait_until(lambda: session.wait_idle(0.3), "the last event")
-    pushed, hand = visitor.pushed_path.pushed, visitor._hand()
-    np.testing.assert_allclose(pushed.path[0], hand, atol=1e-3)
+    drag_until(page, visitor, lambda: np.linalg.norm(visitor._hand() - before) > 0.02, lambda: None, from_the_ball)
+    live = visitor._playback.live
+    wait_until(lambda: live.phase is not Phase.HELD, "the hand to be where it was let go")
+    hand = visitor._hand()
     assert np.linalg.norm(hand - before) > 0.05
     assert abs(hand[1] - before[1]) < 5e-3  # parallel to the drawing plane, y = const
     np.testing.assert_allclose(project(visitor, hand), from_the_ball()[1], atol=12)
-    np.testing.assert_allclose(robot.end_effector(pushed.motion.q[-1]), visitor.shown.goal, atol=1e-3)
+    np.testing.assert_allclose(live.ahead[[0, -1]], [hand, visitor.shown.goal], atol=1e-2)
     session.edit("play", view=View(speed=3.0, field=False, table=False, demonstrations=False))
     wait_until(lambda: np.linalg.norm(visitor._hand() - visitor.shown.goal) < 5e-3, "the goal")
-    wait_until(lambda: visitor.pushed_path.pushed is None, "the loop to begin again")
+    wait_until(lambda: live.phase is Phase.HOMING, "the next round")
 
 
 def test_the_warp_is_played_in_the_page(visit):

@@ -47,7 +47,7 @@ class Blank:
 
 
 def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatch):
-    """Its worker, whoever edits, pushes, holds or asks for the task."""
+    """Its worker, whoever edits, asks for the task, pushes, holds or moves the arm."""
     users, compute = set(), Memo.__call__
 
     def recorded(self, *args, **kwargs):
@@ -55,19 +55,25 @@ def test_one_thread_alone_computes_for_a_session(new_engine, initial, monkeypatc
         return compute(self, *args, **kwargs)
 
     monkeypatch.setattr(Memo, "__call__", recorded)
-    session = Session(new_engine(), initial, "draw_s", cast(Any, Blank()))
+    engine = new_engine()
+    session = Session(engine, initial, "draw_s", cast(Any, Blank()))
     try:
         assert session.wait_idle(60)
-        q = np.zeros(6)
+
+        def move():
+            while threads[0].is_alive() or threads[1].is_alive():
+                engine.arm.advance(0.05, moves=True)
 
         def edit(number):
             session.edit("temperature", **changing(session.scenario, temperature=3.0 + number))
             session.choose_task(("draw_s", "lift_box")[number])
             assert session.task.name in {"draw_s", "lift_box"}
-            session.push(q, lambda _: None)
-            session.hold(q, np.array([0.0, -0.5, 0.4]), lambda _: None, last=True)
+            engine.arm.push()
+            engine.arm.hold(np.array([0.0, -0.5, 0.4]))
+            engine.arm.release()
 
         threads = [threading.Thread(target=edit, args=(number,)) for number in range(2)]
+        threads.append(threading.Thread(target=move))
         for thread in threads:
             thread.start()
         for thread in threads:

@@ -1,6 +1,5 @@
 """A session by its contract: the last picture belongs to the last scenario, and every edit can be taken back."""
 
-import itertools
 import logging
 import threading
 import time
@@ -12,7 +11,6 @@ import pytest
 from scenes import avoiding, biases, changed, changing
 
 from dt_viz import interruption
-from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine import session as session_module
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
@@ -46,8 +44,7 @@ class FakeEngine:
         self.asked = []
         self.begun, self.gate = threading.Event(), None
         self.unlearned, self.learning = set(), threading.Event()
-        self.pushes, self.pushable = [], True
-        self.holds, self.beyond = [], set()
+        self.driven, self.drivers = [], set()
         self.endless, self.busy = None, threading.Event()
 
     def frames(self, scenario, progress=None, checkpoint=None):
@@ -73,16 +70,9 @@ class FakeEngine:
                 raise IndexError("no such flow")
             yield Sketch(scenario, stage)
 
-    def pushed(self, scenario, q, rng):
-        self.pushes.append((scenario, q, rng.random(), threading.current_thread().name))
-        return ("pushed", scenario) if self.pushable else None
-
-    def held(self, scenario, q, place):
-        self.holds.append(tuple(place))
-        time.sleep(0.002)
-        if place[0] in self.beyond:
-            raise UnreachableError("too far")
-        return ("held", tuple(place)) if self.pushable else None
+    def drive(self, frame):
+        self.driven.append(frame)
+        self.drivers.add(threading.current_thread().name)
 
 
 class Page:
@@ -396,22 +386,6 @@ def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
     assert opened.engine.busy.wait(PATIENCE)
     opened.edit("obstacle", obstacles=(at(2.0),))
     assert not opened.session.wait_idle(0.2)  # a newer edit ends nothing that follows a hand
-    opened.session.close()
-    opened.session._worker._thread.join(5.0)
-    assert not opened.session._worker._thread.is_alive()
-    assert opened.page.errors == []
-
-
-def test_a_session_that_closes_ends_what_its_arm_is_asked_for(opened):
-    def endless(scenario, q, rng):
-        opened.engine.busy.set()
-        while True:
-            interruption.checkpoint()
-            time.sleep(0.001)
-
-    opened.engine.pushed = endless
-    opened.session.push(np.zeros(6), lambda _pushed: None)
-    assert opened.engine.busy.wait(PATIENCE)
     opened.session.close()
     opened.session._worker._thread.join(5.0)
     assert not opened.session._worker._thread.is_alive()
@@ -745,164 +719,21 @@ def test_a_level_that_is_gone_is_not_looked_at_when_another_gets_its_name(opened
     assert opened.shown.stack == stack and opened.shown.view.level == ""
 
 
-# --- Pushing the hand ---
+# --- The arm in the loop ---
 
 
-def push(opened):
-    """Push; what was shown of it, and on which threads."""
-    shown = []
-    opened.session.push(np.arange(6.0), lambda pushed: shown.append((pushed, threading.current_thread().name)))
-    return shown
-
-
-def test_a_push_goes_through_the_worker_and_computes_no_frames(opened):
-    num_frames = len(opened.page.frames)
-    shown = push(opened)
+def test_the_arm_is_driven_by_the_first_frame_of_each_motion_and_by_the_refined_one(opened):
+    driven = opened.engine.driven
+    assert [frame.stage for frame in driven] == [Stage.ROLLOUTS, Stage.FINE]
+    opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
-    assert shown == [(("pushed", opened.session.scenario), "session")]
-    ((scenario, q, first, thread),) = opened.engine.pushes
-    assert (scenario, thread) == (opened.session.scenario, "session")
-    np.testing.assert_array_equal(q, np.arange(6.0))
-    assert len(opened.page.frames) == num_frames
-    push(opened)
+    assert [(frame.stage, frame.scenario) for frame in driven[2:]] == [
+        (stage, opened.session.scenario) for stage in (Stage.ROLLOUTS, Stage.FINE)
+    ]
+    assert opened.engine.drivers == {"session"}
+    opened.edit("grid", view=View(grid=True))  # the same motion: it was there before
     opened.settle()
-    assert opened.engine.pushes[1][2] != first  # another direction
-    opened.session.undo()
-    opened.settle()
-    assert opened.session.scenario == fresh("draw_s")  # and none is an edit
-
-
-def busy_with(opened, gesture, **changes):
-    """Have the worker in the middle of an edit, until the gate is set."""
-    opened.engine.gate, opened.engine.begun = threading.Event(), threading.Event()
-    opened.edit(gesture, **changes)
-    assert opened.engine.begun.wait(PATIENCE)
-
-
-def test_a_push_interrupts_frames_and_they_are_completed_after_it(opened):
-    busy_with(opened, "grid", view=View(grid=True))  # the same motion: a push is possible
-    shown = push(opened)
-    opened.engine.gate.set()
-    opened.settle()
-    assert len(shown) == 1
-    assert opened.shown.view.grid and opened.page.frames[-1].stage is max(Stage)
-
-
-def test_nothing_is_pushed_while_another_motion_is_computed_and_no_edit_is_lost(opened):
-    busy_with(opened, "obstacle", obstacles=(at(1.0),))
-    opened.edit("obstacle", obstacles=(at(2.0),))
-    shown = push(opened)
-    opened.engine.gate.set()
-    opened.settle()
-    assert shown == [] and opened.engine.pushes == []
-    assert opened.shown.obstacles[0] == at(2.0) and opened.page.frames[-1].stage is max(Stage)
-
-
-def test_a_motion_that_cannot_be_pushed_shows_nothing(opened):
-    opened.engine.pushable = False
-    shown = push(opened)
-    opened.settle()
-    assert shown == [] and opened.page.errors == []
-
-
-# --- Holding the hand ---
-
-
-def hold(opened, x, shown, *, last=False):
-    return opened.session.hold(np.zeros(6), np.array([x, 0.0, 0.0]), shown.append, last=last)
-
-
-def test_a_hand_that_is_held_is_followed_without_new_frames(opened):
-    num_frames, shown = len(opened.page.frames), []
-    for x in (1.0, 2.0):
-        assert hold(opened, x, shown)
-        opened.settle()
-    assert hold(opened, 3.0, shown, last=True)
-    opened.settle()
-    assert shown == [("held", (x, 0.0, 0.0)) for x in (1.0, 2.0, 3.0)]
-    assert len(opened.page.frames) == num_frames
-    opened.session.undo()
-    assert opened.session.scenario == fresh("draw_s")
-
-
-def test_only_the_newest_place_of_several_threads_is_done_next_and_the_last_one_always(opened):
-    shown, lock, count = [], threading.Lock(), itertools.count(1)
-    busy_with(opened, "grid", view=View(grid=True))
-    for _ in range(2):
-        hold(opened, float(next(count)), shown)
-    opened.engine.gate.set()
-
-    def storm():
-        for _ in range(40):
-            with lock:
-                hold(opened, float(next(count)), shown)
-
-    threads = [threading.Thread(target=storm) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(PATIENCE)
-    opened.settle()
-    assert len(shown) == 162  # each is answered, with nothing where a newer one came first
-    places = [answer[1][0] for answer in shown if answer is not None]
-    assert places == sorted(places) and places[-1] == 162.0
-    assert len(opened.engine.holds) == len(places) < 162
-
-
-def test_frames_wait_while_the_hand_is_held_and_are_completed_when_it_is_let_go(opened):
-    busy_with(opened, "grid", view=View(grid=True))
-    shown = []
-    assert hold(opened, 1.0, shown)
-    opened.engine.gate.set()
-    opened.settle()
-    assert len(shown) == 1 and opened.page.frames[-1].stage is not max(Stage)
-    hold(opened, 1.0, shown, last=True)
-    opened.settle()
-    assert opened.shown.view.grid and opened.page.frames[-1].stage is max(Stage)
-
-
-def test_a_view_that_is_edited_while_the_hand_is_held_is_shown_and_loses_no_release(opened):
-    busy_with(opened, "grid", view=View(grid=True))
-    shown = []
-    hold(opened, 1.0, shown, last=True)
-    opened.edit("grid", view=View(grid=True, base=True))  # overtakes it in the worker's slot
-    opened.engine.gate.set()
-    opened.settle()
-    assert shown == [("held", (1.0, 0.0, 0.0))]
-    assert opened.shown.view.base and opened.page.frames[-1].stage is max(Stage)
-
-
-@pytest.mark.parametrize("last", [False, True])
-def test_a_hold_that_fails_is_said_and_answered_and_the_frames_go_on(opened, last):
-    opened.engine.beyond.add(9.0)
-    busy_with(opened, "grid", view=View(grid=True))
-    shown = []
-    assert hold(opened, 9.0, shown, last=last)
-    opened.engine.gate.set()
-    opened.settle()
-    assert shown == [None]
-    assert [str(error) for error in opened.page.errors] == ["too far"]
-    assert opened.shown.view.grid and opened.page.frames[-1].stage is max(Stage)
-
-
-def test_a_release_that_a_push_replaces_is_answered_before_the_push_is_shown(opened):
-    busy_with(opened, "grid", view=View(grid=True))
-    shown = []
-    assert hold(opened, 1.0, shown, last=True)
-    opened.session.push(np.zeros(6), shown.append)
-    opened.engine.gate.set()
-    opened.settle()
-    assert shown == [None, ("pushed", opened.session.scenario)]
-    assert opened.engine.holds == [] and opened.page.frames[-1].stage is max(Stage)
-
-
-def test_nothing_is_held_while_another_motion_is_computed(opened):
-    busy_with(opened, "obstacle", obstacles=(at(1.0),))
-    shown = []
-    assert not hold(opened, 1.0, shown)
-    opened.engine.gate.set()
-    opened.settle()
-    assert shown == [] and opened.shown.obstacles[0] == at(1.0)
+    assert [frame.stage for frame in driven[4:]] == [Stage.FINE]
 
 
 # --- Starts ---

@@ -31,8 +31,6 @@ def test_what_is_let_go_of_below_where_it_would_rest_stays():
 
 def test_it_is_shown_with_the_arm_in_tasks_with_pots_once_the_hand_is_known(scene):
     carried = Carried(scene)
-    carried.pose(LEFT, 0.0)
-    assert not carried.ball.visible
     carried.stand(POTS)
     assert not carried.ball.visible
     carried.pose(LEFT, 0.0)
@@ -43,3 +41,14 @@ def test_it_is_shown_with_the_arm_in_tasks_with_pots_once_the_hand_is_known(scen
     carried.show(arm=True)
     carried.stand(())
     assert not carried.ball.visible
+
+
+def test_it_stays_where_it_was_dropped_until_the_hand_sets_out_again(scene):
+    carried = Carried(scene)
+    carried.stand(POTS)
+    carried.pose(LEFT, 0.0)
+    for seconds in (0.5, 3.0):
+        carried.pose(LEFT + np.array([0.1, 0.2, 0.1]), seconds)  # the hand goes home
+        np.testing.assert_allclose(carried.ball.position, fallen(LEFT, POTS, seconds))
+    carried.pose(BETWEEN, 0.0)
+    np.testing.assert_allclose(carried.ball.position, BETWEEN)

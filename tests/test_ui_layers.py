@@ -29,7 +29,6 @@ from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS, Panel
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.panel.status import CHANGED, COMPUTING, hint, status_html
-from dt_viz.ui.playback import at_moment
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import PEDESTAL
 from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
@@ -88,14 +87,6 @@ def test_arms_go_from_start_to_goal_with_the_hand_in_equal_steps():
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(hand, axis=0), axis=1))])
     nearest = np.linalg.norm(hand[:, None] - ROBOT.end_effector(q), axis=-1).argmin(axis=0)
     np.testing.assert_allclose(along[nearest], np.linspace(0, along[-1], NUM_ARMS), atol=0.005)
-
-
-@pytest.mark.parametrize("moment", [0.0, 0.3, 1.7, 4.0, 9.0])
-def test_both_arms_are_shown_at_the_same_moment(moment):
-    arm = motion(sway=0.4)
-    q, without = at_moment(arm, moment)
-    for got, path in ((q, arm.q), (without, arm.without)):
-        np.testing.assert_allclose(got, [np.interp(moment, arm.times, angle) for angle in path.T], atol=1e-12)
 
 
 # --- Meshes ---
@@ -427,7 +418,12 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
 
 
 def test_every_layer_has_a_checkbox():
-    switches = {f.name for f in fields(View) if f.type == "bool"} - {"playing", "move_slice", "click_to_start"}
+    switches = {f.name for f in fields(View) if f.type == "bool"} - {
+        "playing",
+        "replay",
+        "move_slice",
+        "click_to_start",
+    }
     assert set(VIEW_LABELS) == switches
 
 

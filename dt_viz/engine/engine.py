@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from dt_viz.arm.robot import Robot
+from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine import compose
 from dt_viz.engine.certify import certify, with_meshes
 from dt_viz.engine.frame import Frame, Stage
+from dt_viz.engine.live_arm import LiveArm
 from dt_viz.engine.turns import Turns
 from dt_viz.flows.fields import Array
 from dt_viz.interruption import Checkpoint, interruptible
@@ -21,9 +21,7 @@ from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower
-from dt_viz.motion.holding import held
 from dt_viz.motion.nominal import Learned, Nominal
-from dt_viz.motion.pushing import Pushed, pushed
 from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.pictures.arm_field import LiftedField
@@ -86,6 +84,8 @@ class Engine:
         self.memo = Memo()
         """All results that are kept."""
         self.follower = Follower(robot, self.memo)
+        self.arm = LiveArm(self.follower)
+        """The arm in the loop."""
         self._shown: dict[str, _Shown] = {}
 
     def task(self, name: str) -> Task:
@@ -167,39 +167,21 @@ class Engine:
             certificates = certificates.warning(*warnings)
         return replace(frame, stage=Stage.FINE, certificates=certificates), tuple(arms)
 
-    def pushed(self, scenario: Scenario, q: Array, rng: np.random.Generator) -> Pushed | None:
-        """The arm's motion after the hand is pushed aside; None unless a motion of this scenario is shown.
+    def drive(self, frame: Frame) -> None:
+        """Have the arm go on with the motion of the frame that was yielded last.
 
-        Args:
-            scenario: whose frames were computed last.
-            q: (6,) joint angles when the push begins, rad.
-            rng: for its direction.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the motions start.
+        Where that is blocked it stays with the motion that is shown, and gives way to what is in its way now.
         """
-        shown = self._shown.get(scenario.task)
-        if shown is None or not shown.frame.scenario.moves_like(scenario):
-            return None
+        scenario = frame.scenario
         with _in_turn():
-            return pushed(self.follower, replace(shown.newest, scenario=scenario), q, rng)
-
-    def held(self, scenario: Scenario, q: Array, place: Array) -> Pushed | None:
-        """The arm with its hand held at a place; None unless a motion of this scenario is shown.
-
-        Args:
-            scenario: whose frames were computed last.
-            q: (6,) joint angles now, rad.
-            place: (3,) where the hand should be, metres.
-
-        Raises:
-            UnreachableError: the arm cannot get to where the motions start.
-        """
-        shown = self._shown.get(scenario.task)
-        if shown is None or not shown.frame.scenario.moves_like(scenario):
-            return None
-        with _in_turn():
-            return held(self.follower, replace(shown.live, scenario=scenario), q, place)
+            if frame.blocked:
+                solved = replace(self._shown[scenario.task].newest, scenario=scenario.motion)
+            else:
+                solved = self.solved(scenario, LIVE if frame.stage < Stage.FINE else FINE)
+            try:
+                self.arm.follow(solved, frame.chosen)
+            except UnreachableError:
+                self.arm.stop()
 
     def _learned(self, scenario: Scenario, progress: Progress | None) -> Learned:
         task = self.task(scenario.task)

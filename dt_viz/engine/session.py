@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -11,16 +12,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
-import numpy as np
-
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.worker import LatestWorker
 from dt_viz.errors import DataError
-from dt_viz.flows.fields import Array
 from dt_viz.interruption import UnwantedError, interruptible
 from dt_viz.learning.imitation import ImitationError
-from dt_viz.motion.pushing import Pushed
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
@@ -33,7 +30,7 @@ GESTURE_PAUSE = 1.0
 MAX_UNDO = 200
 LIVE_PAUSE = 0.05
 """Time between two drawings of field and arm while edits come faster, seconds; rollouts are drawn more often."""
-HABITS = ("playing", "speed", "joint_plots", "health_plots")
+HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
 """Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
@@ -49,17 +46,6 @@ class Pace:
     """Live frames in the last second."""
     num_skipped: int
     """Edits that a newer one overtook, since the session began."""
-
-
-@dataclass(frozen=True)
-class _Request:
-    """Something to do with the arm, which is no edit."""
-
-    compute: Callable[[Scenario], Pushed | None]
-    show: Callable[[Pushed | None], None]
-    """Given what the arm does then; None where it does nothing: see `Session.hold`."""
-    goes_on: bool = False
-    """Whether more such requests follow soon, so that refining the frames would be in vain."""
 
 
 _Job = tuple[Scenario, float]
@@ -135,10 +121,6 @@ class Session:
         """Whether the last computation ended by an error, so that what is shown is not all that the scenario asks for.
         """
         self._shown: Scenario | None = None
-        self._complete = False
-        self._requests: list[_Request] = []
-        """Until the worker comes to them: only the newest is done, the others are told so; edits replace none."""
-        self._rng = np.random.default_rng(0)
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
         self._worker = LatestWorker[_Job](self._compute, display.fail, name="session")
@@ -246,43 +228,6 @@ class Session:
         kept = {name: getattr(self.scenario.view, name) for name in HABITS}
         return _with_a_level_of_its_own(replace(other, view=replace(other.view, **kept)))
 
-    def push(self, q: Array, show: Callable[[Pushed], None]) -> None:
-        """Push the hand aside. Nothing is done while another motion than the scenario's is shown.
-
-        Args:
-            q: (6,) joint angles when the push begins, rad.
-            show: given what the arm does then. Called on the worker thread.
-        """
-
-        def shown(pushed: Pushed | None) -> None:
-            if pushed is not None:
-                show(pushed)
-
-        self._ask(_Request(lambda scenario: self._engine.pushed(scenario, q, self._rng), shown))
-
-    def hold(self, q: Array, place: Array, show: Callable[[Pushed | None], None], *, last: bool) -> bool:
-        """Hold the hand at a place. Of several that are waiting only the newest is done.
-
-        Args:
-            q: (6,) joint angles now, rad.
-            place: (3,) where the hand should be, metres.
-            show: given where the arm is then, and how it would go on; None where another motion than the scenario's is
-                shown, where a newer request came first, and where it failed. Called on the worker thread.
-            last: whether the hand is let go there.
-
-        Returns:
-            Whether `show` will be called: not while another motion than the scenario's is shown.
-        """
-        return self._ask(_Request(lambda scenario: self._engine.held(scenario, q, place), show, goes_on=not last))
-
-    def _ask(self, request: _Request) -> bool:
-        with self._lock:
-            possible = self._shown is not None and self.scenario.moves_like(self._shown)
-            if possible:
-                self._requests.append(request)
-                self._submit()
-        return possible
-
     def undo(self) -> None:
         """Take the last gesture back."""
         self._travel(self._past, self._future)
@@ -380,30 +325,8 @@ class Session:
             self._learning = True
         self._display.learning(fraction, message)
 
-    def _serve(self, scenario: Scenario, request: _Request, replaced: list[_Request]) -> bool:
-        """Do what is asked for; whether the frames of the scenario, which it may have interrupted, can wait."""
-        try:
-            pushed, failed = request.compute(scenario), False
-        except UnwantedError:
-            raise
-        except Exception as error:  # as in `LatestWorker`, but the frames go on
-            logger.exception("the arm could not do what it was asked for")
-            pushed, failed = None, True
-            self._display.fail(error)
-        for other in replaced:
-            other.show(None)
-        request.show(pushed)
-        can_wait = self._complete or (request.goes_on and not failed)
-        return can_wait and self._shown is not None and scenario.computes_like(self._shown)
-
     def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
         scenario, edited = job
-        with self._lock:
-            requests, self._requests = self._requests, []
-        if requests:
-            if self._serve(scenario, requests[-1], requests[:-1]):
-                return
-            edited = time.perf_counter()
         wanted = partial(_end_if, superseded)
         for frame in self._engine.frames(scenario, partial(self._learn, scenario), wanted):
             now = time.perf_counter()
@@ -413,17 +336,18 @@ class Session:
             self._learning, self._shown = False, scenario
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
-            self._complete = frame.stage is Stage.CERTIFIED
             if frame.stage <= Stage.LIVE:
                 self._latency = now - edited
             if frame.stage is Stage.LIVE:
                 self._live_frames.append(now)
             rate = sum(now - t <= 1.0 for t in self._live_frames)
             self._display.draw(frame, Pace(self._latency, rate, self._worker.num_skipped))
+            if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
+                self._engine.drive(frame)
             if frame.stage is Stage.LIVE:
                 self._worker.rest(REST)
             elif frame.stage is Stage.ROLLOUTS:
-                last = self._live_frames[-1] if self._live_frames else -np.inf
+                last = self._live_frames[-1] if self._live_frames else -math.inf
                 pause = last + LIVE_PAUSE - now
                 if pause <= 0:
                     continue  # field and arm are due, whatever is waiting

@@ -37,6 +37,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.anticipation import NOTHING_SEEN, STALE, Sighting
 from dt_viz.motion.dodging import NO_DODGE, Dodge, dodge, lack
 from dt_viz.motion.following import Follower
+from dt_viz.motion.guarding import WINDOW, guarded
 from dt_viz.motion.solve import Solved
 
 ACCELERATION = 4.0
@@ -74,12 +75,18 @@ PASSING = 0.25
 """Way of a moving obstacle, metres, after which it counts as having passed: what the robot does later is not dodged."""
 TURNING = 2.0
 """Rate at which the way out of an obstacle turns, rad/s."""
+HOMING_SPEED = 2.0
+"""Speed of the way home, relative to that of the base attractor."""
 HOLDING_SPEED = 0.25
 """Speed at which the hand follows whoever holds it, m/s."""
 SHOVE_SECONDS = 0.3
 """Duration of a shove, if the joints can be as fast."""
 AT_REST = 1e-3
 """Gap, rad, and velocity, rad/s, of joints that count as at rest."""
+FASTEST_POINT = 1.0
+"""Speed that no point of the arm exceeds, m/s."""
+TOUCHING = 5e-3
+"""Depth of a body point's sphere, less what it sticks out of the arm, that counts as touching, metres."""
 ASIDE = 5e-3
 """Displacement, metres by `LEVERS`, from which on a robot at rest counts as having stepped aside."""
 
@@ -93,7 +100,7 @@ class Phase(Enum):
     ASIDE = "stepped aside"
     HELD = "held"
     TOUCHED = "touched"
-    """There is no way out: it waits where it is or gives way."""
+    """An obstacle touches it, or leaves no way out: it waits where it is or gives way."""
 
 
 class Aim(Enum):
@@ -198,7 +205,9 @@ class Controller:
         self._q: Array | None = None
         self._velocity = np.zeros(NUM_JOINTS)
         self._clock = self._rate = 0.0
-        self._now = self._dodged = self._began = 0.0
+        self._now = self._dodged = self._began = self._safe_until = 0.0
+        self._room = np.inf
+        """Distance from the nearest obstacle when it was last looked at, about, metres."""
         self._settled = self._released = False
 
     # --- What it follows ---
@@ -232,6 +241,7 @@ class Controller:
             before, solved = self._solved, prepared.solved
             alike = self._goes_on(solved, prepared.section)
             self._solved, self._section, self._sighting = solved, prepared.section, prepared.sighting
+            self._safe_until, self._room = 0.0, np.inf
             if self._ahead is None:
                 return
             if prepared.ahead is not None and self._ahead is prepared.begins:
@@ -281,8 +291,9 @@ class Controller:
             u = np.linspace(0, 1, 2 + int(np.linalg.norm(end - begin) / 0.02))
             path = begin + u[:, None] * (end - begin)
             joints = self._arm.limits.inside(track(self.robot, path, q, reference=self._section.reference).q)
-            seconds = max(float(np.linalg.norm(end - begin)) / HOLDING_SPEED, 0.02)
-            self._held(Course(seconds * u, joints, path))
+            lengths = np.linalg.norm(np.diff(self.robot.end_effector(joints), axis=0), axis=1)
+            times = np.concatenate([[0.0], np.cumsum(np.maximum(lengths / HOLDING_SPEED, 0.01))])
+            self._held(Course(times, joints, path))
 
     def displace(self, q: ArrayLike) -> None:
         """Shove the robot towards a posture (6,), rad; it goes on from there."""
@@ -292,8 +303,10 @@ class Controller:
             begin = self._ahead.course.at(self._clock)
             end = self._arm.limits.inside(self._ahead.dodge.transform.forward(self._arm.limits.inside(np.asarray(q))))
             u = np.linspace(0, 1, 9)
-            joints = begin + (u * u * (3 - 2 * u))[:, None] * (end - begin)
-            self._held(Course(SHOVE_SECONDS * u, joints, self.robot.end_effector(joints)), released=True)
+            times, pace = SHOVE_SECONDS * u, self._rate * self._ahead.pace(self._clock)
+            goes_on = np.stack([self._ahead.course.at(self._clock + pace * t) for t in times])
+            joints = goes_on + (u * u * (3 - 2 * u))[:, None] * (end - begin)
+            self._held(Course(times, joints, self.robot.end_effector(joints)), released=True)
 
     def release(self) -> None:
         """Let go of the hand: it goes on to where it was going."""
@@ -326,7 +339,7 @@ class Controller:
             before = ahead.at(self._clock)
             self._clock = min(self._clock + self._rate * ahead.pace(self._clock) * dt, ahead.course.end)
             wanted = (ahead.at(self._clock) - before) / dt + self._closing(before - q, dt)
-            self._velocity = self._within_limits(q, wanted, dt)
+            self._velocity = self._within_limits(q, self._guarded(q, wanted), dt)
             self._q = q + dt * self._velocity
             return self._velocity.copy()
 
@@ -336,7 +349,7 @@ class Controller:
         ahead = self._ahead
         if ahead is None or self._q is None:
             return Phase.RESTING
-        if not ahead.dodge.cleared:
+        if not ahead.dodge.cleared or self._room < -TOUCHING:
             return Phase.TOUCHED
         if self._aim is Aim.HAND:
             return Phase.HELD
@@ -354,6 +367,19 @@ class Controller:
                 return np.empty((0, NUM_JOINTS))
             later = self._ahead.p[self._ahead.times > self._clock]
             return np.concatenate([self._ahead.at(self._clock)[None], later])
+
+    @property
+    def undisturbed(self) -> Array:
+        """The posture (6,) at this moment of the motion without what is stacked on the learned one, rad."""
+        with self._lock:
+            ahead, solved = self._ahead, self._solved
+            if ahead is None:
+                return self._section.reference
+            q = ahead.course.at(self._clock)
+            if self._aim is not Aim.GOAL or not solved.stack.built:
+                return q
+            x = solved.below.system.transform.inverse(self._image()[None])
+            return track(self.robot, x, q, reference=self._section.reference).q[0]
 
     @property
     def _begun(self) -> Ahead:
@@ -385,14 +411,26 @@ class Controller:
         fastest = np.sqrt(2 * BRAKING_SHARE * self.acceleration * size)
         return gap * (min(min(STIFFNESS, 0.5 / dt) * size, fastest) / max(size, 1e-12))
 
+    def _guarded(self, q: Array, wanted: Array) -> Array:
+        """The velocities nearest to those wanted at which the arm comes into no obstacle."""
+        sighting = self._sighting
+        now = sighting.expected(min(self._now - sighting.time, STALE), 0.0)
+        moves = wanted.any() or sighting.speed > 0 or np.isinf(self._room)
+        if now is None or not moves or self._now < self._safe_until:
+            return wanted
+        wanted, self._room = guarded(self._arm, q, wanted, now.obstacle, sighting.velocities)
+        self._safe_until = self._now + (self._room - WINDOW) / (FASTEST_POINT + sighting.speed)
+        return wanted
+
     def _within_limits(self, q: Array, wanted: Array, dt: float) -> Array:
         """The velocities nearest to those wanted that all limits allow."""
         braking = 2 * BRAKING_SHARE * self.acceleration
         highest = np.sqrt(braking * np.maximum(self.robot.upper - q - dt * np.maximum(self._velocity, 0), 0))
         lowest = -np.sqrt(braking * np.maximum(q + dt * np.minimum(self._velocity, 0) - self.robot.lower, 0))
-        change = self.acceleration * dt
-        velocity = np.clip(np.clip(wanted, lowest, highest), self._velocity - change, self._velocity + change)
-        return np.clip(velocity, -self.robot.velocity_limits, self.robot.velocity_limits)
+        limits, most = self.robot.velocity_limits, self.acceleration * dt
+        change = np.clip(np.clip(wanted, lowest, highest), -limits, limits) - self._velocity
+        # all joints together: what lies between two velocities that touch nothing touches nothing
+        return self._velocity + change * min(1.0, most / max(float(np.abs(change).max()), 1e-12))
 
     # --- The motion ahead ---
 
@@ -454,7 +492,7 @@ class Controller:
             outer: list[Diffeomorphism] = [applied.made.transform for applied in stack.built]
             transform = Chain(outer) if outer else Identity(3)
             start = transform.forward(nominal.starts[self._home % len(nominal.starts)])
-            base = Attractor(start, stack.rays.base.speed, stack.rays.base.smoothing)
+            base = Attractor(start, HOMING_SPEED * stack.rays.base.speed, stack.rays.base.smoothing)
             system = DiffeomorphicSystem(transform, base)
         else:
             system = stack.system

@@ -71,9 +71,11 @@ class View:
     click_to_start: bool = False
     """Whether a click on the slice adds a start."""
     playing: bool = True
-    """Whether the arm moves along its rollout."""
+    """Whether the arm moves."""
+    replay: bool = False
+    """Whether the arm repeats its motion along its rollout, instead of being driven from where it is."""
     speed: float = 1.0
-    """Speed of the playback, relative to real time."""
+    """Speed of the arm's time, relative to real time."""
     bias: str = ""
     """Name of the bias point that the panel changes and that has the handles."""
     tuned: str = ""

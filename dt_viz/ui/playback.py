@@ -1,22 +1,20 @@
-"""Playback of the arm's motion in a loop, on a thread of its own."""
+"""Poses the arm: the one in the loop, or, in replay, along its newest motion again and again."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.live_arm import LiveArm
 from dt_viz.flows.fields import Array
 
 PICTURES_PER_SECOND = 25
 REST = 0.8
-"""Time at the goal before the motion begins again, seconds."""
-CATCH_UP = 0.3
-"""Time in which the arm joins a detour, seconds, since it has moved on while the detour was computed."""
+"""Time at the goal before a replay begins again, seconds."""
 
 
 def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
@@ -28,115 +26,91 @@ def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
     return q, without
 
 
-@dataclass(eq=False)
-class _Detour:
-    """A motion that is followed once, from the current posture of the arm."""
+class Replay:
+    """A motion that is shown in a loop; a new one takes over at the same moment of the loop."""
 
-    motion: ArmMotion
-    ended: Callable[[], None]
-    offsets: tuple[Array, Array] | None
-    """Offsets (6,) of the arms' postures from the first ones of the motion when it began, rad."""
-    held: bool = False
-    """Whether the arm stays at the beginning of the motion."""
-    clock: float = 0.0
+    def __init__(self) -> None:
+        self.motion: ArmMotion | None = None
+        """The motion; None before there is one."""
+        self._clock = 0.0
+
+    def advance(self, seconds: float) -> None:
+        """Let some time pass."""
+        self._clock += seconds
 
     @property
-    def over(self) -> bool:
-        """Whether the goal is reached."""
-        return self.clock > self.motion.times[-1] + REST
+    def arrived(self) -> float:
+        """Time since the goal was reached, seconds; 0 before."""
+        return 0.0 if self.motion is None else max(0.0, self._moment - self.motion.times[-1])
 
-    def postures(self) -> tuple[Array, Array]:
-        """Return the current joint angles, as `at_moment`."""
-        q, without = at_moment(self.motion, min(self.clock, self.motion.times[-1]))
-        left = max(0.0, 1 - self.clock / CATCH_UP)
-        if self.offsets is not None and left > 0:
-            q, without = q + left * self.offsets[0], without + left * self.offsets[1]
-        return q, without
+    @property
+    def posture(self) -> tuple[Array, Array] | None:
+        """The joint angles (6,) now, rad, with and without avoidance."""
+        motion = self.motion
+        return None if motion is None else at_moment(motion, min(self._moment, motion.times[-1]))
+
+    @property
+    def _moment(self) -> float:
+        """Time in the loop, seconds."""
+        return 0.0 if self.motion is None else self._clock % (self.motion.times[-1] + REST)
 
 
 class Playback:
-    """Poses the arms along the newest motion; a new motion takes over at the same moment of the loop."""
+    """Moves the arm, on a thread of its own, and has it drawn where it is another one than before."""
 
-    def __init__(self, pose: Callable[[Array, Array], None]) -> None:
-        self._pose = pose
-        self._motion: ArmMotion | None = None
-        self._detour: _Detour | None = None
-        self._changing = threading.Lock()
-        self._posed: tuple[Array, Array] | None = None
-        self._shown: ArmMotion | _Detour | None = None
-        """Motion or detour of the last pose."""
-        self._playing = True
-        self._speed = 1.0
-        self._clock = 0.0
-        self._resting = 0.0
+    def __init__(self, live: LiveArm, draw: Callable[[], None]) -> None:
+        """Begin to move the arm.
+
+        Args:
+            live: the arm in the loop.
+            draw: draws the arm in its posture; called by the playback's thread.
+        """
+        self.live, self.replay = live, Replay()
+        self._draw = draw
+        self._replays = False
+        self._playing, self._speed = True, 1.0
+        self._drawn: tuple[Array, ...] | None = None
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="playback", daemon=True)
         self._thread.start()
 
     @property
     def q(self) -> Array | None:
-        """Current joint angles (6,) of the arm, rad; None before there is a motion."""
-        return None if self._posed is None else self._posed[0]
+        """Joint angles (6,) of the arm now, rad; None before there is a motion."""
+        if not self._replays:
+            return self.live.q
+        posture = self.replay.posture
+        return None if posture is None else posture[0]
 
     @property
-    def resting(self) -> float:
-        """Time that the arm has been at the goal, seconds; 0 before."""
-        return self._resting
+    def without(self) -> Array | None:
+        """The same at this moment of the motion without avoidance."""
+        if not self._replays:
+            return self.live.undisturbed
+        posture = self.replay.posture
+        return None if posture is None else posture[1]
 
-    def follow(self, motion: ArmMotion | None) -> None:
-        """Continue along this motion; None stops the arm."""
-        self._motion = motion
+    @property
+    def arrived(self) -> float:
+        """Time since the arm came to the goal, seconds; 0 before."""
+        return self.replay.arrived if self._replays else self.live.arrived
 
-    def take_detour(self, motion: ArmMotion, ended: Callable[[], None]) -> None:
-        """Follow this motion once to its end; then call `ended` and begin the loop again.
+    def play(self, playing: bool, speed: float, *, replays: bool) -> None:
+        """Choose how the arm moves.
 
-        It replaces a current detour, whose `ended` is not called.
+        Args:
+            playing: whether it does so by itself.
+            speed: its time, relative to real time.
+            replays: whether it repeats its motion; when it does so no more, it goes on from where it is.
         """
-        posed = self._posed
-        offsets = None if posed is None else (posed[0] - motion.q[0], posed[1] - motion.without[0])
-        with self._changing:
-            self._detour = _Detour(motion, ended, offsets)
-
-    def hold(self, motion: ArmMotion | None, ended: Callable[[], None]) -> None:
-        """Hold the arm at the beginning of a motion, or in its posture if that is None, until a detour begins or ends.
-
-        `ended` is called when the hold ends, not when another detour begins.
-        """
-        if motion is None:
-            if self._posed is None:
-                return
-            q, without = (np.stack([posed, posed]) for posed in self._posed)
-            motion = ArmMotion(np.array([0.0, 1.0]), q, without)
-        with self._changing:
-            self._detour = _Detour(motion, ended, None, held=True)
-
-    def end_detour(self) -> None:
-        """End the detour and continue the loop."""
-        detour = self._detour
-        if detour is not None:
-            self._leave(detour)
-
-    def let_go(self) -> None:
-        """Continue the loop if the arm is held; a moving detour continues."""
-        detour = self._detour
-        if detour is not None and detour.held:
-            self._leave(detour)
-
-    def set_pace(self, playing: bool, speed: float) -> None:
-        """Play or pause, at a multiple of real time."""
-        self._playing, self._speed = playing, speed
+        if self._replays and not replays and self.q is not None:
+            self.live.put(self.q)
+        self._playing, self._speed, self._replays = playing, speed, replays
 
     def close(self) -> None:
         """Stop the thread, and wait for the current picture."""
         self._closed.set()
         self._thread.join(timeout=1)
-
-    def _leave(self, detour: _Detour) -> None:
-        with self._changing:
-            if self._detour is not detour:  # another one has begun
-                return
-            self._detour = None
-        detour.ended()
 
     def _loop(self) -> None:
         before = time.monotonic()
@@ -146,27 +120,10 @@ class Playback:
             before = now
 
     def advance(self, seconds: float) -> None:
-        """Advance the clock by real time, in seconds, and pose the arms; called by the playback's thread only."""
-        step = self._speed * seconds if self._playing else 0.0
-        motion, detour = self._motion, self._detour
-        if detour is not None:
-            detour.clock += 0.0 if detour.held else step
-            if detour.over:
-                self._clock = 0.0
-                self._leave(detour)
-                return
-        else:
-            self._clock += step
-        follows = motion if detour is None else detour
-        if motion is None or follows is None or (self._shown is follows and not self._playing):
-            return
-        if detour is not None:
-            posed = detour.postures()
-            self._resting = max(0.0, detour.clock - detour.motion.times[-1])
-        else:
-            moment, end = self._clock % (motion.times[-1] + REST), motion.times[-1]
-            posed = at_moment(motion, min(moment, end))
-            self._resting = max(0.0, moment - end)
-        self._posed = posed
-        self._pose(*posed)
-        self._shown = follows
+        """Let some real time pass, in seconds, and have the arm drawn; called by the playback's thread only."""
+        step = self._speed * seconds
+        if not self._replays:
+            self.live.advance(step, moves=self._playing)
+        elif self._playing:
+            self.replay.advance(step)
+        self._draw()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 
+import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
@@ -14,9 +15,8 @@ from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.fields import Array
-from dt_viz.motion.pushing import Pushed
 from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
@@ -30,9 +30,9 @@ from dt_viz.ui.scene.carried import Carried
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
 from dt_viz.ui.scene.picture import Colour
-from dt_viz.ui.scene.pushed_path import PushedPath
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.starts import Starts
+from dt_viz.ui.scene.way import Way
 
 FIELD_OF_VIEW = 0.75
 """Vertical field of view, rad."""
@@ -65,6 +65,8 @@ class Visitor:
         self.client = client
         self.shown: Frame | None = None
         """The last drawn frame."""
+        self._view = View()
+        """The view that was adopted last."""
         client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
@@ -80,14 +82,15 @@ class Visitor:
             )
             self.arms = Arms(client.scene, robot)
             self.carried = Carried(client.scene)
-            self.pushed_path = PushedPath(client.scene)
+            self.way = Way(client.scene)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
-        self._playback = Playback(self._pose)
+        self._posed: Array | None = None
+        self._playback = Playback(engine.arm, self._pose)
         self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._look_home)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
-        self._panel.push.connect(self._push)
+        self._panel.push.connect(engine.arm.push)
 
     @property
     def arm(self) -> ArmPicture:
@@ -102,14 +105,10 @@ class Visitor:
             self.pictures.draw(frame)
             self.carried.stand(frame.task.pots)
             if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then the arm stays where it was
-                self.arm.stale = bool(frame.blocked) or self.pictures.stale
+                self.arm.stale = self._view.replay and (bool(frame.blocked) or self.pictures.stale)
         if frame.stage is not Stage.ROLLOUTS:
-            if self.pushed_path.is_of_another(frame.scenario):
-                self._playback.end_detour()
-            self._playback.follow(frame.arm)
-            self.grip.draw(frame)
-            if not self.grip.ball.visible:  # a drag of the ball ends without an event
-                self._playback.let_go()
+            self._playback.replay.motion = frame.arm
+            self.grip.draw(frame, live=not self._view.replay)
             self._panel.report(frame, pace)
         self.client.flush()
         self.shown = frame
@@ -118,11 +117,15 @@ class Visitor:
         """See `Display`."""
         with self.client.atomic():
             self.pictures.adopt(scenario)
-            if self.pictures.stale:
-                self.arm.stale = True
-            self.arms.show(scenario.view)
-            self.carried.show(arm=scenario.view.arm)
-        self._playback.set_pace(scenario.view.playing, scenario.view.speed)
+            self._view = view = scenario.view
+            self.arm.stale = view.replay and (self.arm.stale or self.pictures.stale)
+            self.arms.show(view)
+            self.carried.show(arm=view.arm)
+            self.way.visible = view.arm and not view.replay
+            self.grip.ball.visible = not view.replay
+            if view.replay:  # a drag of the ball ends without an event
+                self._playback.live.release()
+        self._playback.play(view.playing, view.speed, replays=view.replay)
         self._panel.adopt(scenario)
 
     def learning(self, fraction: float, message: str) -> None:
@@ -131,7 +134,6 @@ class Visitor:
 
     def fail(self, error: Exception) -> None:
         """See `Display`."""
-        self._playback.let_go()
         self._panel.fail(error)
 
     def cancelled(self, task: str) -> None:
@@ -201,49 +203,30 @@ class Visitor:
             pose = SlicePose(as_point(position), as_quaternion(wxyz))
             self.session.edit("slice", view=replace(scenario.view, slice=pose))
 
-    def _push(self) -> None:
-        if self._playback.q is not None:
-            self.session.push(self._playback.q, self._show_pushed)
-
-    def _show_pushed(self, pushed: Pushed) -> None:
-        with self.client.atomic():
-            self.pushed_path.show(pushed)
-        self._playback.take_detour(pushed.motion, self._detour_ended)
-
-    def _detour_ended(self) -> None:
-        self.pushed_path.hide()
-        self.grip.say("")
-
     def _hand(self) -> Array | None:
         q = self._playback.q
         return None if q is None else self._robot.end_effector(q)
 
     def _hand_held(self, place: Array, phase: str) -> None:
-        q, last = self._playback.q, phase == "end"
+        self._playback.live.hold(place)
+        if phase == "end":
+            self._playback.live.release()
+
+    def _pose(self) -> None:
+        """Draw the arm in its posture, its way, and what it carries."""
+        q, view = self._playback.q, self._view
         if q is None:
             return
-        if phase == "start":
-            self._playback.hold(None, self._detour_ended)
-        if not self.session.hold(q, place, partial(self._show_held, last=last), last=last) and last:
-            self._playback.end_detour()
-
-    def _show_held(self, pushed: Pushed | None, *, last: bool) -> None:
-        if pushed is None:
-            if last:
-                self._playback.end_detour()
-            return
+        hand, live = self._robot.end_effector(q), self._playback.live
         with self.client.atomic():
-            self.pushed_path.show(pushed)
-            self.grip.say(pushed.warning)
-        if last:
-            self._playback.take_detour(pushed.motion, self._detour_ended)
-        else:
-            self._playback.hold(pushed.motion, self._detour_ended)
-
-    def _pose(self, q: Array, without: Array) -> None:
-        with self.client.atomic():
-            self.arms.pose(q, without)
-            self.carried.pose(self._robot.end_effector(q), self._playback.resting)
+            if self._posed is None or not np.array_equal(q, self._posed):
+                self._posed = q
+                without = self._playback.without if view.ghost_arm or view.body_points else None
+                self.arms.pose(q, q if without is None else without)
+            self.carried.pose(hand, self._playback.arrived)
+            if not view.replay:
+                self.way.show(time.monotonic(), hand, live.ahead)
+                self.grip.say(live.note)
 
     def _notify(self, text: str, colour: Colour) -> None:
         self.client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=NOTICE_SECONDS)

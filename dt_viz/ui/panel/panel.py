@@ -282,6 +282,13 @@ class Panel:
             lambda s, value: {"view": replace(s.view, speed=value)},
         )
         self.push = PushButton(gui, self._bindings)
+        self._bindings.input(
+            gui.add_checkbox(
+                "Replay", False, hint="its motion again and again, finished, instead of an arm that reacts"
+            ),
+            lambda s: s.view.replay,
+            lambda s, value: {"view": replace(s.view, replay=value)},
+        )
         followed = gui.add_slider("Follows rollout", 1, 8, 1, 1)
         self._bindings.properties(followed, max=self._num_rollouts)
         self._bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})

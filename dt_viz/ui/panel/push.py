@@ -12,7 +12,7 @@ from dt_viz.ui.panel.bindings import Bindings
 
 
 class PushButton:
-    """The button, which can be pressed while a motion is played."""
+    """The button, which can be pressed while the arm in the loop moves."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Add the button where the panel is being built; it acts once `connect` has said how."""
@@ -20,13 +20,13 @@ class PushButton:
             "Push the hand",
             icon=viser.Icon.HAND_FINGER,
             disabled=True,
-            hint="a few centimetres to a side, while the arm moves: it goes on from there, and still reaches the goal; "
-            "or drag the ball at the hand",
+            hint="a few centimetres to a side: it goes on from there, and still reaches the goal; or drag the ball at "
+            "the hand",
         )
 
         def disabled(scenario: Scenario) -> bool:
             frame = bindings.frame
-            return frame is None or frame.arm is None or bool(frame.blocked) or not scenario.view.playing
+            return frame is None or frame.arm is None or scenario.view.replay or not scenario.view.playing
 
         bindings.properties(self.handle, disabled=disabled)
 

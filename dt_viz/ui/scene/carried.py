@@ -33,7 +33,8 @@ class Carried:
         self.ball = scene.add_icosphere("/carried", radius=RADIUS, color=palette.CARRIED, visible=False)
         self._pots: tuple[Pot, ...] = ()
         self._arm = True
-        self._posed = False
+        self._held: Array | None = None
+        """Where the hand was when it last held the ball."""
 
     def stand(self, pots: tuple[Pot, ...]) -> None:
         """Show the ball for these pots, if there are any."""
@@ -45,12 +46,13 @@ class Carried:
         self._arm = arm
         self._show()
 
-    def pose(self, hand: Array, resting: float) -> None:
-        """Put the ball in the hand at `hand` (3,), metres, or below it, after `resting` seconds at the goal."""
+    def pose(self, hand: Array, dropped: float) -> None:
+        """Put the ball in the hand at `hand` (3,), metres, or below where it was `dropped`, seconds ago; 0 if not."""
+        if self._held is None or dropped == 0:
+            self._held = hand
         if self._pots:
-            self.ball.position = fallen(hand, self._pots, resting)
-            self._posed = True
+            self.ball.position = fallen(self._held, self._pots, dropped)
             self._show()
 
     def _show(self) -> None:
-        self.ball.visible = bool(self._pots) and self._arm and self._posed
+        self.ball.visible = bool(self._pots) and self._arm and self._held is not None

@@ -42,7 +42,7 @@ class Grip:
         self.ball = scene.add_icosphere(
             f"{hand}/grip",
             radius=RADIUS,
-            color=palette.PUSHED,
+            color=palette.WAY,
             position=robot.end_effector_offset,
             opacity=0.85,
             cast_shadow=False,
@@ -72,10 +72,10 @@ class Grip:
 
         gestures.on_drag(self.ball, dragged)
 
-    def draw(self, frame: Frame) -> None:
-        """Show the ball if there is a motion to follow, and remember the slice that it is dragged in."""
+    def draw(self, frame: Frame, *, live: bool) -> None:
+        """Show the ball while the arm is in the loop, and remember the slice that it is dragged in."""
         self._slice = frame.slice
-        self.ball.visible = frame.arm is not None and not frame.blocked
+        self.ball.visible = live
 
     def say(self, warning: str) -> None:
         """Show a warning beside the hand; none if it is empty."""

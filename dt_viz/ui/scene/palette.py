@@ -6,8 +6,10 @@ CHOSEN_ROLLOUT = (150, 45, 0)
 """Rollout that the arm follows."""
 GHOST = (84, 88, 96)
 """Motions without avoidance."""
-PUSHED = (118, 42, 131)
-"""Path of the hand after a push."""
+WAY = (118, 42, 131)
+"""Way of the hand that lies ahead of the arm in the loop, and the ball to hold it by."""
+WAY_FADED = (232, 226, 236)
+"""End of the trail that it leaves."""
 STALE = (158, 163, 171)
 """Rollouts of an earlier scenario."""
 GOAL = (0, 158, 115)

@@ -1,0 +1,77 @@
+"""The last word on the joints' velocity: no part of the arm comes nearer to an obstacle than it can stop.
+
+A control barrier (Ames et al., "Control Barrier Functions: Theory and Applications", 2019): the distance h of each body
+point's sphere may fall no faster than at the rate ḣ = −γh, so it never falls below 0; where it is below, no further.
+Of all velocities that obey, the nearest to the wanted one is taken. A motion that keeps its margin is not changed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dt_viz.arm.robot import NUM_JOINTS, cross
+from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.union import Union
+
+KEPT = 2e-3
+"""Distance of the arm from an obstacle that is kept, about, metres."""
+RATE = 6.0
+"""γ, 1/s."""
+WINDOW = 0.08
+"""Distance from which on a sphere is looked at, metres."""
+NUM_POINTS = 10
+"""Number of body points, those nearest to an obstacle, that are looked at."""
+NUM_ROUNDS = 8
+"""Number of rounds in which the velocity is projected onto what each point allows."""
+DIFFERENCE = 1e-4
+"""Distance between the places that a distance's slope is taken from, metres."""
+
+
+def guarded(arm: WholeArm, q: Array, wanted: Array, obstacle: Union, velocities: Array) -> tuple[Array, float]:
+    """The velocity nearest to the wanted one at which nothing is touched.
+
+    Args:
+        arm: whose body points are guarded.
+        q: (6,) its posture, rad.
+        wanted: (6,) rad/s.
+        obstacle: where the obstacles are now.
+        velocities: (P, 3) of its parts, m/s.
+
+    Returns:
+        The velocity (6,), rad/s, and the distance of the arm from the nearest obstacle, about, metres.
+    """
+    chain = arm.robot.chain(q[:, None])
+    points, radius = arm.body.of_chain(chain)[:, :, 0], arm.body.radius
+    axes, origins = chain.axes[:, 2, :, 0], chain.origins[:, :, 0]
+    slopes, bounds, nearest = [], [], np.inf
+    for part, velocity in zip(obstacle.parts, velocities, strict=True):
+        distance = part.signed_distance(points) - radius + OVERSHOOT
+        nearest = min(nearest, float(distance.min()))
+        h = distance - KEPT
+        for k in np.argsort(h)[:NUM_POINTS]:
+            joint = arm.body.joint[k] + 1
+            if h[k] > WINDOW or joint == 0:
+                continue
+            normal, slope = _outward(part, points[k]), np.zeros(NUM_JOINTS)
+            slope[:joint] = cross(axes[:joint].T, points[k][:, None] - origins[:joint].T).T @ normal
+            slopes.append(slope)
+            bounds.append(float(normal @ velocity) - RATE * max(float(h[k]), 0.0))
+    for _ in range(NUM_ROUNDS):
+        before = wanted
+        for slope, bound in zip(slopes, bounds, strict=True):
+            short = bound - slope @ wanted
+            if short > 0 and (size := slope @ slope) > 1e-6:
+                wanted = wanted + short / size * slope
+        if wanted is before:
+            break
+    return wanted, nearest
+
+
+def _outward(part: Obstacle, point: Array) -> Array:
+    """The unit vector (3,) away from an obstacle at a point (3,)."""
+    steps = DIFFERENCE * np.concatenate([np.eye(3), -np.eye(3)])
+    distance = part.signed_distance(point + steps)
+    slope = distance[:3] - distance[3:]
+    return slope / max(float(np.linalg.norm(slope)), 1e-12)

@@ -1,0 +1,124 @@
+"""Playback: the arm in the loop, or its finished motion again and again, on a thread of its own."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from dt_viz.engine.engine import ArmMotion
+from dt_viz.ui import playback as playback_module
+from dt_viz.ui.playback import REST, Playback, at_moment
+
+PICTURE = 0.02
+PATIENCE = 30.0
+"""Seconds after which a test gives up; nothing takes that long."""
+
+
+class Arm:
+    """An arm in the loop whose first joint turns by a radian in a second."""
+
+    def __init__(self):
+        self.q, self.undisturbed, self.arrived = np.zeros(6), np.ones(6), 0.0
+        self.asked = []
+
+    def advance(self, seconds, *, moves):
+        self.asked.append((seconds, moves))
+        self.q = self.q + seconds * moves * np.eye(6)[0]
+
+    def put(self, q):
+        self.q = q
+
+
+class Player:
+    """A playback whose clock only moves when it is told to, and the places where the arm was drawn."""
+
+    def __init__(self):
+        self.arm, self.places = Arm(), []
+        self.playback = Playback(self.arm, lambda: self.places.append(self.playback.q[0]))
+
+    def play(self, seconds):
+        """The places where the arm is meanwhile."""
+        before = len(self.places)
+        for _ in range(round(seconds / PICTURE)):
+            self.playback.advance(PICTURE)
+        return self.places[before:]
+
+
+def ramp(begin, end, seconds):
+    q = np.linspace(begin, end, 50)[:, None] * np.eye(6)[:1]
+    return ArmMotion(np.linspace(0, seconds, 50), q, q + 1)
+
+
+@pytest.fixture
+def player(monkeypatch):
+    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 1e-4)  # its thread sleeps until it is closed
+    player = Player()
+    yield player
+    player.playback.close()
+
+
+@pytest.mark.parametrize("moment", [0.0, 0.3, 1.7, 4.0, 9.0])
+def test_both_arms_are_shown_at_the_same_moment(moment):
+    times = np.linspace(0, 1, 60) ** 1.5 * 4
+    motion = ArmMotion(times, np.sin(times)[:, None] * np.arange(6), np.cos(times)[:, None] * np.arange(6))
+    for got, path in zip(at_moment(motion, moment), (motion.q, motion.without), strict=True):
+        np.testing.assert_allclose(got, [np.interp(moment, times, angle) for angle in path.T], atol=1e-12)
+
+
+def test_the_arm_moves_without_being_asked_to(monkeypatch):
+    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
+    arm, moved = Arm(), threading.Event()
+    playback = Playback(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
+    assert moved.wait(PATIENCE)
+    playback.close()
+
+
+def test_its_time_has_the_chosen_pace_and_a_pause_stops_it(player):
+    player.playback.play(True, 2.0, replays=False)
+    assert player.play(0.5)[-1] == pytest.approx(1.0)
+    player.playback.play(False, 2.0, replays=False)
+    assert player.play(0.5)[-1] == pytest.approx(1.0)
+    assert player.arm.asked[-1] == (pytest.approx(2 * PICTURE), False)  # it still hears that its hand is held
+    np.testing.assert_array_equal(player.playback.without, np.ones(6))
+
+
+class TestReplay:
+    @pytest.fixture(autouse=True)
+    def _replays(self, player):
+        player.playback.replay.motion = ramp(3.0, 4.0, 0.5)
+        player.playback.play(True, 1.0, replays=True)
+
+    def test_the_motion_is_repeated_after_a_rest(self, player):
+        places = player.play(0.5 + REST + 0.2)
+        assert places[0] == pytest.approx(3.0 + PICTURE / 0.5)
+        assert max(places) == 4.0 and places[-1] == pytest.approx(3.4, abs=0.1)
+        assert sum(place == 4.0 for place in places) * PICTURE == pytest.approx(REST, abs=2 * PICTURE)
+        assert player.arm.asked == []
+        assert player.playback.without[0] == pytest.approx(player.playback.q[0] + 1)
+
+    def test_a_new_motion_takes_over_at_the_same_moment(self, player):
+        player.play(0.2)
+        player.playback.replay.motion = ramp(5.0, 6.0, 0.5)
+        assert player.play(PICTURE)[-1] == pytest.approx(5.44)
+
+    def test_a_pause_stops_it(self, player):
+        held = player.play(0.2)[-1]
+        player.playback.play(False, 1.0, replays=True)
+        assert set(player.play(0.2)) == {held}
+
+    def test_the_time_at_the_goal_is_counted_from_arrival_to_the_next_round(self, player):
+        rests = []
+        for _ in range(200):
+            player.play(PICTURE)
+            rests.append((player.places[-1], player.playback.arrived))
+        assert all((rest > 0) <= (place == 4.0) for place, rest in rests)
+        assert REST - 2 * PICTURE < max(rest for _, rest in rests) <= REST
+
+    def test_the_arm_goes_on_in_the_loop_from_where_the_replay_left_it(self, player):
+        left = player.play(0.3)[-1]
+        player.playback.play(True, 1.0, replays=False)
+        assert player.play(PICTURE)[-1] == pytest.approx(left + PICTURE)
+
+    def test_without_a_motion_nothing_is_posed(self, player):
+        player.playback.replay.motion = None
+        assert player.playback.q is None and player.playback.without is None and player.playback.arrived == 0
