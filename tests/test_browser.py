@@ -13,7 +13,6 @@ from PIL import Image
 from scenes import beside, changing
 
 import dt_viz.learning.store
-from dt_viz.engine.engine import ArmMotion
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.control import Phase
 from dt_viz.obstacles.files import MAX_BYTES
@@ -21,6 +20,7 @@ from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
@@ -493,14 +493,13 @@ ARM_LAYERS = {  # the layer's label in the page, its field of View, and which pi
 }
 
 
-def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit):
+def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit, monkeypatch):
     page, visitor = visit
     session, plain = visitor.session, View(playing=False, replay=True, field=False, ghost=False)
     session.edit("test", view=plain)
     wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
     q = visitor.shown.arm.q[50]
-    apart = ArmMotion(np.array([0.0, 1.0]), np.stack([q, q]), np.stack([q, q]) + 0.6 * np.eye(6)[0])
-    visitor._playback.replay.motion = apart
+    monkeypatch.setattr(Replay, "posture", property(lambda _: (q, q + 0.6 * np.eye(6)[0])))
     wait_until(lambda: np.array_equal(visitor._playback.q, q), "the arm to be posed")
     open_tab(page, "Show")
     until_drawn(visitor)
