@@ -418,13 +418,8 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
 
 
 def test_every_layer_has_a_checkbox():
-    switches = {f.name for f in fields(View) if f.type == "bool"} - {
-        "playing",
-        "replay",
-        "move_slice",
-        "click_to_start",
-    }
-    assert set(VIEW_LABELS) == switches
+    switches = {f.name for f in fields(View) if f.type == "bool"}
+    assert set(VIEW_LABELS) == switches - {"playing", "replay", "move_slice", "click_to_start"}
 
 
 PACE = Pace(0.02, 10.0, 0)
