@@ -11,7 +11,9 @@ from pages import Bound, frame_of
 from scenes import avoiding, biases, changing
 
 from dt_viz.arm.collision import CollisionReport, Nearest
+from dt_viz.engine import player as player_module
 from dt_viz.engine.engine import Engine
+from dt_viz.engine.player import Player
 from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.certificates import Certificates
@@ -22,7 +24,7 @@ from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel import warp as warp_module
 from dt_viz.ui.panel.status import status_html
 from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
-from dt_viz.ui.panel.warp import WarpPlayer
+from dt_viz.ui.panel.warp import grown
 from dt_viz.warning import Kind
 
 AVOIDANCE = "Avoidance"
@@ -169,16 +171,22 @@ def wait_until(condition):
         time.sleep(0.005)
 
 
+def play_warp(session, told, seconds, monkeypatch):
+    monkeypatch.setattr(warp_module, "SECONDS", seconds)
+    player = Player(told.append)
+    player.start(session, "Warp", grown)
+    return player
+
+
 def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(session, monkeypatch):
     edit = session.edit
     session.edit("Warp", warp=0.7)
     session.end_gesture()
     told, clock = [], itertools.count()
-    monkeypatch.setattr(warp_module, "time", SimpleNamespace(monotonic=lambda: 0.03 * next(clock)))
-    player = WarpPlayer(told.append, seconds=0.3)
+    monkeypatch.setattr(player_module, "time", SimpleNamespace(monotonic=lambda: 0.03 * next(clock)))
     warps = []
     monkeypatch.setattr(session, "edit", lambda name, warp: warps.append(warp) or edit(name, warp=warp))
-    player.toggle(session)
+    play_warp(session, told, 0.3, monkeypatch)
     wait_until(lambda: told == [True, False])
     assert warps == sorted(warps) and warps[0] < 0.3 and warps[-1] == 1
     assert session.scenario == SCENARIO
@@ -188,37 +196,34 @@ def test_playing_goes_from_straight_rays_to_the_full_stack_as_one_step_for_undo(
     assert session.scenario == SCENARIO
 
 
-def test_playing_that_ends_as_it_began_leaves_nothing_to_undo(session):
+def test_playing_that_ends_as_it_began_leaves_nothing_to_undo(session, monkeypatch):
     session.edit("T", **changing(session.scenario, temperature=9.0))
     session.end_gesture()
     told = []
-    player = WarpPlayer(told.append, seconds=0.2)
-    player.toggle(session)
+    play_warp(session, told, 0.2, monkeypatch)
     wait_until(lambda: told == [True, False])
     session.undo()
     assert session.scenario == SCENARIO
 
 
-def test_playing_stops_when_it_is_told_to_or_something_else_is_moved(session):
+def test_playing_stops_when_it_is_told_to_or_something_else_is_moved(session, monkeypatch):
     told = []
-    player = WarpPlayer(told.append, seconds=1000.0)
-    player.toggle(session)
+    player = play_warp(session, told, 1000.0, monkeypatch)
     wait_until(lambda: session.scenario.warp < 0.5)
     session.edit("view", view=View(grid=True))  # moves nothing
     assert player.playing
-    player.toggle(session)
+    player.stop()
     wait_until(lambda: not player.playing)
     assert told == [True, False]
-    player.toggle(session)
+    player.start(session, "Warp", grown)
     wait_until(lambda: told == [True, False, True])
     session.edit("obstacle", **changing(session.scenario, obstacles=(), warp=0.9))
     wait_until(lambda: not player.playing)
     assert session.scenario.warp == 0.9
 
 
-def test_closing_ends_playing(session):
-    player = WarpPlayer(lambda _: None, seconds=1000.0)
-    player.toggle(session)
+def test_closing_ends_playing(session, monkeypatch):
+    player = play_warp(session, [], 1000.0, monkeypatch)
     player.close()
     assert not player.playing
 

@@ -22,6 +22,7 @@ from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
 from dt_viz.ui.panel.avoid import AvoidPanel
 from dt_viz.ui.panel.bindings import KEEP, Bindings
+from dt_viz.ui.panel.disturbances import Disturbances
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
 from dt_viz.ui.panel.plots import JointPlots
@@ -140,6 +141,7 @@ class Panel:
         """Stop playing and reading: the visitor has left."""
         self._obstacles.close()
         self._stack.close()
+        self._disturbances.close()
         self._saver.close()
         self._beginnings.close()
         self._chores.close()
@@ -289,6 +291,7 @@ class Panel:
             lambda s: s.view.replay,
             lambda s, value: {"view": replace(s.view, replay=value)},
         )
+        self._disturbances = Disturbances(gui, self._bindings)
         followed = gui.add_slider("Follows rollout", 1, 8, 1, 1)
         self._bindings.properties(followed, max=self._num_rollouts)
         self._bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})

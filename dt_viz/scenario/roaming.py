@@ -1,0 +1,139 @@
+"""Smooth random ways of an obstacle that crosses a task's motion again and again, and of a goal that moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.metrics import resample_by_arc_length
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import Stack, plane_of, with_added, with_avoidance, with_transform
+from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.bias import BiasPoint
+
+SWINGS, TURNS = 5, 3
+"""Number of swings through the motion and back on one round, and of turns of their direction."""
+ALONG = 0.3
+"""Largest distance of the swings' middle from that of the motion, in lengths of the motion."""
+BESIDE = 0.22
+"""Distance from the motion at which an obstacle turns round, beside its own size, metres."""
+SOFT = 0.03
+"""Width in which the way bends where it comes near to table or pedestal, metres."""
+TABLE_ROOM = 0.01
+"""Height of the obstacle above the table, metres."""
+PEDESTAL_ROOM = 0.20
+"""Distance of the obstacle's surface from the axis of the arm's base, metres."""
+NUM_TRIED = 12
+"""Number of random ways of which the smoothest is taken."""
+NUM_SAMPLES = 1200
+"""Number of samples of a round."""
+JOINING = 0.8
+"""Time constant with which an obstacle joins its round, seconds."""
+GOAL_SWAY = 0.07
+"""Amplitude of a goal that moves, metres."""
+GOAL_PERIODS = (7.0, 11.0)
+"""Periods of a goal that moves, along two axes, seconds."""
+
+
+def crossings(task: Task, size: float, rng: np.random.Generator) -> Array:
+    """A closed way (`NUM_SAMPLES`, 3), metres, evenly sampled, that crosses the mean motion again and again.
+
+    It is a rose curve, whose petals all pass its middle, and the middle goes to and fro along the motion.
+
+    Args:
+        task: whose motion it is.
+        size: radius of what moves, metres.
+        rng: for directions and places.
+    """
+    mean = resample_by_arc_length(task.mean_path, 201)
+    return max((_rose(mean, size, rng) for _ in range(NUM_TRIED)), key=_smoothness)
+
+
+def _smoothness(way: Array) -> float:
+    """Cosine of the sharpest angle between neighbouring pieces of a way."""
+    pieces = np.diff(np.concatenate([way, way[1:2]]), axis=0)
+    pieces /= np.linalg.norm(pieces, axis=1, keepdims=True)
+    return float((pieces[1:] * pieces[:-1]).sum(axis=1).min())
+
+
+def _rose(mean: Array, size: float, rng: np.random.Generator) -> Array:
+    """A way around a mean motion (201, 3), which may have corners where it is bent away from table and pedestal."""
+    u, v = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
+    at, angle = rng.uniform(0, 2 * np.pi, size=2)
+    round_ = np.linspace(0, 2 * np.pi, 4 * NUM_SAMPLES)
+    along = 200 * (0.5 + ALONG * np.sin(round_ + at))
+    middle = np.stack([np.interp(along, np.arange(201), axis) for axis in mean.T], axis=1)
+    turned = TURNS * round_ + angle
+    direction = np.cos(turned)[:, None] * u + np.sin(turned)[:, None] * v
+    way = middle + (BESIDE + size) * np.sin(SWINGS * round_)[:, None] * direction
+    way[:, 2] = _at_least(way[:, 2], size + TABLE_ROOM)
+    away = np.linalg.norm(way[:, :2], axis=1)
+    way[:, :2] *= (_at_least(away, size + PEDESTAL_ROOM) / np.maximum(away, 1e-6))[:, None]
+    return resample_by_arc_length(way, NUM_SAMPLES)
+
+
+def _at_least(values: Array, least: float) -> Array:
+    """Values, smoothly kept above the least."""
+    return (values + least + np.sqrt((values - least) ** 2 + SOFT**2)) / 2
+
+
+class Chase:
+    """The selected obstacle, or a new sphere, crosses the motion at a constant speed."""
+
+    def __init__(self, task: Task, scenario: Scenario, speed: float, rng: np.random.Generator) -> None:
+        """Choose its way.
+
+        Args:
+            task: the scenario's.
+            scenario: before.
+            speed: m/s.
+            rng: for the way.
+        """
+        selected = scenario.selected
+        self._index = 0 if selected is None else selected
+        self._begins = Sphere(task.obstacle_position) if selected is None else scenario.obstacles[selected]
+        self._way, self._speed = crossings(task, self._begins.radius, rng), speed
+        steps = np.linalg.norm(np.diff(self._way, axis=0), axis=1)
+        self._length = float(steps.sum())
+        # it begins where it is nearest to
+        nearest = int(np.linalg.norm(self._way - np.asarray(self._begins.position), axis=1).argmin())
+        self._offset = float(steps[:nearest].sum())
+
+    def place(self, seconds: float) -> Array:
+        """Where the obstacle is (3,), metres."""
+        joins = np.exp(-seconds / JOINING) * (np.asarray(self._begins.position) - self._at(0.0))
+        return self._at(self._speed * seconds) + joins
+
+    def __call__(self, scenario: Scenario, seconds: float) -> dict[str, Stack]:
+        """The stack with the obstacle where it is after some seconds."""
+        obstacles = list(scenario.obstacles)
+        moved = self._begins.moved(as_point(self.place(seconds)), self._begins.wxyz)
+        obstacles[self._index : self._index + 1] = [moved]
+        return {"stack": with_avoidance(scenario, obstacles=tuple(obstacles))}
+
+    def _at(self, length: float) -> Array:
+        along = (self._offset + length) % self._length / self._length * (len(self._way) - 1)
+        return np.array([np.interp(along, np.arange(len(self._way)), axis) for axis in self._way.T])
+
+
+class MovingGoal:
+    """A bias point takes the goal along a figure around its place."""
+
+    def __init__(self, task: Task, goal: Array) -> None:
+        """Take the task and its goal (3,), metres."""
+        self._goal, self._axes = goal, task.slice.axes
+        self._point = BiasPoint(as_point(goal), moves_goal=True, plane=plane_of(task))
+        self._name = ""
+
+    def __call__(self, scenario: Scenario, seconds: float) -> dict[str, Stack]:
+        """The stack with the goal where it is after some seconds."""
+        if not self._name:
+            stack, self._name = with_added(scenario, self._point)
+            scenario = replace(scenario, stack=stack)
+        sway = GOAL_SWAY * np.sin(2 * np.pi * seconds / np.array(GOAL_PERIODS))
+        place = self._goal + self._axes @ sway
+        place[2] = max(place[2], self._goal[2] - GOAL_SWAY / 2, TABLE_ROOM)
+        return {"stack": with_transform(scenario, self._name, replace(self._point, position=as_point(place)))}
