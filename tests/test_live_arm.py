@@ -217,6 +217,24 @@ class TestPause:
         assert np.abs(whole.arm.q - before).max() < 0.26 * whole.robot.velocity_limits.max()
 
 
+def test_what_is_seen_is_not_touched_before_there_is_a_motion_around_it(whole):
+    """However long that takes: the sphere comes to rest in the way, and no stack takes over. It may slide along it."""
+    whole.run(1.0)
+    model, ahead = load_collision_model(), whole.arm.ahead
+    place = ahead[np.linalg.norm(ahead - whole.hand, axis=1) > 0.25][0]
+    seen = changed(whole.scenario, obstacles=(sphere_at(place),))
+    whole.engine.see(seen)
+    begun = len(whole.passed)
+    whole.run(6.0)
+    passed = np.array(whole.passed[begun:])
+    assert model.nearest_to_obstacle(passed, seen.obstacle).distance > 0
+    whole.show(seen)
+    whole.run(30, lambda: whole.missed() < 1e-3)
+    assert whole.missed() < 1e-3
+    whole.assert_no_jump()
+    assert model.nearest_to_obstacle(np.array(whole.passed[begun:]), seen.obstacle).distance > 0
+
+
 class TestBadInput:
     def test_it_says_that_it_is_touched_gives_way_and_goes_on(self, whole):
         whole.run(2.0)

@@ -44,7 +44,7 @@ class FakeEngine:
         self.asked = []
         self.begun, self.gate = threading.Event(), None
         self.unlearned, self.learning = set(), threading.Event()
-        self.driven, self.drivers = [], set()
+        self.seen, self.driven, self.drivers = [], [], set()
         self.endless, self.busy = None, threading.Event()
 
     def frames(self, scenario, progress=None, checkpoint=None):
@@ -69,6 +69,9 @@ class FakeEngine:
             if stage is Stage.LIVE and scenario.view.generator_layer == -9:
                 raise IndexError("no such flow")
             yield Sketch(scenario, stage)
+
+    def see(self, scenario):
+        self.seen.append(scenario)
 
     def drive(self, frame):
         self.driven.append(frame)
@@ -730,7 +733,7 @@ def test_the_arm_is_driven_by_the_first_frame_of_each_motion_and_by_the_refined_
     assert [(frame.stage, frame.scenario) for frame in driven[2:]] == [
         (stage, opened.session.scenario) for stage in (Stage.ROLLOUTS, Stage.FINE)
     ]
-    assert opened.engine.drivers == {"session"}
+    assert opened.engine.drivers == {"session"} and opened.engine.seen[-1] == opened.session.scenario
     opened.edit("grid", view=View(grid=True))  # the same motion: it was there before
     opened.settle()
     assert [frame.stage for frame in driven[4:]] == [Stage.FINE]

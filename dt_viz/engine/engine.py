@@ -167,6 +167,10 @@ class Engine:
             certificates = certificates.warning(*warnings)
         return replace(frame, stage=Stage.FINE, certificates=certificates), tuple(arms)
 
+    def see(self, scenario: Scenario) -> None:
+        """Let the arm know where the obstacles of a scenario are, long before its frames; any thread may."""
+        self.arm.see(scenario.arm_avoidance)
+
     def drive(self, frame: Frame) -> None:
         """Have the arm go on with the motion of the frame that was yielded last.
 

@@ -12,6 +12,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.motion.control import Controller, Phase
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
+from dt_viz.transforms.base import ArmAvoidance
 
 TICK = 0.01
 """Time between two ticks of the controller, seconds: 100 Hz."""
@@ -60,6 +61,8 @@ class LiveArm:
         """Where the hand is to be held, (3,), metres."""
         self._homing = self._let_go = False
         self._due = self._rested = self._arrived = 0.0
+        self._seen: tuple[ArmAvoidance | None] | None = None
+        """What was seen since the last tick."""
         self._rng = np.random.default_rng(0)
 
     # --- What it is doing ---
@@ -143,6 +146,10 @@ class LiveArm:
         if another and number is not None:
             self._wish(lambda controller: self._go_home(controller, number))
 
+    def see(self, avoidance: ArmAvoidance | None) -> None:
+        """Take note of where the obstacles are now: it touches none, also before there is a motion around them."""
+        self._seen = (avoidance,)
+
     def stop(self) -> None:
         """Stay in this posture: there is nothing to follow."""
         self._controller = self._solved = None
@@ -186,6 +193,9 @@ class LiveArm:
             controller.release()
         if not moves and controller.phase is not Phase.HELD:
             return
+        seen, self._seen = self._seen, None
+        if seen is not None:
+            controller.see(*seen)
         self._due = min(self._due + seconds, LONGEST)
         ticks = int(self._due / TICK)
         self._due -= ticks * TICK

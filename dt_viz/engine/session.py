@@ -292,6 +292,7 @@ class Session:
 
     def _submit(self) -> None:
         self._stopped = False
+        self._engine.see(self.scenario)
         self._worker.submit((self.scenario, time.perf_counter()))
 
     def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:

@@ -52,7 +52,7 @@ from dt_viz.transforms.avoidance import Avoidance
 TICK = 0.01
 """Time between two ticks, seconds."""
 STACK_PERIOD = 0.03
-"""Shortest time between the beginnings of two stacks, seconds."""
+"""Shortest time between the beginnings of two stacks, and time between two looks at the sphere, seconds."""
 HALF_LENGTH = 0.40
 """Half the length of a sphere's path, metres."""
 WIGGLE, WAVELENGTH = 0.04, 0.5
@@ -136,7 +136,7 @@ class InTheLoop:
         self.controller = Controller(bench.follower, bench.solved, **blind)
         self.controller.home(crossing.start)
         self._pending: Any = None
-        self._ready, self._next, self._went, self._present = 0.0, 0.0, False, True
+        self._ready, self._next, self._looks, self._went, self._present = 0.0, 0.0, 0.0, False, True
 
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
         """See `Arm`."""
@@ -147,9 +147,12 @@ class InTheLoop:
             self.controller.take(self._pending)
             self._pending = None
         present = t < crossing.gone
+        solved = self._bench.around(self._bench.sphere(crossing.at(t)) if present else ())
+        if t >= self._looks and run.q[1:]:
+            self.controller.see(solved.scenario.arm_avoidance)
+            self._looks = t + STACK_PERIOD
         if self._pending is None and t >= self._next and run.q[1:] and (present or self._present):
             self._present = present
-            solved = self._bench.around(self._bench.sphere(crossing.at(t)) if present else ())
             began = time.thread_time()
             self._pending = self.controller.prepared(solved)
             delay = time.thread_time() - began

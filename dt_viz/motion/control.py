@@ -39,6 +39,7 @@ from dt_viz.motion.dodging import NO_DODGE, Dodge, dodge, lack
 from dt_viz.motion.following import Follower
 from dt_viz.motion.guarding import WINDOW, guarded
 from dt_viz.motion.solve import Solved
+from dt_viz.transforms.base import ArmAvoidance
 
 ACCELERATION = 4.0
 """Limit of the joints' acceleration, rad/s². The arm's URDF names none; chosen so that joints reach their limits of
@@ -198,7 +199,8 @@ class Controller:
         self._arm, self._follower = follower.whole_arm, follower
         self._lock = threading.RLock()
         self._solved = solved
-        self._sighting = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0)
+        self._sighting = self._seen = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0)
+        """The obstacles that the dodge is made for, and where they were seen last."""
         self._section = Section(self.robot, follower.reference(solved.nominal))
         self._aim, self._home, self._then = Aim.GOAL, 0, Aim.GOAL
         self._ahead: Ahead | None = None
@@ -223,6 +225,12 @@ class Controller:
         """
         self.take(self.prepared(solved))
 
+    def see(self, avoidance: ArmAvoidance | None) -> None:
+        """Take note of where the obstacles are, which is quick: nothing is touched before a stack takes over."""
+        with self._lock:
+            self._seen = self._seen.then(avoidance, self._now)
+            self._safe_until, self._room = 0.0, np.inf
+
     def prepared(self, solved: Solved) -> Prepared:
         """Work out how to go on with another stack, while ticks go on; see `follow`."""
         section = Section(self.robot, self._follower.reference(solved.nominal))
@@ -241,7 +249,9 @@ class Controller:
             before, solved = self._solved, prepared.solved
             alike = self._goes_on(solved, prepared.section)
             self._solved, self._section, self._sighting = solved, prepared.section, prepared.sighting
-            self._safe_until, self._room = 0.0, np.inf
+            if self._sighting.time >= self._seen.time:
+                self._seen = self._sighting
+                self._safe_until, self._room = 0.0, np.inf
             if self._ahead is None:
                 return
             if prepared.ahead is not None and self._ahead is prepared.begins:
@@ -413,12 +423,12 @@ class Controller:
 
     def _guarded(self, q: Array, wanted: Array) -> Array:
         """The velocities nearest to those wanted at which the arm comes into no obstacle."""
-        sighting = self._sighting
+        sighting = self._seen
         now = sighting.expected(min(self._now - sighting.time, STALE), 0.0)
         moves = wanted.any() or sighting.speed > 0 or np.isinf(self._room)
         if now is None or not moves or self._now < self._safe_until:
             return wanted
-        wanted, self._room = guarded(self._arm, q, wanted, now.obstacle, sighting.velocities)
+        wanted, self._room = guarded(self._arm, q, wanted, now, sighting.velocities)
         self._safe_until = self._now + (self._room - WINDOW) / (FASTEST_POINT + sighting.speed)
         return wanted
 

@@ -13,10 +13,10 @@ from dt_viz.arm.robot import NUM_JOINTS, cross
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.union import Union
+from dt_viz.transforms.base import ArmAvoidance
 
-KEPT = 2e-3
-"""Distance of the arm from an obstacle that is kept, about, metres."""
+KEPT = 5e-3
+"""Distance of the arm from an obstacle that is kept, about, metres; half the margin if that is less."""
 RATE = 6.0
 """γ, 1/s."""
 WINDOW = 0.08
@@ -29,15 +29,15 @@ DIFFERENCE = 1e-4
 """Distance between the places that a distance's slope is taken from, metres."""
 
 
-def guarded(arm: WholeArm, q: Array, wanted: Array, obstacle: Union, velocities: Array) -> tuple[Array, float]:
+def guarded(arm: WholeArm, q: Array, wanted: Array, avoidance: ArmAvoidance, velocities: Array) -> tuple[Array, float]:
     """The velocity nearest to the wanted one at which nothing is touched.
 
     Args:
         arm: whose body points are guarded.
         q: (6,) its posture, rad.
         wanted: (6,) rad/s.
-        obstacle: where the obstacles are now.
-        velocities: (P, 3) of its parts, m/s.
+        avoidance: where the obstacles are now, and the margin.
+        velocities: (P, 3) of the obstacles, m/s.
 
     Returns:
         The velocity (6,), rad/s, and the distance of the arm from the nearest obstacle, about, metres.
@@ -45,11 +45,11 @@ def guarded(arm: WholeArm, q: Array, wanted: Array, obstacle: Union, velocities:
     chain = arm.robot.chain(q[:, None])
     points, radius = arm.body.of_chain(chain)[:, :, 0], arm.body.radius
     axes, origins = chain.axes[:, 2, :, 0], chain.origins[:, :, 0]
-    slopes, bounds, nearest = [], [], np.inf
-    for part, velocity in zip(obstacle.parts, velocities, strict=True):
+    slopes, bounds, nearest, kept = [], [], np.inf, min(KEPT, avoidance.margin / 2)
+    for part, velocity in zip(avoidance.obstacle.parts, velocities, strict=True):
         distance = part.signed_distance(points) - radius + OVERSHOOT
         nearest = min(nearest, float(distance.min()))
-        h = distance - KEPT
+        h = distance - kept
         for k in np.argsort(h)[:NUM_POINTS]:
             joint = arm.body.joint[k] + 1
             if h[k] > WINDOW or joint == 0:
