@@ -446,7 +446,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
 
 def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     page, visitor = visit
-    visitor.session.edit("test", view=replace(LIGHT, rollouts=True, colour="det"))
+    visitor.session.edit("test", view=replace(LIGHT, rollouts=True, arm=True, table=True, colour="det"))
     assert visitor.session.wait_idle(PATIENCE)
     open_tab(page, "Picture")
     with page.expect_download() as download:
