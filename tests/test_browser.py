@@ -27,8 +27,6 @@ from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor, initial_scenario
 
 WIDTH, HEIGHT = 900, 560
-RESOLUTION = 0.5
-"""Drawn pixels per CSS pixel, along each side: the scene is drawn by software."""
 CORNER = (5, 5)
 """CSS pixels where the mouse touches nothing."""
 PATIENCE = 240.0
@@ -88,7 +86,7 @@ def open_page(browser, server):
     page.on("console", lambda message: page_errors.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: page_errors.append(str(error)))
     page.add_init_script(UNHURRIED)
-    page.goto(f"http://127.0.0.1:{server.port}/?fixedDpr={RESOLUTION}")
+    page.goto(f"http://127.0.0.1:{server.port}")
     wait_until(lambda: set(server.visitors) - known, "the page of a visitor")
     (visitor,) = set(server.visitors) - known
     visitor.session.edit("test", view=LIGHT)
