@@ -2,6 +2,7 @@
 
 import os
 import re
+from pathlib import Path
 
 # Tests run beside each other, each on one core: read when numpy is imported, by its BLAS.
 os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"} | os.environ)
@@ -53,11 +54,18 @@ def robot() -> Robot:
 
 
 @pytest.fixture(scope="session")
-def fits(tmp_path_factory, request) -> FitStore:
-    """Learns each task once for the whole test run: workers beside each other share a folder."""
+def cache(tmp_path_factory, request) -> Path:
+    """Folder of caches, in which each task is learned once for the whole test run: workers, and servers that are
+    processes of their own, share it."""
     is_worker = hasattr(request.config, "workerinput")
     folder = tmp_path_factory.getbasetemp()
-    return FitStore((folder.parent if is_worker else folder) / "fits")
+    return (folder.parent if is_worker else folder) / "cache"
+
+
+@pytest.fixture(scope="session")
+def fits(cache) -> FitStore:
+    """The learned tasks, where a process finds them whose `XDG_CACHE_HOME` is the folder of caches."""
+    return FitStore(cache / "dt-viz")
 
 
 @pytest.fixture(scope="session")

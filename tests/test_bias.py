@@ -163,7 +163,7 @@ def test_in_a_plane_nothing_moves_out_of_it(seed):
 # motions
 
 
-@pytest.mark.parametrize("task", ["draw_s", "lift_box", "push_box"])
+@pytest.mark.parametrize("task", ["draw_s", "lift_box", pytest.param("push_box", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("num", [15, pytest.param(30, marks=pytest.mark.slow)])
 def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(nominal, task, num):
     g, rng, off, turns = nominal(task), np.random.default_rng(7), [], []
@@ -255,7 +255,9 @@ def test_a_chosen_strength_is_taken_as_it_is():
 
 
 @pytest.mark.parametrize("order", [1, -1])
-@pytest.mark.parametrize("task", ["draw_s", "draw_j", "lift_box", "push_box"])
+@pytest.mark.parametrize(
+    "task", ["draw_s", "lift_box", *(pytest.param(task, marks=pytest.mark.slow) for task in ("draw_j", "push_box"))]
+)
 def test_two_bias_points_in_either_order(nominal, task, order):
     g, plane = nominal(task), plane_of(task)
     path = resample_by_arc_length(g.bundle.paths[0], 101)

@@ -3,7 +3,7 @@
 import io
 import itertools
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -13,25 +13,28 @@ from PIL import Image
 from scenes import beside, changing
 
 import dt_viz.learning.store
+from dt_viz.learning.store import FitStore
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.control import Phase
 from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.obstacles.shapes import MeshObstacle
-from dt_viz.scenario.scenario import View
+from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.server import Server
-from dt_viz.ui.visitor import Visitor
+from dt_viz.ui.visitor import Visitor, initial_scenario
 
 WIDTH, HEIGHT = 900, 560
+CORNER = (5, 5)
+"""CSS pixels where the mouse touches nothing."""
 PATIENCE = 240.0
 """Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
 TRIES = 8
 """Drags or clicks until the page, which may still be on its way to what was asked of it, has taken one."""
-LIGHT = View(playing=False, field=False, arm=False, table=False, demonstrations=False)
-"""What is drawn by software thirty times a second; with the arm it takes most of a second."""
+LIGHT = View(playing=False, rollouts=False, ghost=False, field=False, arm=False, table=False, demonstrations=False)
+"""The obstacle only: drawing the lines by software takes a tenth of a second, and the arm most of one."""
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 
@@ -44,8 +47,9 @@ UNHURRIED = """
 
 
 @pytest.fixture(scope="module")
-def server(fits):
-    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=2)
+def server():
+    """Knows nothing that other tests have learned, so that it has to learn what a test here chooses."""
+    server = Server(TASKS, FitStore(None), task="draw_s", port=0, max_sessions=2)
     yield server
     server.close()
 
@@ -93,15 +97,65 @@ def open_page(browser, server):
     return page, visitor
 
 
-@pytest.fixture
-def visit(browser, server):
-    page_errors.clear()
-    page, visitor = open_page(browser, server)
-    wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
-    yield page, visitor
+def close_page(page, server, visitor):
     page.close()
     wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
+
+
+class Tab:
+    """One tab for all tests: opening it takes longer than most of them."""
+
+    def __init__(self, browser, server):
+        self._browser, self._server, self._opened = browser, server, None
+        self.sound = True
+        """Whether it can be visited again: not after a test that failed, until that is known of the next one."""
+
+    def visit(self):
+        if not self.sound:
+            self.close()
+        if self._opened is None:
+            self._opened = open_page(self._browser, self._server)
+        self.sound = False
+        return self._opened
+
+    def close(self):
+        if self._opened is not None:
+            page, visitor = self._opened
+            self._opened = None
+            close_page(page, self._server, visitor)
+
+
+@pytest.fixture(scope="module")
+def tab(browser, server):
+    tab = Tab(browser, server)
+    yield tab
+    tab.close()
+
+
+@pytest.fixture
+def visit(tab, initial, request):
+    """The tab as it is when a visitor comes, but for the arm: the hand avoids, and nothing else is drawn or moves."""
+    page_errors.clear()
+    failed = request.session.testsfailed
+    page, visitor = tab.visit()
+    begin(visitor, replace(initial("draw_s"), view=LIGHT))
+    page.mouse.move(*CORNER)
+    open_tab(page, "World")
+    visitor.client.camera.position, visitor.client.camera.look_at = TASKS["draw_s"]().camera
+    until_drawn(visitor)
+    close_notices(page)
+    wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
+    yield page, visitor
+    tab.sound = request.session.testsfailed == failed
     assert [error for error in page_errors if OF_VISER not in error] == []
+
+
+def begin(visitor: Visitor, scenario: Scenario) -> None:
+    """Begin with a scenario, and wait until it is shown."""
+    visitor.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(Scenario)})
+    visitor.session.end_gesture()
+    assert visitor.session.wait_idle(PATIENCE)
+    assert visitor.shown is not None and visitor.shown.scenario.moves_like(scenario)
 
 
 def camera_rests(visitor: Visitor) -> bool:
@@ -187,7 +241,7 @@ def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
     )
     obstacle = after.scenario.obstacle
     assert max(maximum_collision_distance(path, obstacle.signed_distance) for path in after.rollouts) == 0
-    assert after.certificates.clearance > 0  # of the spheres that cover the arm, which stick out of it
+    assert after.certificates.clearance > 0
 
 
 def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_pose_is_shown(visit):
@@ -231,6 +285,16 @@ def press(locator):
     locator.click(force=True)
 
 
+def choose(page, visitor, dropdown, option):
+    """Choose in a dropdown of the panel, once it is where it stays, and shows what was chosen before.
+
+    Its list may still be on its way to its place: no pixel of it is clicked.
+    """
+    until_drawn(visitor)
+    press(page.get_by_label(dropdown, exact=True))
+    press_unseen(page.get_by_role("option", name=option, exact=True))
+
+
 def press_unseen(locator):
     """Click wherever the panel is scrolled to."""
     locator.evaluate("element => element.click()")
@@ -271,8 +335,7 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     x, y = project(visitor, sphere.position)
     page.mouse.click(x - 18, y + 14)
     wait_until(lambda: [item.handles.shown for item in pictures.items] == [True, False], "the sphere to be selected")
-    press(page.locator("input[value='1: sphere']").first)
-    press(page.get_by_role("option", name="2: box"))
+    choose(page, visitor, "Selected", "2: box")
     wait_until(lambda: session.scenario.selected == 1, "the box to be selected")
     click_button(page, "Delete")
     wait_until(lambda: session.scenario.obstacles == (sphere,) and len(pictures.items) == 1, "the box to go")
@@ -280,13 +343,19 @@ def test_a_box_is_added_dragged_and_deleted_and_a_click_selects_the_sphere(visit
     page.get_by_text("no obstacle").first.wait_for()
 
 
+def upload_in(page):
+    """The input for a file, in its folder, which stays open from test to test."""
+    if not page.get_by_role("button", name="Mesh or point cloud").is_visible():
+        press(page.get_by_text("From a file", exact=True))
+    return page.locator("input[type=file]").first
+
+
 def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     page, visitor = visit
     session = visitor.session
     session.edit("test", **changing(session.scenario, obstacles=(), avoids=False))
     crate = trimesh.creation.box((150, 100, 50)).export(file_type="stl")
-    press(page.get_by_text("From a file", exact=True))
-    upload = page.locator("input[type=file]").first
+    upload = upload_in(page)
     upload.set_input_files({"name": "crate.stl", "mimeType": "model/stl", "buffer": crate})
     page.get_by_text("seems to be in millimetres: 150 × 100 × 50 units").first.wait_for()
     assert session.scenario.obstacles == ()
@@ -326,8 +395,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
 
 def test_a_file_that_is_too_large_is_refused_with_a_reason_and_the_next_can_be_chosen(visit):
     page, visitor = visit
-    press(page.get_by_text("From a file", exact=True))
-    upload = page.locator("input[type=file]").first
+    upload = upload_in(page)
     upload.set_input_files({"name": "city.stl", "mimeType": "model/stl", "buffer": bytes(MAX_BYTES + 1)})
     page.get_by_text("city.stl: file: found 20.0 MB; accepted: at most 20 MB").wait_for(timeout=1000 * PATIENCE)
     page.get_by_text("Uploading city.stl").wait_for(state="detached", timeout=1000 * PATIENCE)
@@ -376,7 +444,7 @@ def test_a_bias_point_is_added_dragged_in_the_drawing_plane_and_switched_off_in_
 
 def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
     page, visitor = visit
-    visitor.session.edit("test", view=View(playing=False, colour="det"))
+    visitor.session.edit("test", view=replace(LIGHT, rollouts=True, arm=True, table=True, colour="det"))
     assert visitor.session.wait_idle(PATIENCE)
     open_tab(page, "Picture")
     with page.expect_download() as download:
@@ -398,23 +466,22 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
 def test_what_was_learned_of_a_sphere_without_points_is_shown(visit):
     """The browser complains of points without colours; see the fixture."""
     page, visitor = visit
-    visitor.session.edit("test", view=View(colour="occupancy"))
+    visitor.session.edit("test", view=replace(LIGHT, colour="occupancy"))
     assert visitor.session.wait_idle(PATIENCE)
     press(page.get_by_text("Show", exact=True))
     page.get_by_text("Learned occupancy: how likely something is there").wait_for(timeout=1000 * PATIENCE)
-    page.wait_for_timeout(1000)
+    until_drawn(visitor)
 
 
-def test_reset_brings_back_the_scene_and_the_camera(visit):
+def test_reset_brings_back_the_scene_and_the_camera(visit, engine):
     page, visitor = visit
-    begun = replace(visitor.session.scenario, view=View())
     drag(page, (100, HEIGHT - 60), (260, HEIGHT - 120))
     visitor.session.edit("test", **changing(visitor.session.scenario, temperature=2.0), view=View(grid=True))
     wait_until(lambda: not camera_rests(visitor), "the camera to be turned")
-    page.wait_for_timeout(1000)
+    until_drawn(visitor)
     click_button(page, "Reset")
     wait_until(lambda: camera_rests(visitor), "the camera to be back")
-    assert visitor.session.scenario == begun
+    assert visitor.session.scenario == initial_scenario(engine, "draw_s")
 
 
 def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):
@@ -430,15 +497,13 @@ def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, serv
         third.get_by_text("All 2 places are taken").wait_for()
     finally:
         third.close()
-        page.close()
-    wait_until(lambda: second not in server.visitors, "the second visitor to leave")
+        close_page(page, server, second)
     assert len(server.visitors) == 1
 
 
 def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
     page, visitor = visit
-    press(page.get_by_role("textbox", name="Task").or_(page.locator("input[value='Draw S']")).first)
-    press(page.get_by_role("option", name="Lift box"))
+    choose(page, visitor, "Task", "Lift box")
     wait_until(lambda: visitor.shown is not None and visitor.shown.task.name == "lift_box", "the other task")
     assert len(visitor.shown.rollouts) == 8
 
@@ -495,7 +560,7 @@ ARM_LAYERS = {  # the layer's label in the page, its field of View, and which pi
 
 def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit, monkeypatch):
     page, visitor = visit
-    session, plain = visitor.session, View(playing=False, replay=True, field=False, ghost=False)
+    session, plain = visitor.session, replace(LIGHT, replay=True, arm=True)
     session.edit("test", view=plain)
     wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
     q = visitor.shown.arm.q[50]
@@ -526,11 +591,10 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit, m
 
 def test_who_avoids_is_chosen_in_the_page(visit):
     page, visitor = visit
-    assert visitor.session.scenario.avoidance.space == "cspace"
-    press(page.get_by_role("textbox", name="Avoid").or_(page.locator("input[value='Arm']")).first)
-    press(page.get_by_role("option", name="Hand"))
-    wait_until(lambda: visitor.session.scenario.avoidance.space == "task", "the choice to arrive")
-    wait_until(lambda: visitor.shown.scenario.avoidance.space == "task", "its picture")
+    for label, space in (("Arm", "cspace"), ("Hand", "task")):
+        choose(page, visitor, "Avoid", label)
+        wait_until(lambda space=space: visitor.session.scenario.avoidance.space == space, "the choice to arrive")
+        wait_until(lambda space=space: visitor.shown.scenario.avoidance.space == space, "its picture")
     visitor.session.edit("test", view=replace(LIGHT, arm=True))
     press(page.get_by_role("button", name="Let the whole arm avoid"))
     wait_until(lambda: visitor.session.scenario.avoidance.space == "cspace", "the whole arm to avoid again")
@@ -548,10 +612,9 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
 
     monkeypatch.setattr(dt_viz.learning.store, "fit", endless)
     open_tab(page, "Stack")
-    press(page.get_by_role("textbox", name="Settings of").or_(page.locator("input[value='Whole arm']")).first)
-    press(page.get_by_role("option", name="Imitation"))
-    press(page.get_by_role("textbox", name="Learn").or_(page.locator("input[value='trajectory']")).first)
-    press(page.get_by_role("option", name="velocity"))
+    choose(page, visitor, "Settings of", "Imitation")
+    wait_until(lambda: visitor.session.scenario.view.tuned == "Imitation", "its settings")
+    choose(page, visitor, "Learn", "velocity")
     page.get_by_text("Learning the motion: without end").wait_for()
     press(page.get_by_role("button", name="Cancel"))
     page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for()
@@ -567,7 +630,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
     session.edit(
         "test",
         **changing(session.scenario, obstacles=()),
-        view=View(playing=False, field=False, table=False, demonstrations=False),
+        view=replace(LIGHT, arm=True),
     )
     wait_until(
         lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion without obstacle"
@@ -587,7 +650,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
     assert abs(hand[1] - before[1]) < 5e-3  # parallel to the drawing plane, y = const
     np.testing.assert_allclose(project(visitor, hand), from_the_ball()[1], atol=12)
     np.testing.assert_allclose(live.ahead[[0, -1]], [hand, visitor.shown.goal], atol=1e-2)
-    session.edit("play", view=View(speed=3.0, field=False, table=False, demonstrations=False))
+    session.edit("play", view=replace(LIGHT, arm=True, playing=True, speed=3.0))
     wait_until(lambda: np.linalg.norm(visitor._hand() - visitor.shown.goal) < 5e-3, "the goal")
     wait_until(lambda: live.phase is Phase.HOMING, "the next round")
 

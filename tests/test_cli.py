@@ -21,11 +21,6 @@ PATIENCE = 120.0
 """Seconds that anything may take: the machine may be busy."""
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
 @contextmanager
 def started(cache, *arguments):
     """The process."""

@@ -166,10 +166,11 @@ def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_the_last_frame_says_what_margin_the_meshes_keep(new_engine, initial, monkeypatch, kept):
+def test_the_last_frame_says_what_margin_the_meshes_keep(engine, new_engine, initial, monkeypatch, kept):
     if not kept:  # the flow ends where the covering spheres are clear
         monkeypatch.setattr("dt_viz.arm.whole_arm.MESH_ROUNDING", np.inf)
-    engine, margin, scenario = new_engine(), 0.01, changed(initial("draw_s"), space="cspace", margin=0.01)
+        engine = new_engine()
+    margin, scenario = 0.01, changed(initial("draw_s"), space="cspace", margin=0.01)
     frame = stage(engine, scenario, Stage.CERTIFIED)
     model, arm = load_collision_model(), engine.solved(scenario, FINE).arm
     clearance = [

@@ -61,10 +61,10 @@ def lasa(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
+def fits_of_the_tests(cache):
     """Fits go to a folder of the tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(cache))
         yield
 
 

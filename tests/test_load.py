@@ -14,12 +14,24 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.server import Server
 
 NUM_VISITORS = 8
+NUM_POSES = 12
+"""Number of poses to drag to: more than a visitor's edits here."""
 PATIENCE = 240.0
 """Seconds that anything may take: the machine may be busy."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few(cache):
+    """Fewer poses, as near to each other; and what is learned is known to the servers and the measurement."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(load, "RADIUS", load.RADIUS * NUM_POSES / load.NUM_POSES)
+        patch.setattr(load, "NUM_POSES", NUM_POSES)
+        patch.setenv("XDG_CACHE_HOME", str(cache))
+        yield
+
+
 @pytest.fixture(scope="module")
-def poses(engine):
+def poses(few, engine):
     return load.Poses(engine, engine.task("draw_s"))
 
 
@@ -33,8 +45,8 @@ def shown(poses, index, *, finest=False):
 
 
 def test_a_pose_is_found_by_its_rollouts(poses):
-    assert [poses.find(shown(poses, index)) for index in (0, 41, 99)] == [0, 41, 99]
-    assert poses.find(shown(poses, 41) + np.float32(1e-3)) is None
+    assert [poses.find(shown(poses, index)) for index in (0, 4, 11)] == [0, 4, 11]
+    assert poses.find(shown(poses, 4) + np.float32(1e-3)) is None
 
 
 @pytest.mark.parametrize("finest", [False, True])
@@ -54,27 +66,24 @@ async def first_pictures(url):
         return await asyncio.gather(*(client.wait_for(lambda c=client: c.has_picture, PATIENCE) for client in clients))
 
 
-def test_all_who_come_at_the_same_instant_get_their_picture(fits):
+@pytest.fixture(scope="module")
+def url(fits):
+    """Address of a server in this process."""
     server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=NUM_VISITORS)
-    try:
-        assert all(asyncio.run(first_pictures(f"ws://127.0.0.1:{server.port}")))
-    finally:
-        server.close()
+    yield f"ws://127.0.0.1:{server.port}"
+    server.close()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """The task is learned once, here and in the servers that are started."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
+def test_all_who_come_at_the_same_instant_get_their_picture(url):
+    assert all(asyncio.run(first_pictures(url)))
 
 
 def test_visitors_drag_in_a_started_server_and_are_shown_the_last_pose(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
     monkeypatch.setattr(load, "PATIENCE", PATIENCE)
+    monkeypatch.setattr(load, "REST", 0.0)
     out = tmp_path / "load.json"
-    assert main(["load", "--clients", "2", "--seconds", "2", "--rounds", "2", "--out", str(out)]) == 0
+    assert main(["load", "--clients", "2", "--seconds", "0.5", "--rounds", "2", "--out", str(out)]) == 0
     figures = json.loads(out.read_text())
     assert np.array(figures["first_picture_s"]).shape == (2, 2)
     assert [visitor["last_shown"] for visitor in figures["visitors"]] == [True, True]
@@ -85,13 +94,15 @@ def test_visitors_drag_in_a_started_server_and_are_shown_the_last_pose(tmp_path,
     assert f"median {figures['median_ms']:.0f} ms" in printed
 
 
-def test_who_gets_no_picture_fails_the_measurement(monkeypatch, capsys):
+def test_who_gets_no_picture_fails_the_measurement(monkeypatch, capsys, url):
+    monkeypatch.setattr(load, "NUM_POSES", 1)
     monkeypatch.setattr(load, "FIRST_PICTURE", 0.0)
-    assert main(["load", "--clients", "1", "--seconds", "1"]) == 1
+    assert main(["load", "--clients", "1", "--seconds", "1", "--url", url]) == 1
     assert "round 1: 0 of 1 have a picture" in capsys.readouterr().out
 
 
-def test_a_server_that_is_not_there_fails_the_measurement(capsys, unused_port):
+def test_a_server_that_is_not_there_fails_the_measurement(monkeypatch, capsys, unused_port):
+    monkeypatch.setattr(load, "NUM_POSES", 1)
     assert main(["load", "--clients", "1", "--seconds", "1", "--url", f"ws://127.0.0.1:{unused_port}"]) == 1
     assert "a visitor was lost" in capsys.readouterr().err
 

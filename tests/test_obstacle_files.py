@@ -11,6 +11,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles.files import MAX_BYTES, MAX_FACES, ShapeError, read_cloud, read_mesh
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle
 
@@ -198,6 +199,16 @@ class TestMeshes:
         assert time.thread_time() - start < 20  # a tenth of it on a machine at rest
 
 
+@pytest.fixture
+def coarse(monkeypatch):
+    """What is read is looked at, not how finely it is mapped."""
+    monkeypatch.setattr(clouds, "NUM_NODES", 16**3)
+    monkeypatch.setattr(solids, "NUM_NODES", 24**3)
+    monkeypatch.setattr(solids, "NUM_SAMPLES", 6000)
+    monkeypatch.setattr(solids, "NUM_PROBES", 6000)
+
+
+@pytest.mark.usefixtures("coarse")
 class TestClouds:
     @pytest.mark.parametrize(
         ("content", "name"),

@@ -14,6 +14,14 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import POTS, TASKS
 
+OTHER_LETTERS = [f"letter_{letter}" for letter in "cgz"]
+"""Scenes of the same kind as that of the W."""
+
+
+def all_but_slow(names):
+    """Each name, those of the other letters marked."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in OTHER_LETTERS)) for name in names]
+
 
 @pytest.fixture(scope="module")
 def certified(engine):
@@ -29,7 +37,7 @@ def certified(engine):
     return frame
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", all_but_slow(SCENES))
 def test_a_scene_is_computed_without_warnings(certified, name):
     frame, scene = certified(name), SCENES[name]
     assert frame.scenario.scene == name == scene.name
@@ -112,11 +120,11 @@ def test_the_clover_is_the_same_every_time():
     assert clover() == before == Cloud(before.points, before.labels)
 
 
-@pytest.mark.parametrize("letter", "cgwz")
-def test_every_stroke_of_a_letter_goes_around_the_sphere_and_the_arm_with_it(certified, letter):
-    frame = certified(f"letter_{letter}")
+@pytest.mark.parametrize("name", all_but_slow(["letter_w", *OTHER_LETTERS]))
+def test_every_stroke_of_a_letter_goes_around_the_sphere_and_the_arm_with_it(certified, name):
+    frame = certified(name)
     (sphere,) = frame.scenario.obstacles
-    assert isinstance(sphere, Sphere) and frame.task.name == f"draw_{letter}"
+    assert isinstance(sphere, Sphere) and frame.task.name == name.replace("letter", "draw")
     assert min(maximum_collision_distance(path, sphere.signed_distance) for path in frame.ghost) > 0.02  # on each
     assert max(maximum_collision_distance(path, sphere.signed_distance) for path in frame.rollouts) == 0
     assert frame.certificates.collision.warnings == ()
