@@ -170,8 +170,9 @@ class TestHolding:
         assert whole.missed() < 1e-3
         whole.assert_no_jump()
 
-    def test_it_is_held_also_in_a_pause_and_stays_where_it_is_let_go(self, whole):
-        whole.run(1.5)
+    @pytest.mark.parametrize("seconds", [0.0, 1.5])
+    def test_it_is_held_also_in_a_pause_and_stays_where_it_is_let_go(self, whole, seconds):
+        whole.run(seconds)
         place = whole.hand + np.array([0.0, 0.0, 0.08])
         whole.arm.hold(place)
         whole.run(0.1, moves=False)

@@ -135,10 +135,12 @@ class LiveArm:
         starts = tuple(np.array(nominal.numbers)[reached].tolist())
         if self._controller is None:
             first = chosen or 0
-            controller = Controller(self._follower, solved)
+            controller, q = Controller(self._follower, solved), self._q
+            if q is None:
+                q = _posture(self._follower, solved, first)
+            controller.begin(q)
             with self._changing:
-                self._q = _posture(self._follower, solved, first)
-                self._number, self._controller = nominal.numbers[first], controller
+                self._q, self._number, self._controller = q, nominal.numbers[first], controller
         else:
             self._controller.follow(solved)
         another = before is not None and (before.nominal.task is not nominal.task or number != self._chosen)

@@ -281,6 +281,12 @@ class Controller:
 
     # --- What happens to it ---
 
+    def begin(self, q: ArrayLike) -> None:
+        """Begin at a posture (6,), rad, before the first tick: what lies ahead is known from then on."""
+        with self._lock:
+            self._q = np.array(q, float)
+            self._anchor(self._q, NO_DODGE)
+
     def go(self) -> None:
         """Go to the goal from here."""
         self._set_out(Aim.GOAL)

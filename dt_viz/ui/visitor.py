@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
-import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
@@ -85,7 +84,8 @@ class Visitor:
             self.way = Way(client.scene)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
-        self._posed: Array | None = None
+        self._posed: tuple[bytes, bool] | None = None
+        """The posture that was drawn last, and whether with that without avoidance."""
         self._playback = Playback(engine.arm, self._pose)
         self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._look_home)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
@@ -219,9 +219,10 @@ class Visitor:
             return
         hand, live = self._robot.end_effector(q), self._playback.live
         with self.client.atomic():
-            if self._posed is None or not np.array_equal(q, self._posed):
-                self._posed = q
-                without = self._playback.without if view.ghost_arm or view.body_points else None
+            posed = q.tobytes(), view.ghost_arm or view.body_points
+            if posed != self._posed:
+                self._posed = posed
+                without = self._playback.without if posed[1] else None
                 self.arms.pose(q, q if without is None else without)
             self.carried.pose(hand, self._playback.arrived)
             if not view.replay:
