@@ -125,6 +125,7 @@ class Visitor:
             self.grip.ball.visible = not view.replay
             if view.replay:  # a drag of the ball ends without an event
                 self._playback.live.release()
+                self.way.forget()
         self._playback.play(view.playing, view.speed, replays=view.replay)
         self._panel.adopt(scenario)
 

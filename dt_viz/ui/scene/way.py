@@ -14,8 +14,10 @@ from dt_viz.ui.scene.picture import Lines, Shown, assign
 
 TRAIL_SECONDS = 2.5
 """Time after which the trail has faded, seconds."""
-STEP = 0.004
+STEP = 0.006
 """Shortest way of the hand that becomes a piece of the trail, metres."""
+PERIOD = 0.12
+"""Time between two drawings, seconds: each sends the whole line to the browser."""
 
 
 class Way(Shown):
@@ -27,7 +29,7 @@ class Way(Shown):
         self._trail = scene.add_line_segments(
             "/way/trail", np.zeros((1, 2, 3), np.float32), np.zeros(3, np.uint8), thickness=0.005
         )
-        self._drawn = np.empty((0, 3))
+        self._drawn, self._when = np.empty((0, 3)), -np.inf
         self._came: deque[tuple[float, Array]] = deque()
         """When the hand was where, the newest last."""
 
@@ -39,11 +41,14 @@ class Way(Shown):
             hand: (3,) where the hand is, metres.
             ahead: (K, 3) where it is going, metres.
         """
+        if not self._came or np.linalg.norm(hand - self._came[-1][1]) > STEP:
+            self._came.append((moment, hand))
+        if moment - self._when < PERIOD:
+            return
+        self._when = moment
         if not np.array_equal(ahead, self._drawn):
             self._drawn = ahead
             self.ahead.show([ahead])
-        if not self._came or np.linalg.norm(hand - self._came[-1][1]) > STEP:
-            self._came.append((moment, hand))
         while self._came and moment - self._came[0][0] > TRAIL_SECONDS:
             self._came.popleft()
         times, places = np.array([t for t, _ in self._came]), [*(place for _, place in self._came), hand]
