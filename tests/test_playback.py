@@ -34,7 +34,7 @@ class Player:
 
     def __init__(self):
         self.arm, self.places = Arm(), []
-        self.playback = Playback(self.arm, lambda: self.places.append(self.playback.q[0]))
+        self.playback = Playback(self.arm, lambda: self.places.append(self.playback.q[0]), pytest.fail)
 
     def play(self, seconds):
         """The places where the arm is meanwhile."""
@@ -68,9 +68,27 @@ def test_both_arms_are_shown_at_the_same_moment(moment):
 def test_the_arm_moves_without_being_asked_to(monkeypatch):
     monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
     arm, moved = Arm(), threading.Event()
-    playback = Playback(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
+    playback = Playback(arm, lambda: moved.set() if arm.q[0] > 0.1 else None, pytest.fail)
     assert moved.wait(PATIENCE)
     playback.close()
+
+
+def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkeypatch):
+    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
+    arm, said, moved = Arm(), [], threading.Event()
+    advance = arm.advance
+
+    def stuck(*_, **__):
+        raise ZeroDivisionError("no way")
+
+    def stop():
+        arm.advance = advance
+
+    arm.advance, arm.stop = stuck, stop
+    playback = Playback(arm, lambda: moved.set() if arm.q[0] > 0.1 else None, said.append)
+    assert moved.wait(PATIENCE)
+    playback.close()
+    assert [str(error) for error in said] == ["no way"]
 
 
 def test_its_time_has_the_chosen_pace_and_a_pause_stops_it(player):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -11,6 +12,8 @@ import numpy as np
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.engine.live_arm import LiveArm
 from dt_viz.flows.fields import Array
+
+logger = logging.getLogger(__name__)
 
 PICTURES_PER_SECOND = 25
 REST = 0.8
@@ -58,18 +61,18 @@ class Replay:
 class Playback:
     """Moves the arm, on a thread of its own, and has it drawn where it is another one than before."""
 
-    def __init__(self, live: LiveArm, draw: Callable[[], None]) -> None:
+    def __init__(self, live: LiveArm, draw: Callable[[], None], fail: Callable[[Exception], None]) -> None:
         """Begin to move the arm.
 
         Args:
             live: the arm in the loop.
             draw: draws the arm in its posture; called by the playback's thread.
+            fail: called with what keeps the arm in the loop from moving; it waits for its next motion then.
         """
         self.live, self.replay = live, Replay()
-        self._draw = draw
+        self._draw, self._fail = draw, fail
         self._replays = False
         self._playing, self._speed = True, 1.0
-        self._drawn: tuple[Array, ...] | None = None
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="playback", daemon=True)
         self._thread.start()
@@ -116,7 +119,12 @@ class Playback:
         before = time.monotonic()
         while not self._closed.wait(1 / PICTURES_PER_SECOND):
             now = time.monotonic()
-            self.advance(now - before)
+            try:
+                self.advance(now - before)
+            except Exception as error:
+                logger.exception("the arm stopped")
+                self.live.stop()
+                self._fail(error)
             before = now
 
     def advance(self, seconds: float) -> None:

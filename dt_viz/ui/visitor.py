@@ -86,7 +86,7 @@ class Visitor:
         self._robot = robot
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
-        self._playback = Playback(engine.arm, self._pose)
+        self._playback = Playback(engine.arm, self._pose, self.fail)
         self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._look_home)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
