@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from dt_viz.flows.fields import Array
@@ -22,6 +26,63 @@ ALIKE = np.cos(np.deg2rad(40.0))
 """Cosine of the largest angle between two directions of one escape."""
 SELECTIVITY = 0.03
 """Relative difference in cost over which a direction's share in its escape falls by a factor e, for smooth drags."""
+STAYING = 1.5
+"""Cost of the way out that was chosen before, relative to the least one, up to which it is kept."""
+TURNING = 120.0
+"""Angle, rad, by which a way out turns for each metre that its obstacle moves."""
+NEARBY = 0.1
+"""Distance that an obstacle may move from one motion to the next for its way out to be remembered, metres."""
+OPPOSITE = -0.7
+"""Cosine of the angle between two ways out beyond which the one turns to the other through a third."""
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """The way out of one obstacle that the motions around it take."""
+
+    obstacle: Obstacle
+    side: Array
+    """(3,) unit vector, the escape that was chosen."""
+    direction: Array
+    """(3,) unit vector of the motions' way out: the same, or on its way there from another one."""
+
+    def turned_from(self, before: Way, sides: Sequence[Array]) -> Way:
+        """The way on its way here from that before: an angle farther for each metre that the obstacle has moved.
+
+        Args:
+            before: the way out of the same obstacle where it was just before.
+            sides: (3,) unit vectors, all escapes, the cheapest first.
+        """
+        start, towards = before.direction, self.side
+        if start @ towards < OPPOSITE:  # over the cheapest escape that is across both
+            towards = next((side for side in sides if abs(start @ side) < -OPPOSITE), towards)
+        direction = _turned(start, towards, TURNING * _travel(before.obstacle, self.obstacle))
+        return self if direction is self.side else Way(self.obstacle, self.side, direction)
+
+
+def remembered(ways: Sequence[Way | None], obstacles: Sequence[Obstacle]) -> tuple[Way | None, ...]:
+    """The ways out of obstacles that are still the same, and near to where they were; None for the others."""
+    if len(ways) != len(obstacles):
+        return (None,) * len(obstacles)
+    return tuple(
+        way if way is not None and _travel(way.obstacle, obstacle) < NEARBY else None
+        for way, obstacle in zip(ways, obstacles, strict=True)
+    )
+
+
+def _turned(start: Array, towards: Array, most: float) -> Array:
+    """The unit vector `start` (3,), turned towards another one, not opposite, by an angle of at most `most`, rad."""
+    across = towards - (towards @ start) * start
+    size = float(np.linalg.norm(across))
+    angle = math.atan2(size, float(towards @ start))
+    return towards if angle <= most else math.cos(most) * start + math.sin(most) / size * across
+
+
+def _travel(before: Obstacle, after: Obstacle) -> float:
+    """Distance that an obstacle has moved, metres; infinite where it has also become another one."""
+    if before.moved(after.position, after.wxyz) != after:
+        return math.inf
+    return float(np.linalg.norm(np.subtract(before.position, after.position)))
 
 
 def escape_directions(
@@ -33,6 +94,7 @@ def escape_directions(
     *,
     num: int = 3,
     velocity: Array | None = None,
+    before: Array | None = None,
 ) -> list[Array]:
     """Find directions in which the arm can escape, the one with the least detour first.
 
@@ -47,9 +109,11 @@ def escape_directions(
         margin: required clearance, metres.
         num: largest number of directions.
         velocity: (3,) the obstacle's, m/s; None where it rests. Whoever runs away along it is caught up with.
+        before: (3,) escape that was chosen just before. What is nearest to it comes first, or second where it costs
+            more than `STAYING` times the least.
 
     Returns:
-        Unit vectors (3,), one for each distinct escape.
+        Unit vectors (3,), one for each distinct escape; all of them where there is one `before`.
     """
     directions = golden_spiral(NUM_DIRECTIONS, 0.5)
     centres, radii = obstacle.cover()
@@ -73,11 +137,17 @@ def escape_directions(
     cost = detour * (1 + SIDEWAYS * parallel) + TABLE_WEIGHT * below
 
     found: list[Array] = []
-    while len(found) < num and np.isfinite(cost).any():
+    costs: list[float] = []
+    while (before is not None or len(found) < num) and np.isfinite(cost).any():
         best = directions[cost.argmin()]
+        costs.append(float(cost.min()))
         alike = directions @ best > ALIKE
         share = np.where(alike, np.exp((cost.min() - cost) / (SELECTIVITY * cost.min())), 0)
         escape = share @ directions
         found.append(escape / np.linalg.norm(escape))
         cost[alike] = np.inf
+    if before is not None:
+        kept = int(np.argmax(np.stack(found) @ before))
+        if kept:
+            found.insert(0 if costs[kept] < STAYING * costs[0] else 1, found.pop(kept))
     return found
