@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
 from dt_viz.flows.fields import Array
@@ -28,61 +24,6 @@ SELECTIVITY = 0.03
 """Relative difference in cost over which a direction's share in its escape falls by a factor e, for smooth drags."""
 STAYING = 1.5
 """Cost of the way out that was chosen before, relative to the least one, up to which it is kept."""
-TURNING = 120.0
-"""Angle, rad, by which a way out turns for each metre that its obstacle moves."""
-NEARBY = 0.1
-"""Distance that an obstacle may move from one motion to the next for its way out to be remembered, metres."""
-OPPOSITE = -0.7
-"""Cosine of the angle between two ways out beyond which the one turns to the other through a third."""
-
-
-@dataclass(frozen=True, eq=False)
-class Way:
-    """The way out of one obstacle that the motions around it take."""
-
-    obstacle: Obstacle
-    side: Array
-    """(3,) unit vector, the escape that was chosen."""
-    direction: Array
-    """(3,) unit vector of the motions' way out: the same, or on its way there from another one."""
-
-    def turned_from(self, before: Way, sides: Sequence[Array]) -> Way:
-        """The way on its way here from that before: an angle farther for each metre that the obstacle has moved.
-
-        Args:
-            before: the way out of the same obstacle where it was just before.
-            sides: (3,) unit vectors, all escapes, the cheapest first.
-        """
-        start, towards = before.direction, self.side
-        if start @ towards < OPPOSITE:  # over the cheapest escape that is across both
-            towards = next((side for side in sides if abs(start @ side) < -OPPOSITE), towards)
-        direction = _turned(start, towards, TURNING * _travel(before.obstacle, self.obstacle))
-        return self if direction is self.side else Way(self.obstacle, self.side, direction)
-
-
-def remembered(ways: Sequence[Way | None], obstacles: Sequence[Obstacle]) -> tuple[Way | None, ...]:
-    """The ways out of obstacles that are still the same, and near to where they were; None for the others."""
-    if len(ways) != len(obstacles):
-        return (None,) * len(obstacles)
-    return tuple(
-        way if way is not None and _travel(way.obstacle, obstacle) < NEARBY else None
-        for way, obstacle in zip(ways, obstacles, strict=True)
-    )
-
-
-def _turned(start: Array, towards: Array, most: float) -> Array:
-    """The unit vector `start` (3,), turned towards another one, not opposite, by an angle of at most `most`, rad."""
-    across = towards - (towards @ start) * start
-    size = float(np.linalg.norm(across))
-    angle = math.atan2(size, float(towards @ start))
-    return towards if angle <= most else math.cos(most) * start + math.sin(most) / size * across
-
-
-def _travel(before: Obstacle, after: Obstacle) -> float:
-    """Distance that an obstacle has moved, metres; infinite where it has also become another one."""
-    if before.moved(after.position, after.wxyz) != after:
-        return math.inf
-    return float(np.linalg.norm(np.subtract(before.position, after.position)))
 
 
 def escape_directions(

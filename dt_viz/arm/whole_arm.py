@@ -25,7 +25,7 @@ from dt_viz.arm.cspace import (
     WholeArmField,
     squared_lengths,
 )
-from dt_viz.arm.escape import Way, escape_directions, remembered
+from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import JointPath, track
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
@@ -35,6 +35,7 @@ from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.ways import Way, remembered
 from dt_viz.properties import cached_property
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -229,7 +230,10 @@ class WholeArm:
         best = None
         for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
             escapes = [found[min(attempt, len(found) - 1)] if found else None for found in sides]
-            ways = [side if side is None else Way(part, side, side) for part, side in zip(parts, escapes, strict=True)]
+            ways = [
+                None if side is None else Way(part, side, side, kept=last is not None)
+                for part, side, last in zip(parts, escapes, known, strict=True)
+            ]
             tried = solution(ways)
             if best is None or tried.cleared or tried.clearance > best.clearance:
                 best = tried

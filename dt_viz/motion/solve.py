@@ -7,13 +7,13 @@ from itertools import islice
 
 import numpy as np
 
-from dt_viz.arm.escape import remembered
 from dt_viz.arm.whole_arm import ArmSolution, Lift
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal, Stance
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
+from dt_viz.obstacles.ways import remembered
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.transforms.base import start_warnings
 from dt_viz.warning import Kind
@@ -117,7 +117,8 @@ def _solved(
     scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Solved | None = None
 ) -> Solved:
     """The motion in the stance of `nominal`; see `solve`."""
-    stack, avoidance = build_stack(nominal, scenario.active, precision), scenario.arm_avoidance
+    stack = build_stack(nominal, scenario.active, precision, before and before.stack)
+    avoidance = scenario.arm_avoidance
     if avoidance is None:
         return Solved(scenario, nominal, nominal, stack)
     live = precision is LIVE

@@ -1,0 +1,124 @@
+"""Sides: on which of them all motions of the end effector pass an obstacle that is dragged through them.
+
+The flow that avoids an obstacle takes each motion out on the side of the obstacle's middle on which it is. So motions
+would change sides one by one as the middle is dragged across them. While it is dragged, all keep the side on which they
+have been: a flow along it first carries those that are beyond the middle back,
+
+    ẏ = n exp(−‖y − c‖²/2σ²),    σ the obstacle's radius,
+
+until all pass the middle c by `ROOM` on the side n. Where they do so already it is the identity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import erfi
+
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.ways import Way
+from dt_viz.transforms.base import MotionBelow
+
+ROOM = 8e-3
+"""Distance, metres, of all motions from an obstacle's middle on the side on which they pass it."""
+KEPT = 0.25
+"""Distance of the motions beyond the middle up to which they keep their side, in the obstacle's radii."""
+ALIKE = 0.5
+"""Cosine of the angle between a side and the one on which motions are, up to which they turn to it."""
+INNER = 0.6
+"""Distance from the middle up to which a motion's side counts in full, in the obstacle's radii."""
+FARTHEST = 1.0
+"""Distance by which motions are carried to their side at most, about, in the obstacle's radii."""
+UPWARDS = 0.01
+"""Distance beside the middle, metres, that outweighs passing above it, where motions turn to the opposite side."""
+TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Passes:
+    """Where motions pass the middle of an obstacle within its radius."""
+
+    obstacle: Obstacle
+    offsets: Array
+    """(K, 3) from the middle to the nearest point of each pass, metres."""
+    tangent: Array
+    """(3,) mean direction of the passes, a unit vector."""
+
+    @classmethod
+    def of(cls, motion: MotionBelow, obstacle: Obstacle) -> Passes | None:
+        """The passes of the rollouts that have a demonstration; None where none comes so near."""
+        motion = motion.demonstrated
+        offset = motion.positions - np.asarray(obstacle.position)
+        distance = np.linalg.norm(offset, axis=1)
+        inside = np.flatnonzero(distance < obstacle.radius)
+        if not len(inside):
+            return None
+        begins = np.flatnonzero(np.diff(inside, prepend=-2) + np.diff(motion.index[inside], prepend=-1) > 1)
+        parts = np.split(inside, begins[1:])
+        nearest = np.array([part[distance[part].argmin()] for part in parts])
+        is_last = np.diff(motion.index, append=-1) != 0
+        after = np.where(is_last[nearest], nearest, nearest + 1)
+        tangents = offset[after] - offset[after - 1]
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
+        offsets = offset[nearest]
+        offsets = offsets - (offsets * tangents).sum(axis=1, keepdims=True) * tangents
+        return cls(obstacle, offsets, np.linalg.svd(tangents)[2][0])
+
+    @property
+    def mean(self) -> Array:
+        """(3,) mean offset, metres; the nearer ones count more."""
+        weights = np.maximum(1 - (self.offsets**2).sum(axis=1) / self.obstacle.radius**2, TINY)
+        return weights @ self.offsets / weights.sum()
+
+    def way(self, before: Way | None, *, gradually: bool) -> Way | None:
+        """The way out on the side on which the motions are, or on which they were before while they are near to it.
+
+        None where they are too far apart to pass on one side.
+
+        Args:
+            before: the way out of the obstacle where it was just before; None where there was none.
+            gradually: whether it turns there as the obstacle moves on; else it is there at once.
+        """
+        mean = self.mean
+        nearest = self._across(mean)
+        if before is None:
+            return Way(self.obstacle, nearest, nearest)
+        kept = self._across(before.side)
+        settled = float((self.offsets @ nearest).min()) >= ROOM
+        gone = -mean @ kept > KEPT * self.obstacle.radius
+        side = nearest if gone or (settled and nearest @ kept > ALIKE) else kept
+        ways = [Way(self.obstacle, side, side, kept=True), Way(self.obstacle, nearest, nearest, kept=True)]
+        if gradually:
+            over = np.cross(self.tangent, before.direction)
+            over = self._across(over if mean @ over + UPWARDS * over[2] > 0 else -over)
+            ways.insert(0, ways[0].turned_from(before, [over]))
+        longest = FARTHEST * self.obstacle.radius
+        return next((way for way in ways if self.duration(way.direction) <= longest), None)
+
+    def duration(self, direction: Array) -> float:
+        """Time, metres, for which the flow along a unit vector (3,) runs until all passes are on that side."""
+        sigma = self.obstacle.radius
+        along = self.offsets @ direction
+        squared = (self.offsets**2).sum(axis=1)
+        aside = np.exp((squared - along**2) / (2 * sigma**2))
+        scale = np.sqrt(2) * sigma
+        duration = aside * sigma * np.sqrt(np.pi / 2) * (erfi(ROOM / scale) - erfi(along / scale))
+        outer = (np.sqrt(squared) / sigma - INNER) / (1 - INNER)
+        return float((duration * np.clip(1 - outer, 0, 1)).max(initial=0.0))
+
+    def field(self, direction: Array) -> GridRBF:
+        """The generator of that flow, (N, 3) of no unit; it is against the direction: motions follow the reverse."""
+        position = np.asarray(self.obstacle.position)
+        grid = GaussianGrid(tuple(np.array([c]) for c in position), 0.5 / self.obstacle.radius**2)
+        return GridRBF(grid, -direction[None])
+
+    def _across(self, direction: Array) -> Array:
+        """A direction (3,) without what is along the passes, a unit vector."""
+        across = direction - (direction @ self.tangent) * self.tangent
+        size = float(np.linalg.norm(across))
+        if size > TINY:
+            return across / size
+        least = np.eye(3)[np.abs(self.tangent).argmin()]
+        return self._across(least)
