@@ -24,7 +24,7 @@ The npz file holds for each step, drag after drag:
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -46,16 +46,16 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_npz,
 )
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.avoidance import Avoidance, Space
 
-SPACE = {"hand": "task", "arm": "cspace"}
+SPACE: Mapping[str, Space] = {"hand": "task", "arm": "cspace"}
 """Spaces of the avoidance."""
 JUMP = 0.05
 """Fréchet distance of a rollout from the one in the frame before beyond which it jumps, metres."""
@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".npz")
     fits, robot = FitStore(default_cache_folder()), load_jaco()
     drags = []
-    for places in _drags(task, options):
+    for places in paths(task, options):
         drags.append(_measured(Engine(tasks, fits, robot), Engine(tasks, fits, robot), task, places, options))
     moved = [drag.moved for drag in drags]
     write_npz(
@@ -135,7 +135,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _drags(task: Task, options: argparse.Namespace) -> Iterator[Array]:
+def paths(task: Task, options: argparse.Namespace) -> Iterator[Array]:
     """The places (S, 3) of each drag, metres."""
     if (options.begin is None) != (options.end is None):
         raise InputError("--from, --to", "one of them", "both, or none of them for random drags")
@@ -212,9 +212,9 @@ def _by_number(frame: Frame, numbers: Sequence[int], points: int, task: Task) ->
     return rollouts
 
 
-def _jumps(moved: Array) -> Array:
+def _jumps(moved: Array) -> Mask:
     """Which frames (S,) a rollout jumps in."""
-    return (moved > JUMP).any(axis=1)
+    return np.any(moved > JUMP, axis=1)
 
 
 def _off_at_rest(drag: Drag) -> float:
@@ -225,12 +225,12 @@ def _off_at_rest(drag: Drag) -> float:
 def _row(drags: Sequence[Drag], moved: Sequence[Array]) -> tuple[str, ...]:
     """The row of some drags in the table."""
     of_all, seconds = np.concatenate(moved), np.concatenate([drag.seconds for drag in drags])
-    whole = (of_all > JUMP) | np.isnan(of_all)
+    whole = np.all((of_all > JUMP) | np.isnan(of_all), axis=1) & _jumps(of_all)
     return (
         str(len(of_all) - len(drags)),
         str(sum(int(drag.blocked.sum()) for drag in drags)),
         str(_jumps(of_all).sum()),
-        str((whole.all(axis=1) & _jumps(of_all)).sum()),
+        str(whole.sum()),
         f"{1e3 * np.nanmax(of_all, initial=0.0):.0f}",
         f"{1e3 * max(_off_at_rest(drag) for drag in drags):.1f}",
         f"{1e3 * np.median(seconds):.1f}",

@@ -41,7 +41,7 @@ class Way:
         start, towards = before.direction, self.side
         if start @ towards < OPPOSITE:
             towards = next((direction for direction in across if abs(start @ direction) < -OPPOSITE), towards)
-        direction = _turned(start, towards, TURNING * _travel(before.obstacle, self.obstacle))
+        direction = turned(start, towards, TURNING * _travel(before.obstacle, self.obstacle))
         return self if direction is self.side else replace(self, direction=direction)
 
 
@@ -57,7 +57,7 @@ def remembered(ways: Sequence[Way | None], obstacles: Sequence[Obstacle]) -> tup
     return tuple(known(way, obstacle) for way, obstacle in zip(ways, obstacles, strict=True))
 
 
-def _turned(start: Array, towards: Array, most: float) -> Array:
+def turned(start: Array, towards: Array, most: float) -> Array:
     """The unit vector `start` (3,), turned towards another one, not opposite, by an angle of at most `most`, rad."""
     across = towards - (towards @ start) * start
     size = float(np.linalg.norm(across))

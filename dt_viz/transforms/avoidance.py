@@ -244,19 +244,20 @@ class Avoidance(Transform):
     def _kept_sides(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], list[Diffeomorphism]]:
         """Return the ways out of the obstacles, and the flows that keep all motions on one side of each.
 
-        Without ways out before, there is no such flow: each motion goes to the side that it is nearer to.
+        Without ways out before, there is no such flow: each motion goes to the side that it is nearer to. So it does
+        in a plane, where no way out turns from one side to the other.
         """
-        known = remembered(motion.before, self.obstacles)
+        known = remembered(motion.before if self.plane is None else (), self.obstacles)
         ways: list[Way | None] = []
         nudges: list[Diffeomorphism] = []
         for obstacle, before in zip(self.obstacles, known, strict=True):
             passes = Passes.of(motion, obstacle)
             way = None if passes is None else passes.way(before, gradually=motion.gradual)
             ways.append(way)
-            if passes is None or way is None or before is None:
-                continue
-            if (duration := passes.duration(way.direction)) > 0:
-                nudges.append(AdaptiveFlow(passes.field(way.direction), duration, motion.tolerance))
+            if passes is not None and way is not None and before is not None:
+                duration = passes.duration(way.direction)
+                if duration > 0:
+                    nudges.append(AdaptiveFlow(passes.field(way.direction), duration, motion.tolerance))
         return tuple(ways), nudges
 
     def satisfied(self, motion: MotionBelow) -> bool:

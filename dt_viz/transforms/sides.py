@@ -29,8 +29,6 @@ ALIKE = 0.5
 """Cosine of the angle between a side and the one on which motions are, up to which they turn to it."""
 INNER = 0.6
 """Distance from the middle up to which a motion's side counts in full, in the obstacle's radii."""
-FARTHEST = 1.0
-"""Distance by which motions are carried to their side at most, about, in the obstacle's radii."""
 UPWARDS = 0.01
 """Distance beside the middle, metres, that outweighs passing above it, where motions turn to the opposite side."""
 TINY = 1e-9
@@ -72,10 +70,8 @@ class Passes:
         weights = np.maximum(1 - (self.offsets**2).sum(axis=1) / self.obstacle.radius**2, TINY)
         return weights @ self.offsets / weights.sum()
 
-    def way(self, before: Way | None, *, gradually: bool) -> Way | None:
+    def way(self, before: Way | None, *, gradually: bool) -> Way:
         """The way out on the side on which the motions are, or on which they were before while they are near to it.
-
-        None where they are too far apart to pass on one side.
 
         Args:
             before: the way out of the obstacle where it was just before; None where there was none.
@@ -89,13 +85,11 @@ class Passes:
         settled = float((self.offsets @ nearest).min()) >= ROOM
         gone = -mean @ kept > KEPT * self.obstacle.radius
         side = nearest if gone or (settled and nearest @ kept > ALIKE) else kept
-        ways = [Way(self.obstacle, side, side, kept=True), Way(self.obstacle, nearest, nearest, kept=True)]
-        if gradually:
-            over = np.cross(self.tangent, before.direction)
-            over = self._across(over if mean @ over + UPWARDS * over[2] > 0 else -over)
-            ways.insert(0, ways[0].turned_from(before, [over]))
-        longest = FARTHEST * self.obstacle.radius
-        return next((way for way in ways if self.duration(way.direction) <= longest), None)
+        way = Way(self.obstacle, side, side, kept=True)
+        if not gradually:
+            return way
+        over = np.cross(self.tangent, before.direction)
+        return way.turned_from(before, [self._across(over if mean @ over + UPWARDS * over[2] > 0 else -over)])
 
     def duration(self, direction: Array) -> float:
         """Time, metres, for which the flow along a unit vector (3,) runs until all passes are on that side."""
