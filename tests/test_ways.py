@@ -50,14 +50,14 @@ def test_a_way_turns_by_an_angle_for_each_metre_and_arrives(seed, travel):
     before = Way(ball(), start, start)
     way = Way(ball(travel, 0.0, 0.0), side, side, kept=True).turned_from(before, across)
     assert np.linalg.norm(way.direction) == pytest.approx(1, abs=1e-12)
-    assert angle(way.direction, start) <= TURNING * travel + 1e-6
+    assert angle(way.direction, start) <= TURNING * travel / RADIUS + 1e-6
     assert way.kept and way.side is side
     for _ in range(200):
         if way.direction is side:
             break
         farther = ball(way.obstacle.position[0] + 0.005, 0.0, 0.0)
         turned = Way(farther, side, side).turned_from(way, across)
-        assert angle(turned.direction, way.direction) <= TURNING * 0.005 + 1e-6
+        assert angle(turned.direction, way.direction) <= TURNING * 0.005 / RADIUS + 1e-6
         way = turned
     assert way.direction is side
 
@@ -65,7 +65,7 @@ def test_a_way_turns_by_an_angle_for_each_metre_and_arrives(seed, travel):
 def test_a_way_turns_to_the_opposite_over_what_is_across():
     before, way = Way(ball(), Z, Z), Way(ball(0.0, 0.0, 0.005), -Z, -Z)
     turned = way.turned_from(before, [Z, Y])
-    assert turned.direction @ Y == pytest.approx(np.sin(TURNING * 0.005))
+    assert turned.direction @ Y == pytest.approx(np.sin(TURNING * 0.005 / RADIUS))
 
 
 @pytest.mark.parametrize(
@@ -107,12 +107,12 @@ def test_all_motions_are_carried_to_one_side_of_the_middle(seed):
     duration = passes.duration(Z)
     moved = AdaptiveFlow(passes.field(Z), duration, 1e-9).inverse(motion.positions).reshape(4, -1, 3)
     least = moved[:, 40, 2].min()  # where they pass the middle
-    assert least == pytest.approx(ROOM, abs=1e-6) if duration else least >= ROOM
+    assert least == pytest.approx(ROOM * RADIUS, abs=1e-6) if duration else least >= ROOM * RADIUS
     np.testing.assert_allclose(moved[:, [0, -1]], motion.positions.reshape(4, -1, 3)[:, [0, -1]], atol=1e-6)
 
 
 def test_motions_keep_their_side_until_they_are_far_beyond_the_middle_then_turn_together():
-    way, heights = Way(ball(), Z, Z, kept=True), np.arange(0.02, -0.07, -0.001)
+    way, heights = Way(ball(), Z, Z, kept=True), np.arange(0.02, -0.078, -0.001)
     directions, durations = [], []
     for k, height in enumerate(heights):
         obstacle = ball(0.0, 0.0, 0.001 * k)  # moved as a drag moves it; the motions are told relative to it
@@ -126,7 +126,7 @@ def test_motions_keep_their_side_until_they_are_far_beyond_the_middle_then_turn_
     assert (beyond[heights < -KEPT * RADIUS - 2e-3] < 1).all()
     assert beyond[-1] == pytest.approx(-1)
     between = [angle(a, b) for a, b in pairwise(directions)]
-    assert max(between) <= TURNING * 1e-3 + 1e-6
+    assert max(between) <= TURNING * 1e-3 / RADIUS + 1e-6
     assert np.abs(np.diff(durations)).max() < 5e-3
     assert durations[0] == durations[-1] == 0
 

@@ -11,8 +11,8 @@ import numpy as np
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle
 
-TURNING = 80.0
-"""Angle, rad, by which a way out turns for each metre that its obstacle moves."""
+TURNING = 5.0
+"""Angle, rad, by which a way out turns while its obstacle moves by its radius."""
 NEARBY = 0.1
 """Distance that an obstacle may move from one motion to the next for its way out to be remembered, metres."""
 OPPOSITE = -0.7
@@ -32,7 +32,7 @@ class Way:
     """Whether it goes on from a way out where the obstacle was before."""
 
     def turned_from(self, before: Way, across: Sequence[Array]) -> Way:
-        """The way on its way here from that before: an angle farther for each metre that the obstacle has moved.
+        """The way on its way here from that before: farther by an angle for each metre that the obstacle has moved.
 
         Args:
             before: the way out of the same obstacle where it was just before.
@@ -41,7 +41,8 @@ class Way:
         start, towards = before.direction, self.side
         if start @ towards < OPPOSITE:
             towards = next((direction for direction in across if abs(start @ direction) < -OPPOSITE), towards)
-        direction = turned(start, towards, TURNING * _travel(before.obstacle, self.obstacle))
+        angle = TURNING * _travel(before.obstacle, self.obstacle) / self.obstacle.radius
+        direction = turned(start, towards, angle)
         return self if direction is self.side else replace(self, direction=direction)
 
 

@@ -6,7 +6,7 @@ have been: a flow along it first carries those that are beyond the middle back,
 
     ẏ = n exp(−‖y − c‖²/2σ²),    σ the obstacle's radius,
 
-until all pass the middle c by `ROOM` on the side n. Where they do so already it is the identity.
+until all pass the middle c on the side n, by `ROOM`·σ. Where they do so already it is the identity.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.ways import Way
 from dt_viz.transforms.base import MotionBelow
 
-ROOM = 8e-3
-"""Distance, metres, of all motions from an obstacle's middle on the side on which they pass it."""
+ROOM = 0.1
+"""Distance of all motions from an obstacle's middle on the side on which they pass it, in its radii."""
 KEPT = 0.25
 """Distance of the motions beyond the middle up to which they keep their side, in the obstacle's radii."""
 ALIKE = 0.5
@@ -82,7 +82,7 @@ class Passes:
         if before is None:
             return Way(self.obstacle, nearest, nearest)
         kept = self._across(before.side)
-        settled = float((self.offsets @ nearest).min()) >= ROOM
+        settled = float((self.offsets @ nearest).min()) >= ROOM * self.obstacle.radius
         gone = -mean @ kept > KEPT * self.obstacle.radius
         side = nearest if gone or (settled and nearest @ kept > ALIKE) else kept
         way = Way(self.obstacle, side, side, kept=True)
@@ -98,7 +98,7 @@ class Passes:
         squared = (self.offsets**2).sum(axis=1)
         aside = np.exp((squared - along**2) / (2 * sigma**2))
         scale = np.sqrt(2) * sigma
-        duration = aside * sigma * np.sqrt(np.pi / 2) * (erfi(ROOM / scale) - erfi(along / scale))
+        duration = aside * sigma * np.sqrt(np.pi / 2) * (erfi(ROOM * sigma / scale) - erfi(along / scale))
         outer = (np.sqrt(squared) / sigma - INNER) / (1 - INNER)
         return float((duration * np.clip(1 - outer, 0, 1)).max(initial=0.0))
 
