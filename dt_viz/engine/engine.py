@@ -75,9 +75,10 @@ class _Shown:
 class Engine:
     """Computes frames for one visitor; one thread calls it.
 
-    The same scenario always gives the same frame, with two exceptions. Where there is no motion for it the last one
-    that there was for the task is shown, marked by `Frame.blocked`. And up to stage LIVE joints are looked for from
-    those shown before: they differ by less than a milliradian.
+    The same scenario always gives the same frame, with three exceptions. Where there is no motion for it the last one
+    that there was for the task is shown, marked by `Frame.blocked`. Up to stage LIVE joints are looked for from those
+    shown before: they differ by less than a milliradian. And while an obstacle is dragged, motions keep the side on
+    which they pass it, and the arm its stance; where it then rests this choice is all that is left of the drag.
     """
 
     def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot) -> None:

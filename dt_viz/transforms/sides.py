@@ -4,9 +4,10 @@ The flow that avoids an obstacle takes each motion out on the side of the obstac
 would change sides one by one as the middle is dragged across them. While it is dragged, all keep the side on which they
 have been: a flow along it first carries those that are beyond the middle back,
 
-    ẏ = n exp(−‖y − c‖²/2σ²),    σ the obstacle's radius,
+    ẏ = n exp(−‖y − c‖²/2σ²),
 
-until all pass the middle c on the side n, by `ROOM`·σ. Where they do so already it is the identity.
+until all pass the middle c on the side n. Where they do so already it is the identity. What passes farther from the
+middle than `CORE` has a side of its own, as the two legs of a bend around the obstacle have.
 """
 
 from __future__ import annotations
@@ -27,8 +28,14 @@ KEPT = 0.25
 """Distance of the motions beyond the middle up to which they keep their side, in the obstacle's radii."""
 ALIKE = 0.5
 """Cosine of the angle between a side and the one on which motions are, up to which they turn to it."""
-INNER = 0.6
-"""Distance from the middle up to which a motion's side counts in full, in the obstacle's radii."""
+INNER, CORE = 0.4, 0.65
+"""Distances from the middle, in the obstacle's radii, up to which motions are carried all the way to the side, and from
+which on they are not carried at all."""
+SPREAD = 0.7
+"""σ, in the obstacle's radii."""
+ENDS = (1.0, 2.0)
+"""Distances of the nearest start or goal, in the obstacle's radii, from which on motions are carried a little, and all
+the way: what is carried there would have to begin or end elsewhere."""
 UPWARDS = 0.01
 """Distance beside the middle, metres, that outweighs passing above it, where motions turn to the opposite side."""
 TINY = 1e-9
@@ -36,13 +43,15 @@ TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Passes:
-    """Where motions pass the middle of an obstacle within its radius."""
+    """Where motions pass the middle of an obstacle nearer than `CORE`."""
 
     obstacle: Obstacle
     offsets: Array
     """(K, 3) from the middle to the nearest point of each pass, metres."""
     tangent: Array
     """(3,) mean direction of the passes, a unit vector."""
+    share: float = 1.0
+    """Part of the way to the side that motions are carried."""
 
     @classmethod
     def of(cls, motion: MotionBelow, obstacle: Obstacle) -> Passes | None:
@@ -50,7 +59,7 @@ class Passes:
         motion = motion.demonstrated
         offset = motion.positions - np.asarray(obstacle.position)
         distance = np.linalg.norm(offset, axis=1)
-        inside = np.flatnonzero(distance < obstacle.radius)
+        inside = np.flatnonzero(distance < CORE * obstacle.radius)
         if not len(inside):
             return None
         begins = np.flatnonzero(np.diff(inside, prepend=-2) + np.diff(motion.index[inside], prepend=-1) > 1)
@@ -62,12 +71,16 @@ class Passes:
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
         offsets = offset[nearest]
         offsets = offsets - (offsets * tangents).sum(axis=1, keepdims=True) * tangents
-        return cls(obstacle, offsets, np.linalg.svd(tangents)[2][0])
+        ends = np.concatenate([motion.starts, motion.goal[None]]) - np.asarray(obstacle.position)
+        nearest_end = np.linalg.norm(ends, axis=1).min() / obstacle.radius
+        share = float(np.interp(nearest_end, ENDS, (0, 1)))
+        return cls(obstacle, offsets, np.linalg.svd(tangents)[2][0], share)
 
     @property
     def mean(self) -> Array:
         """(3,) mean offset, metres; the nearer ones count more."""
-        weights = np.maximum(1 - (self.offsets**2).sum(axis=1) / self.obstacle.radius**2, TINY)
+        core = CORE * self.obstacle.radius
+        weights = np.maximum(1 - (self.offsets**2).sum(axis=1) / core**2, TINY)
         return weights @ self.offsets / weights.sum()
 
     def way(self, before: Way | None, *, gradually: bool) -> Way:
@@ -93,19 +106,18 @@ class Passes:
 
     def duration(self, direction: Array) -> float:
         """Time, metres, for which the flow along a unit vector (3,) runs until all passes are on that side."""
-        sigma = self.obstacle.radius
+        radius, sigma = self.obstacle.radius, SPREAD * self.obstacle.radius
         along = self.offsets @ direction
         squared = (self.offsets**2).sum(axis=1)
         aside = np.exp((squared - along**2) / (2 * sigma**2))
-        scale = np.sqrt(2) * sigma
-        duration = aside * sigma * np.sqrt(np.pi / 2) * (erfi(ROOM * sigma / scale) - erfi(along / scale))
-        outer = (np.sqrt(squared) / sigma - INNER) / (1 - INNER)
-        return float((duration * np.clip(1 - outer, 0, 1)).max(initial=0.0))
+        to_side = erfi(ROOM * radius / (np.sqrt(2) * sigma)) - erfi(along / (np.sqrt(2) * sigma))
+        carried = np.interp(np.sqrt(squared) / radius, (INNER, CORE), (1, 0))
+        return self.share * float((sigma * np.sqrt(np.pi / 2) * aside * to_side * carried).max(initial=0.0))
 
     def field(self, direction: Array) -> GridRBF:
         """The generator of that flow, (N, 3) of no unit; it is against the direction: motions follow the reverse."""
         position = np.asarray(self.obstacle.position)
-        grid = GaussianGrid(tuple(np.array([c]) for c in position), 0.5 / self.obstacle.radius**2)
+        grid = GaussianGrid(tuple(np.array([c]) for c in position), 0.5 / (SPREAD * self.obstacle.radius) ** 2)
         return GridRBF(grid, -direction[None])
 
     def _across(self, direction: Array) -> Array:
