@@ -20,9 +20,10 @@ from dt_viz.transforms.base import ArmAvoidance
 JUMP = 0.05
 """Distance of a rollout from that in the frame before that is not wanted, metres."""
 DRAGS = {
-    # task, who gives way: a place at which motions change sides, and the direction of the drag
-    ("draw_s", "task"): ((0.0967, -0.4986, 0.2306), (0.74, 0.54, -0.40)),
-    ("push_box", "cspace"): ((0.2340, -0.4880, 0.1777), (-0.72, -0.42, 0.55)),
+    # task, who gives way: a place at which motions change sides, the direction of the drag, and the distance beyond the
+    # place at which they have changed sides in a drag, too, metres
+    ("draw_s", "task"): ((0.0967, -0.4986, 0.2306), (0.74, 0.54, -0.40), 0.036),
+    ("push_box", "cspace"): ((0.2340, -0.4880, 0.1777), (-0.72, -0.42, 0.55), 0.056),
 }
 
 
@@ -31,7 +32,8 @@ class Drag:
 
     def __init__(self, initial, task, space):
         self.scenario = changed(initial(task), space=space)
-        self._place, self._direction = map(np.array, DRAGS[task, space])
+        place, direction, self.beyond = DRAGS[task, space]
+        self._place, self._direction = np.array(place), np.array(direction)
 
     def at(self, offset):
         """The scenario with the ball that far beyond the place, metres."""
@@ -84,8 +86,8 @@ def test_sides_are_kept_at_rest_and_do_not_depend_on_the_steps(drag, new_engine)
 
 def test_a_change_of_sides_is_complete_at_rest(drag, new_engine):
     engine, fresh = new_engine(), new_engine()
-    drag.dragged(engine, np.arange(-0.012, 0.038, 0.004))
-    rested, alone = (ways(e.solved(drag.at(0.036), FINE)) for e in (engine, fresh))
+    drag.dragged(engine, np.linspace(-0.012, drag.beyond, 14))
+    rested, alone = (ways(e.solved(drag.at(drag.beyond), FINE)) for e in (engine, fresh))
     assert rested.side @ alone.side > 0.999
 
 
@@ -94,9 +96,8 @@ def test_where_nothing_was_dragged_nothing_is_remembered(drag, new_engine):
     drag.dragged(engine, [0.0])
     shown = engine.solved(scenario, FINE)
     alone = solve(scenario.motion, engine.nominal(scenario), FINE, engine.follower)
-    for now, then in ((shown.stack.bundle.positions, alone.stack.bundle.positions),):
-        np.testing.assert_array_equal(now, then)
-    if shown.arm is not None:
+    np.testing.assert_array_equal(shown.stack.bundle.positions, alone.stack.bundle.positions)
+    if shown.arm is not None and alone.arm is not None:
         np.testing.assert_array_equal(shown.arm.p, alone.arm.p)
 
 
