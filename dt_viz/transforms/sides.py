@@ -6,8 +6,8 @@ have been: a flow along it first carries those that are beyond the middle back,
 
     ẏ = n exp(−‖y − c‖²/2σ²),
 
-until all pass the middle c on the side n. Where they do so already it is the identity. What passes farther from the
-middle than `CORE` has a side of its own, as the two legs of a bend around the obstacle have.
+until all pass the middle c on the side n. Where they do so already it is the identity. The two legs of a bend around
+the middle are left on their own sides.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ KEPT = 0.25
 """Distance of the motions beyond the middle up to which they keep their side, in the obstacle's radii."""
 ALIKE = 0.5
 """Cosine of the angle between a side and the one on which motions are, up to which they turn to it."""
-INNER, CORE = 0.4, 0.65
+INNER, CORE = 0.6, 0.9
 """Distances from the middle, in the obstacle's radii, up to which motions are carried all the way to the side, and from
 which on they are not carried at all."""
 SPREAD = 0.7
@@ -55,7 +55,7 @@ class Passes:
 
     @classmethod
     def of(cls, motion: MotionBelow, obstacle: Obstacle) -> Passes | None:
-        """The passes of the rollouts that have a demonstration; None where none comes so near."""
+        """The only passes of the rollouts that have a demonstration; None where none comes so near just once."""
         motion = motion.demonstrated
         offset = motion.positions - np.asarray(obstacle.position)
         distance = np.linalg.norm(offset, axis=1)
@@ -63,8 +63,11 @@ class Passes:
         if not len(inside):
             return None
         begins = np.flatnonzero(np.diff(inside, prepend=-2) + np.diff(motion.index[inside], prepend=-1) > 1)
-        parts = np.split(inside, begins[1:])
-        nearest = np.array([part[distance[part].argmin()] for part in parts])
+        parts, rollouts = np.split(inside, begins[1:]), motion.index[inside[begins]]
+        once = np.bincount(rollouts)[rollouts] == 1
+        nearest = np.array([part[distance[part].argmin()] for part, only in zip(parts, once, strict=True) if only])
+        if not len(nearest):
+            return None
         is_last = np.diff(motion.index, append=-1) != 0
         after = np.where(is_last[nearest], nearest, nearest + 1)
         tangents = offset[after] - offset[after - 1]
