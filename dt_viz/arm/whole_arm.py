@@ -25,7 +25,7 @@ from dt_viz.arm.cspace import (
     WholeArmField,
     squared_lengths,
 )
-from dt_viz.arm.escape import escape_directions
+from dt_viz.arm.escape import ALIKE, escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import JointPath, track
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
@@ -234,22 +234,26 @@ class WholeArm:
                 None if side is None else Way(part, side, side, kept=last is not None)
                 for part, side, last in zip(parts, escapes, known, strict=True)
             ]
+            met = [(way, last) for way, last in zip(ways, known, strict=True) if way is not None and last is not None]
+            turned = [
+                way.turned_from(last, found) if coarse and way is not None and last is not None else way
+                for way, last, found in zip(ways, known, sides, strict=True)
+            ]
+            turns = any(way is not there for way, there in zip(turned, ways, strict=True))
+            if turns and all(way.side @ last.side > ALIKE for way, last in met):  # that there is a way is known
+                tried = solution(turned)
+                if tried.cleared:
+                    return tried
+                turns = False
             tried = solution(ways)
+            if tried.cleared and turns:
+                on_the_way = solution(turned)
+                return on_the_way if on_the_way.cleared else tried
             if best is None or tried.cleared or tried.clearance > best.clearance:
                 best = tried
             if tried.cleared or avoidance.duration is not None or avoidance.generator == "probability":
                 break
-        if best is None:
-            return self.undisturbed(lifted, avoidance, spacing)
-        if coarse:
-            turned = [
-                way.turned_from(last, found) if way is not None and last is not None else way
-                for way, last, found in zip(best.ways, known, sides, strict=True)
-            ]
-            if any(way is not there for way, there in zip(turned, best.ways, strict=True)):
-                tried = solution(turned)
-                return tried if tried.cleared or not best.cleared else best
-        return best
+        return best or self.undisturbed(lifted, avoidance, spacing)
 
     def warped(
         self, full: ArmSolution, lifted: Lift, avoidance: ArmAvoidance, fraction: float, spacing: float
