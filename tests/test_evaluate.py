@@ -1,5 +1,6 @@
 """The command line of the measurements, each subcommand from arguments to files, on small settings."""
 
+import argparse
 import json
 from contextlib import redirect_stdout
 from io import StringIO
@@ -11,7 +12,7 @@ from PIL import Image
 
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.engine.frame import Stage
-from dt_viz.evaluate import latency, rollouts
+from dt_viz.evaluate import drag, latency, rollouts
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
 from dt_viz.evaluate.latency import Recorder
@@ -378,6 +379,40 @@ def test_the_hand_has_room_where_some_orientation_of_it_has(robot):
     assert far - near == pytest.approx(0.065, abs=0.01)  # the hand points at the ball, whatever its size
 
 
+# --- drag ---
+
+
+def test_drag_writes_every_step_and_counts_its_jumps(lasa, tmp_path, middle, capsys, monkeypatch):
+    out = tmp_path / "drag.npz"
+    ends = [",".join(f"{value:.6f}" for value in middle + offset) for offset in ([0, 0, 0.03], [0.0, 0, -0.03])]
+    where = ["--from", ends[0], "--to", ends[1], "--step", "0.004", "--diameter", "0.1", "--points", "20"]
+    arguments = ["drag", "--task", "Hook", "--lasa", str(lasa), "--avoid", "hand", *where, "--out", str(out)]
+    monkeypatch.setattr(drag, "JUMP", 0.015)
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    with np.load(out) as arrays:
+        rollouts, places = arrays["rollouts"], arrays["places"]
+        assert rollouts.shape == (16, NUM_DEMONSTRATIONS, 20, 3) and not arrays["blocked"].any()
+        np.testing.assert_allclose(places, middle + np.linspace(0.03, -0.03, 16)[:, None] * [0, 0, 1], atol=1e-6)
+        assert np.isnan(arrays["moved"][0]).all()
+        moved = discrete_frechet(rollouts[1:], rollouts[:-1])
+        np.testing.assert_allclose(arrays["moved"][1:], moved, rtol=0, atol=1e-12)
+        assert number_after(printed, "a rollout jumps") == (moved > 0.015).any(axis=1).sum() > 0
+        assert number_after(printed, "elsewhere than without the drag") == 0  # it has changed sides on the way
+        np.testing.assert_allclose(arrays["rested"], arrays["fresh"], rtol=0, atol=1e-3)
+
+
+def test_random_drags_go_through_the_motion_and_repeat(lasa, tmp_path):
+    task, options = lasa_tasks(lasa)["Hook"](), argparse.Namespace(begin=None, end=None, drags=6, seed=3, step=0.001)
+    first, second = (list(drag.paths(task, options)) for _ in range(2))
+    assert len(first) == 6
+    for places, same in zip(first, second, strict=True):
+        np.testing.assert_array_equal(places, same)
+        assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() <= 0.001 + 1e-12
+        assert np.linalg.norm(places[0] - places[-1]) >= drag.REACH
+        assert distance_from_path(task.mean_path, places[[0, -1]]).min() < 5e-3 or len(places) < 160
+
+
 # --- reactive ---
 
 
@@ -535,6 +570,7 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
         (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),
         (["starts", *TASK, "--out", "folder.npz"], "--out: found 'folder.npz', which cannot be written"),
         (["imitation", "Hook.mat", "--folds", "2", "--out", "out"], "--folds: found 2; accepted: it together with"),
+        (["drag", *TASK, "--from", "0,0,0", "--out", "a.npz"], "--from, --to: found one of them; accepted: both"),
         (["rollouts", "--task", "Draw S"], "--task: found 'Draw S'; accepted: draw_s, "),
     ],
 )

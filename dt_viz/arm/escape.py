@@ -22,6 +22,8 @@ ALIKE = np.cos(np.deg2rad(40.0))
 """Cosine of the largest angle between two directions of one escape."""
 SELECTIVITY = 0.03
 """Relative difference in cost over which a direction's share in its escape falls by a factor e, for smooth drags."""
+STAYING = 1.5
+"""Cost of the way out that was chosen before, relative to the least one, up to which it is kept."""
 
 
 def escape_directions(
@@ -33,6 +35,7 @@ def escape_directions(
     *,
     num: int = 3,
     velocity: Array | None = None,
+    before: Array | None = None,
 ) -> list[Array]:
     """Find directions in which the arm can escape, the one with the least detour first.
 
@@ -47,9 +50,11 @@ def escape_directions(
         margin: required clearance, metres.
         num: largest number of directions.
         velocity: (3,) the obstacle's, m/s; None where it rests. Whoever runs away along it is caught up with.
+        before: (3,) escape that was chosen just before. What is nearest to it comes first, or second where it costs
+            more than `STAYING` times the least.
 
     Returns:
-        Unit vectors (3,), one for each distinct escape.
+        Unit vectors (3,), one for each distinct escape; all of them where there is one `before`.
     """
     directions = golden_spiral(NUM_DIRECTIONS, 0.5)
     centres, radii = obstacle.cover()
@@ -73,11 +78,17 @@ def escape_directions(
     cost = detour * (1 + SIDEWAYS * parallel) + TABLE_WEIGHT * below
 
     found: list[Array] = []
-    while len(found) < num and np.isfinite(cost).any():
+    costs: list[float] = []
+    while (before is not None or len(found) < num) and np.isfinite(cost).any():
         best = directions[cost.argmin()]
+        costs.append(float(cost.min()))
         alike = directions @ best > ALIKE
         share = np.where(alike, np.exp((cost.min() - cost) / (SELECTIVITY * cost.min())), 0)
         escape = share @ directions
         found.append(escape / np.linalg.norm(escape))
         cost[alike] = np.inf
+    if before is not None:
+        kept = int(np.argmax(np.stack(found) @ before))
+        if kept:
+            found.insert(0 if costs[kept] < STAYING * costs[0] else 1, found.pop(kept))
     return found

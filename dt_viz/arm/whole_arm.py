@@ -8,7 +8,7 @@ drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from dt_viz.arm.cspace import (
     WholeArmField,
     squared_lengths,
 )
-from dt_viz.arm.escape import escape_directions
+from dt_viz.arm.escape import ALIKE, escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import JointPath, track
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
@@ -35,6 +35,7 @@ from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.ways import Way, remembered
 from dt_viz.properties import cached_property
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -71,6 +72,8 @@ TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
+NUM_WAYS = 3
+"""Largest number of ways out of each obstacle that are tried."""
 BESIDE = 0.20
 """Clearance up to which a sample is bent along with the colliding ones, metres."""
 
@@ -169,6 +172,8 @@ class ArmSolution:
     """Guests, counted among all rollouts, that do not keep it."""
     moved: Indices
     """Guests that begin more than `MOVED` away from their start."""
+    ways: tuple[Way | None, ...] = ()
+    """Way out of each obstacle; None for those that are not in the way, empty where none is."""
 
     @property
     def cleared(self) -> bool:
@@ -195,6 +200,7 @@ class WholeArm:
         spacing: float,
         *,
         coarse: bool,
+        before: Sequence[Way | None] = (),
     ) -> ArmSolution:
         """The motions around the obstacle.
 
@@ -202,18 +208,50 @@ class WholeArm:
         margin, or what the start or goal beside it has. Of several ways out the first is taken that works,
         or the one that comes nearest to it. All this looks at the hosts only: guests do not change their motions.
 
+        While an obstacle is dragged, the side on which all motions pass it is kept until another one is much shorter.
+        Coarse motions then turn to that side as the obstacle moves on, instead of jumping there.
+
         Args:
             lifted: the motions below.
             avoidance: what is to be avoided, and how.
             spacing: largest distance between neighbouring samples, metres at the hand, about.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
+            before: the ways out of the obstacles where they were just before.
         """
+        parts, known = avoidance.obstacle.parts, remembered(before, avoidance.obstacle.parts)
+        sides = self._sides(lifted, avoidance, known)
+        pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
+
+        def solution(ways: Sequence[Way | None]) -> ArmSolution:
+            generator = self._generator(ways, avoidance, pins)
+            found = _Solver(self, lifted, avoidance, generator, spacing, coarse=coarse).solution()
+            return replace(found, ways=tuple(ways))
+
         best = None
-        for generator in self._generators(lifted, avoidance):
-            solution = _Solver(self, lifted, avoidance, generator, spacing, coarse=coarse).solution()
-            if best is None or solution.cleared or solution.clearance > best.clearance:
-                best = solution
-            if solution.cleared or avoidance.duration is not None:
+        for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
+            escapes = [found[min(attempt, len(found) - 1)] if found else None for found in sides]
+            ways = [
+                None if side is None else Way(part, side, side, kept=last is not None)
+                for part, side, last in zip(parts, escapes, known, strict=True)
+            ]
+            met = [(way, last) for way, last in zip(ways, known, strict=True) if way is not None and last is not None]
+            turned = [
+                way.turned_from(last, found) if coarse and way is not None and last is not None else way
+                for way, last, found in zip(ways, known, sides, strict=True)
+            ]
+            turns = any(way is not there for way, there in zip(turned, ways, strict=True))
+            if turns and all(way.side @ last.side > ALIKE for way, last in met):  # that there is a way is known
+                tried = solution(turned)
+                if tried.cleared:
+                    return tried
+                turns = False
+            tried = solution(ways)
+            if tried.cleared and turns:
+                on_the_way = solution(turned)
+                return on_the_way if on_the_way.cleared else tried
+            if best is None or tried.cleared or tried.clearance > best.clearance:
+                best = tried
+            if tried.cleared or avoidance.duration is not None or avoidance.generator == "probability":
                 break
         return best or self.undisturbed(lifted, avoidance, spacing)
 
@@ -230,7 +268,7 @@ class WholeArm:
             spacing: as in `avoiding`.
         """
         solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
-        return solver.through(full.transform.scaled(fraction), full.duration)
+        return replace(solver.through(full.transform.scaled(fraction), full.duration), ways=full.ways)
 
     def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
@@ -248,31 +286,28 @@ class WholeArm:
             clearance[near] = load_collision_model().gaps(q[near], obstacle, enough[near])
         return clearance
 
-    def _generators(self, lifted: Lift, avoidance: ArmAvoidance) -> Iterator[VectorField]:
-        """The fields to try, the most promising first; none where nothing comes too near an obstacle."""
+    def _generator(self, ways: Sequence[Way | None], avoidance: ArmAvoidance, pins: Array) -> VectorField:
+        """The field whose flow takes these ways, with these postures (K, 6) at rest, where the flow meets them."""
         reach = REACH_PER_TEMPERATURE * avoidance.temperature
+        met = [way for way in ways if way is not None]
+        if avoidance.generator == "probability":
+            return Sum(tuple(GradientField(self.robot, self.body, way.obstacle, reach) for way in met))
+        return Sum(tuple(WholeArmField(self.robot, self.body, w.obstacle, w.direction, pins, reach) for w in met))
+
+    def _sides(self, lifted: Lift, avoidance: ArmAvoidance, before: Sequence[Way | None]) -> list[list[Array]]:
+        """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it."""
         q = lifted.tracked.q[: lifted.num_hosts]
         points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-        near = avoidance.obstacle.parts
-        escapes = [self._escapes(points, tangents, obstacle, avoidance.margin) for obstacle in near]
-        met = [(obstacle, found) for obstacle, found in zip(near, escapes, strict=True) if found]
-        if not met:
-            return
-        if avoidance.generator == "probability":
-            yield Sum(tuple(GradientField(self.robot, self.body, obstacle, reach) for obstacle, _ in met))
-            return
-        pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
-        for attempt in range(max(len(found) for _, found in met)):
-            yield Sum(
-                tuple(
-                    WholeArmField(self.robot, self.body, obstacle, found[min(attempt, len(found) - 1)], pins, reach)
-                    for obstacle, found in met
-                )
-            )
+        return [
+            self._escapes(points, tangents, obstacle, avoidance.margin, None if way is None else way.side)
+            for obstacle, way in zip(avoidance.obstacle.parts, before, strict=True)
+        ]
 
-    def _escapes(self, points: Array, tangents: Array, obstacle: Obstacle, margin: float) -> list[Array]:
+    def _escapes(
+        self, points: Array, tangents: Array, obstacle: Obstacle, margin: float, before: Array | None
+    ) -> list[Array]:
         """Ways out of one obstacle, the best first; none where nothing comes too near it.
 
         Args:
@@ -280,6 +315,7 @@ class WholeArm:
             tangents: (N, 3) directions of the end effector's motion there.
             obstacle: to escape from.
             margin: clearance below which a sample counts, metres.
+            before: (3,) way out of it that was chosen just before; None where none was.
         """
         distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
         clearance = distance.min(axis=0)
@@ -293,6 +329,8 @@ class WholeArm:
             tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
             obstacle,
             margin,
+            num=NUM_WAYS,
+            before=before,
         )
 
 

@@ -22,7 +22,7 @@ from dt_viz.memo import Memo
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower
 from dt_viz.motion.nominal import Learned, Nominal
-from dt_viz.motion.solve import Solved, solve, warped
+from dt_viz.motion.solve import Solved, kept_stance, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.pictures.arm_field import LiftedField
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
@@ -73,9 +73,10 @@ class _Shown:
 class Engine:
     """Computes frames for one visitor; one thread calls it.
 
-    The same scenario always gives the same frame, with two exceptions. Where there is no motion for it the last one
-    that there was for the task is shown, marked by `Frame.blocked`. And up to stage LIVE joints are looked for from
-    those shown before: they differ by less than a milliradian.
+    The same scenario always gives the same frame, with three exceptions. Where there is no motion for it the last one
+    that there was for the task is shown, marked by `Frame.blocked`. Up to stage LIVE joints are looked for from those
+    shown before: they differ by less than a milliradian. And while an obstacle is dragged, motions keep the side on
+    which they pass it, and the arm its stance; where it then rests this choice is all that is left of the drag.
     """
 
     def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot) -> None:
@@ -130,8 +131,7 @@ class Engine:
             UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
         """
         nominal, motion, follower = self._admission(scenario).nominal, scenario.motion, self.follower
-        shown = self._shown.get(scenario.task)
-        before = shown.newest.lifted if shown and shown.newest.nominal.learned is nominal.learned else None
+        before = self._before(scenario, nominal.learned)
         full = self.memo(
             "full",
             (replace(motion, warp=1.0), precision),
@@ -140,11 +140,12 @@ class Engine:
         )
         if motion.warp == 1:
             return full
+        lifted = (before and before.lifted) or full.lifted
         below = self.memo("below", (full.nominal, motion.warp), lambda: full.nominal.warped(motion.warp), newest=1)
         return self.memo(
             "warped",
             (motion, precision),
-            lambda: warped(full, below, motion.warp, precision, follower, before or full.lifted),
+            lambda: warped(full, below, motion.warp, precision, follower, lifted),
             newest=2,
         )
 
@@ -195,7 +196,15 @@ class Engine:
     def _admission(self, scenario: Scenario) -> Admission:
         """Whether the scenario has a motion, and from which starts."""
         nominal, avoidance = self.nominal(scenario), scenario.arm_avoidance
-        return Admission(nominal) if avoidance is None else self.follower.admission(nominal, avoidance)
+        if avoidance is None:
+            return Admission(nominal)
+        before = self._before(scenario, nominal.learned)
+        return self.follower.admission(nominal, avoidance, before and kept_stance(scenario, before))
+
+    def _before(self, scenario: Scenario, learned: Learned) -> Solved | None:
+        """The motion of the task that was shown last; None where it was not learned alike."""
+        shown = self._shown.get(scenario.task)
+        return shown.newest if shown and shown.newest.nominal.learned is learned else None
 
     def _stages(self, scenario: Scenario, checkpoint: Checkpoint) -> Iterator[Frame]:
         with _in_turn():

@@ -19,6 +19,7 @@ def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.e
     from dt_viz.errors import DataError  # noqa: PLC0415
     from dt_viz.evaluate import (  # noqa: PLC0415
         avoidance,
+        drag,
         imitation,
         latency,
         load,
@@ -38,6 +39,7 @@ def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.e
         "latency": latency,
         "load": load,
         "avoidance": avoidance,
+        "drag": drag,
         "places": places,
         "reactive": reactive,
         "rollouts": rollouts,

@@ -21,13 +21,12 @@ from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Ident
 from dt_viz.flows.fields import Array, Mask, Sum, VectorField
 from dt_viz.flows.integrators import rk4
 from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.ways import OPPOSITE, turned
 from dt_viz.transforms.base import ArmAvoidance
 
 COMPARED = 16
 """Number of colliding postures that ways out are compared by."""
 NO_PINS = np.empty((0, NUM_JOINTS))
-OPPOSITE = -0.7
-"""Cosine of the angle between a way out and the better one beyond which it turns over the top."""
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -123,10 +122,7 @@ def _turned(before: Array, towards: Array, most: float) -> Array:
     if before @ towards < OPPOSITE:
         towards = towards + UP + 1e-3 * np.roll(before, 1)
         towards = towards / np.linalg.norm(towards)
-    across = towards - (towards @ before) * before
-    size = float(np.linalg.norm(across))
-    angle = min(most, math.atan2(size, float(towards @ before)))
-    return before if size < 1e-9 else math.cos(angle) * before + math.sin(angle) / size * across
+    return turned(before, towards, most)
 
 
 def _cleared(

@@ -154,25 +154,32 @@ class Follower:
         """
         return track(self.robot, path, self.reference(nominal), before)
 
-    def admission(self, nominal: Nominal, avoidance: ArmAvoidance) -> Admission:
-        """Whether the whole arm can move around what it avoids, from which starts, and in which stance."""
-        asked = avoidance.obstacle, avoidance.margin
+    def admission(self, nominal: Nominal, avoidance: ArmAvoidance, before: Stance | None = None) -> Admission:
+        """Whether the whole arm can move around what it avoids, from which starts, and in which stance.
+
+        Args:
+            nominal: all rollouts.
+            avoidance: what is to be avoided.
+            before: the stance where the obstacle was just before, which is kept while none leaves more starts free;
+                None is the usual one.
+        """
+        asked = avoidance.obstacle, avoidance.margin, before
         return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=1)
 
     def alternatives(self, nominal: Nominal, avoidance: ArmAvoidance) -> Iterator[Nominal]:
         """The same motions in other stances that have room at as many starts and at the goal, the best first."""
-        ranked = self._stances(nominal.learned, avoidance.obstacle, avoidance.margin)
+        ranked = self._stances(nominal.learned, avoidance.obstacle, avoidance.margin, nominal.stance)
         _, free = next(ranked)
         for stance, others in ranked:
             if not (others >= free).all():
                 return
             yield self._standing(nominal, stance)
 
-    def _admission(self, nominal: Nominal, obstacle: Union, margin: float) -> Admission:
+    def _admission(self, nominal: Nominal, obstacle: Union, margin: float, before: Stance | None) -> Admission:
         blocked = self._unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
         if blocked:
             return Admission(nominal, blocked)
-        stance, free = next(self._stances(nominal.learned, obstacle, margin))
+        stance, free = next(self._stances(nominal.learned, obstacle, margin, before))
         if not free[-1]:
             text = "the goal is inside the obstacle: the arm there touches it"
             return Admission(nominal, (MotionWarning(Kind.GOAL_COVERED, text, ARM),))
@@ -212,8 +219,12 @@ class Follower:
                 return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
         return ()
 
-    def _stances(self, learned: Learned, obstacle: Union, margin: float) -> Iterator[tuple[Stance | None, Mask]]:
+    def _stances(
+        self, learned: Learned, obstacle: Union, margin: float, before: Stance | None
+    ) -> Iterator[tuple[Stance | None, Mask]]:
         """The stances with most room at the task's starts and goal, the best first: the usual one where it has enough.
+
+        But the stance `before`, if it is not the usual one, comes before all that leave no more starts free.
 
         Yields:
             A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
@@ -222,7 +233,7 @@ class Follower:
         near = self.whole_arm.clearance(usual.pins, obstacle)
         enough = bool((near >= asked).all())
         room = near if enough else self._mesh_room(usual.pins, obstacle, near, margin)
-        if enough or (room >= margin).all():
+        if before is None and (enough or (room >= margin).all()):
             yield None, room >= 0
         paths = learned.demonstrated.paths
         known = self._memo(
@@ -234,9 +245,10 @@ class Follower:
         clearance = np.concatenate([at_starts, on_path[:, -1:]], axis=1)
         free, ample = clearance >= 0, clearance >= asked
         free[0], ample[0] = room >= 0, room >= margin
+        kept = np.zeros(len(free), bool) if before is None else (known.references == before).all(axis=1)
         # the goal first, then as many starts as possible, then as much room as is asked for
-        merit = [free[:, -1], free.sum(axis=1), ample.sum(axis=1), -known.cost(on_path, asked)]
-        left = ~known.alike(0) if ample[0].all() else np.ones(len(free), bool)
+        merit = [free[:, -1], free.sum(axis=1), kept, ample.sum(axis=1), -known.cost(on_path, asked)]
+        left = ~known.alike(0) if before is None and ample[0].all() else np.ones(len(free), bool)
         for best in np.lexsort(merit[::-1])[::-1]:
             stance = None if best == 0 else _as_stance(known.references[best])
             if left[best] and (stance is None or self._sound(learned, stance)):

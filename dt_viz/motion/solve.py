@@ -10,9 +10,10 @@ import numpy as np
 from dt_viz.arm.whole_arm import ArmSolution, Lift
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
-from dt_viz.motion.nominal import Nominal
+from dt_viz.motion.nominal import Nominal, Stance
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
+from dt_viz.obstacles.ways import remembered
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.transforms.base import start_warnings
 from dt_viz.warning import Kind
@@ -52,7 +53,7 @@ class Solved:
 
 
 def solve(
-    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Lift | None = None
+    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Solved | None = None
 ) -> Solved:
     """The motion of a scenario, every flow run for its full duration.
 
@@ -62,42 +63,72 @@ def solve(
             result has another stance, or lacks the starts that have none.
         precision: how exactly.
         follower: the arm.
-        before: joints to look for those of LIVE from, as shown last; the result differs by less than a milliradian.
+        before: the motion that was shown last, of the same learned motion. The sides on which it passes obstacles are
+            kept while they do; and joints of LIVE are looked for from its own, which changes the result by less than a
+            milliradian.
 
     Raises:
         UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
     """
     scenario = replace(scenario, warp=1.0)
+    if precision is LIVE and before is not None and (lacking := _lacking(nominal, scenario, before)) is not None:
+        solved = _solved(scenario, lacking, precision, follower, before)
+        if solved.cleared:
+            return solved
     solved, avoidance = _solved(scenario, nominal, precision, follower, before), scenario.arm_avoidance
     if avoidance is None or avoidance.duration is not None or solved.cleared:
         return solved
     for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
-        tried = _solved(scenario, other, LIVE, follower)  # quick, and the same stance is found at each precision
+        tried = _solved(scenario, other, LIVE, follower, before)  # quick; the same stance is found at each precision
         if tried.cleared:
-            return tried if precision is LIVE else _solved(scenario, other, precision, follower)
+            return tried if precision is LIVE else _solved(scenario, other, precision, follower, before)
     assert solved.arm is not None
     others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
     if not (others < nominal.num_hosts).any():
         return solved
     numbers, how = np.array(nominal.numbers), "without a way around the obstacle for the arm"
     told = start_warnings(numbers[solved.arm.stuck], nominal.num_demonstrated, Kind.START_COVERED, how)
-    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), precision, follower)
+    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), precision, follower, before)
     return tried if tried.cleared else solved
 
 
+def kept_stance(scenario: Scenario, before: Solved) -> Stance | None:
+    """The stance that the arm keeps while it avoids what is dragged: that before; None is the usual one."""
+    return before.nominal.stance if _goes_on(scenario, before) else None
+
+
+def _goes_on(scenario: Scenario, before: Solved) -> bool:
+    """Whether the arm was avoiding an obstacle that is hardly anywhere else now."""
+    if before.arm is None or scenario.arm_avoidance is None:
+        return False
+    return any(remembered(before.arm.ways, scenario.arm_avoidance.obstacle.parts))
+
+
+def _lacking(nominal: Nominal, scenario: Scenario, before: Solved) -> Nominal | None:
+    """The motion without the starts that had no way before; None where all had one."""
+    without = set(before.nominal.left_out) - set(nominal.left_out)
+    kept = [k for k, number in enumerate(nominal.numbers) if number not in without]
+    if not without or not kept or before.nominal.stance != nominal.stance or not _goes_on(scenario, before):
+        return None
+    return nominal.only(kept, before.nominal.warnings)
+
+
 def _solved(
-    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Lift | None = None
+    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Solved | None = None
 ) -> Solved:
     """The motion in the stance of `nominal`; see `solve`."""
-    stack, avoidance = build_stack(nominal, scenario.active, precision), scenario.arm_avoidance
+    stack = build_stack(nominal, scenario.active, precision, before and before.stack)
+    avoidance = scenario.arm_avoidance
     if avoidance is None:
         return Solved(scenario, nominal, nominal, stack)
     live = precision is LIVE
     if stack.built:
-        lifted = follower.behaving(nominal, stack, exact=not live, before=before)
+        joints = None if before is None else before.lifted
+        lifted = follower.behaving(nominal, stack, exact=not live, before=joints)
     else:
         lifted = follower.undisturbed(nominal)
-    arm = follower.whole_arm.avoiding(lifted, avoidance, precision.spacing, coarse=live)
+    ways = () if before is None or before.arm is None else before.arm.ways
+    arm = follower.whole_arm.avoiding(lifted, avoidance, precision.spacing, coarse=live, before=ways)
     return Solved(scenario, nominal, nominal, stack, arm, lifted)
 
 
@@ -112,7 +143,7 @@ def warped(
         fraction: s, from 0 to 1.
         precision: how exactly.
         follower: the arm.
-        before: as in `solve`.
+        before: joints to look for those of LIVE from, as shown last.
 
     Raises:
         UnreachableError: as `solve`.

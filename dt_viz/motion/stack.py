@@ -13,6 +13,7 @@ from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.motion.nominal import Nominal
 from dt_viz.obstacles.shapes import Point
+from dt_viz.obstacles.ways import Way
 from dt_viz.scenario.scenario import Layer
 from dt_viz.transforms.base import Built, MotionBelow, Transform
 from dt_viz.warning import MotionWarning
@@ -99,7 +100,9 @@ def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
     return np.stack(levels, axis=1)
 
 
-def build_stack(nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision: Precision) -> Solution:
+def build_stack(
+    nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision: Precision, before: Solution | None = None
+) -> Solution:
     """Build the transforms for the motion below them, and the exact rollouts of the whole stack.
 
     A transform is made for the samples of the motion that there are. Refinement finds new samples, and ends that the
@@ -110,7 +113,10 @@ def build_stack(nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision
         nominal: the undisturbed motion.
         layers: those that act, from the inside out, each with its place in the whole stack; see `Scenario.active`.
         precision: how exactly.
+        before: the stack as it was just before: motions keep the sides on which they pass obstacles.
     """
+    known = [before and before.at(place) for place, _ in layers]
+    ways = [applied.made.ways if applied else () for applied in known]
     solution = None
     for keeps_goal in (True, False):
         rays, bundle = nominal.rays, nominal.bundle
@@ -125,8 +131,9 @@ def build_stack(nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision
                 tolerance=precision.tolerance,
                 keeps_goal=keeps_goal,
                 num_demonstrated=nominal.num_hosts,
+                gradual=precision is LIVE,
             )
-            built = _build(layers, lowest, durations, above)
+            built = _build(layers, lowest, durations, above, ways)
             above = _above([made for _, made in built])
             durations = [made.duration for _, made in built]
             outer = [made.transform for _, made in built]
@@ -157,13 +164,14 @@ def _build(
     motion: MotionBelow,
     durations: Sequence[float],
     above: Sequence[Diffeomorphism | None],
+    ways: Sequence[tuple[Way | None, ...]],
 ) -> list[tuple[MotionBelow, Built]]:
     """Each layer's transform, with the motion that it was made for."""
     built: list[tuple[MotionBelow, Built]] = []
     targets: list[Point] = []
-    for (_, layer), at_least, outer in zip(layers, durations, above, strict=True):
+    for (_, layer), at_least, outer, before in zip(layers, durations, above, ways, strict=True):
         told = {"name": layer.name, "at_least": at_least, "above": outer, "targets": tuple(targets)}
-        motion = replace(motion, **told)
+        motion = replace(motion, **told, before=before)
         made = layer.transform.build(motion)
         built.append((motion, made))
         if layer.transform.anchor is not None:

@@ -9,12 +9,13 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from dt_viz.errors import check_between
-from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
 from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
 from dt_viz.flows.integrators import integrate_adaptive, rk4
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.ways import Way, remembered
 from dt_viz.transforms.base import (
     MOST_DURATION,
     ArmAvoidance,
@@ -28,6 +29,7 @@ from dt_viz.transforms.base import (
     axes_of,
     start_warnings,
 )
+from dt_viz.transforms.sides import Passes
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
 Space = Literal["task", "cspace", "both"]
@@ -202,6 +204,8 @@ class Avoidance(Transform):
         """
         obstacle = self.avoided
         field = self._field()
+        ways, nudges = self._kept_sides(motion)
+        motion = replace(motion, positions=Chain(nudges).inverse(motion.positions)) if nudges else motion
         num_demonstrated = len(motion.demonstrated.starts)
         covered = np.flatnonzero(_blocked(obstacle, motion))
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
@@ -226,13 +230,35 @@ class Avoidance(Transform):
                     why = "∇p is flat inside it" if flat else "it runs through its dead centre"
                     text = f"a motion does not leave the obstacle: {why}"
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
-        flow = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
+        flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
+        if nudges:
+            flow = Chain([*nudges, flow])
         goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
             end = "end beside it" if inside < BESIDE else f"end {1e3 * inside:.0f} mm deep in it"
             warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
-        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, {"duration": duration})
+        chosen = {"duration": duration}
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, ways)
+
+    def _kept_sides(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], list[Diffeomorphism]]:
+        """Return the ways out of the obstacles, and the flows that keep all motions on one side of each.
+
+        Without ways out before, there is no such flow: each motion goes to the side that it is nearer to. So it does
+        in a plane, where no way out turns from one side to the other.
+        """
+        known = remembered(motion.before if self.plane is None else (), self.obstacles)
+        ways: list[Way | None] = []
+        nudges: list[Diffeomorphism] = []
+        for obstacle, before in zip(self.obstacles, known, strict=True):
+            passes = Passes.of(motion, obstacle)
+            way = None if passes is None else passes.way(before, gradually=motion.gradual)
+            ways.append(way)
+            if passes is not None and way is not None and before is not None:
+                duration = passes.duration(way.direction)
+                if duration > 0:
+                    nudges.append(AdaptiveFlow(passes.field(way.direction), duration, motion.tolerance))
+        return tuple(ways), nudges
 
     def satisfied(self, motion: MotionBelow) -> bool:
         """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""

@@ -17,6 +17,7 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.ways import Way
 from dt_viz.warning import Kind, MotionWarning
 
 MOST_DURATION = 100.0
@@ -51,6 +52,10 @@ class MotionBelow:
     """Number of rollouts, the first ones, that have a demonstration; None is all. The others begin anywhere."""
     targets: tuple[Point, ...] = ()
     """Places that transforms further down lead the motions to, metres."""
+    before: tuple[Way | None, ...] = ()
+    """Ways out of obstacles that motions took with the transform as it was just before."""
+    gradual: bool = False
+    """Whether these turn to where they are to be as the obstacles move on; else they are there at once."""
 
     @property
     def demonstrated(self) -> MotionBelow:
@@ -86,6 +91,8 @@ class Built:
     """Integration of its flow; the error of one chosen by hand is checked."""
     chosen: Mapping[str, float] = field(default_factory=dict, compare=False)
     """Values that were chosen automatically, by the transform's fields."""
+    ways: tuple[Way | None, ...] = field(default=(), compare=False)
+    """Ways out of the obstacles that it avoids; None of those that are not in the way."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,172 @@
+"""Obstacles that are dragged through motions: what is remembered from one frame to the next, and what is left of it."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scenes import changed
+
+from dt_viz.arm.escape import STAYING, escape_directions
+from dt_viz.engine.frame import Stage
+from dt_viz.metrics import discrete_frechet, resample_by_arc_length
+from dt_viz.motion.following import Follower
+from dt_viz.motion.solve import kept_stance, solve
+from dt_viz.motion.stack import FINE, LIVE
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Union
+from dt_viz.transforms.base import ArmAvoidance
+
+JUMP = 0.05
+"""Distance of a rollout from that in the frame before that is not wanted, metres."""
+DRAGS = {
+    # task, who gives way: a place at which motions change sides, the direction of the drag, and the distance beyond the
+    # place at which they have changed sides in a drag, too, metres
+    ("draw_s", "task"): ((0.0967, -0.4986, 0.2306), (0.74, 0.54, -0.40), 0.036),
+    ("push_box", "cspace"): ((0.2340, -0.4880, 0.1777), (-0.72, -0.42, 0.55), 0.056),
+}
+
+
+class Drag:
+    """A ball of 15 cm that is dragged straight through a motion."""
+
+    def __init__(self, initial, task, space):
+        self.scenario = changed(initial(task), space=space)
+        place, direction, self.beyond = DRAGS[task, space]
+        self._place, self._direction = np.array(place), np.array(direction)
+
+    def at(self, offset):
+        """The scenario with the ball that far beyond the place, metres."""
+        x, y, z = (float(c) for c in self._place + offset * self._direction)
+        return changed(self.scenario, obstacles=(Sphere((x, y, z), 0.15),))
+
+    def dragged(self, engine, offsets):
+        """The frames of stage LIVE of an engine."""
+        stages = (engine.frames(self.at(offset)) for offset in offsets)
+        return [next(frame for frame in frames if frame.stage is Stage.LIVE) for frames in stages]
+
+
+@pytest.fixture(name="drag", params=DRAGS, ids=str)
+def _drag(request, initial):
+    return Drag(initial, *request.param)
+
+
+def resampled(frame):
+    return np.stack([resample_by_arc_length(path, 60) for path in frame.rollouts])
+
+
+def largest_step(frames):
+    return max(float(discrete_frechet(a, b).max()) for a, b in pairwise(map(resampled, frames)))
+
+
+def ways(solved):
+    """The ways out of the only obstacle."""
+    (way,) = solved.stack.built[0].made.ways if solved.arm is None else solved.arm.ways
+    return way
+
+
+def test_no_motion_jumps_where_a_drag_goes_on(drag, new_engine):
+    offsets = np.arange(-0.015, 0.007, 0.001)
+    assert largest_step([drag.dragged(new_engine(), [offset])[0] for offset in offsets[13:18]]) > JUMP
+    assert largest_step(drag.dragged(new_engine(), offsets)) < JUMP
+
+
+def test_sides_are_kept_at_rest_and_do_not_depend_on_the_steps(drag, new_engine):
+    rested = []
+    for num in (5, 11):
+        engine = new_engine()
+        drag.dragged(engine, np.linspace(-0.012, 0.004, num))
+        live, fine = (engine.solved(drag.at(0.004), precision) for precision in (LIVE, FINE))
+        assert ways(fine).kept and ways(fine).direction is ways(fine).side
+        assert ways(fine).side @ ways(live).side > 0.9
+        rested.append(ways(fine))
+    assert rested[0].side @ rested[1].side > 0.99
+    assert rested[0].side @ ways(new_engine().solved(drag.at(0.004), FINE)).side < 0.5
+
+
+def test_a_change_of_sides_is_complete_at_rest(drag, new_engine):
+    engine, fresh = new_engine(), new_engine()
+    drag.dragged(engine, np.linspace(-0.012, drag.beyond, 14))
+    rested, alone = (ways(e.solved(drag.at(drag.beyond), FINE)) for e in (engine, fresh))
+    assert rested.side @ alone.side > 0.999
+
+
+def test_where_nothing_was_dragged_nothing_is_remembered(drag, new_engine):
+    engine, scenario = new_engine(), drag.at(0.0)
+    drag.dragged(engine, [0.0])
+    shown = engine.solved(scenario, FINE)
+    alone = solve(scenario.motion, engine.nominal(scenario), FINE, engine.follower)
+    np.testing.assert_array_equal(shown.stack.bundle.positions, alone.stack.bundle.positions)
+    if shown.arm is not None and alone.arm is not None:
+        np.testing.assert_array_equal(shown.arm.p, alone.arm.p)
+
+
+# --- the arm ---
+
+
+def test_the_escape_before_comes_first_unless_it_costs_much_more():
+    rng = np.random.default_rng(0)
+    radius, tangents = np.full(3, 0.04), np.zeros((1, 3))
+    for depth in (0.002, 0.05):  # of the middle of the arm beside that of the obstacle
+        points = rng.normal(size=(3, 3, 2)) * 0.002 + np.array([0, 0, 2 + depth])[:, None]
+        ball = Sphere((0.0, 0.0, 2.0), 0.12)
+        usual = escape_directions(points, radius, tangents, ball)
+        found = escape_directions(points, radius, tangents, ball, before=np.array([0.0, 0.0, -1.0]))
+        assert usual[0][2] > 0.9
+        nearest = min(found, key=lambda direction: direction[2])
+        cheap = (0.1 + depth) < STAYING * (0.1 - depth)
+        assert cheap == (depth < 0.01)
+        assert nearest is found[0 if cheap else 1] and found[1 if cheap else 0][2] == pytest.approx(usual[0][2])
+
+
+def beside_goal(nominal, distance):
+    """What the arm avoids: a ball on the motion at this distance from the goal, metres."""
+    mean = np.mean(nominal.paths, axis=0)
+    x, y, z = mean[np.argmin(np.abs(np.linalg.norm(mean - nominal.goal, axis=1) - distance))]
+    return Sphere((float(x), float(y), float(z)), 0.15)
+
+
+def test_a_stance_is_kept_while_it_leaves_as_many_starts_free(engine, robot, initial):
+    nominal, follower = engine.nominal(initial("push_box")), Follower(robot)
+    near, farther = (ArmAvoidance(Union((beside_goal(nominal, distance),))) for distance in (0.11, 0.19))
+    stance = follower.admission(nominal, near).nominal.stance
+    assert stance is not None and follower.admission(nominal, farther).nominal.stance is None
+    assert follower.admission(nominal, farther, stance).nominal.stance == stance
+
+
+def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, initial):
+    nominal, follower = engine.nominal(initial("push_box")), Follower(robot)
+    ball = beside_goal(nominal, 0.11)
+    scenario = changed(initial("push_box"), obstacles=ball, space="cspace")
+    other = follower.admission(nominal, scenario.arm_avoidance).nominal
+    solved = solve(scenario, other, LIVE, follower)
+    x, y, z = ball.position
+    moved, away = (changed(scenario, obstacles=ball.moved((x, y, z + by))) for by in (0.005, 0.5))
+    assert kept_stance(moved, solved) == other.stance is not None
+    assert kept_stance(away, solved) is None
+    assert kept_stance(scenario, replace(solved, arm=None)) is None
+
+
+def test_a_start_without_a_way_is_not_tried_again_in_a_drag(engine, robot, initial, monkeypatch):
+    nominal, follower = engine.nominal(initial("lift_box")), Follower(robot)
+    x, y, z = (float(c) for c in np.mean(nominal.paths, axis=0)[90])
+    first, second = (
+        changed(initial("lift_box"), obstacles=Sphere((x, y, z + dz)), space="cspace") for dz in (0, 0.003)
+    )
+    avoiding, num, tried = follower.whole_arm.avoiding, len(nominal.strands), []
+
+    def never_from_the_third(lifted, *arguments, **options):
+        tried.append(lifted.num_hosts)
+        found = avoiding(lifted, *arguments, **options)
+        return replace(found, stuck=np.array([2])) if lifted.num_hosts == num else found
+
+    monkeypatch.setattr(follower.whole_arm, "avoiding", never_from_the_third)
+    before = solve(first, nominal, LIVE, follower)
+    assert before.nominal.left_out == (2,) and tried[0] == num
+    tried.clear()
+    after = solve(second, nominal, LIVE, follower, before)
+    assert after.nominal.left_out == (2,) and tried == [num - 1]
+    assert after.nominal.warnings == before.nominal.warnings
+    tried.clear()
+    solve(second, nominal, FINE, follower, before)
+    assert tried[0] == num
