@@ -1,6 +1,7 @@
 """Playback: the arm in the loop, or its finished motion again and again, on a thread of its own."""
 
 import threading
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -29,12 +30,21 @@ class Arm:
         self.q = q
 
 
+def playback_of(arm, draw, fail=None):
+    """A playback of such an arm; what keeps it from moving fails the test, unless it is taken."""
+    return Playback(cast(Any, arm), draw, fail or (lambda error: pytest.fail(str(error))))
+
+
 class Player:
     """A playback whose clock only moves when it is told to, and the places where the arm was drawn."""
 
     def __init__(self):
         self.arm, self.places = Arm(), []
-        self.playback = Playback(self.arm, lambda: self.places.append(self.playback.q[0]), pytest.fail)
+        self.playback = playback_of(self.arm, self.draw)
+
+    def draw(self):
+        if self.playback.q is not None:
+            self.places.append(self.playback.q[0])
 
     def play(self, seconds):
         """The places where the arm is meanwhile."""
@@ -60,7 +70,7 @@ def player(monkeypatch):
 @pytest.mark.parametrize("moment", [0.0, 0.3, 1.7, 4.0, 9.0])
 def test_both_arms_are_shown_at_the_same_moment(moment):
     times = np.linspace(0, 1, 60) ** 1.5 * 4
-    motion = ArmMotion(times, np.sin(times)[:, None] * np.arange(6), np.cos(times)[:, None] * np.arange(6))
+    motion = ArmMotion(times, np.sin(times)[:, None] * np.arange(6.0), np.cos(times)[:, None] * np.arange(6.0))
     for got, path in zip(at_moment(motion, moment), (motion.q, motion.without), strict=True):
         np.testing.assert_allclose(got, [np.interp(moment, times, angle) for angle in path.T], atol=1e-12)
 
@@ -68,14 +78,15 @@ def test_both_arms_are_shown_at_the_same_moment(moment):
 def test_the_arm_moves_without_being_asked_to(monkeypatch):
     monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
     arm, moved = Arm(), threading.Event()
-    playback = Playback(arm, lambda: moved.set() if arm.q[0] > 0.1 else None, pytest.fail)
+    playback = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
     assert moved.wait(PATIENCE)
     playback.close()
 
 
 def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkeypatch):
     monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
-    arm, said, moved = Arm(), [], threading.Event()
+    arm: Any = Arm()
+    said, moved = [], threading.Event()
     advance = arm.advance
 
     def stuck(*_, **__):
@@ -85,7 +96,7 @@ def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkey
         arm.advance = advance
 
     arm.advance, arm.stop = stuck, stop
-    playback = Playback(arm, lambda: moved.set() if arm.q[0] > 0.1 else None, said.append)
+    playback = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None, said.append)
     assert moved.wait(PATIENCE)
     playback.close()
     assert [str(error) for error in said] == ["no way"]

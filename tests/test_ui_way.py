@@ -16,9 +16,10 @@ def _way(scene):
 
 def moved(way, seconds, speed=0.1, begins=0.0):
     """Move the hand along the x axis; return where it is."""
-    for t in np.arange(begins, begins + seconds, 0.04):
+    times = np.arange(begins, begins + seconds, 0.04)
+    for t in times:
         way.show(t, np.array([speed * t, 0.0, 0.0]), AHEAD)
-    return speed * t
+    return float(speed * times[-1])
 
 
 def test_the_way_ahead_is_drawn_as_it_is(way):

@@ -141,6 +141,7 @@ class LiveArm:
             controller.begin(q)
             with self._changing:
                 self._q, self._number, self._controller = q, nominal.numbers[first], controller
+                self._homing = False
         else:
             self._controller.follow(solved)
         another = before is not None and (before.nominal.task is not nominal.task or number != self._chosen)
