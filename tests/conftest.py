@@ -74,10 +74,26 @@ def new_engine(fits, robot):
     return lambda: Engine(TASKS, fits, robot)
 
 
+_shared: list[Engine] = []
+
+
 @pytest.fixture(scope="session")
 def engine(new_engine) -> Engine:
-    """One engine for all tests: what it shows may not depend on what it has shown before."""
-    return new_engine()
+    """One engine for all tests: each begins with one that has shown nothing, so no obstacle is being dragged."""
+    _shared.append(new_engine())
+    return _shared[0]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_shown_before_a_module():
+    for engine in _shared:
+        engine._shown.clear()
+
+
+@pytest.fixture(autouse=True)
+def _nothing_shown_before_a_test(_nothing_shown_before_a_module):
+    for engine in _shared:
+        engine._shown.clear()
 
 
 @pytest.fixture(scope="session")

@@ -12,11 +12,14 @@ from scenes import biases, changing
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
+from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
+from dt_viz.engine.live_arm import LiveArm
 from dt_viz.engine.session import Session
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.certificates import Certificates
+from dt_viz.motion.following import Follower
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
@@ -49,6 +52,12 @@ def frame_of(scenario: Scenario, **changes: Any) -> Frame:
 
 class NoFrames:
     """An engine that has no frames: nothing here is about motions."""
+
+    def __init__(self):
+        self.arm = LiveArm(Follower(load_jaco()))
+
+    def see(self, _scenario):
+        pass
 
     def task(self, name):
         return TASKS[name]()
