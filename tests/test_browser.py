@@ -248,15 +248,24 @@ def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_p
     page, visitor = visit
     centre = np.array(visitor.session.scenario.obstacles[0].position)
     x, y = project(visitor, centre)
+    session = visitor.session
     for target in ((x + 40, y - 30), (x - 60, y + 20), (x + 25, y + 35)):
-        before = np.array(seen_at(visitor))
-        drag(page, np.add(before, (-18, 14)), target)  # off the handles
-        wait_until(lambda before=before: np.linalg.norm(seen_at(visitor) - before) > 20, "the sphere to follow")
-        until_drawn(visitor)
-    assert visitor.session.wait_idle(PATIENCE)
-    shift = np.array(visitor.session.scenario.obstacles[0].position) - centre
-    assert np.linalg.norm(shift) > 0.02
-    assert abs(shift[1]) < 1e-6  # the drawing plane is y = const
+        (here,) = session.scenario.obstacles
+
+        def put_back(here=here):
+            session.edit("test", **changing(session.scenario, obstacles=(here,)))
+
+        def followed(here=here):
+            """In the drawing plane, y = const, which a drag by an arrow of the gizmo leaves."""
+            shift = np.subtract(session.scenario.obstacles[0].position, here.position)
+            return np.linalg.norm(shift) > 0.02 and abs(shift[1]) < 1e-6
+
+        def ends(target=target):
+            return np.add(seen_at(visitor), (-18, 14)), target
+
+        drag_until(page, visitor, followed, put_back, ends)
+    assert session.wait_idle(PATIENCE)
+    assert abs(session.scenario.obstacles[0].position[1] - centre[1]) < 1e-6
     assert_shows_the_obstacle_where_it_is(visitor)
 
 
