@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.live_arm import REST
 from dt_viz.ui import playback as playback_module
-from dt_viz.ui.playback import REST, Playback, at_moment
+from dt_viz.ui.playback import Playback, at_moment
 
 PICTURE = 0.02
 PATIENCE = 30.0

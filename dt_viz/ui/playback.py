@@ -10,14 +10,12 @@ from collections.abc import Callable
 import numpy as np
 
 from dt_viz.engine.engine import ArmMotion
-from dt_viz.engine.live_arm import LiveArm
+from dt_viz.engine.live_arm import REST, LiveArm
 from dt_viz.flows.fields import Array
 
 logger = logging.getLogger(__name__)
 
 PICTURES_PER_SECOND = 25
-REST = 0.8
-"""Time at the goal before a replay begins again, seconds."""
 
 
 def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
