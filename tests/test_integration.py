@@ -8,7 +8,7 @@ from scenes import avoiding, biases, changed
 from test_stacks import random_scenario
 
 from dt_viz.engine.frame import Stage
-from dt_viz.flows.diffeomorphisms import AUTO, METHODS, AdaptiveFlow, Conjugated, Flow, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, METHODS, AdaptiveFlow, Chain, Conjugated, Flow, Integration
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, rk4
 from dt_viz.motion.diagnostics import fold_warnings, integration_warnings
@@ -80,6 +80,10 @@ def test_a_fold_of_what_is_drawn_is_found_where_there_is_none_on_the_way_back():
     conjugated = Conjugated(flow, by)
     assert fold_warnings("It", conjugated, coarse, by.inverse(y[missed]), by.inverse(x[missed]))
     assert fold_warnings("It", conjugated, coarse, by.inverse(y[fine]), by.inverse(x[fine])) == ()
+    inner, outer = AdaptiveFlow(field(0.3), 1.0), AdaptiveFlow(field(0.25), -1.0)  # and in a chain with others
+    chain, ends = Chain([inner, flow, outer]), (outer.inverse(y), inner.forward(x))
+    assert fold_warnings("It", chain, coarse, ends[0][missed], ends[1][missed])
+    assert fold_warnings("It", chain, coarse, ends[0][fine], ends[1][fine]) == ()
 
 
 def certified(engine, scenario):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from dt_viz.arm.collision import Nearest
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import Robot
-from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Integration
+from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import MAX_SAMPLES
 from dt_viz.motion.certificates import MAX_ROUND_TRIP
@@ -190,7 +190,7 @@ def integration_warnings(
         return ()
     keep = np.unique(np.linspace(0, len(y) - 1, NUM_CHECKED_LIVE).astype(int))
     lost = float(np.linalg.norm((flow.inverse(flow.forward(y[keep])) - y[keep]) * unit, axis=1).max())
-    folds = fold_warnings(name, flow, integration, y[keep], x[keep]) if isinstance(flow, Flow) else ()
+    folds = () if isinstance(flow, Conjugated) else fold_warnings(name, flow, integration, y[keep], x[keep])
     if lost <= MAX_ROUND_TRIP:
         return folds
     text = f"{name}: {integration} loses {in_millimetres(lost)} there and back"
@@ -206,18 +206,33 @@ def fold_warnings(
 
     Args:
         name: of the transform.
-        flow: its ψ, if it has steps in these or other coordinates; nothing is said of others.
+        flow: its ψ, or a chain with it, in these or other coordinates; nothing is said of what has no steps.
         integration: of that flow.
         y: (N, d) samples of the motions with the transform.
         x: (N, d) the samples below, which ψ⁻¹ leads to `y`.
     """
-    while isinstance(flow, Conjugated):
-        flow, y, x = flow.inner, flow.by.forward(y), flow.by.forward(x)
-    if not integration.by_hand or not isinstance(flow, Flow):
+    if not integration.by_hand:
         return ()
-    # ψ⁻¹ is looked at on its way to the samples: after a coarse ψ it starts elsewhere
-    det = min(flow.min_step_determinant(y, inverse=False), flow.min_step_determinant(x, inverse=True))
+    det = np.inf
+    for part, above, below in _stepped(flow, y, x):
+        # ψ⁻¹ is looked at on its way to the samples: after a coarse ψ it starts elsewhere
+        det = min(det, part.min_step_determinant(above, inverse=False), part.min_step_determinant(below, inverse=True))
     if det > 0:
         return ()
     text = f"{name}: a step of {integration} folds space (det {det:.2g}); take more steps or less time"
     return (MotionWarning(Kind.FOLDS, text, name),)
+
+
+def _stepped(flow: Diffeomorphism, y: Array, x: Array) -> Iterator[tuple[Flow, Array, Array]]:
+    """The parts of ψ that take equal steps, with the samples (N, d) above and below each, in its coordinates."""
+    if isinstance(flow, Flow):
+        yield flow, y, x
+    elif isinstance(flow, Conjugated):
+        yield from _stepped(flow.inner, flow.by.forward(y), flow.by.forward(x))
+    elif isinstance(flow, Chain):
+        above = [y]
+        for part in reversed(flow.parts[1:]):
+            above.append(part.forward(above[-1]))
+        for part, top in zip(flow.parts, reversed(above), strict=True):
+            yield from _stepped(part, top, x)
+            x = part.inverse(x)
