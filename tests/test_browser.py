@@ -3,6 +3,7 @@
 import io
 import itertools
 import time
+from contextlib import suppress
 from dataclasses import fields, replace
 
 import numpy as np
@@ -63,8 +64,13 @@ def wait_until(condition, what):
 
 def until_drawn(visitor):
     """Until the page has drawn what it was sent, and what it has sent itself has arrived: messages keep their order."""
-    visitor.client.flush()
-    visitor.client.get_render(height=16, width=16, timeout=PATIENCE)
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        visitor.client.flush()
+        with suppress(TimeoutError):  # a page that is busy may lose what it is asked
+            visitor.client.get_render(height=16, width=16, timeout=PATIENCE / TRIES)
+            return
+    pytest.fail("the page draws nothing")
 
 
 page_errors: list[str] = []

@@ -33,7 +33,9 @@ class Arm:
 
 def playback_of(arm, draw, fail=None):
     """A playback of such an arm; what keeps it from moving fails the test, unless it is taken."""
-    return Playback(cast(Any, arm), draw, fail or (lambda error: pytest.fail(str(error))))
+    playback = Playback(cast(Any, arm), draw, fail or (lambda error: pytest.fail(str(error))))
+    playback.begin()
+    return playback
 
 
 class Player:
@@ -101,6 +103,16 @@ def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkey
     assert moved.wait(PATIENCE)
     playback.close()
     assert [str(error) for error in said] == ["no way"]
+
+
+def test_nothing_moves_before_it_begins():
+    """The page that it draws on is being built."""
+    arm, drawn = Arm(), threading.Event()
+    playback = Playback(cast(Any, arm), drawn.set, pytest.fail)
+    assert not drawn.wait(0.2) and arm.asked == []
+    playback.begin()
+    assert drawn.wait(10)
+    playback.close()
 
 
 def test_its_time_has_the_chosen_pace_and_a_pause_stops_it(player):

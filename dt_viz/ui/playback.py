@@ -60,7 +60,7 @@ class Playback:
     """Moves the arm, on a thread of its own, and has it drawn where it is another one than before."""
 
     def __init__(self, live: LiveArm, draw: Callable[[], None], fail: Callable[[Exception], None]) -> None:
-        """Begin to move the arm.
+        """Take an arm; it moves from `begin` on.
 
         Args:
             live: the arm in the loop.
@@ -73,6 +73,9 @@ class Playback:
         self._playing, self._speed = True, 1.0
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="playback", daemon=True)
+
+    def begin(self) -> None:
+        """Move the arm from now on."""
         self._thread.start()
 
     @property
@@ -111,7 +114,8 @@ class Playback:
     def close(self) -> None:
         """Stop the thread, and wait for the current picture."""
         self._closed.set()
-        self._thread.join(timeout=1)
+        if self._thread.is_alive():
+            self._thread.join(timeout=1)
 
     def _loop(self) -> None:
         before = time.monotonic()

@@ -29,6 +29,8 @@ MAX_WAITING = 8
 MAX_SLEEP = 0.5
 """Longest sleep of the main thread, seconds. Only this thread runs signal handlers, and a signal that arrives just
 before a sleep, or on another thread, is handled after it."""
+CLOSING = 2.0
+"""Longest wait for what is drawn on a page while the server closes, seconds."""
 
 # a visitor may leave between two pictures of the arm; a picture without a receiver is no problem
 warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
@@ -98,8 +100,11 @@ class Server:
 
     def close(self) -> None:
         """Close all pages and stop listening."""
-        for visitor in self.visitors:
+        visitors = self.visitors
+        for visitor in visitors:
             visitor.close()
+        for visitor in visitors:  # what they are drawing needs the server
+            visitor.session.wait_idle(CLOSING)
         self._server.stop()
 
     def _welcome(self, client: viser.ClientHandle) -> None:

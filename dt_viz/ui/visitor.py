@@ -91,6 +91,7 @@ class Visitor:
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(engine.arm.push)
+        self._playback.begin()
 
     @property
     def arm(self) -> ArmPicture:

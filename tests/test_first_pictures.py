@@ -1,0 +1,34 @@
+"""The first picture of each task is one in which every check holds, along every rollout."""
+
+import numpy as np
+import pytest
+
+from dt_viz.engine.frame import Stage
+from dt_viz.motion.certificates import MAX_ROUND_TRIP
+from dt_viz.motion.diagnostics import MARGIN_TOLERANCE
+from dt_viz.motion.stack import FINE
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.visitor import initial_scenario
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_check_of_the_first_picture_holds(engine, robot, task):
+    scenario = initial_scenario(engine, task)
+    *_, frame = engine.frames(scenario)
+    certificates, report = frame.certificates, frame.certificates.collision
+    assert frame.stage is Stage.CERTIFIED
+    assert (frame.blocked, certificates.found) == ((), ())
+    assert certificates.lyapunov_falls
+    assert certificates.min_det_jacobian > 0
+    assert certificates.round_trip_error < MAX_ROUND_TRIP
+    assert report.itself is None
+    assert report.table.distance > 0
+    assert np.linalg.norm(frame.reached - frame.goal) < 1e-5
+    # the report is of the motion that the arm shows: look at the meshes on all of them, where one was in the way
+    arm, margin = engine.solved(scenario, FINE).arm, scenario.avoidance.margin
+    assert np.unique(arm.index).tolist() == list(range(len(frame.task.paths)))
+    clearance = engine.follower.whole_arm.mesh_clearance
+    enough = np.full(len(arm.q), margin)
+    assert clearance(arm.q, scenario.obstacle, enough).min() < margin - MARGIN_TOLERANCE
+    assert clearance(arm.p, scenario.obstacle, enough).min() > margin - MARGIN_TOLERANCE
+    assert np.all((robot.lower <= arm.p) & (arm.p <= robot.upper))
