@@ -155,7 +155,7 @@ class Page:
             "test",
             **changing(self.session.scenario, obstacles=obstacles, layers=layers, **avoidance),
             starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
-            view=View(generator=True, click_to_start=True, **view),
+            view=View(generator=True, click_to_start=True, handles=True, **view),
         )
         assert task.name == "draw_s"
         return self.session.scenario

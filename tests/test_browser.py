@@ -34,7 +34,8 @@ PATIENCE = 240.0
 """Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
 TRIES = 8
 """Drags or clicks until the page, which may still be on its way to what was asked of it, has taken one."""
-LIGHT = View(playing=False, rollouts=False, ghost=False, field=False, arm=False, table=False, demonstrations=False)
+HIDDEN = ("playing", "rollouts", "ghost", "field", "arm", "table", "demonstrations")
+LIGHT = View(handles=True, **dict.fromkeys(HIDDEN, False))
 """The obstacle only: drawing the lines by software takes a tenth of a second, and the arm most of one."""
 
 pytestmark = [pytest.mark.browser, needs_chromium]

@@ -29,7 +29,6 @@ from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS, Panel
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.panel.status import CHANGED, COMPUTING, hint, status_html
-from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import PEDESTAL
 from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.scene.legend import OCCUPANCY
@@ -200,16 +199,11 @@ def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
 
     def colours(blocked):
         rollouts.draw(replace(frame(blocked=blocked), task=TASKS["draw_s"](), rollouts=paths))
-        return rollouts.lines.node.colors.reshape(-1, 3).astype(int)
+        return np.array([rollouts.hero.colour, rollouts.others.colour])
 
     fresh, stale = colours(()), colours(("the obstacle touches the base",))
     assert np.ptp(fresh, axis=1).min() > 60 and np.ptp(stale, axis=1).max() < 20
     np.testing.assert_array_equal(colours(()), fresh)
-    starts = rollouts.starts
-    rollouts.draw(replace(frame(blocked=("no way",)), task=TASKS["draw_s"](), rollouts=paths))
-    np.testing.assert_array_equal(np.reshape(starts.colors, (-1, 3))[0], palette.STALE)
-    colours(())
-    np.testing.assert_array_equal(np.reshape(starts.colors, (-1, 3))[0], palette.START)
 
 
 def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(engine, initial, scene):
@@ -217,7 +211,7 @@ def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(eng
         pass
 
     starts = Starts(scene, ignored, ignored, ignored)
-    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, starts)
+    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, ignored, starts)
     view = View(field=True, streamlines=True, grid=True, onion=True, colour="det")
     good = changed(initial("draw_s"), space="cspace", view=view)
     base = changed(good, obstacles=(Sphere((0.0, 0.0, 0.2)),))
@@ -245,7 +239,7 @@ def drawn(engine, initial, scene):
         pass
 
     starts = Starts(scene, ignored, ignored, ignored)
-    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, starts)
+    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, ignored, starts)
     scenario = replace(initial("draw_s"), view=View(field=True, streamlines=True, grid=True, onion=True))
     pictures.adopt(scenario)
     pictures.draw(next(engine.frames(scenario)))
@@ -253,9 +247,9 @@ def drawn(engine, initial, scene):
 
 
 def is_grey(pictures):
-    lines = cast(Rollouts, pictures.layer("rollouts")).lines.node
+    rollouts = cast(Rollouts, pictures.layer("rollouts"))
     shown = {pictures.layer(name).visible for name in (*OF_A_MOTION, *OF_A_TASK)}
-    grey = bool(np.ptp(lines.colors.reshape(-1, 3).astype(int), axis=1).max() < 20)
+    grey = bool(np.ptp(rollouts.hero.colour) < 20)
     assert shown == {not grey}
     return grey
 
@@ -344,15 +338,15 @@ def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(serv
 
 
 @pytest.mark.parametrize("num", [0, 1, 5])
-def test_the_browser_gets_a_colour_for_each_point_and_of_none_a_single_one(scene, num):
+def test_the_browser_gets_a_colour_for_each_arrow_and_of_none_a_single_one(scene, num):
     lines = Lines(scene, "/lines", (10, 20, 30), 0.001)
     arrows = Arrows(scene, "/arrows", (10, 20, 30), (40, 50, 60), 0.01)
     for _ in range(2):
         lines.show_segments(np.ones((num, 2, 3)))
         arrows.show(np.ones((num, 3)), np.ones((num, 3)))
-        for node in (lines.node, arrows.node):
-            assert len(node.points) == num
-            assert node.colors.shape[0] == (num or 3)
+        assert len(lines.node.points) == len(arrows.node.points) == num
+        assert lines.node.colors.shape == (3,)
+        assert arrows.node.colors.shape[0] == (num or 3)
 
 
 # --- Joint plots ---
@@ -419,7 +413,7 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
 
 def test_every_layer_has_a_checkbox():
     switches = {f.name for f in fields(View) if f.type == "bool"}
-    assert set(VIEW_LABELS) == switches - {"playing", "replay", "move_slice", "click_to_start"}
+    assert set(VIEW_LABELS) == switches - {"playing", "replay", "move_slice", "click_to_start", "handles"}
 
 
 PACE = Pace(0.02, 10.0, 0)

@@ -39,12 +39,12 @@ CLOUD = CloudObstacle((-0.1, -0.5, 0.4), Cloud(POINTS, np.linalg.norm(POINTS, ax
 
 @pytest.fixture
 def shown(server):
-    yield Obstacles(server.scene, lambda *_: None, lambda _: None)
+    yield Obstacles(server.scene, lambda *_: None, lambda _: None, lambda _: None)
     server.scene.reset()
 
 
 def scenario(*obstacles, selected=0, **changes):
-    return avoiding("draw_s", obstacles, view=View(selected=selected), **changes)
+    return avoiding("draw_s", obstacles, view=View(selected=selected, handles=True), **changes)
 
 
 # --- The scene ---

@@ -27,6 +27,7 @@ from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.scene import Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import VOLUME, ColourSlice, FieldArrows, Streamlines, painted, scale_of
+from dt_viz.ui.scene.tubes import NUM_SIDES
 
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
 POSE = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
@@ -63,12 +64,15 @@ def test_the_frame_lies_where_the_slice_does_and_only_while_it_is_of_use(scene):
 
 
 def test_one_thing_at_a_time_has_handles_and_none_in_a_picture(scene):
-    picture, obstacles = MovableSlice(scene, lambda *_: None), Obstacles(scene, lambda *_: None, lambda _: None)
+    picture, obstacles = (
+        MovableSlice(scene, lambda *_: None),
+        Obstacles(scene, lambda *_: None, lambda _: None, lambda _: None),
+    )
     biases = Anchors(scene, lambda *_: None, lambda _: None)
     picture.draw(frame())
     for moving in (True, False):
         for each in (picture, obstacles, biases):
-            each.adopt(seen(move_slice=moving))
+            each.adopt(seen(move_slice=moving, handles=True))
         assert obstacles.items[0].handles.shown is not moving
     picture.adopt(seen(move_slice=True))
     with picture.without_handles():
@@ -145,15 +149,19 @@ def test_the_image_follows_the_slice(scene):
         assert abs((place - area.centre) @ area.normal) < 1e-9
 
 
-def test_rollouts_of_the_whole_stack_are_paler_and_thinner_beside_a_level(scene):
+def test_rollouts_of_the_whole_stack_are_translucent_and_thinner_beside_a_level(scene):
+    def widths():
+        meshes = (tubes.node.vertices for tubes in (rollouts.hero, rollouts.others))
+        return [np.ptp(mesh[-2 * NUM_SIDES :, 1]) for mesh in meshes]  # at the end
+
     rollouts = Rollouts(scene)
     rollouts.draw(frame())
-    bold, colours = rollouts.lines.node.thickness, rollouts.lines.node.colors.copy()
+    hero, others = widths()
+    assert hero > others > 0
     rollouts.draw(frame(level=0))
-    assert rollouts.lines.node.thickness < bold
-    assert rollouts.lines.node.colors.mean() > colours.mean()
+    assert len(rollouts.hero.node.vertices) == 3 and widths()[1] < others
     rollouts.draw(frame())
-    assert rollouts.lines.node.thickness == bold
+    assert widths() == [hero, others]
 
 
 # --- Scales ---

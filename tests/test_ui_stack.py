@@ -19,6 +19,7 @@ from dt_viz.ui.panel.transforms import add, add_transform_controls, delete
 from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.levels import LevelRollouts
 from dt_viz.ui.scene.pots import Pots, surface
+from dt_viz.ui.scene.tubes import NUM_SIDES
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 AVOIDANCE = "Avoidance"
@@ -127,8 +128,8 @@ def test_the_selected_level_is_drawn_and_named(scene):
     for name, level in ((IMITATION, 0), ("Bias 2", 2), (AVOIDANCE, 3)):
         picture.draw(frame(replace(SCENARIO, view=View(level=name)), level=level))
         assert picture.visible and name.lower() in picture.label.text.lower()
-        assert len(picture.lines.node.points) == 4
-        assert (picture.lines.node.points == level).all()
+        middles = picture.tubes.node.vertices.reshape(-1, NUM_SIDES, 3).mean(axis=1)
+        np.testing.assert_allclose(middles[-1], level, atol=1e-6)
     picture.draw(frame())
     assert not picture.visible
 

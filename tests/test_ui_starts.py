@@ -100,7 +100,7 @@ class Scene:
         self.labels[name] = text
 
     def add_icosphere(self, name, **_look):
-        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False, color=palette.START, visible=True)
+        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False, color=palette.ADDED, visible=True)
 
         def keep(callback, what):
             setattr(node, what, callback)
@@ -182,6 +182,6 @@ def test_balls_are_grey_while_nothing_moves_from_them(opened, initial, engine):
     _, starts, _ = opened
     starts.adopt(replace(initial("draw_s"), starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))))
     area = engine.task("draw_s").slice
-    for blocked, colour in ((("no way",), palette.STALE), ((), palette.START)):
+    for blocked, colour in ((("no way",), palette.STALE), ((), palette.ADDED)):
         starts.draw(cast(Frame, SimpleNamespace(slice=area, blocked=blocked)))
         assert [item.ball.color for item in starts.items] == [colour] * 2

@@ -59,7 +59,9 @@ class View:
     """Lyapunov value, distance to the demonstration and clearance along the rollout that the arm follows."""
     table: bool = True
     selected: int = 0
-    """Number of the obstacle that has handles; if there are fewer, the last one has."""
+    """Number of the obstacle that the panel changes; if there are fewer, it is the last one."""
+    handles: bool = False
+    """Whether that has handles, which move and turn it along axes."""
     generator: bool = False
     """Arrows of the learned generator, the vector field whose flow is ψ."""
     generator_layer: int = 0

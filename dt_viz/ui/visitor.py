@@ -73,7 +73,8 @@ class Visitor:
                 client.scene,
                 robot,
                 self._obstacle_moved,
-                self._obstacle_selected,
+                self._obstacle_grabbed,
+                self._obstacle_clicked,
                 self._anchor_moved,
                 self._anchor_selected,
                 self._slice_moved,
@@ -173,8 +174,13 @@ class Visitor:
                 obstacles[index] = obstacles[index].moved(as_point(position), as_quaternion(wxyz))
                 self.session.edit(f"obstacle {index}", stack=with_avoidance(scenario, obstacles=tuple(obstacles)))
 
-    def _obstacle_selected(self, index: int) -> None:
+    def _obstacle_grabbed(self, index: int) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, selected=index))
+
+    def _obstacle_clicked(self, index: int) -> None:
+        scenario = self.session.scenario
+        handles = not (scenario.view.handles and index == scenario.selected)
+        self.session.edit("select", view=replace(scenario.view, selected=index, handles=handles))
 
     def _anchor_moved(self, name: str, position: Array, phase: str) -> None:
         with self._dragging(phase) as scenario:
@@ -227,6 +233,7 @@ class Visitor:
                 without = self._playback.without if posed[1] else None
                 self.arms.pose(q, q if without is None else without)
             self.carried.pose(hand, self._playback.arrived)
+            self.pictures.rollouts.fade()
             if not view.replay:
                 self.way.show(time.monotonic(), hand, live.ahead)
                 self.grip.say(live.note)

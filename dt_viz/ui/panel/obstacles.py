@@ -63,7 +63,7 @@ class ObstaclePanel:
         """Content and name of a file that was refused for its size, and the unit that would fit."""
         self._reader = Reader(lambda: say("Another visitor's file is being read; yours is read after it.", False))
         with gui.add_folder("Obstacles"):
-            hint = "the obstacle with handles; a click in the scene selects one, too"
+            hint = "the obstacle that is changed here; a click in the scene selects one, too"
             choice = gui.add_dropdown("Selected", (NONE,), hint=hint)
             bindings.properties(choice, options=_names)
             bindings.input(
@@ -71,6 +71,9 @@ class ObstaclePanel:
                 lambda s: _names(s)[s.selected or 0],
                 lambda s, name: {"view": replace(s.view, selected=choice.options.index(name))},
             )
+            hint = "arrows and arcs that move and turn it along axes; a click on an obstacle shows and hides them"
+            handles = gui.add_checkbox("Handles", False, hint=hint)
+            bindings.input(handles, lambda s: s.view.handles, lambda s, on: {"view": replace(s.view, handles=on)})
             group = gui.add_button_group("Add", tuple(SHAPES), hint=f"up to {MAX_OBSTACLES}, where there is room")
             bindings.properties(group, visible=_has_room)  # groups of buttons cannot be disabled
             bindings.on(group, lambda session, name: later(partial(add, session, SHAPES[name])))

@@ -11,7 +11,8 @@ from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.picture import Lines, Picture
+from dt_viz.ui.scene.picture import Picture
+from dt_viz.ui.scene.tubes import Tubes
 
 LABEL_GAP = 0.03
 """Height of the label above the slice, metres."""
@@ -22,7 +23,7 @@ class LevelRollouts(Picture):
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/level", show_axes=False, visible=False))
-        self.lines = Lines(scene, "/level/rollouts", palette.LEVEL, 0.0052)
+        self.tubes = Tubes(scene, "/level/rollouts", palette.LEVEL, 0.0026, ball=0.006)
         self.end = scene.add_frame("/level/end", show_axes=False, visible=False)
         scene.add_icosphere("/level/end/ball", radius=0.009, color=palette.LEVEL)
         scene.add_label(
@@ -34,7 +35,8 @@ class LevelRollouts(Picture):
         """See `Picture`."""
         if frame.level is not None:
             paths = frame.levels[frame.level]
-            self.lines.show(paths, colour=palette.STALE if frame.blocked else None)
+            self.tubes.show(paths)
+            self.tubes.colour = palette.STALE if frame.blocked else palette.LEVEL
             self._mark(paths[0][-1], frame.goal)
             self.label.text, area = manifold(frame.scenario), frame.slice
             self.label.position = area.centre + np.array([0.0, 0.0, np.ptp(area.border[:, 2]) / 2 + LABEL_GAP])

@@ -7,6 +7,7 @@ import viser
 from dt_viz.engine.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Arrows, Lines, Picture
+from dt_viz.ui.scene.tubes import Tubes
 
 GENERATOR_LENGTH = 0.030
 """Length of the largest arrow, metres."""
@@ -52,7 +53,8 @@ class WarpedGrid(Picture):
         """See `Picture`."""
         if frame.pictures.grid is not None:
             beside = frame.level is not None
-            self.lines.show(frame.pictures.grid.lines, colour=palette.GRID_BESIDE if beside else palette.GRID)
+            self.lines.show(frame.pictures.grid.lines)
+            self.lines.colour = palette.GRID_BESIDE if beside else palette.GRID
             self.lines.node.thickness = THIN if beside else THICK
 
 
@@ -64,7 +66,7 @@ class BaseInset(Picture):
         self._border = Lines(scene, "/base/border", palette.INSET, 0.0016)
         self._grid = Lines(scene, "/base/grid", palette.GRID, 0.0010)
         self.arrows = Arrows(scene, "/base/field", palette.INSET, palette.ARROW_FAST, INSET_LENGTH)
-        self.rays = Lines(scene, "/base/rays", palette.ROLLOUT, 0.0036)
+        self.rays = Tubes(scene, "/base/rays", palette.ROLLOUT, 0.0018, ball=0.0045)
         self._goal = scene.add_icosphere("/base/goal", radius=0.009, color=palette.GOAL)
         self._labels = tuple(
             scene.add_label(f"/base/{text}", text, anchor="bottom-center", font_screen_scale=0.8)
@@ -76,7 +78,7 @@ class BaseInset(Picture):
         picture = frame.pictures.base
         if picture is None:
             return
-        self.rays.show(picture.rays, marked=frame.scenario.arm_rollout % len(picture.rays))
+        self.rays.show(picture.rays)
         self.arrows.show(picture.points, picture.velocities)
         self._border.show([picture.border])
         self._grid.node.visible = frame.scenario.view.grid

@@ -43,7 +43,8 @@ class ObstaclePicture:
         scene: viser.SceneApi,
         index: int,
         moved: Moved,
-        selected: Callable[[int], None],
+        grabbed: Callable[[int], None],
+        clicked: Callable[[int], None],
         along: Callable[[Drag], Array],
     ) -> None:
         """Draw nothing yet.
@@ -52,7 +53,8 @@ class ObstaclePicture:
             scene: scene of the visitor.
             index: index of the obstacle in the scenario.
             moved: called with each new pose.
-            selected: called with the index when the obstacle is clicked or grabbed.
+            grabbed: called with the index when a drag of the obstacle begins.
+            clicked: called with the index when it is clicked.
             along: returns the shift (3,) by an event of a drag, metres.
         """
         self.gizmo = scene.add_transform_controls(f"/obstacles/{index}", line_width=3.0, depth_test=False)
@@ -68,19 +70,19 @@ class ObstaclePicture:
 
         def dragged(drag: Drag) -> None:
             if drag.phase == "start":
-                selected(index)
+                grabbed(index)
             self.handles.drag(drag, along(drag), partial(moved, index))
 
         self.handles.on_move(partial(moved, index))
         gestures.on_drag(self.mesh, dragged)
-        gestures.on_click(self.mesh, partial(selected, index))
+        gestures.on_click(self.mesh, partial(clicked, index))
 
-    def adopt(self, obstacle: Obstacle, *, selected: bool, avoided: bool, opened: bool) -> None:
+    def adopt(self, obstacle: Obstacle, *, handles: bool, avoided: bool, opened: bool) -> None:
         """Show the obstacle where it stands; a pose that the browser has already is not sent to it.
 
         Args:
             obstacle: obstacle to show.
-            selected: whether it has handles.
+            handles: whether it has handles.
             avoided: whether motions avoid it.
             opened: whether its front faces are left out, to show the inside.
         """
@@ -92,7 +94,7 @@ class ObstaclePicture:
             self.gizmo.disable_rotations = isinstance(look, Sphere)
         self.mesh.scale = scale
         self.handles.scale = HANDLE_SCALE * (0.5 + min(obstacle.radius / MAX_DIAMETER, 0.8))
-        self.handles.show(selected)
+        self.handles.show(handles)
         self.mesh.side = "back" if opened else "front"
         self.mesh.opacity = OPACITY_OPENED if opened else OPACITY if avoided else OPACITY_FAINT
 
@@ -104,17 +106,20 @@ class ObstaclePicture:
 class Obstacles(Dragged):
     """All obstacles of a scenario."""
 
-    def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[int], None]) -> None:
+    def __init__(
+        self, scene: viser.SceneApi, moved: Moved, grabbed: Callable[[int], None], clicked: Callable[[int], None]
+    ) -> None:
         """Begin with none.
 
         Args:
             scene: scene of the visitor.
             moved: called with each new pose of one of them.
-            selected: called with the index of one that is clicked or grabbed.
+            grabbed: called with the index of one that a drag begins of.
+            clicked: called with the index of one that is clicked.
         """
         super().__init__(scene.add_frame("/obstacles", show_axes=False))
         self._scene = scene
-        self._moved, self._selected = moved, selected
+        self._moved, self._grabbed, self._clicked = moved, grabbed, clicked
         self.items: list[ObstaclePicture] = []
         """Pictures of the obstacles, in the order of the scenario."""
 
@@ -129,11 +134,13 @@ class Obstacles(Dragged):
             self.items.pop().remove()
         while len(self.items) < len(scenario.obstacles):
             index = len(self.items)
-            self.items.append(ObstaclePicture(self._scene, index, self._moved, self._selected, self.along))
+            told = self._moved, self._grabbed, self._clicked
+            self.items.append(ObstaclePicture(self._scene, index, *told, self.along))
+        handled = scenario.selected if scenario.view.handles and not scenario.view.move_slice else None
         for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
             item.adopt(
                 obstacle,
-                selected=index == scenario.selected and not scenario.view.move_slice,
+                handles=index == handled,
                 avoided=scenario.avoids,
                 opened=scenario.view.colour == "occupancy",
             )

@@ -2,26 +2,23 @@
 
 DEMONSTRATION = (86, 180, 233)
 ROLLOUT = (213, 94, 0)
-CHOSEN_ROLLOUT = (150, 45, 0)
-"""Rollout that the arm follows."""
+ADDED = (150, 98, 20)
+"""Rollouts from added starts, and these."""
 GHOST = (84, 88, 96)
 """Motions without avoidance."""
 WAY = (118, 42, 131)
 """Way of the hand that lies ahead of the arm in the loop, and the ball to hold it by."""
-WAY_FADED = (232, 226, 236)
+WAY_FADED = (214, 204, 222)
 """End of the trail that it leaves."""
 STALE = (158, 163, 171)
 """Rollouts of an earlier scenario."""
 GOAL = (0, 158, 115)
-START = (213, 94, 0)
 OBSTACLE = (204, 121, 167)
 BIAS = (230, 159, 0)
 REGION = (240, 196, 108)
 """Region of influence of a bias point."""
 LEVEL = (0, 114, 178)
 """Rollouts on the selected level of the stack."""
-ROLLOUT_BESIDE = (238, 178, 132)
-"""Rollouts of the whole stack beside those of a level."""
 SLICE = (120, 126, 136)
 """Frame of a moved slice."""
 STREAMLINE = (92, 108, 138)
@@ -52,7 +49,9 @@ INSET = (120, 126, 136)
 POT = (176, 132, 98)
 CARRIED = (240, 228, 66)
 """Ball that is dropped in a pot."""
-TABLE = (226, 217, 204)
+TABLE = (233, 231, 229)
+ZENITH, HORIZON = (212, 221, 234), (238, 241, 245)
+"""Background, from above down to where the table fades into it."""
 ARM = (206, 210, 216)
 ARM_RING = (62, 66, 74)
 ONION = (70, 116, 168)
@@ -66,7 +65,7 @@ BRAND = (0, 114, 178)
 
 
 def linear(colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Return the value that shows as this colour on lines and arrows, whose colours are linear light."""
+    """Return the value that shows as this colour in fog and on lines and arrows of many colours: linear light."""
     red, green, blue = (round(255 * (c / 255) ** 2.2) for c in colour)
     return red, green, blue
 

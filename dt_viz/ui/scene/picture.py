@@ -89,34 +89,36 @@ class Lines:
             thickness: metres.
             dash: length of a dash and of the gap after it, metres; 0 draws through.
         """
-        self._colour = colour
         self._dash = dash
-        self.node = scene.add_line_segments(
-            name, np.zeros((1, 2, 3), np.float32), rgb(colour, (1, 2, 3)), thickness=thickness
-        )
+        self.node = scene.add_line_segments(name, np.zeros((1, 2, 3), np.float32), colour, thickness=thickness)
 
-    def show(
-        self,
-        paths: Sequence[Array],
-        marked: int | None = None,
-        mark: Colour = palette.CHOSEN_ROLLOUT,
-        colour: Colour | None = None,
-    ) -> None:
-        """Show polylines (T_i, 3), metres, in a `colour`, the one with index `marked` in the colour `mark`."""
+    @property
+    def colour(self) -> NDArray[np.uint8]:
+        """Colour of all lines, (3,)."""
+        return self.node.colors
+
+    @colour.setter
+    def colour(self, colour: Colour) -> None:
+        self.node.colors = np.array(colour, np.uint8)
+
+    def show(self, paths: Sequence[Array]) -> None:
+        """Show polylines (T_i, 3), metres."""
+        self.show_segments(self.segments(paths))
+
+    def segments(self, paths: Sequence[Array]) -> Array:
+        """The segments (K, 2, 3) that polylines (T_i, 3), metres, are drawn with."""
         segments: list[Array] = [np.zeros((0, 2, 3))]
-        colours: list[NDArray[np.uint8]] = [np.zeros((0, 2, 3), np.uint8)]
-        for index, path in enumerate(paths):
+        for path in paths:
             pieces = np.stack([path[:-1], path[1:]], axis=1)
             if self._dash:
                 middle = np.cumsum(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1))
                 pieces = pieces[(middle / self._dash).astype(int) % 2 == 0]
             segments.append(pieces)
-            colours.append(rgb(mark if index == marked else colour or self._colour, pieces.shape))
-        assign(self.node, np.concatenate(segments), np.concatenate(colours))
+        return np.concatenate(segments)
 
     def show_segments(self, segments: Array) -> None:
         """Show segments (K, 2, 3), metres."""
-        assign(self.node, segments, rgb(self._colour, segments.shape))
+        self.node.points = segments.astype(np.float32)
 
 
 def assign(node: Any, points: Array, colours: NDArray[np.uint8]) -> None:  # noqa: ANN401 - lines, arrows and clouds

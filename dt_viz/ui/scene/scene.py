@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import viser
+from scipy.spatial import KDTree
 
 from dt_viz.arm.robot import Robot
 from dt_viz.engine.frame import Frame
+from dt_viz.flows.fields import Array
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
-from dt_viz.scenario.tasks import Task
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.anchors import BALL_RADIUS, Anchors
 from dt_viz.ui.scene.anchors import Moved as AnchorMoved
@@ -28,14 +31,24 @@ from dt_viz.ui.scene.picture import Lines, Picture
 from dt_viz.ui.scene.pots import Pots
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
+from dt_viz.ui.scene.stage import Table, set_stage
 from dt_viz.ui.scene.starts import Starts
+from dt_viz.ui.scene.tubes import Tubes, evenly_bent
 
-BOLD, THIN = 0.0048, 0.0026
-"""Thickness of the whole stack's rollouts, metres: by themselves, and beside those of a level."""
+BOLD, THIN = 0.0034, 0.0020
+"""Radius of the rollout that the arm follows, and of the others, metres."""
+BESIDE = 0.7
+"""Thickness of rollouts beside those of a level, relative to the usual one."""
+OPACITY = 0.55
+"""Opacity of the rollouts that the arm does not follow."""
+COVERED = 0.0035
+"""Distance of a line from the middle of a rollout up to which it counts as inside its tube, metres."""
+NUM_COMPARED = 400
+"""Number of points of a rollout that lines are compared with."""
+JUMP, FADING = 0.05, 0.15
+"""Distance by which a rollout jumps, metres, where it then fades out where it was, and the time that takes, seconds."""
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
 """Labels of the demonstrations' end: where motions end there, and where they end elsewhere."""
-ADDED = 0.0022
-"""Thickness of rollouts from added starts, metres."""
 OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
 """Fields of `View` whose pictures are hidden while there is no motion: unlike the rollouts they cannot turn grey."""
 OF_A_TASK = {"demonstrations", "ghost"}
@@ -43,64 +56,97 @@ OF_A_TASK = {"demonstrations", "ghost"}
 COMPUTING = "computing"
 
 
-class Demonstrations(Picture):
-    """The demonstrations, as thin lines."""
+class Covered:
+    """Where lines run inside the rollouts' tubes: there they are not drawn."""
 
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._lines = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018)
+    def __init__(self) -> None:
+        self._rollouts: tuple[Array, ...] = ()
+        self._samples = KDTree(np.zeros((1, 3)))
+
+    def beside(self, rollouts: tuple[Array, ...], segments: Array) -> Array:
+        """Those of the segments (K, 2, 3), metres, that are beside all rollouts (T_i, 3)."""
+        if rollouts is not self._rollouts:
+            samples = np.concatenate([evenly_bent(path, NUM_COMPARED) for path in rollouts])
+            self._rollouts, self._samples = rollouts, KDTree(samples)
+        distance, _ = self._samples.query(segments.mean(axis=1))
+        return segments[distance > COVERED]
+
+
+class Demonstrations(Picture):
+    """The demonstrations, as thin lines, where no rollout covers them."""
+
+    def __init__(self, scene: viser.SceneApi, covered: Covered) -> None:
+        self._lines, self._covered = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018), covered
         super().__init__(self._lines.node)
-        self._task: Task | None = None
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        if frame.task is not self._task:
-            self._task = frame.task
-            self._lines.show(frame.task.paths)
+        self._lines.show_segments(self._covered.beside(frame.rollouts, self._lines.segments(frame.task.paths)))
 
 
 class Rollouts(Picture):
-    """The rollouts, bold, with a dot at each start; thin and pale beside those of a level of the stack.
+    """The rollouts as tubes: the one that the arm follows thick, the others thin and translucent.
 
-    Motions that begin at added starts are thin.
+    Where some of them jump elsewhere, as when a drag takes them past the other side of an obstacle, they fade out
+    where they were.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self.lines = Lines(scene, "/rollouts", palette.ROLLOUT, BOLD)
-        super().__init__(self.lines.node)
-        self.added = Lines(scene, "/rollouts/added", palette.ROLLOUT, ADDED)
-        self.starts = scene.add_point_cloud(
-            "/rollouts/starts", np.zeros((1, 3), np.float32), palette.START, point_size=0.010, point_shape="circle"
-        )
+        super().__init__(scene.add_frame("/rollouts", show_axes=False))
+        self.hero = Tubes(scene, "/rollouts/followed", palette.ROLLOUT, BOLD, ball=2.4 * BOLD)
+        self.others = Tubes(scene, "/rollouts/others", palette.ROLLOUT, THIN, ball=2.6 * THIN, opacity=OPACITY)
+        self.added = Tubes(scene, "/rollouts/added", palette.ADDED, THIN)
+        self.former = Tubes(scene, "/rollouts/former", palette.ROLLOUT, THIN, opacity=OPACITY)
+        self._drawn: Frame | None = None
+        self._jumped = -math.inf
+        """Time at which some jumped, seconds."""
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        num = len(frame.rollouts) - frame.num_added
-        for lines, paths, first in ((self.lines, frame.rollouts[:num], 0), (self.added, frame.rollouts[num:], num)):
-            chosen = None if frame.chosen is None else frame.chosen - first
-            if frame.blocked:
-                lines.show(paths, chosen, mark=palette.GHOST, colour=palette.STALE)
-            elif frame.level is not None:
-                lines.show(paths, colour=palette.ROLLOUT_BESIDE)
-            else:
-                lines.show(paths, chosen)
-        self.lines.node.thickness = BOLD if frame.level is None else THIN
-        self.starts.points = np.stack([path[0] for path in frame.rollouts[:num]]).astype(np.float32)
-        self.starts.colors = np.array(palette.STALE if frame.blocked else palette.START, np.uint8)
+        num, paths = len(frame.rollouts) - frame.num_added, frame.rollouts
+        followed = frame.chosen if frame.level is None else None
+        self.hero.show([] if followed is None else [paths[followed]])
+        self.others.show([paths[k] for k in range(num) if k != followed], scale=1.0 if frame.level is None else BESIDE)
+        self.added.show([paths[k] for k in range(num, len(paths)) if k != followed])
+        for tubes, colour in (
+            (self.hero, palette.ROLLOUT),
+            (self.others, palette.ROLLOUT),
+            (self.added, palette.ADDED),
+        ):
+            tubes.colour = palette.STALE if frame.blocked else colour
+        jumped = _jumped(self._drawn, frame)
+        if jumped:
+            self.former.show(jumped)
+            self._jumped = time.monotonic()
+        self._drawn = frame
+
+    def fade(self) -> None:
+        """Let what has jumped fade; called again and again."""
+        left = 1 - (time.monotonic() - self._jumped) / FADING
+        self.former.node.visible = left > 0
+        if left > 0:
+            self.former.node.opacity = OPACITY * left
+
+
+def _jumped(before: Frame | None, frame: Frame) -> list[Array]:
+    """The rollouts of a frame that are far from where they are in the next one."""
+    if before is None or before.task is not frame.task or len(before.rollouts) != len(frame.rollouts):
+        return []
+    pairs = zip(before.rollouts, frame.rollouts, strict=True)
+    return [old for old, new in pairs if np.linalg.norm(evenly_bent(old) - evenly_bent(new), axis=1).max() > JUMP]
 
 
 class Ghost(Picture):
-    """The undeformed rollouts, dashed."""
+    """The undeformed rollouts, dashed, where no rollout covers them."""
 
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._lines = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012)
+    def __init__(self, scene: viser.SceneApi, covered: Covered) -> None:
+        self._lines, self._covered = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012), covered
         super().__init__(self._lines.node)
-        self._shown: object = None
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        if frame.ghost is not self._shown:
-            self._shown = frame.ghost
-            self._lines.show(frame.ghost[: len(frame.ghost) - frame.num_added])
+        undisturbed = frame.ghost[: len(frame.ghost) - frame.num_added]
+        self._lines.show_segments(self._covered.beside(frame.rollouts, self._lines.segments(undisturbed)))
 
 
 class Goal(Picture):
@@ -128,33 +174,6 @@ class Goal(Picture):
         self._end.visible = elsewhere and not marked
 
 
-class Table(Picture):
-    """The work table under the arm."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        box = scene.add_box(
-            "/table",
-            dimensions=(1.10, 0.96, 0.03),
-            position=(0.0, -0.27, -0.0155),
-            color=palette.TABLE,
-            cast_shadow=False,  # on itself it would show as stripes
-            receive_shadow=0.2,
-        )
-        super().__init__(box)
-
-    def draw(self, frame: Frame) -> None:
-        """See `Picture`: it never changes."""
-
-
-def set_lights(scene: viser.SceneApi) -> None:
-    """Set lights that look the same on the screen and in an exported picture, which has no environment map."""
-    scene.configure_default_lights(enabled=False)
-    scene.configure_environment_map(hdri=None)
-    scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(214, 208, 200), intensity=1.8)
-    scene.add_light_directional("/lights/key", position=(0.8, -1.6, 2.4), intensity=2.2, cast_shadow=True)
-    scene.add_light_directional("/lights/fill", position=(-1.6, -1.0, 1.2), intensity=0.8)
-
-
 class ScenePictures:
     """Everything in the scene of one visitor that is drawn from frames."""
 
@@ -163,15 +182,16 @@ class ScenePictures:
         scene: viser.SceneApi,
         robot: Robot,
         moved: Moved,
-        selected: Callable[[int], None],
+        grabbed: Callable[[int], None],
+        clicked: Callable[[int], None],
         anchor_moved: AnchorMoved,
         anchor_selected: Callable[[str], None],
         slice_moved: SliceMoved,
         starts: Starts,
     ) -> None:
         """Build the scene of this robot; the callbacks are those of the pictures."""
-        set_lights(scene)
-        self.obstacles = Obstacles(scene, moved, selected)
+        set_stage(scene)
+        self.obstacles = Obstacles(scene, moved, grabbed, clicked)
         self.anchors = Anchors(scene, anchor_moved, anchor_selected)
         self.slice = MovableSlice(scene, slice_moved)
         self.starts = starts
@@ -184,10 +204,11 @@ class ScenePictures:
             Goal(scene),
             Pots(scene),
         )
+        covered, self.rollouts = Covered(), Rollouts(scene)
         self._by_view: dict[str, Picture] = {
-            "demonstrations": Demonstrations(scene),
-            "rollouts": Rollouts(scene),
-            "ghost": Ghost(scene),
+            "demonstrations": Demonstrations(scene, covered),
+            "rollouts": self.rollouts,
+            "ghost": Ghost(scene, covered),
             "field": FieldArrows(scene),
             "streamlines": Streamlines(scene),
             "table": Table(scene),

@@ -47,7 +47,7 @@ class StartBall:
             area: returns the slice that it is dragged parallel to.
         """
         self.ball = scene.add_icosphere(
-            f"/starts/{index}", radius=RADIUS, color=palette.START, subdivisions=2, cast_shadow=False
+            f"/starts/{index}", radius=RADIUS, color=palette.ADDED, subdivisions=2, cast_shadow=False
         )
         scene.add_label(
             f"/starts/{index}/label",
@@ -92,7 +92,7 @@ class Starts(Picture):
     def draw(self, frame: Frame) -> None:
         """See `Picture`: remembers the slice; starts without a motion are grey."""
         self._slice = frame.slice
-        colour = palette.STALE if frame.blocked else palette.START
+        colour = palette.STALE if frame.blocked else palette.ADDED
         for item in self.items:
             item.ball.color = colour
 

@@ -25,7 +25,7 @@ class Way(Shown):
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/way", show_axes=False, visible=False))
-        self.ahead = Lines(scene, "/way/ahead", palette.WAY, 0.0075)
+        self.ahead = Lines(scene, "/way/ahead", palette.WAY, 0.0055)
         self._trail = scene.add_line_segments(
             "/way/trail", np.zeros((1, 2, 3), np.float32), np.zeros(3, np.uint8), thickness=0.005
         )
