@@ -71,7 +71,14 @@ class Page:
 
     def __init__(self, server: viser.ViserServer, robot: Any) -> None:
         self.gui, self.scene = server.gui, server.scene
-        self.camera = SimpleNamespace(position=np.array([0.8, -1.6, 0.8]), look_at=np.zeros(3), fov=0.75)
+        self.camera = SimpleNamespace(
+            position=np.array([0.8, -1.6, 0.8]),
+            look_at=np.zeros(3),
+            fov=0.75,
+            image_width=1280,
+            image_height=720,
+            on_update=lambda _moved: None,
+        )
         self.client = SimpleNamespace(
             client_id=0,
             gui=server.gui,

@@ -23,6 +23,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.playback import Replay
+from dt_viz.ui.scene.camera import camera_for
 from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor, initial_scenario
@@ -148,7 +149,7 @@ def visit(tab, initial, request):
     begin(visitor, replace(initial("draw_s"), view=LIGHT))
     page.mouse.move(*CORNER)
     open_tab(page, "World")
-    visitor.client.camera.position, visitor.client.camera.look_at = TASKS["draw_s"]().camera
+    look_home(visitor)
     until_drawn(visitor)
     close_notices(page)
     wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
@@ -165,9 +166,14 @@ def begin(visitor: Visitor, scenario: Scenario) -> None:
     assert visitor.shown is not None and visitor.shown.scenario.moves_like(scenario)
 
 
+def look_home(visitor: Visitor) -> None:
+    camera = visitor.client.camera
+    camera.position, camera.look_at = camera_for(TASKS["draw_s"](), camera)
+
+
 def camera_rests(visitor: Visitor) -> bool:
     camera = visitor.client.camera
-    wanted, _ = TASKS["draw_s"]().camera
+    wanted, _ = camera_for(TASKS["draw_s"](), camera)
     return bool(np.abs(np.asarray(camera.position) - wanted).max() < 1e-3)
 
 
@@ -206,7 +212,7 @@ def drag_until(page, visitor, done, reset, ends):
     may not show the handles in their place yet: then the drag has turned the camera instead."""
     for _ in range(TRIES):
         reset()
-        visitor.client.camera.position, visitor.client.camera.look_at = TASKS["draw_s"]().camera
+        look_home(visitor)
         until_drawn(visitor)
         wait_until(lambda: camera_rests(visitor), "the camera to be back")
         close_notices(page)

@@ -6,7 +6,9 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
@@ -20,11 +22,13 @@ from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.scenario.tasks import Task
+from dt_viz.ui import gestures
 from dt_viz.ui.panel.panel import Panel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import ArmPicture
 from dt_viz.ui.scene.arm_layers import Arms
+from dt_viz.ui.scene.camera import FIELD_OF_VIEW, camera_for, window
 from dt_viz.ui.scene.carried import Carried
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
@@ -33,8 +37,8 @@ from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.starts import Starts
 from dt_viz.ui.scene.way import Way
 
-FIELD_OF_VIEW = 0.75
-"""Vertical field of view, rad."""
+MOVED = 1e-3
+"""Distance of the camera from where it was put, metres, from which on the user has moved it."""
 NOTICE_SECONDS = 12.0
 """Time after which a notification closes by itself, seconds."""
 
@@ -85,6 +89,8 @@ class Visitor:
             self.way = Way(client.scene)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
+        self._stand, self._window = (np.zeros(3), np.zeros(3)), (0, 0)
+        """Position and look-at of the camera where it was put last, metres, and the size of the window, pixels."""
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
         self._playback = Playback(engine.arm, self._pose, self.fail)
@@ -93,6 +99,8 @@ class Visitor:
         self._panel.connect(self.session)
         self._panel.push.connect(engine.arm.push)
         self._playback.begin()
+        moved: Any = self._camera_moved  # viser takes coroutines, too, against its type hints
+        client.camera.on_update(moved)
 
     @property
     def arm(self) -> ArmPicture:
@@ -144,9 +152,20 @@ class Visitor:
         self._panel.cancelled(task)
 
     def _look_at(self, task: Task) -> None:
-        """Move the camera to the task's view."""
-        self.client.camera.position, self.client.camera.look_at = task.camera
-        self.client.camera.fov = FIELD_OF_VIEW
+        """Move the camera to where the task is seen best."""
+        camera = self.client.camera
+        self._stand, self._window = camera_for(task, camera), window(camera)
+        camera.position, camera.look_at = self._stand
+        camera.fov = FIELD_OF_VIEW
+
+    async def _camera_moved(self, camera: viser.CameraHandle) -> None:
+        """Fit the picture to a window of another size, unless the user has moved the camera."""
+        if self.shown is None or window(camera) == self._window:
+            return
+        self._window = window(camera)
+        place = gestures.vector(camera.position, 3, gestures.MAX_SIGHT)
+        if place is not None and np.abs(place - self._stand[0]).max() < MOVED:
+            self._look_at(self.shown.task)
 
     def _look_home(self) -> None:
         if self.shown is not None:

@@ -1,0 +1,109 @@
+"""Where the camera stands: so that a task's motions and its arm fill the part of the window beside the panel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.scenario.tasks import Task
+from dt_viz.ui import gestures
+
+FIELD_OF_VIEW = 0.75
+"""Vertical field of view, rad."""
+PANEL = 350
+"""Width of the panel and its margins, pixels."""
+NARROW = 700
+"""Width of a window, pixels, below which the panel lies under the picture, not beside it."""
+UNDER = 0.6
+"""Part of a narrow window's height that the panel takes."""
+MARGIN = 0.06
+"""Part of the free window that stays empty on each side."""
+MIN_SIZE, MAX_SIZE = 100, 20_000
+"""Sides of a window that are believed, pixels."""
+USUAL = (1280, 720)
+"""Width and height that are taken for a window whose size is not known, pixels."""
+VIEWS = {"Front": (0.0, 1.0, -0.12), "Side": (-1.0, 0.12, -0.12), "Top": (0.0, 0.02, -1.0)}
+"""Directions of sight, by name."""
+ARM_SPACE = ((-0.10, -0.10, 0.0), (0.10, 0.10, 0.0), (-0.08, -0.12, 0.80), (0.08, 0.0, 0.80))
+"""Places, metres, between which the arm's base, shoulder and elbow are."""
+HAND_ROOM = (0.0, 0.08, 0.12)
+"""Offset of the wrist from a place of the hand, about, metres."""
+OBSTACLE_ROOM = 0.09
+"""Room around the obstacle's first place, metres."""
+
+
+def camera_for(task: Task, camera: Any, view: str = "Home") -> tuple[Array, Array]:  # noqa: ANN401
+    """Return position (3,) and look-at (3,), metres, for a view of a task.
+
+    Args:
+        task: its motions and its usual direction of sight are taken.
+        camera: viser's, of which the size of the window is taken.
+        view: one of `VIEWS`, or else the task's own.
+    """
+    position, look_at = (np.asarray(place) for place in task.camera)
+    direction = np.asarray(VIEWS[view]) if view in VIEWS else look_at - position
+    return framed(shown(task), direction, *free_part(window(camera)))
+
+
+def shown(task: Task) -> Array:
+    """Return the places (N, 3) that are to be seen of a task, metres."""
+    paths = np.concatenate(task.paths)
+    around = OBSTACLE_ROOM * np.concatenate([np.eye(3), -np.eye(3)])
+    pots = [(pot.x + side * pot.radius, pot.y, z) for pot in task.pots for side in (-1, 1) for z in (0, pot.height)]
+    obstacle = np.asarray(task.obstacle_position) + around
+    return np.concatenate([paths, paths + HAND_ROOM, obstacle, ARM_SPACE, np.reshape(pots, (-1, 3))])
+
+
+def free_part(size: tuple[int, int]) -> tuple[Array, Array]:
+    """Return what the panel leaves of a window of this width and height, pixels.
+
+    Returns:
+        The tangents (2,) of the angles between the line of sight and its left and right border, and those of its lower
+        and upper border.
+    """
+    width, height = size
+    narrow = width < NARROW
+    right = 1.0 if narrow else 1 - 2 * PANEL / width
+    bottom = -1 + 2 * UNDER if narrow else -1.0
+    tangent = np.tan(FIELD_OF_VIEW / 2)
+
+    def within(low: float, high: float) -> Array:
+        return np.array([low, high]) + MARGIN * (high - low) * np.array([1, -1])
+
+    return within(-1.0, right) * tangent * width / height, within(bottom, 1.0) * tangent
+
+
+def window(camera: Any) -> tuple[int, int]:  # noqa: ANN401
+    """Return width and height of the window of viser's camera, pixels, as the browser told, if it can be."""
+    size = gestures.vector((camera.image_width, camera.image_height), 2, MAX_SIZE)
+    return USUAL if size is None or size.min() < MIN_SIZE else (int(size[0]), int(size[1]))
+
+
+def framed(points: Array, direction: Array, across: Array, upright: Array) -> tuple[Array, Array]:
+    """Return the nearest camera that sees all points within a part of its picture.
+
+    Args:
+        points: (N, 3), metres.
+        direction: (3,) of sight.
+        across: (2,) tangents of the part's left and right border.
+        upright: (2,) tangents of its lower and upper border.
+
+    Returns:
+        Position (3,) and look-at (3,), metres.
+    """
+    ahead = direction / np.linalg.norm(direction)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    depth = points @ ahead
+    # a camera at depth w and x across sees a point at X, Z between a and b where a (Z − w) ≤ X − x ≤ b (Z − w)
+    bounds = []
+    for axis, (low, high) in ((right, across), (up, upright)):
+        place = points @ axis
+        bounds.append(((place - high * depth).max(), (place - low * depth).min(), low, high))
+    w = min((most - least) / (high - low) for least, most, low, high in bounds)
+    x, y = ((least + high * w + most + low * w) / 2 for least, most, low, high in bounds)
+    position = x * right + y * up + w * ahead
+    return position, position + float(np.median(depth) - w) * ahead
