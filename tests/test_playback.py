@@ -108,7 +108,7 @@ def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkey
 def test_nothing_moves_before_it_begins():
     """The page that it draws on is being built."""
     arm, drawn = Arm(), threading.Event()
-    playback = Playback(cast(Any, arm), drawn.set, pytest.fail)
+    playback = Playback(cast(Any, arm), drawn.set, lambda error: pytest.fail(str(error)))
     assert not drawn.wait(0.2) and arm.asked == []
     playback.begin()
     assert drawn.wait(10)

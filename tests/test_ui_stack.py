@@ -9,16 +9,14 @@ from pages import Bound, Edited, frame_of
 from scenes import avoiding, beside, biases, changed
 
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, selected
-from dt_viz.scenario.tasks import POTS, TASKS
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.stack import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, durations, legend_html, press, rows
 from dt_viz.ui.panel.transforms import add, add_transform_controls, delete
 from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.levels import LevelRollouts
-from dt_viz.ui.scene.pots import Pots, surface
 from dt_viz.ui.scene.tubes import NUM_SIDES
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -198,32 +196,3 @@ def test_the_panel_shows_what_auto_chose(server):
     bound.report(frame())
     radius = bound["Radius [cm]"].control
     assert radius.value == 20.0 and radius.handle.disabled
-
-
-# --- Pots ---
-
-
-def test_pots_are_open_above_and_hold_what_falls_in():
-    for pot in POTS:
-        vertices, faces = surface(pot)
-        radius = np.linalg.norm(vertices[:, :2], axis=1)
-        assert vertices[:, 2].min() == 0 and vertices[:, 2].max() == pot.height
-        rim = vertices[:, 2] == pot.height
-        assert radius[rim].min() == pytest.approx(pot.radius)
-        corners = vertices[faces]
-        volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-        outer, inner = radius.max(), pot.radius
-        floor = np.unique(vertices[:, 2])[1]
-        expected = np.pi * (outer**2 * pot.height - inner**2 * (pot.height - floor))
-        assert volume == pytest.approx(expected, rel=0.01)  # positive: faces look outward
-
-
-def test_pots_are_drawn_for_tasks_that_have_some(scene):
-    picture = Pots(scene)
-    picture.draw(frame())
-    assert picture.handles == ()
-    pots = SCENES["left_pot"]
-    picture.draw(frame(Scenario(pots.task)))
-    assert [tuple(handle.position) for handle in picture.handles] == [(pot.x, pot.y, 0.0) for pot in POTS]
-    picture.draw(frame())
-    assert picture.handles == ()

@@ -13,9 +13,10 @@ from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Point, Sphere, as_point
+from dt_viz.scenario.objects import Pot
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import plane_of, with_added
-from dt_viz.scenario.tasks import Pot, Task
+from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
 

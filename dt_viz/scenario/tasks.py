@@ -16,6 +16,7 @@ from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, la
 from dt_viz.learning.imitation import Imitation
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.properties import cached_property
+from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.slices import Slice
 from dt_viz.shipped import ASSETS
 
@@ -25,29 +26,6 @@ DRAWING_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
 """Columns: right, up, and out of the plane towards the viewer."""
 DRAWING_SIZE = 0.40
 """Larger of width and height, metres, to which a drawing in other units is scaled."""
-
-
-@dataclass(frozen=True)
-class Pot:
-    """An open pot on the table."""
-
-    x: float
-    """Position of the axis, metres."""
-    y: float
-    radius: float = 0.055
-    """Radius of the opening, metres."""
-    height: float = 0.10
-    """Height of the rim above the table, metres."""
-
-    @property
-    def opening(self) -> tuple[float, float, float]:
-        """Middle of the opening, metres."""
-        return self.x, self.y, self.height
-
-    def catches(self, position: Array) -> bool:
-        """Return whether an object released at `position` (3,), metres, falls into it."""
-        x, y, z = (float(c) for c in position)
-        return z > self.height and float(np.hypot(x - self.x, y - self.y)) < self.radius
 
 
 POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
@@ -78,6 +56,10 @@ class Task:
     """First position of the obstacle, metres."""
     pots: tuple[Pot, ...] = ()
     """Pots on the table, from left to right."""
+    objects: tuple[TaskObject, ...] = ()
+    """What the hand moves."""
+    draws: bool = False
+    """Whether the hand holds a pen and draws on the slice."""
 
     def to_world(self, points: Array) -> Array:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""
@@ -138,6 +120,7 @@ def lift_box() -> Task:
         [1.0, 1.0, 0.0]
     )
     along /= np.linalg.norm(along)
+    lowest = np.mean([d.positions[d.positions[:, 2].argmin()] for d in demonstrations], axis=0)
     return Task(
         name="lift_box",
         title="Lift box",
@@ -149,6 +132,7 @@ def lift_box() -> Task:
         slice=Slice(middle + np.array([0.0, 0.0, 0.02]), np.stack([along, [0.0, 0.0, 1.0]], axis=1), (0.32, 0.26)),
         camera=((0.98, -1.60, 0.92), (0.24, -0.33, 0.28)),
         obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.42),
+        objects=(LiftedBox((float(lowest[0]), float(lowest[1])), float(lowest[2])),),
     )
 
 
@@ -159,6 +143,7 @@ def push_box() -> Task:
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     height = demonstrations[0].positions[-1, 2]  # of the push: the slice lies level in it
     x, y, z = _on_mean_path(demonstrations, lambda u: u, 0.55)
+    down, goal = (np.array(_on_mean_path(demonstrations, lambda u: u, u))[:2] for u in (0.35, 1.0))
     return Task(
         name="push_box",
         title="Push box",
@@ -170,6 +155,7 @@ def push_box() -> Task:
         slice=Slice(np.array([middle[0], middle[1], height]), np.eye(3)[:, :2], (0.42, 0.20)),
         camera=((0.70, -1.58, 0.95), (0.13, -0.32, 0.22)),
         obstacle_position=(x, y, z - 0.02),  # a little low: the way over it is free, under it is the table
+        objects=(PushedBox.before(down, goal),),
     )
 
 
@@ -192,6 +178,7 @@ def drop_pots() -> Task:
         camera=((0.62, -1.58, 0.90), (0.06, -0.38, 0.24)),
         obstacle_position=(0.0, -0.58, 0.36),  # beyond the pots: on the other side it would meet the arm
         pots=POTS,
+        objects=(Ball(POTS),),
     )
 
 
@@ -228,6 +215,7 @@ def drawing_task(
         obstacle_position=_on_mean_path(
             demonstrations, lambda u: origin + scale * u @ DRAWING_AXES[:, :2].T, obstacle_at
         ),
+        draws=True,
     )
 
 

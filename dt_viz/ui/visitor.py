@@ -29,9 +29,10 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import ArmPicture
 from dt_viz.ui.scene.arm_layers import Arms
 from dt_viz.ui.scene.camera import FIELD_OF_VIEW, camera_for, window
-from dt_viz.ui.scene.carried import Carried
+from dt_viz.ui.scene.drawing import Drawing
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
+from dt_viz.ui.scene.objects import Objects
 from dt_viz.ui.scene.picture import Colour
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.starts import Starts
@@ -85,7 +86,8 @@ class Visitor:
                 Starts(client.scene, self._start_moved, self._start_chosen, self._start_clicked),
             )
             self.arms = Arms(client.scene, robot)
-            self.carried = Carried(client.scene)
+            self.objects = Objects(client.scene)
+            self.drawing = Drawing(client.scene, self.arm.frames[-1].name, robot.end_effector_offset)
             self.way = Way(client.scene)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
@@ -113,7 +115,8 @@ class Visitor:
             self._look_at(frame.task)
         with self.client.atomic():
             self.pictures.draw(frame)
-            self.carried.stand(frame.task.pots)
+            self.objects.stand(frame.task)
+            self.drawing.stand(frame.task)
             if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then the arm stays where it was
                 self.arm.stale = self._view.replay and (bool(frame.blocked) or self.pictures.stale)
         if frame.stage is not Stage.ROLLOUTS:
@@ -130,7 +133,8 @@ class Visitor:
             self._view = view = scenario.view
             self.arm.stale = view.replay and (self.arm.stale or self.pictures.stale)
             self.arms.show(view)
-            self.carried.show(arm=view.arm)
+            self.objects.show(arm=view.arm)
+            self.drawing.show(arm=view.arm)
             self.way.visible = view.arm and not view.replay
             self.grip.ball.visible = not view.replay
             if view.replay:  # a drag of the ball ends without an event
@@ -251,7 +255,8 @@ class Visitor:
                 self._posed = posed
                 without = self._playback.without if posed[1] else None
                 self.arms.pose(q, q if without is None else without)
-            self.carried.pose(hand, self._playback.arrived)
+            self.objects.pose(hand, self._playback.arrived)
+            self.drawing.pose(time.monotonic(), hand, self._playback.arrived)
             self.pictures.rollouts.fade()
             if not view.replay:
                 self.way.show(time.monotonic(), hand, live.ahead)

@@ -47,8 +47,9 @@ GRID_BESIDE = (158, 196, 222)
 """Warped grid, and the same beside the rollouts of a level."""
 INSET = (120, 126, 136)
 POT = (176, 132, 98)
-CARRIED = (240, 228, 66)
-"""Ball that is dropped in a pot."""
+OBJECT = (240, 200, 90)
+"""What the hand moves."""
+INK, BOARD = (24, 44, 92), (40, 70, 80)
 TABLE = (233, 231, 229)
 ZENITH, HORIZON = (212, 221, 234), (238, 241, 245)
 """Background, from above down to where the table fades into it."""

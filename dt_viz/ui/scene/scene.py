@@ -28,7 +28,6 @@ from dt_viz.ui.scene.levels import LevelRollouts
 from dt_viz.ui.scene.manifold import BaseInset, Generator, WarpedGrid
 from dt_viz.ui.scene.obstacles import Moved, Obstacles
 from dt_viz.ui.scene.picture import Lines, Picture
-from dt_viz.ui.scene.pots import Pots
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
 from dt_viz.ui.scene.stage import Table, set_stage
@@ -202,7 +201,6 @@ class ScenePictures:
             self.starts,
             LevelRollouts(scene),
             Goal(scene),
-            Pots(scene),
         )
         covered, self.rollouts = Covered(), Rollouts(scene)
         self._by_view: dict[str, Picture] = {
