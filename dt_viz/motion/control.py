@@ -17,6 +17,7 @@ Whoever moves the robot by hand changes q, by ψ_q(p) at the place where it is t
 from __future__ import annotations
 
 import threading
+from bisect import bisect_right
 from dataclasses import dataclass
 from enum import Enum
 
@@ -146,16 +147,22 @@ class Ahead:
         self.times = course.times[-len(p) :]
         slowed = within_velocity_limits(self.times, p, limits)
         self._pace = np.diff(self.times) / np.maximum(np.diff(slowed), 1e-12)
-        self._curve = CubicHermiteSpline(self.times, p, np.gradient(p, self.times, axis=0))
+        # its coefficients instead of the spline itself: a tick asks for one moment, with hardly more than a product
+        curve = CubicHermiteSpline(self.times, p, np.gradient(p, self.times, axis=0))
+        self._coefficients, self._begins = curve.c.transpose(1, 0, 2), self.times[:-1].tolist()
 
     def at(self, clock: float) -> Array:
         """The posture (6,) at a time of the course."""
-        return self._curve(min(max(clock, self.times[0]), self.times[-1]))
+        segment = self._segment(clock)
+        u = min(max(clock, self._begins[0]), self.times[-1]) - self._begins[segment]
+        return np.array([u * u * u, u * u, u, 1.0]) @ self._coefficients[segment]
 
     def pace(self, clock: float) -> float:
         """Pace there, at most 1: seconds of the course in a second."""
-        segment = int(np.searchsorted(self.times, clock, side="right")) - 1
-        return float(self._pace[min(max(segment, 0), len(self._pace) - 1)])
+        return float(self._pace[self._segment(clock)])
+
+    def _segment(self, clock: float) -> int:
+        return max(bisect_right(self._begins, clock) - 1, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,11 +418,12 @@ class Controller:
             else:
                 self._settled = True
                 self._take(self._begun.course)  # what was in the way of the motion need not be in that of its end
-        if self._behind(q) > LOST and self._now > self._began + LOOKING and self._aim is not Aim.HAND:
+        behind = self._behind(q)
+        if behind > LOST and self._now > self._began + LOOKING and self._aim is not Aim.HAND:
             self._anchor(q, NO_DODGE)
-            self._began = self._now
-        target = 1 / (1 + (self._behind(q) / GAP) ** 2) if self._begun.dodge.cleared else 0.0
-        self._rate += float(np.clip(target - self._rate, -dt / RAMP, dt / RAMP))
+            self._began, behind = self._now, self._behind(q)
+        target = 1 / (1 + (behind / GAP) ** 2) if self._begun.dodge.cleared else 0.0
+        self._rate += min(max(target - self._rate, -dt / RAMP), dt / RAMP)
 
     def _behind(self, q: Array) -> float:
         """The largest gap of a joint, rad."""
@@ -430,9 +438,10 @@ class Controller:
     def _guarded(self, q: Array, wanted: Array) -> Array:
         """The velocities nearest to those wanted at which the arm comes into no obstacle."""
         sighting = self._seen
+        if self._now < self._safe_until or not (wanted.any() or sighting.speed > 0 or np.isinf(self._room)):
+            return wanted
         now = sighting.expected(min(self._now - sighting.time, STALE), 0.0)
-        moves = wanted.any() or sighting.speed > 0 or np.isinf(self._room)
-        if now is None or not moves or self._now < self._safe_until:
+        if now is None:
             return wanted
         wanted, self._room = guarded(self._arm, q, wanted, now, sighting.velocities)
         self._safe_until = self._now + (self._room - WINDOW) / (FASTEST_POINT + sighting.speed)
@@ -444,7 +453,8 @@ class Controller:
         highest = np.sqrt(braking * np.maximum(self.robot.upper - q - dt * np.maximum(self._velocity, 0), 0))
         lowest = -np.sqrt(braking * np.maximum(q + dt * np.minimum(self._velocity, 0) - self.robot.lower, 0))
         limits, most = self.robot.velocity_limits, self.acceleration * dt
-        change = np.clip(np.clip(wanted, lowest, highest), -limits, limits) - self._velocity
+        allowed = np.minimum(np.maximum(wanted, np.maximum(lowest, -limits)), np.minimum(highest, limits))
+        change = allowed - self._velocity
         # all joints together: what lies between two velocities that touch nothing touches nothing
         return self._velocity + change * min(1.0, most / max(float(np.abs(change).max()), 1e-12))
 

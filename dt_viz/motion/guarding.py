@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dt_viz.arm.robot import NUM_JOINTS, cross
+from dt_viz.arm.robot import cross
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle
@@ -25,6 +25,8 @@ NUM_POINTS = 10
 """Number of body points, those nearest to an obstacle, that are looked at."""
 NUM_ROUNDS = 8
 """Number of rounds in which the velocity is projected onto what each point allows."""
+IMMOBILE = 1e-6
+"""Squared slope of a distance, m²/rad², up to which no joint moves the point to speak of."""
 DIFFERENCE = 1e-4
 """Distance between the places that a distance's slope is taken from, metres."""
 
@@ -50,28 +52,35 @@ def guarded(arm: WholeArm, q: Array, wanted: Array, avoidance: ArmAvoidance, vel
         distance = part.signed_distance(points) - radius + OVERSHOOT
         nearest = min(nearest, float(distance.min()))
         h = distance - kept
-        for k in np.argsort(h)[:NUM_POINTS]:
-            joint = arm.body.joint[k] + 1
-            if h[k] > WINDOW or joint == 0:
-                continue
-            normal, slope = _outward(part, points[k]), np.zeros(NUM_JOINTS)
-            slope[:joint] = cross(axes[:joint].T, points[k][:, None] - origins[:joint].T).T @ normal
-            slopes.append(slope)
-            bounds.append(float(normal @ velocity) - RATE * max(float(h[k]), 0.0))
-    for _ in range(NUM_ROUNDS):
-        before = wanted
-        for slope, bound in zip(slopes, bounds, strict=True):
-            short = bound - slope @ wanted
-            if short > 0 and (size := slope @ slope) > 1e-6:
-                wanted = wanted + short / size * slope
-        if wanted is before:
-            break
+        near = np.argsort(h)[:NUM_POINTS]
+        near = near[h[near] <= WINDOW]
+        if not len(near):
+            continue
+        normal = _outward(part, points[near])
+        lever = cross(axes[..., None], points[near].T - origins[..., None])  # (6, 3, K)
+        slopes.append((arm.body.is_beyond[:, near] * (lever * normal.T).sum(axis=1)).T)
+        bounds.append(normal @ velocity - RATE * np.maximum(h[near], 0.0))
+    if slopes:
+        wanted = _projected(wanted, np.concatenate(slopes), np.concatenate(bounds))
     return wanted, nearest
 
 
-def _outward(part: Obstacle, point: Array) -> Array:
-    """The unit vector (3,) away from an obstacle at a point (3,)."""
+def _projected(wanted: Array, slopes: Array, bounds: Array) -> Array:
+    """The vector v (6,) with s·v ≥ b, for slopes s (K, 6) and bounds b (K,), that projections on them lead to."""
+    sizes = (slopes * slopes).sum(axis=1)
+    for _ in range(NUM_ROUNDS):
+        if (slopes @ wanted >= bounds)[sizes > IMMOBILE].all():
+            break
+        for slope, bound, size in zip(slopes, bounds, sizes, strict=True):
+            short = bound - slope @ wanted
+            if short > 0 and size > IMMOBILE:
+                wanted = wanted + short / size * slope
+    return wanted
+
+
+def _outward(part: Obstacle, points: Array) -> Array:
+    """Unit vectors (K, 3) away from an obstacle at points (K, 3)."""
     steps = DIFFERENCE * np.concatenate([np.eye(3), -np.eye(3)])
-    distance = part.signed_distance(point + steps)
-    slope = distance[:3] - distance[3:]
-    return slope / max(float(np.linalg.norm(slope)), 1e-12)
+    distance = part.signed_distance(points[:, None] + steps)
+    slope = distance[:, :3] - distance[:, 3:]
+    return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)

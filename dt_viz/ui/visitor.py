@@ -227,7 +227,7 @@ class Visitor:
                 self.arms.pose(q, q if without is None else without)
             self.carried.pose(hand, self._playback.arrived)
             if not view.replay:
-                self.way.show(time.monotonic(), hand, live.ahead)
+                self.way.show(time.monotonic(), hand, lambda: live.ahead)
                 self.grip.say(live.note)
 
     def _notify(self, text: str, colour: Colour) -> None:
