@@ -147,6 +147,47 @@ class TestArrival:
         assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
 
 
+class TestSeveralSteps:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_at_once_they_are_those_of_one_after_the_other(self, scene, seed):
+        """Also after pushes, with other stacks, and with obstacles that are seen beside the arm."""
+        rng, singly = np.random.default_rng(seed), 0
+        alone, together = (Robot(scene.controller(), scene.start) for _ in range(2))
+        step = together.controller.step
+
+        def counted(q, dt):
+            nonlocal singly
+            singly += 1
+            return step(q, dt)
+
+        together.controller.step = counted
+        for k in range(120):
+            alone.run(5 * TICK)
+            velocities = together.controller.steps(together.q, TICK, 5)
+            together.q = together.q + TICK * velocities.sum(axis=0)
+            np.testing.assert_allclose(velocities, alone.velocities[-5:], atol=1e-7)
+            np.testing.assert_allclose(together.q, alone.q, atol=1e-9)
+            assert together.controller.phase is alone.phases[-1]
+            if k % 20 == 19:
+                place = scene.robot.end_effector(alone.q) + rng.normal(scale=0.12, size=3)
+                beside, q = scene.around(place, rng.uniform(0.04, 0.1)), alone.q + rng.normal(scale=0.1, size=6)
+                for controller in (alone.controller, together.controller):
+                    match (k // 20) % 4:
+                        case 0:
+                            controller.see(beside.scenario.arm_avoidance)
+                        case 1:
+                            controller.follow(beside)
+                        case 2:
+                            controller.displace(q)
+                        case 3:
+                            controller.follow(scene.solved)
+        assert singly < 300
+
+    def test_a_posture_has_to_be_one(self, scene):
+        with pytest.raises(ValueError, match="6 finite angles"):
+            scene.controller().steps(np.full(6, np.nan), TICK, 3)
+
+
 class TestDisturbances:
     @pytest.mark.parametrize("seed", range(3))
     def test_limits_hold_under_random_stacks_and_pushes(self, scene, seed):

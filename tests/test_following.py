@@ -273,7 +273,7 @@ class TestBlocked:
             assert frame.arm is good.arm and frame.rollouts is good.rollouts
             assert frame.certificates.clearance < 0  # of the motion that is shown, from the obstacle where it is now
             assert frame.certificates.min_det_jacobian is None  # certificates of another scenario certify nothing
-        recovered = self.last(engine, free)
+        recovered = self.last(engine, free, Stage.FINE)
         assert recovered.blocked == ()
         for a, b in zip(recovered.rollouts, good.rollouts, strict=True):
             np.testing.assert_array_equal(a, b)

@@ -38,7 +38,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.anticipation import NOTHING_SEEN, STALE, Sighting
 from dt_viz.motion.dodging import NO_DODGE, Dodge, dodge, lack
 from dt_viz.motion.following import Follower
-from dt_viz.motion.guarding import WINDOW, guarded
+from dt_viz.motion.guarding import WINDOW, guarded, is_allowed
 from dt_viz.motion.solve import Solved
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -366,6 +366,21 @@ class Controller:
             self._q = q + dt * self._velocity
             return self._velocity.copy()
 
+    def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
+        """The joint velocities (num, 6), rad/s, of some steps in a row of a robot that does as it is told; see `step`.
+
+        What goes on as foreseen is sampled, and held against limits and obstacles, all at once.
+        """
+        q = np.asarray(q, float)
+        with self._lock:
+            velocities = self._foreseen(q, dt, num)
+            if velocities is None:
+                velocities = np.empty((num, NUM_JOINTS))
+                for k in range(num):
+                    velocities[k] = self.step(q, dt)
+                    q = q + dt * velocities[k]
+            return velocities
+
     @property
     def phase(self) -> Phase:
         """What it is doing."""
@@ -443,20 +458,62 @@ class Controller:
         now = sighting.expected(min(self._now - sighting.time, STALE), 0.0)
         if now is None:
             return wanted
-        wanted, self._room = guarded(self._arm, q, wanted, now, sighting.velocities)
-        self._safe_until = self._now + (self._room - WINDOW) / (FASTEST_POINT + sighting.speed)
+        wanted, room = guarded(self._arm, q, wanted, now, sighting.velocities)
+        self._seen_from(room, self._now)
         return wanted
 
     def _within_limits(self, q: Array, wanted: Array, dt: float) -> Array:
         """The velocities nearest to those wanted that all limits allow."""
-        braking = 2 * BRAKING_SHARE * self.acceleration
-        highest = np.sqrt(braking * np.maximum(self.robot.upper - q - dt * np.maximum(self._velocity, 0), 0))
-        lowest = -np.sqrt(braking * np.maximum(q + dt * np.minimum(self._velocity, 0) - self.robot.lower, 0))
-        limits, most = self.robot.velocity_limits, self.acceleration * dt
-        allowed = np.minimum(np.maximum(wanted, np.maximum(lowest, -limits)), np.minimum(highest, limits))
-        change = allowed - self._velocity
+        lowest, highest = self._range(q, self._velocity, dt)
+        change = np.minimum(np.maximum(wanted, lowest), highest) - self._velocity
         # all joints together: what lies between two velocities that touch nothing touches nothing
-        return self._velocity + change * min(1.0, most / max(float(np.abs(change).max()), 1e-12))
+        return self._velocity + change * min(1.0, self.acceleration * dt / max(float(np.abs(change).max()), 1e-12))
+
+    def _range(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
+        """The lowest and highest velocities (*B, 6) after others (*B, 6) at postures (*B, 6) that can stop in time."""
+        braking, limits = 2 * BRAKING_SHARE * self.acceleration, self.robot.velocity_limits
+        above = self.robot.upper - q - dt * np.maximum(velocity, 0)
+        below = q + dt * np.minimum(velocity, 0) - self.robot.lower
+        highest, lowest = (np.sqrt(braking * np.maximum(room, 0)) for room in (above, below))
+        return -np.minimum(lowest, limits), np.minimum(highest, limits)
+
+    def _foreseen(self, q: Array, dt: float, num: int) -> Array | None:
+        """The velocities (num, 6) of steps in which nothing is due and nothing binds; None where something may be."""
+        ahead, seen = self._ahead, self._seen
+        if ahead is None or self._q is None or not ahead.dodge.cleared or max(seen.speed, self._sighting.speed) > 0:
+            return None
+        stiffness, gap = min(STIFFNESS, 0.5 / dt), ahead.at(self._clock) - q
+        size, linear = float(np.abs(gap).max()), 2 * BRAKING_SHARE * self.acceleration / stiffness**2
+        if np.abs(q - self._q).max() > MOVED or not size < min(LOST, linear):
+            return None
+        closed = (1 - stiffness * dt) ** np.arange(num)
+        rate, clocks = self._rate, [self._clock]
+        for part in closed.tolist():
+            rate += min(max(1 / (1 + (part * size / GAP) ** 2) - rate, -dt / RAMP), dt / RAMP)
+            clocks.append(min(clocks[-1] + rate * ahead.pace(clocks[-1]) * dt, ahead.course.end))
+        if not self._settled and clocks[-1] >= ahead.course.end:
+            return None
+        p, gaps = np.array([ahead.at(clock) for clock in clocks]), closed[:, None] * gap
+        postures, velocities = p[:-1] - gaps, np.diff(p, axis=0) / dt + stiffness * gaps
+        before = np.concatenate([self._velocity[None], velocities[:-1]])
+        lowest, highest = self._range(postures, before, dt)
+        binds = np.abs(velocities - before).max() > self.acceleration * dt
+        if binds or (velocities < lowest).any() or (velocities > highest).any():
+            return None
+        now = self._now + num * dt
+        if seen.avoidance is not None and now >= self._safe_until and (velocities.any() or np.isinf(self._room)):
+            allowed, room = is_allowed(self._arm, postures, velocities, seen.avoidance, seen.velocities)
+            if not allowed:
+                return None
+            self._seen_from(room, now)
+        self._now, self._clock, self._rate = now, clocks[-1], rate
+        self._velocity, self._q = velocities[-1], postures[-1] + dt * velocities[-1]
+        return velocities
+
+    def _seen_from(self, room: float, now: float) -> None:
+        """Take note of the distance from the nearest obstacle, metres, and of how long none can be near for sure."""
+        self._room = room
+        self._safe_until = now + (room - WINDOW) / (FASTEST_POINT + self._seen.speed)
 
     # --- The motion ahead ---
 
