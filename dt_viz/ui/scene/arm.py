@@ -7,6 +7,7 @@ import trimesh
 import viser
 from viser import transforms
 
+from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
@@ -18,8 +19,8 @@ PEDESTAL = 2
 STALE_OPACITY = 0.4
 """Opacity of the arm while its motion is not the scenario's."""
 GHOST_OPACITY = 0.5
-SEEN = 3e-4
-"""Smallest turn of a joint that is drawn, rad: it moves the hand by a quarter of a millimetre at most."""
+SEEN = 4e-4
+"""Smallest motion of the hand by a joint that is drawn, metres: a third of a pixel, about."""
 MIN_APART = 0.006
 """Smallest distance of a link from its ghost at which the ghost is shown, metres: coinciding surfaces flicker."""
 
@@ -41,7 +42,7 @@ class ArmFrames:
 
     def pose(self, q: Array) -> None:
         """Take the joint angles `q` (6,), rad, as far as the change is seen: each joint is a message to the browser."""
-        turned = np.abs(q - self._drawn) > SEEN
+        turned = LEVERS * np.abs(q - self._drawn) > SEEN
         self._drawn = np.where(turned, q, self._drawn)
         c, s = np.cos(q / 2)[:, None], np.sin(q / 2)[:, None]
         wxyzs = c * self._unturned + s * self._half_turned  # a quaternion is linear in both

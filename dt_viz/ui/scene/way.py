@@ -34,6 +34,10 @@ class Way(Shown):
         self._came: deque[tuple[float, Array]] = deque()
         """When the hand was where, the newest last."""
 
+    def is_due(self, moment: float) -> bool:
+        """Whether `show` sends something at a moment, seconds."""
+        return moment - self._when >= PERIOD
+
     def show(self, moment: float, hand: Array, going: Callable[[], Array]) -> None:
         """Show the way.
 
@@ -44,7 +48,7 @@ class Way(Shown):
         """
         if not self._came or np.linalg.norm(hand - self._came[-1][1]) > STEP:
             self._came.append((moment, hand))
-        if moment - self._when < PERIOD:
+        if not self.is_due(moment):
             return
         self._when, ahead = moment, going()
         if not np.array_equal(ahead, self._drawn):
