@@ -271,11 +271,17 @@ class TestDisturbances:
         robot.run(12, until=Phase.RESTING)
         assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
 
-    def test_a_stack_of_the_hand_takes_over_where_the_motion_is(self, scene, engine):
+    @pytest.mark.parametrize("turns", [0, 1])
+    def test_a_stack_of_the_hand_takes_over_where_the_motion_is(self, scene, engine, turns):
         """The base coordinates go on, so that the robot comes to the same motion seen through the new stack."""
         scenario = changed(scene.scenario, space="task", obstacles=Sphere(as_point(scene.middle), 0.1), margin=0.02)
-        robot = Robot(scene.controller(), scene.start).run(1.5)
+        turned = scene.start + 2 * np.pi * turns * np.isinf(scene.robot.lower)
+        robot = Robot(scene.controller(), turned).run(1.5)
         robot.controller.follow(engine.solved(scenario, LIVE))
+        course, section = robot.controller._ahead.course, robot.controller.system.section
+        ahead = course.q[course.times > 2]  # by then it has nearly converged to the section
+        exact = section.postures(scene.robot.end_effector(ahead)[::-1])[::-1]
+        assert len(ahead) > 10 and np.abs(np.sin((ahead - exact) / 2)).max() < 5e-3
         robot.run(15, until=Phase.RESTING)
         hand = scene.robot.end_effector(np.array(robot.passed))
         assert scenario.obstacle.signed_distance(hand).min() > 0.01

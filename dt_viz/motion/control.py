@@ -137,6 +137,12 @@ class Course:
         """The posture (6,) at a time."""
         return np.array([np.interp(clock, self.times, joint) for joint in self.q.T])
 
+    def where_left(self, distance: Array, section: Section) -> Array:
+        """The postures (N, 6) at distances (N,) from the end in base coordinates, in the turn that a section has."""
+        along = np.linalg.norm(self.z - self.z[-1], axis=1)[::-1]
+        turns = np.where(np.isinf(section.robot.lower), np.round((self.q[-1] - section.reference) / (2 * np.pi)), 0.0)
+        return np.stack([np.interp(distance, along, joint) for joint in self.q[::-1].T], axis=1) - 2 * np.pi * turns
+
 
 class Ahead:
     """The motion ahead: the image of a course under ψ_q⁻¹, slowed down to the joints' limits."""
@@ -255,6 +261,7 @@ class Controller:
         with self._lock:
             before, solved = self._solved, prepared.solved
             alike = self._goes_on(solved, prepared.section)
+            stays = np.array_equal(self._section.reference, prepared.section.reference)
             self._solved, self._section, self._sighting = solved, prepared.section, prepared.sighting
             if self._sighting.time >= self._seen.time:
                 self._seen = self._sighting
@@ -266,8 +273,9 @@ class Controller:
             elif self._aim is Aim.HAND or alike:
                 self._take(self._ahead.course)
             else:
-                learned = before.below.system is solved.below.system and self._aim is Aim.GOAL
-                course = self._course(self._ahead.course.at(self._clock), self._image() if learned else None)
+                learned, course = before.below.system is solved.below.system, self._ahead.course
+                z = self._image() if learned and self._aim is Aim.GOAL else None
+                course = self._course(course.at(self._clock), z, course if stays else None)
                 self._clock, self._settled = 0.0, False
                 self._take(course)
 
@@ -568,8 +576,8 @@ class Controller:
         known, p = dodge(self._arm, course.q[first:], hosts, avoidance, sighting.velocities, before, turn)
         return Ahead(course, known, p, VELOCITY_SHARE * self.robot.velocity_limits)
 
-    def _course(self, q: Array, z: Array | None = None) -> Course:
-        """The undisturbed motion from a posture (6,), or from base coordinates `z` (3,), to where it is to go."""
+    def _course(self, q: Array, z: Array | None = None, near: Course | None = None) -> Course:
+        """The undisturbed motion from a posture (6,) to where it is to go; see `_towards`."""
         stack, nominal = self._solved.stack, self._solved.nominal
         if self._aim is Aim.HOME:
             outer: list[Diffeomorphism] = [applied.made.transform for applied in stack.built]
@@ -579,11 +587,23 @@ class Controller:
             system = DiffeomorphicSystem(transform, base)
         else:
             system = stack.system
-        return _towards(system, self._section, self.robot.lower, q, z)
+        return _towards(system, self._section, q, z, near)
 
 
-def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Array, z: Array | None) -> Course:
+def _towards(
+    system: DiffeomorphicSystem, section: Section, q: Array, z: Array | None = None, near: Course | None = None
+) -> Course:
+    """The motion of a system that a robot follows on a section, onto which it converges.
+
+    Args:
+        system: of the end effector.
+        section: the postures on which it is followed.
+        q: (6,) where the robot is, rad.
+        z: (3,) base coordinates to begin from; None are those of the hand.
+        near: the motion on that section, of another system, that begins or has been at `z`: its postures are nearby.
+    """
     robot, base = section.robot, system.base
+    lower = robot.lower
     z0 = system.transform.forward(robot.end_effector(q)) if z is None else z
     if np.linalg.norm(z0 - base.goal) < ARRIVED:
         times, fractions, path = np.zeros(1), np.ones(1), system.transform.inverse(base.goal[None])
@@ -592,7 +612,9 @@ def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Arr
         bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
     # from the end, which is near the reference, backwards: the beginning may be far from the section's branch
-    joints = track(robot, path[::-1], section.reference, reference=section.reference).q[::-1]
+    left = (1 - fractions) * np.linalg.norm(z0 - base.goal)
+    initial = None if z is None or near is None else near.where_left(left[::-1], section)
+    joints = track(robot, path[::-1], section.reference, initial, reference=section.reference).q[::-1]
     turns = np.where(np.isinf(lower), np.round((q - joints[0]) / (2 * np.pi)), 0.0)
     offset = q - joints[0] - 2 * np.pi * turns
     converged = CONVERGENCE * np.log(max(float(np.abs(offset).max()) / CONVERGED, 1.0))
