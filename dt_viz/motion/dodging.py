@@ -132,7 +132,7 @@ def _cleared(
     """The shortest duration after which the flow has carried the hosts clear, or `MAX_DURATION`, and all images."""
     duration, state, p = 0.0, arm.limits.forward(q), q.copy()
     slope = field(state)
-    moving = slope.any(axis=1)  # where the field vanishes its flow rests
+    moving: Mask = np.any(slope, axis=1)  # where the field vanishes its flow rests
     lacking, carries = lack(arm, q[hosts], avoidance, end), moving[hosts]
     at_rest, lacking = lacking[~carries].max(initial=-np.inf), lacking[carries]
     state, slope, hosts = state[moving], slope[moving], hosts[moving]
