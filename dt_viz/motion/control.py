@@ -138,7 +138,7 @@ class Course:
         return np.array([np.interp(clock, self.times, joint) for joint in self.q.T])
 
     def where_left(self, distance: Array, section: Section) -> Array:
-        """The postures (N, 6) at distances (N,) from the end in base coordinates, in the turn that a section has."""
+        """The postures (N, 6) at distances (N,) from the end in base coordinates, unwound by whole turns to a section's."""
         along = np.linalg.norm(self.z - self.z[-1], axis=1)[::-1]
         turns = np.where(np.isinf(section.robot.lower), np.round((self.q[-1] - section.reference) / (2 * np.pi)), 0.0)
         return np.stack([np.interp(distance, along, joint) for joint in self.q[::-1].T], axis=1) - 2 * np.pi * turns
@@ -600,7 +600,7 @@ def _towards(
         section: the postures on which it is followed.
         q: (6,) where the robot is, rad.
         z: (3,) base coordinates to begin from; None are those of the hand.
-        near: the motion on that section, of another system, that begins or has been at `z`: its postures are nearby.
+        near: a motion of another system on that section, whose postures are looked for first.
     """
     robot, base = section.robot, system.base
     lower = robot.lower
