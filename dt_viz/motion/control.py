@@ -138,7 +138,7 @@ class Course:
         return np.array([np.interp(clock, self.times, joint) for joint in self.q.T])
 
     def where_left(self, distance: Array, section: Section) -> Array:
-        """The postures (N, 6) at distances (N,) from the end in base coordinates, unwound by whole turns to a section's."""
+        """The postures (N, 6) at distances (N,) from the end in base coordinates, unwound to a section's."""
         along = np.linalg.norm(self.z - self.z[-1], axis=1)[::-1]
         turns = np.where(np.isinf(section.robot.lower), np.round((self.q[-1] - section.reference) / (2 * np.pi)), 0.0)
         return np.stack([np.interp(distance, along, joint) for joint in self.q[::-1].T], axis=1) - 2 * np.pi * turns
