@@ -147,6 +147,48 @@ class TestArrival:
         assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
 
 
+class TestSeveralSteps:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_at_once_they_are_those_of_one_after_the_other(self, scene, seed):
+        """Also after pushes, with other stacks, with obstacles that are seen ahead, and at the goal."""
+        rng, singly = np.random.default_rng(seed), 0
+        alone, together = (Robot(scene.controller(), scene.start) for _ in range(2))
+        step = together.controller.step
+
+        def counted(q, dt):
+            nonlocal singly
+            singly += 1
+            return step(q, dt)
+
+        together.controller.step = counted
+        for k in range(280):
+            alone.run(5 * TICK)
+            velocities = together.controller.steps(together.q, TICK, 5)
+            together.q = together.q + TICK * velocities.sum(axis=0)
+            np.testing.assert_allclose(velocities, alone.velocities[-5:], atol=1e-7)
+            np.testing.assert_allclose(together.q, alone.q, atol=1e-9)
+            assert together.controller.phase is alone.phases[-1]
+            if k % 20 == 19 and k < 160:
+                ahead = scene.robot.end_effector(alone.controller.ahead)
+                place = ahead[min(12, len(ahead) - 1)] + rng.normal(scale=0.03, size=3)
+                beside, q = scene.around(place, rng.uniform(0.04, 0.1)), alone.q + rng.normal(scale=0.1, size=6)
+                for controller in (alone.controller, together.controller):
+                    match (k // 20) % 4:
+                        case 0:
+                            controller.see(beside.scenario.arm_avoidance)
+                        case 1:
+                            controller.follow(beside)
+                        case 2:
+                            controller.displace(q)
+                        case 3:
+                            controller.follow(scene.solved)
+        assert singly < 700 and scene.missed(alone.q) < 1e-3 and alone.phases[-1] is Phase.RESTING
+
+    def test_a_posture_has_to_be_one(self, scene):
+        with pytest.raises(ValueError, match="6 finite angles"):
+            scene.controller().steps(np.full(6, np.nan), TICK, 3)
+
+
 class TestDisturbances:
     @pytest.mark.parametrize("seed", range(3))
     def test_limits_hold_under_random_stacks_and_pushes(self, scene, seed):
@@ -229,11 +271,17 @@ class TestDisturbances:
         robot.run(12, until=Phase.RESTING)
         assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
 
-    def test_a_stack_of_the_hand_takes_over_where_the_motion_is(self, scene, engine):
+    @pytest.mark.parametrize("turns", [0, 1])
+    def test_a_stack_of_the_hand_takes_over_where_the_motion_is(self, scene, engine, turns):
         """The base coordinates go on, so that the robot comes to the same motion seen through the new stack."""
         scenario = changed(scene.scenario, space="task", obstacles=Sphere(as_point(scene.middle), 0.1), margin=0.02)
-        robot = Robot(scene.controller(), scene.start).run(1.5)
+        turned = scene.start + 2 * np.pi * turns * np.isinf(scene.robot.lower)
+        robot = Robot(scene.controller(), turned).run(1.5)
         robot.controller.follow(engine.solved(scenario, LIVE))
+        course, section = robot.controller._ahead.course, robot.controller.system.section
+        ahead = course.q[course.times > 2]  # by then it has nearly converged to the section
+        exact = section.postures(scene.robot.end_effector(ahead)[::-1])[::-1]
+        assert len(ahead) > 10 and np.abs(np.sin((ahead - exact) / 2)).max() < 5e-3
         robot.run(15, until=Phase.RESTING)
         hand = scene.robot.end_effector(np.array(robot.passed))
         assert scenario.obstacle.signed_distance(hand).min() > 0.01

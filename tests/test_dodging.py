@@ -1,5 +1,7 @@
 """The dodge of the robot's own motion: it clears what is ahead, and changes gradually."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,15 @@ def test_nothing_near_or_nothing_to_avoid_changes_nothing(arm, q):
         found, p = made(arm, q, avoidance)
         assert found is NO_DODGE
         np.testing.assert_array_equal(p, q)
+
+
+def test_what_the_field_does_not_reach_is_not_called_clear(arm, q):
+    """The margin that is asked for is wider than the field."""
+    avoidance = replace(around(arm, q[50], (0, -0.14, 0.1)), margin=0.1, temperature=0.5)
+    found, p = made(arm, q, avoidance)
+    assert 0.02 < arm.clearance(q, avoidance.obstacle).min() < avoidance.margin - OVERSHOOT
+    assert not found.cleared
+    np.testing.assert_array_equal(p, q)
 
 
 def test_only_hosts_are_cleared(arm, q):

@@ -82,7 +82,7 @@ def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(eng
         assert frame.scenario == scenario
         assert len(frame.rollouts) == len(frame.times) == len(frame.ghost) == len(frame.task.demonstrations)
         assert (frame.pictures.field is not None) == (frame.stage >= Stage.LIVE)
-        assert (frame.arm is not None) == (frame.stage >= Stage.LIVE)
+        assert (frame.arm is not None) == (frame.stage >= Stage.FINE)
         assert (frame.certificates.min_det_jacobian is not None) == (frame.stage >= Stage.CERTIFIED)
         assert_finite(frame)
         for path, times in zip(frame.rollouts, frame.times, strict=True):
@@ -242,7 +242,21 @@ def test_an_edit_of_the_view_gives_the_same_motion(engine, scenario):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("space", ["task", "cspace"])
+@pytest.mark.parametrize("shown", ["replay", "onion", "joint_plots"])
+def test_the_arm_moves_along_its_rollout_in_a_drag_only_where_that_is_shown(new_engine, initial, shown, space):
+    hidden, engine = changed(initial("draw_s"), space=space), new_engine()
+    live = stage(engine, hidden, Stage.LIVE)
+    assert live.arm is None
+    seen = stage(engine, replace(hidden, view=replace(hidden.view, **{shown: True})), Stage.LIVE)
+    assert seen.arm is not None and stage(engine, hidden, Stage.LIVE).arm is None
+    refined = stage(engine, hidden, Stage.FINE)
+    assert refined.arm is not None
+    assert np.abs(refined.arm.q[[0, -1]] - seen.arm.q[[0, -1]]).max() < 1e-2
+
+
 def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
+    scenario = replace(scenario, view=replace(scenario.view, replay=True))
     for chosen in (0, 3):
         frame = stage(engine, replace(scenario, arm_rollout=chosen), Stage.LIVE)
         assert frame.arm is not None

@@ -262,7 +262,7 @@ class TestBlocked:
 
     def test_the_last_good_motion_is_shown_marked_until_the_obstacle_moves_away(self, new_engine, initial):
         engine, free = new_engine(), placed(initial("push_box"), *initial("push_box").obstacles)
-        good = self.last(engine, free)
+        good = self.last(engine, free, Stage.FINE)
         assert good.blocked == ()
         covered = placed(initial("push_box"), around(good.goal))
         frames = list(engine.frames(covered))
@@ -273,10 +273,19 @@ class TestBlocked:
             assert frame.arm is good.arm and frame.rollouts is good.rollouts
             assert frame.certificates.clearance < 0  # of the motion that is shown, from the obstacle where it is now
             assert frame.certificates.min_det_jacobian is None  # certificates of another scenario certify nothing
-        recovered = self.last(engine, free)
+        recovered = self.last(engine, free, Stage.FINE)
         assert recovered.blocked == ()
         for a, b in zip(recovered.rollouts, good.rollouts, strict=True):
             np.testing.assert_array_equal(a, b)
+
+    def test_a_drag_that_ends_blocked_shows_the_arm_along_its_last_good_motion(self, new_engine, initial):
+        engine = new_engine()
+        good = self.last(engine, placed(initial("push_box"), *initial("push_box").obstacles))
+        assert good.arm is None  # nothing showed it
+        blocked = self.last(engine, placed(initial("push_box"), around(good.goal)))
+        assert blocked.blocked and blocked.arm is not None
+        hand = engine.follower.robot.end_effector(blocked.arm.q)
+        np.testing.assert_allclose(hand, good.rollouts[good.chosen], atol=1e-9)
 
     def test_without_a_motion_before_it_is_the_undisturbed_one(self, new_engine, initial):
         frame = self.last(new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
-from dt_viz.motion.guarding import KEPT, RATE, WINDOW, guarded
+from dt_viz.motion.guarding import KEPT, RATE, WINDOW, guarded, is_allowed
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import ArmAvoidance
@@ -62,6 +62,21 @@ def test_no_distance_falls_faster_than_it_may(arm):
             changed += 1
             assert np.abs(v - wanted).max() > 0
     assert changed > 15
+
+
+def test_several_velocities_are_allowed_where_each_of_them_is(arm):
+    told = []
+    for q, wanted, avoidance, velocities in scenes(arm, 60):
+        postures = q + np.linspace(0, 0.05, 4)[:, None]
+        several = wanted * np.array([1.0, 0.5, -0.5, 0.1])[:, None]
+        alone = [guarded(arm, p, v, avoidance, velocities) for p, v in zip(postures, several, strict=True)]
+        allowed, nearest = is_allowed(arm, postures, several, avoidance, velocities)
+        unchanged = np.array_equal([v for v, _ in alone], several)
+        assert unchanged if allowed else nearest < WINDOW + KEPT
+        if allowed:
+            assert nearest == pytest.approx(alone[-1][1])
+        told.append((allowed, unchanged))
+    assert {(True, True), (False, False)} <= set(told) and told.count((False, True)) < 5
 
 
 def test_it_stops_before_what_it_runs_into(arm):

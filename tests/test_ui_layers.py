@@ -15,6 +15,7 @@ from viser import transforms  # noqa: TID251
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import CollisionReport, Nearest
+from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.engine.frame import Stage
@@ -29,7 +30,7 @@ from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS, Panel
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.panel.status import CHANGED, COMPUTING, hint, status_html
-from dt_viz.ui.scene.arm import PEDESTAL
+from dt_viz.ui.scene.arm import PEDESTAL, SEEN, ArmPicture
 from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.scene.legend import OCCUPANCY
 from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
@@ -545,3 +546,18 @@ def test_a_scenario_without_motion_says_why_and_what_is_shown_instead():
     row = said.split("Clearance")[1].split("</tr>")[0]
     assert "–" in row and "mm" not in row
     assert "last good" not in status_html(frame(), PACE)
+
+
+def test_a_joint_is_drawn_once_its_turn_is_seen(scene, robot):
+    arm, q, least = ArmPicture(scene, robot), robot.home + 0.3, SEEN / LEVERS
+
+    def drawn():
+        return np.array([frame.wxyz for frame in arm.frames[1:]])
+
+    for turned in (q, q + 1.1 * least):
+        arm.pose(turned)
+        np.testing.assert_allclose(drawn(), robot.joint_frames(turned), atol=1e-7)
+        arm.pose(turned + 0.9 * least)
+        np.testing.assert_allclose(drawn(), robot.joint_frames(turned), atol=1e-7)
+    arm.pose(turned + 2 * least * np.eye(6)[3])
+    np.testing.assert_allclose(drawn(), robot.joint_frames(turned + 2 * least * np.eye(6)[3]), atol=1e-7)

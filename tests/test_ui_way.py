@@ -18,16 +18,16 @@ def moved(way, seconds, speed=0.1, begins=0.0):
     """Move the hand along the x axis; return where it is."""
     times = np.arange(begins, begins + seconds, 0.04)
     for t in times:
-        way.show(t, np.array([speed * t, 0.0, 0.0]), AHEAD)
+        way.show(t, np.array([speed * t, 0.0, 0.0]), lambda: AHEAD)
     return float(speed * times[-1])
 
 
 def test_the_way_ahead_is_drawn_as_it_is(way):
-    way.show(0.0, AHEAD[0], AHEAD)
+    way.show(0.0, AHEAD[0], lambda: AHEAD)
     np.testing.assert_allclose(way.ahead.node.points, np.stack([AHEAD[:-1], AHEAD[1:]], axis=1))
-    way.show(PERIOD / 2, AHEAD[1], AHEAD[1:])
+    way.show(PERIOD / 2, AHEAD[1], lambda: AHEAD[1:])
     assert len(way.ahead.node.points) == 4  # it is sent a few times a second only
-    way.show(PERIOD, AHEAD[1], AHEAD[1:])
+    way.show(PERIOD, AHEAD[1], lambda: AHEAD[1:])
     assert len(way.ahead.node.points) == 3
 
 
@@ -46,9 +46,9 @@ def test_the_trail_is_where_the_hand_was_and_fades(way):
 def test_the_trail_of_a_hand_at_rest_goes(way):
     here = np.array([moved(way, 3.0), 0.0, 0.0])
     for t in np.arange(3.0, 3.0 + TRAIL_SECONDS + 2 * PERIOD, PERIOD):
-        way.show(t, here, AHEAD)
+        way.show(t, here, lambda: AHEAD)
     assert np.ptp(way._trail.points, axis=1).max(initial=0.0) == 0
     moved(way, 1.0, begins=6.0)
     way.forget()
-    way.show(8.0, here, AHEAD)
+    way.show(8.0, here, lambda: AHEAD)
     assert np.ptp(way._trail.points, axis=1).max(initial=0.0) == 0

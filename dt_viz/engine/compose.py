@@ -75,20 +75,23 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
     )
 
 
-def with_arm(frame: Frame, solved: Solved, follower: Follower, before: Array | None = None) -> Frame:
-    """The frame with the arm's motion along the rollout that it follows.
+def with_arm(
+    frame: Frame, solved: Solved, follower: Follower, before: Array | None = None, *, moves: bool = True
+) -> Frame:
+    """The frame with the arm's motion along the rollout that it follows, and with the starts that it cannot get to.
 
     Args:
         frame: the rollouts.
         solved: the motion that they are of.
         follower: the arm.
         before: (`NUM_ARM_SAMPLES`, 6) joints to begin from where the arm follows a path of the hand, rad.
+        moves: whether its motion is wanted.
     """
     nominal = solved.nominal
     arm, warnings = None, ()
     try:
         far = follower.out_of_reach(nominal)
-        if frame.chosen is not None and not far[frame.chosen]:
+        if moves and frame.chosen is not None and not far[frame.chosen]:
             arm, warnings = arm_along(frame, solved, frame.chosen, follower, before)
         warnings += tuple(far_starts(np.array(nominal.numbers)[far], nominal.num_demonstrated))
     except UnreachableError as error:

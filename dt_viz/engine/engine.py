@@ -244,12 +244,14 @@ class Engine:
         return replace(frame, scenario=scenario, level=compose.level_of(scenario, solved.stack))
 
     def _with_arm(self, scenario: Scenario, precision: Precision) -> Frame:
-        """The frame of stage ROLLOUTS, with the arm."""
+        """The frame of stage ROLLOUTS, with the arm; at LIVE with its motion only if that is drawn."""
         frame, solved = self._rollouts(scenario, precision), self.solved(scenario, precision)
+        moves = precision is not LIVE or scenario.view.shows_arm_motion
+        before = self._joints_before(scenario, solved, precision)
         with_arm = self.memo(
             "arm",
-            (scenario.plain, precision),
-            lambda: compose.with_arm(frame, solved, self.follower, self._joints_before(scenario, solved, precision)),
+            (scenario.plain, precision, moves),
+            lambda: compose.with_arm(frame, solved, self.follower, before, moves=moves),
             newest=2,
         )
         return replace(with_arm, scenario=scenario, level=frame.level)
@@ -296,6 +298,9 @@ class Engine:
             next(frame for frame in undisturbed if frame.stage is Stage.FINE)
         shown = self._shown[scenario.task]
         good, solved = shown.frame, shown.newest
+        if good.arm is None and good.stage is Stage.LIVE:
+            good = compose.with_arm(good, solved, self.follower)
+            self._shown[scenario.task] = replace(shown, frame=good)
         seen = replace(good.scenario, view=scenario.view)
         changed = not seen.computes_like(good.scenario)
         good = replace(good, level=compose.level_of(seen, solved.stack))

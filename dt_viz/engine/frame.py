@@ -23,7 +23,7 @@ class Stage(IntEnum):
     ROLLOUTS = 0
     """Rollouts and their clearance."""
     LIVE = 1
-    """Also the arm and what lies on the slice: what follows a drag."""
+    """Also what lies on the slice, and the arm's motion if it is shown: what follows a drag."""
     FINE = 2
     """All of it refined, for a scenario that rests."""
     CERTIFIED = 3
@@ -68,7 +68,7 @@ class Frame:
     level: int | None = None
     """Index in `levels` of the manifold that the view and the pictures show; None is the top of the stack."""
     arm: ArmMotion | None = None
-    """None before stage LIVE, and where the arm cannot reach the start."""
+    """None before stage FINE, at LIVE only unless the view shows it, and where the arm cannot reach the start."""
     pictures: Pictures = NO_PICTURES
     """Pictures of ψ and on the slice, as far as the view shows them; empty before stage LIVE."""
     profiles: Profiles | None = None

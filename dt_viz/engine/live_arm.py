@@ -202,13 +202,13 @@ class LiveArm:
         self._due = min(self._due + seconds, LONGEST)
         ticks = int(self._due / TICK)
         self._due -= ticks * TICK
-        for _ in range(ticks):
+        if ticks:
             q = self._q
             assert q is not None
-            velocity = controller.step(q, TICK)
+            velocities = controller.steps(q, TICK, ticks)
             with self._changing:
                 if self._q is q:  # or it was put elsewhere meanwhile
-                    self._q = q + TICK * velocity
+                    self._q = q + TICK * velocities.sum(axis=0)
         self._go_round(controller, ticks * TICK)
 
     # --- On the thread that moves it ---

@@ -29,7 +29,7 @@ GESTURE_PAUSE = 1.0
 """Time without an edit, seconds, after which the next edit of the same control is a step of its own for undo."""
 MAX_UNDO = 200
 LIVE_PAUSE = 0.05
-"""Time between two drawings of field and arm while edits come faster, seconds; rollouts are drawn more often."""
+"""Time between two drawings of the field while edits come faster, seconds; rollouts are drawn more often."""
 HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
@@ -351,7 +351,7 @@ class Session:
                 last = self._live_frames[-1] if self._live_frames else -math.inf
                 pause = last + LIVE_PAUSE - now
                 if pause <= 0:
-                    continue  # field and arm are due, whatever is waiting
+                    continue  # the field is due, whatever is waiting
                 self._worker.rest(pause)
             if superseded():
                 return

@@ -6,7 +6,7 @@ milliseconds and over all sessions together:
 ``median_ms``, ``p95_ms``
     from an edit until its rollouts are ready (stage ROLLOUTS, the first frame of a rebuild).
 ``live_median_ms``, ``live_p95_ms``
-    from an edit until the vector field and the arm are ready, too (stage LIVE).
+    from an edit until the vector field is ready, too (stage LIVE).
 ``rebuild_median_ms``
     for computing the rollouts alone, without the wait for the frame before.
 ``frames``, ``skipped``
@@ -168,7 +168,7 @@ def run(options: argparse.Namespace) -> int:
         ("edit → frame ready", "median ms", "95 % ms"),
         [
             ("rollouts", f"{figures['median_ms']:.1f}", f"{figures['p95_ms']:.1f}"),
-            ("also field and arm", f"{figures['live_median_ms']:.1f}", f"{figures['live_p95_ms']:.1f}"),
+            ("also the field", f"{figures['live_median_ms']:.1f}", f"{figures['live_p95_ms']:.1f}"),
             ("computing rollouts", f"{figures['rebuild_median_ms']:.1f}", f"{np.percentile(rebuild, 95):.1f}"),
         ],
     )

@@ -9,6 +9,7 @@ import numpy as np
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.properties import cached_property
 from dt_viz.transforms.base import ArmAvoidance
 
 SMOOTHING = 0.08
@@ -30,15 +31,15 @@ class Sighting:
     velocities: Array
     """(P, 3) measured, m/s."""
 
-    @property
+    @cached_property
     def speed(self) -> float:
         """That of the fastest, m/s."""
         return float(np.linalg.norm(self.velocities, axis=1).max(initial=0.0))
 
     def expected(self, seconds: float, room: float) -> ArmAvoidance | None:
         """The obstacles some seconds later, and a margin that grows by `room` seconds of their speed."""
-        if self.avoidance is None:
-            return None
+        if self.avoidance is None or not self.speed:
+            return self.avoidance
         parts = self.avoidance.obstacle.parts
         moved = tuple(
             part.moved(as_point(np.asarray(part.position) + seconds * velocity), part.wxyz)

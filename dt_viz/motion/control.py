@@ -17,6 +17,7 @@ Whoever moves the robot by hand changes q, by ψ_q(p) at the place where it is t
 from __future__ import annotations
 
 import threading
+from bisect import bisect_right
 from dataclasses import dataclass
 from enum import Enum
 
@@ -37,7 +38,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.anticipation import NOTHING_SEEN, STALE, Sighting
 from dt_viz.motion.dodging import NO_DODGE, Dodge, dodge, lack
 from dt_viz.motion.following import Follower
-from dt_viz.motion.guarding import WINDOW, guarded
+from dt_viz.motion.guarding import WINDOW, guarded, is_allowed
 from dt_viz.motion.solve import Solved
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -136,6 +137,12 @@ class Course:
         """The posture (6,) at a time."""
         return np.array([np.interp(clock, self.times, joint) for joint in self.q.T])
 
+    def where_left(self, distance: Array, section: Section) -> Array:
+        """The postures (N, 6) at distances (N,) from the end in base coordinates, unwound to a section's."""
+        along = np.linalg.norm(self.z - self.z[-1], axis=1)[::-1]
+        turns = np.where(np.isinf(section.robot.lower), np.round((self.q[-1] - section.reference) / (2 * np.pi)), 0.0)
+        return np.stack([np.interp(distance, along, joint) for joint in self.q[::-1].T], axis=1) - 2 * np.pi * turns
+
 
 class Ahead:
     """The motion ahead: the image of a course under ψ_q⁻¹, slowed down to the joints' limits."""
@@ -146,16 +153,22 @@ class Ahead:
         self.times = course.times[-len(p) :]
         slowed = within_velocity_limits(self.times, p, limits)
         self._pace = np.diff(self.times) / np.maximum(np.diff(slowed), 1e-12)
-        self._curve = CubicHermiteSpline(self.times, p, np.gradient(p, self.times, axis=0))
+        # its coefficients instead of the spline itself: a tick asks for one moment, with hardly more than a product
+        curve = CubicHermiteSpline(self.times, p, np.gradient(p, self.times, axis=0))
+        self._coefficients, self._begins = curve.c.transpose(1, 0, 2), self.times[:-1].tolist()
 
     def at(self, clock: float) -> Array:
         """The posture (6,) at a time of the course."""
-        return self._curve(min(max(clock, self.times[0]), self.times[-1]))
+        segment = self._segment(clock)
+        u = min(max(clock, self._begins[0]), self.times[-1]) - self._begins[segment]
+        return np.array([u * u * u, u * u, u, 1.0]) @ self._coefficients[segment]
 
     def pace(self, clock: float) -> float:
         """Pace there, at most 1: seconds of the course in a second."""
-        segment = int(np.searchsorted(self.times, clock, side="right")) - 1
-        return float(self._pace[min(max(segment, 0), len(self._pace) - 1)])
+        return float(self._pace[self._segment(clock)])
+
+    def _segment(self, clock: float) -> int:
+        return max(bisect_right(self._begins, clock) - 1, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +261,7 @@ class Controller:
         with self._lock:
             before, solved = self._solved, prepared.solved
             alike = self._goes_on(solved, prepared.section)
+            stays = np.array_equal(self._section.reference, prepared.section.reference)
             self._solved, self._section, self._sighting = solved, prepared.section, prepared.sighting
             if self._sighting.time >= self._seen.time:
                 self._seen = self._sighting
@@ -259,8 +273,9 @@ class Controller:
             elif self._aim is Aim.HAND or alike:
                 self._take(self._ahead.course)
             else:
-                learned = before.below.system is solved.below.system and self._aim is Aim.GOAL
-                course = self._course(self._ahead.course.at(self._clock), self._image() if learned else None)
+                learned, course = before.below.system is solved.below.system, self._ahead.course
+                z = self._image() if learned and self._aim is Aim.GOAL else None
+                course = self._course(course.at(self._clock), z, course if stays else None)
                 self._clock, self._settled = 0.0, False
                 self._take(course)
 
@@ -359,6 +374,21 @@ class Controller:
             self._q = q + dt * self._velocity
             return self._velocity.copy()
 
+    def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
+        """The joint velocities (num, 6), rad/s, of some steps in a row of a robot that does as it is told; see `step`.
+
+        What goes on as foreseen is sampled, and held against limits and obstacles, all at once.
+        """
+        q = np.asarray(q, float)
+        with self._lock:
+            velocities = self._foreseen(q, dt, num)
+            if velocities is None:
+                velocities = np.empty((num, NUM_JOINTS))
+                for k in range(num):
+                    velocities[k] = self.step(q, dt)
+                    q = q + dt * velocities[k]
+            return velocities
+
     @property
     def phase(self) -> Phase:
         """What it is doing."""
@@ -411,11 +441,12 @@ class Controller:
             else:
                 self._settled = True
                 self._take(self._begun.course)  # what was in the way of the motion need not be in that of its end
-        if self._behind(q) > LOST and self._now > self._began + LOOKING and self._aim is not Aim.HAND:
+        behind = self._behind(q)
+        if behind > LOST and self._now > self._began + LOOKING and self._aim is not Aim.HAND:
             self._anchor(q, NO_DODGE)
-            self._began = self._now
-        target = 1 / (1 + (self._behind(q) / GAP) ** 2) if self._begun.dodge.cleared else 0.0
-        self._rate += float(np.clip(target - self._rate, -dt / RAMP, dt / RAMP))
+            self._began, behind = self._now, self._behind(q)
+        target = 1 / (1 + (behind / GAP) ** 2) if self._begun.dodge.cleared else 0.0
+        self._rate += min(max(target - self._rate, -dt / RAMP), dt / RAMP)
 
     def _behind(self, q: Array) -> float:
         """The largest gap of a joint, rad."""
@@ -430,23 +461,67 @@ class Controller:
     def _guarded(self, q: Array, wanted: Array) -> Array:
         """The velocities nearest to those wanted at which the arm comes into no obstacle."""
         sighting = self._seen
-        now = sighting.expected(min(self._now - sighting.time, STALE), 0.0)
-        moves = wanted.any() or sighting.speed > 0 or np.isinf(self._room)
-        if now is None or not moves or self._now < self._safe_until:
+        if self._now < self._safe_until or not (wanted.any() or sighting.speed > 0 or np.isinf(self._room)):
             return wanted
-        wanted, self._room = guarded(self._arm, q, wanted, now, sighting.velocities)
-        self._safe_until = self._now + (self._room - WINDOW) / (FASTEST_POINT + sighting.speed)
+        now = sighting.expected(min(self._now - sighting.time, STALE), 0.0)
+        if now is None:
+            return wanted
+        wanted, room = guarded(self._arm, q, wanted, now, sighting.velocities)
+        self._seen_from(room, self._now)
         return wanted
 
     def _within_limits(self, q: Array, wanted: Array, dt: float) -> Array:
         """The velocities nearest to those wanted that all limits allow."""
-        braking = 2 * BRAKING_SHARE * self.acceleration
-        highest = np.sqrt(braking * np.maximum(self.robot.upper - q - dt * np.maximum(self._velocity, 0), 0))
-        lowest = -np.sqrt(braking * np.maximum(q + dt * np.minimum(self._velocity, 0) - self.robot.lower, 0))
-        limits, most = self.robot.velocity_limits, self.acceleration * dt
-        change = np.clip(np.clip(wanted, lowest, highest), -limits, limits) - self._velocity
+        lowest, highest = self._range(q, self._velocity, dt)
+        change = np.minimum(np.maximum(wanted, lowest), highest) - self._velocity
         # all joints together: what lies between two velocities that touch nothing touches nothing
-        return self._velocity + change * min(1.0, most / max(float(np.abs(change).max()), 1e-12))
+        return self._velocity + change * min(1.0, self.acceleration * dt / max(float(np.abs(change).max()), 1e-12))
+
+    def _range(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
+        """The lowest and highest velocities (*B, 6) after others (*B, 6) at postures (*B, 6) that can stop in time."""
+        braking, limits = 2 * BRAKING_SHARE * self.acceleration, self.robot.velocity_limits
+        above = self.robot.upper - q - dt * np.maximum(velocity, 0)
+        below = q + dt * np.minimum(velocity, 0) - self.robot.lower
+        highest, lowest = (np.sqrt(braking * np.maximum(room, 0)) for room in (above, below))
+        return -np.minimum(lowest, limits), np.minimum(highest, limits)
+
+    def _foreseen(self, q: Array, dt: float, num: int) -> Array | None:
+        """The velocities (num, 6) of steps in which nothing is due and nothing binds; None where something may be."""
+        ahead, seen = self._ahead, self._seen
+        if ahead is None or self._q is None or not ahead.dodge.cleared or max(seen.speed, self._sighting.speed) > 0:
+            return None
+        stiffness, gap = min(STIFFNESS, 0.5 / dt), ahead.at(self._clock) - q
+        size, linear = float(np.abs(gap).max()), 2 * BRAKING_SHARE * self.acceleration / stiffness**2
+        if np.abs(q - self._q).max() > MOVED or not size < min(LOST, linear):
+            return None
+        closed = (1 - stiffness * dt) ** np.arange(num)
+        rate, clocks = self._rate, [self._clock]
+        for part in closed.tolist():
+            rate += min(max(1 / (1 + (part * size / GAP) ** 2) - rate, -dt / RAMP), dt / RAMP)
+            clocks.append(min(clocks[-1] + rate * ahead.pace(clocks[-1]) * dt, ahead.course.end))
+        if not self._settled and clocks[-1] >= ahead.course.end:
+            return None
+        p, gaps = np.array([ahead.at(clock) for clock in clocks]), closed[:, None] * gap
+        postures, velocities = p[:-1] - gaps, np.diff(p, axis=0) / dt + stiffness * gaps
+        before = np.concatenate([self._velocity[None], velocities[:-1]])
+        lowest, highest = self._range(postures, before, dt)
+        binds = np.abs(velocities - before).max() > self.acceleration * dt
+        if binds or (velocities < lowest).any() or (velocities > highest).any():
+            return None
+        now = self._now + num * dt
+        if seen.avoidance is not None and now >= self._safe_until and (velocities.any() or np.isinf(self._room)):
+            allowed, room = is_allowed(self._arm, postures, velocities, seen.avoidance, seen.velocities)
+            if not allowed:
+                return None
+            self._seen_from(room, now)
+        self._now, self._clock, self._rate = now, clocks[-1], rate
+        self._velocity, self._q = velocities[-1], postures[-1] + dt * velocities[-1]
+        return velocities
+
+    def _seen_from(self, room: float, now: float) -> None:
+        """Take note of the distance from the nearest obstacle, metres, and of how long none can be near for sure."""
+        self._room = room
+        self._safe_until = now + (room - WINDOW) / (FASTEST_POINT + self._seen.speed)
 
     # --- The motion ahead ---
 
@@ -501,8 +576,8 @@ class Controller:
         known, p = dodge(self._arm, course.q[first:], hosts, avoidance, sighting.velocities, before, turn)
         return Ahead(course, known, p, VELOCITY_SHARE * self.robot.velocity_limits)
 
-    def _course(self, q: Array, z: Array | None = None) -> Course:
-        """The undisturbed motion from a posture (6,), or from base coordinates `z` (3,), to where it is to go."""
+    def _course(self, q: Array, z: Array | None = None, near: Course | None = None) -> Course:
+        """The undisturbed motion from a posture (6,) to where it is to go; see `_towards`."""
         stack, nominal = self._solved.stack, self._solved.nominal
         if self._aim is Aim.HOME:
             outer: list[Diffeomorphism] = [applied.made.transform for applied in stack.built]
@@ -512,11 +587,23 @@ class Controller:
             system = DiffeomorphicSystem(transform, base)
         else:
             system = stack.system
-        return _towards(system, self._section, self.robot.lower, q, z)
+        return _towards(system, self._section, q, z, near)
 
 
-def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Array, z: Array | None) -> Course:
+def _towards(
+    system: DiffeomorphicSystem, section: Section, q: Array, z: Array | None = None, near: Course | None = None
+) -> Course:
+    """The motion of a system that a robot follows on a section, onto which it converges.
+
+    Args:
+        system: of the end effector.
+        section: the postures on which it is followed.
+        q: (6,) where the robot is, rad.
+        z: (3,) base coordinates to begin from; None are those of the hand.
+        near: a motion of another system on that section, whose postures are looked for first.
+    """
     robot, base = section.robot, system.base
+    lower = robot.lower
     z0 = system.transform.forward(robot.end_effector(q)) if z is None else z
     if np.linalg.norm(z0 - base.goal) < ARRIVED:
         times, fractions, path = np.zeros(1), np.ones(1), system.transform.inverse(base.goal[None])
@@ -525,7 +612,9 @@ def _towards(system: DiffeomorphicSystem, section: Section, lower: Array, q: Arr
         bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
     # from the end, which is near the reference, backwards: the beginning may be far from the section's branch
-    joints = track(robot, path[::-1], section.reference, reference=section.reference).q[::-1]
+    left = (1 - fractions) * np.linalg.norm(z0 - base.goal)
+    initial = None if z is None or near is None else near.where_left(left[::-1], section)
+    joints = track(robot, path[::-1], section.reference, initial, reference=section.reference).q[::-1]
     turns = np.where(np.isinf(lower), np.round((q - joints[0]) / (2 * np.pi)), 0.0)
     offset = q - joints[0] - 2 * np.pi * turns
     converged = CONVERGENCE * np.log(max(float(np.abs(offset).max()) / CONVERGED, 1.0))

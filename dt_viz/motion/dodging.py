@@ -19,13 +19,13 @@ from dt_viz.arm.robot import NUM_JOINTS
 from dt_viz.arm.whole_arm import BESIDE, COARSE_STEP, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Mask, Sum, VectorField
-from dt_viz.flows.integrators import rk4
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.ways import OPPOSITE, turned
 from dt_viz.transforms.base import ArmAvoidance
 
 COMPARED = 16
-"""Number of colliding postures that ways out are compared by."""
+"""Number of colliding postures that ways out are compared by, about; half of it where an obstacle moves, for each is
+then compared with several places of the obstacle."""
 NO_PINS = np.empty((0, NUM_JOINTS))
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -112,7 +112,8 @@ def _direction(
     if not len(near):
         return None
     bent = np.flatnonzero(clearance < BESIDE)
-    compared = points[:, :, near[:: max(1, len(near) // COMPARED)]]
+    num = COMPARED // 2 if velocity.any() else COMPARED
+    compared = points[:, :, near[:: max(1, len(near) // num)]]
     best, *_ = escape_directions(compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity)
     return best if before is None else _turned(before, best, turn)
 
@@ -129,17 +130,37 @@ def _cleared(
     arm: WholeArm, field: VectorField, q: Array, hosts: Mask, avoidance: ArmAvoidance, end: Array | None
 ) -> tuple[float, Array]:
     """The shortest duration after which the flow has carried the hosts clear, or `MAX_DURATION`, and all images."""
-    duration, state = 0.0, arm.limits.forward(q)
-    lacking = lack(arm, q[hosts], avoidance, end)
-    while duration < MAX_DURATION and lacking.max() > 0:
-        carried, _ = rk4(field, state, None, -COARSE_STEP)
+    duration, state, p = 0.0, arm.limits.forward(q), q.copy()
+    slope = field(state)
+    moving: Mask = np.any(slope, axis=1)  # where the field vanishes its flow rests
+    lacking, carries = lack(arm, q[hosts], avoidance, end), moving[hosts]
+    at_rest, lacking = lacking[~carries].max(initial=-np.inf), lacking[carries]
+    state, slope, hosts = state[moving], slope[moving], hosts[moving]
+    while duration < MAX_DURATION and lacking.max(initial=at_rest) > 0:
+        carried, there = _stepped(field, state, slope, -COARSE_STEP)
         before, lacking = lacking, lack(arm, arm.limits.inverse(carried[hosts]), avoidance, end)
         part = 1.0
-        if lacking.max() <= 0:
+        if lacking.max(initial=at_rest) <= 0:
             part = float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
-            carried, _ = rk4(field, state, None, -part * COARSE_STEP)
-        state, duration = carried, duration + part * COARSE_STEP
-    return duration, arm.limits.inverse(state)
+            carried = _between(state, slope, carried, there, -COARSE_STEP, part)
+        state, slope, duration = carried, there, duration + part * COARSE_STEP
+    p[moving] = arm.limits.inverse(state)
+    return duration, p
+
+
+def _stepped(field: VectorField, s: Array, slope: Array, h: float) -> tuple[Array, Array]:
+    """The points (N, d) after an RK4 step of length h, and the field there, from the field at `s` (N, d)."""
+    second = field(s + h / 2 * slope)
+    third = field(s + h / 2 * second)
+    fourth = field(s + h * third)
+    after = s + h / 6 * (slope + 2 * second + 2 * third + fourth)
+    return after, field(after)
+
+
+def _between(s: Array, slope: Array, after: Array, there: Array, h: float, part: float) -> Array:
+    """The points (N, d) within that step, at a part of it, by the cubic with these ends and slopes."""
+    bend = (1 - 2 * part) * (after - s) + h * ((part - 1) * slope + part * there)
+    return (1 - part) * s + part * after + part * (part - 1) * bend
 
 
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) -> Array:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from dt_viz.arm.robot import NUM_JOINTS, cross
+from dt_viz.arm.robot import KinematicChain, cross
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -25,6 +25,8 @@ NUM_POINTS = 10
 """Number of body points, those nearest to an obstacle, that are looked at."""
 NUM_ROUNDS = 8
 """Number of rounds in which the velocity is projected onto what each point allows."""
+IMMOBILE = 1e-6
+"""Squared slope of a distance, m²/rad², up to which no joint moves the point to speak of."""
 DIFFERENCE = 1e-4
 """Distance between the places that a distance's slope is taken from, metres."""
 
@@ -43,35 +45,85 @@ def guarded(arm: WholeArm, q: Array, wanted: Array, avoidance: ArmAvoidance, vel
         The velocity (6,), rad/s, and the distance of the arm from the nearest obstacle, about, metres.
     """
     chain = arm.robot.chain(q[:, None])
-    points, radius = arm.body.of_chain(chain)[:, :, 0], arm.body.radius
-    axes, origins = chain.axes[:, 2, :, 0], chain.origins[:, :, 0]
-    slopes, bounds, nearest, kept = [], [], np.inf, min(KEPT, avoidance.margin / 2)
+    points, kept = arm.body.of_chain(chain), _kept(avoidance)
+    slopes, bounds, nearest = [], [], np.inf
     for part, velocity in zip(avoidance.obstacle.parts, velocities, strict=True):
-        distance = part.signed_distance(points) - radius + OVERSHOOT
+        distance = part.signed_distance(points[:, :, 0]) - arm.body.radius + OVERSHOOT
         nearest = min(nearest, float(distance.min()))
-        h = distance - kept
-        for k in np.argsort(h)[:NUM_POINTS]:
-            joint = arm.body.joint[k] + 1
-            if h[k] > WINDOW or joint == 0:
-                continue
-            normal, slope = _outward(part, points[k]), np.zeros(NUM_JOINTS)
-            slope[:joint] = cross(axes[:joint].T, points[k][:, None] - origins[:joint].T).T @ normal
-            slopes.append(slope)
-            bounds.append(float(normal @ velocity) - RATE * max(float(h[k]), 0.0))
-    for _ in range(NUM_ROUNDS):
-        before = wanted
-        for slope, bound in zip(slopes, bounds, strict=True):
-            short = bound - slope @ wanted
-            if short > 0 and (size := slope @ slope) > 1e-6:
-                wanted = wanted + short / size * slope
-        if wanted is before:
-            break
+        near = np.argsort(distance)[:NUM_POINTS]
+        near = near[distance[near] - kept <= WINDOW]
+        if len(near):
+            found = _constraints(arm, chain, points, part, velocity, distance[near] - kept, near, np.zeros_like(near))
+            slopes.append(found[0])
+            bounds.append(found[1])
+    if slopes:
+        wanted = _projected(wanted, np.concatenate(slopes), np.concatenate(bounds))
     return wanted, nearest
 
 
-def _outward(part: Obstacle, point: Array) -> Array:
-    """The unit vector (3,) away from an obstacle at a point (3,)."""
+def is_allowed(
+    arm: WholeArm, q: Array, wanted: Array, avoidance: ArmAvoidance, velocities: Array
+) -> tuple[bool, float]:
+    """Whether `guarded` leaves several velocities (N, 6) at postures (N, 6) as they are, all at once.
+
+    Returns:
+        Whether it does, for sure; and the distance of the arm from the nearest obstacle at the last posture, metres.
+    """
+    chain = arm.robot.chain(q.T)
+    points, kept, nearest = arm.body.of_chain(chain), _kept(avoidance), np.inf
+    for part, velocity in zip(avoidance.obstacle.parts, velocities, strict=True):
+        distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.body.radius[:, None] + OVERSHOOT
+        nearest = min(nearest, float(distance[:, -1].min()))
+        near, posture = np.nonzero(distance - kept <= WINDOW)
+        if len(near):
+            h = distance[near, posture] - kept
+            slopes, bounds = _constraints(arm, chain, points, part, velocity, h, near, posture)
+            if ((slopes * wanted[posture]).sum(axis=1) < bounds).any():
+                return False, nearest
+    return True, nearest
+
+
+def _kept(avoidance: ArmAvoidance) -> float:
+    return min(KEPT, avoidance.margin / 2)
+
+
+def _constraints(
+    arm: WholeArm,
+    chain: KinematicChain,
+    points: Array,
+    part: Obstacle,
+    velocity: Array,
+    h: Array,
+    near: Indices,
+    posture: Indices,
+) -> tuple[Array, Array]:
+    """Slopes s (K, 6) and bounds b (K,) of s·q̇ ≥ b for body points `near` (K,) at some of the chain's postures (K,).
+
+    Those that no joint moves to speak of have slopes of 0 and bounds of −∞.
+    """
+    at = points[near, :, posture]
+    normal = _outward(part, at)
+    lever = cross(chain.axes[:, 2][..., posture], at.T - chain.origins[..., posture])  # (6, 3, K)
+    slopes = (arm.body.is_beyond[:, near] * (lever * normal.T).sum(axis=1)).T
+    mobile = (slopes * slopes).sum(axis=1) > IMMOBILE
+    return slopes * mobile[:, None], np.where(mobile, normal @ velocity - RATE * np.maximum(h, 0.0), -np.inf)
+
+
+def _projected(wanted: Array, slopes: Array, bounds: Array) -> Array:
+    """The vector v (6,) with s·v ≥ b, for slopes s (K, 6) and bounds b (K,), that projections on them lead to."""
+    for _ in range(NUM_ROUNDS):
+        if (slopes @ wanted >= bounds).all():
+            break
+        for slope, bound in zip(slopes, bounds, strict=True):
+            short = bound - slope @ wanted
+            if short > 0:
+                wanted = wanted + short / (slope @ slope) * slope
+    return wanted
+
+
+def _outward(part: Obstacle, points: Array) -> Array:
+    """Unit vectors (K, 3) away from an obstacle at points (K, 3)."""
     steps = DIFFERENCE * np.concatenate([np.eye(3), -np.eye(3)])
-    distance = part.signed_distance(point + steps)
-    slope = distance[:3] - distance[3:]
-    return slope / max(float(np.linalg.norm(slope)), 1e-12)
+    distance = part.signed_distance(points[:, None] + steps)
+    slope = distance[:, :3] - distance[:, 3:]
+    return slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)

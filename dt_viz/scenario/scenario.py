@@ -86,6 +86,11 @@ class View:
     """Name of the level of the stack whose rollouts are shown beside those of the whole stack, and whose pictures are
     on the slice; the whole stack if empty."""
 
+    @property
+    def shows_arm_motion(self) -> bool:
+        """Whether something is drawn from the arm's motion along its rollout, as replay is."""
+        return self.replay or self.onion or self.joint_plots
+
 
 @dataclass(frozen=True)
 class Layer:

@@ -15,7 +15,7 @@ from dt_viz.flows.fields import Array
 
 logger = logging.getLogger(__name__)
 
-PICTURES_PER_SECOND = 25
+PICTURES_PER_SECOND = 20
 
 
 def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
@@ -118,8 +118,10 @@ class Playback:
             self._thread.join(timeout=1)
 
     def _loop(self) -> None:
+        period = 1 / PICTURES_PER_SECOND
         before = time.monotonic()
-        while not self._closed.wait(1 / PICTURES_PER_SECOND):
+        # at even times, however long a picture takes
+        while not self._closed.wait(max(0.0, before + period - time.monotonic())):
             now = time.monotonic()
             try:
                 self.advance(now - before)

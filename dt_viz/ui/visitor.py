@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -248,18 +248,20 @@ class Visitor:
         q, view = self._playback.q, self._view
         if q is None:
             return
-        hand, live = self._robot.end_effector(q), self._playback.live
-        with self.client.atomic():
-            posed = q.tobytes(), view.ghost_arm or view.body_points
-            if posed != self._posed:
+        hand, live, now = self._robot.end_effector(q), self._playback.live, time.monotonic()
+        posed = q.tobytes(), view.ghost_arm or view.body_points
+        moves = posed != self._posed
+        # a block wakes the connection, also if nothing is sent
+        with self.client.atomic() if moves or self.way.is_due(now) else nullcontext():
+            if moves:
                 self._posed = posed
                 without = self._playback.without if posed[1] else None
                 self.arms.pose(q, q if without is None else without)
             self.objects.pose(hand, self._playback.arrived)
-            self.drawing.pose(time.monotonic(), hand, self._playback.arrived)
+            self.drawing.pose(now, hand, self._playback.arrived)
             self.pictures.rollouts.fade()
             if not view.replay:
-                self.way.show(time.monotonic(), hand, live.ahead)
+                self.way.show(now, hand, lambda: live.ahead)
                 self.grip.say(live.note)
 
     def _notify(self, text: str, colour: Colour) -> None:

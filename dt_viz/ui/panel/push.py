@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import viser
 
+from dt_viz.engine.frame import Stage
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.ui.controls import on_press
 from dt_viz.ui.panel.bindings import Bindings
@@ -26,7 +27,8 @@ class PushButton:
 
         def disabled(scenario: Scenario) -> bool:
             frame = bindings.frame
-            return frame is None or frame.arm is None or scenario.view.replay or not scenario.view.playing
+            stands = frame is None or (frame.arm is None and frame.stage >= Stage.FINE)
+            return stands or scenario.view.replay or not scenario.view.playing
 
         bindings.properties(self.handle, disabled=disabled)
 

@@ -7,7 +7,8 @@ import trimesh
 import viser
 from viser import transforms
 
-from dt_viz.arm.robot import Robot
+from dt_viz.arm.cspace import LEVERS
+from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.links import bodies, light_shells
@@ -18,6 +19,8 @@ PEDESTAL = 2
 STALE_OPACITY = 0.4
 """Opacity of the arm while its motion is not the scenario's."""
 GHOST_OPACITY = 0.5
+SEEN = 4e-4
+"""Smallest motion of the hand by a joint that is drawn, metres: a third of a pixel, about."""
 MIN_APART = 0.006
 """Smallest distance of a link from its ghost at which the ghost is shown, metres: coinciding surfaces flicker."""
 
@@ -26,7 +29,9 @@ class ArmFrames:
     """The frames of the base and the six links as a tree in the scene of one visitor."""
 
     def __init__(self, scene: viser.SceneApi, robot: Robot, name: str) -> None:
-        self._robot = robot
+        unturned_and_half_turned = np.broadcast_to(np.array([[0.0], [np.pi]]), (2, NUM_JOINTS))
+        self._unturned, self._half_turned = robot.joint_frames(unturned_and_half_turned)
+        self._drawn = np.full(NUM_JOINTS, np.inf)
         self.frames: list[viser.FrameHandle] = []
         for index, body in enumerate(bodies(robot.joint_names)):
             name += f"/joint_{index}" if index else ""
@@ -36,9 +41,13 @@ class ArmFrames:
             )
 
     def pose(self, q: Array) -> None:
-        """Take the joint angles `q` (6,), rad."""
-        for frame, wxyz in zip(self.frames[1:], self._robot.joint_frames(q), strict=True):
-            frame.wxyz = wxyz
+        """Take the joint angles `q` (6,), rad, as far as the change is seen: each joint is a message to the browser."""
+        turned = LEVERS * np.abs(q - self._drawn) > SEEN
+        self._drawn = np.where(turned, q, self._drawn)
+        c, s = np.cos(q / 2)[:, None], np.sin(q / 2)[:, None]
+        wxyzs = c * self._unturned + s * self._half_turned  # a quaternion is linear in both
+        for joint in np.flatnonzero(turned):
+            self.frames[joint + 1].wxyz = wxyzs[joint]
 
 
 class ArmPicture:

@@ -55,7 +55,7 @@ class Grip:
             font_screen_scale=0.8,
             visible=False,
         )
-        self.ball.visible = False
+        self.ball.visible, self._said = False, ""
         self._slice: Slice | None = None
         self._grabbed, self._offset, self._place = np.zeros(3), np.zeros(3), np.zeros(3)
 
@@ -79,8 +79,10 @@ class Grip:
 
     def say(self, warning: str) -> None:
         """Show a warning beside the hand; none if it is empty."""
-        self._note.text = warning or self._note.text
-        self._note.visible = bool(warning)
+        if warning != self._said:
+            self._said = warning
+            self._note.text = warning or self._note.text
+            self._note.visible = bool(warning)
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 import viser
@@ -16,7 +17,7 @@ TRAIL_SECONDS = 2.5
 """Time after which the trail has faded, seconds."""
 STEP = 0.006
 """Shortest way of the hand that becomes a piece of the trail, metres."""
-PERIOD = 0.12
+PERIOD = 0.2
 """Time between two drawings, seconds: each sends the whole line to the browser."""
 
 
@@ -33,19 +34,23 @@ class Way(Shown):
         self._came: deque[tuple[float, Array]] = deque()
         """When the hand was where, the newest last."""
 
-    def show(self, moment: float, hand: Array, ahead: Array) -> None:
+    def is_due(self, moment: float) -> bool:
+        """Whether `show` sends something at a moment, seconds."""
+        return moment - self._when >= PERIOD
+
+    def show(self, moment: float, hand: Array, going: Callable[[], Array]) -> None:
         """Show the way.
 
         Args:
             moment: now, seconds.
             hand: (3,) where the hand is, metres.
-            ahead: (K, 3) where it is going, metres.
+            going: returns (K, 3) where it is going, metres; asked for each drawing only.
         """
         if not self._came or np.linalg.norm(hand - self._came[-1][1]) > STEP:
             self._came.append((moment, hand))
-        if moment - self._when < PERIOD:
+        if not self.is_due(moment):
             return
-        self._when = moment
+        self._when, ahead = moment, going()
         if not np.array_equal(ahead, self._drawn):
             self._drawn = ahead
             self.ahead.show([ahead])
