@@ -587,7 +587,7 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit, m
     wait_until(lambda: visitor.shown.arm is not None and session.wait_idle(0.2), "a motion")
     q = visitor.shown.arm.q[50]
     monkeypatch.setattr(Replay, "posture", property(lambda _: (q, q + 0.6 * np.eye(6)[0])))
-    wait_until(lambda: np.array_equal(visitor._playback.q, q), "the arm to be posed")
+    wait_until(lambda: np.array_equal(visitor.playback.q, q), "the arm to be posed")
     open_tab(page, "Show")
     until_drawn(visitor)
     before = pixels(page)
@@ -665,7 +665,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
         return (x, y), (x - 50, y - 40)
 
     drag_until(page, visitor, lambda: np.linalg.norm(visitor._hand() - before) > 0.02, lambda: None, from_the_ball)
-    live = visitor._playback.live
+    live = visitor.playback.live
     wait_until(lambda: live.phase is not Phase.HELD, "the hand to be where it was let go")
     hand = visitor._hand()
     assert np.linalg.norm(hand - before) > 0.05

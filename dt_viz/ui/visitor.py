@@ -95,12 +95,13 @@ class Visitor:
         """Position and look-at of the camera where it was put last, metres, and the size of the window, pixels."""
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
-        self._playback = Playback(engine.arm, self._pose, self.fail)
+        self.playback = Playback(engine.arm, self._pose, self.fail)
+        """What moves the arm."""
         self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._look_home)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(engine.arm.push)
-        self._playback.begin()
+        self.playback.begin()
         moved: Any = self._camera_moved  # viser takes coroutines, too, against its type hints
         client.camera.on_update(moved)
 
@@ -120,7 +121,7 @@ class Visitor:
             if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then the arm stays where it was
                 self.arm.stale = self._view.replay and (bool(frame.blocked) or self.pictures.stale)
         if frame.stage is not Stage.ROLLOUTS:
-            self._playback.replay.motion = frame.arm
+            self.playback.replay.motion = frame.arm
             self.grip.draw(frame, live=not self._view.replay)
             self._panel.report(frame, pace)
         self.client.flush()
@@ -138,9 +139,9 @@ class Visitor:
             self.way.visible = view.arm and not view.replay
             self.grip.ball.visible = not view.replay
             if view.replay:  # a drag of the ball ends without an event
-                self._playback.live.release()
+                self.playback.live.release()
                 self.way.forget()
-        self._playback.play(view.playing, view.speed, replays=view.replay)
+        self.playback.play(view.playing, view.speed, replays=view.replay)
         self._panel.adopt(scenario)
 
     def learning(self, fraction: float, message: str) -> None:
@@ -179,7 +180,7 @@ class Visitor:
         """Stop all threads: the visitor has left."""
         self._panel.close()
         self.session.close()
-        self._playback.close()
+        self.playback.close()
 
     @contextmanager
     def _dragging(self, phase: str) -> Iterator[Scenario]:
@@ -235,30 +236,30 @@ class Visitor:
             self.session.edit("slice", view=replace(scenario.view, slice=pose))
 
     def _hand(self) -> Array | None:
-        q = self._playback.q
+        q = self.playback.q
         return None if q is None else self._robot.end_effector(q)
 
     def _hand_held(self, place: Array, phase: str) -> None:
-        self._playback.live.hold(place)
+        self.playback.live.hold(place)
         if phase == "end":
-            self._playback.live.release()
+            self.playback.live.release()
 
     def _pose(self) -> None:
         """Draw the arm in its posture, its way, and what it carries."""
-        q, view = self._playback.q, self._view
+        q, view = self.playback.q, self._view
         if q is None:
             return
-        hand, live, now = self._robot.end_effector(q), self._playback.live, time.monotonic()
+        hand, live, now = self._robot.end_effector(q), self.playback.live, time.monotonic()
         posed = q.tobytes(), view.ghost_arm or view.body_points
         moves = posed != self._posed
         # a block wakes the connection, also if nothing is sent
         with self.client.atomic() if moves or self.way.is_due(now) else nullcontext():
             if moves:
                 self._posed = posed
-                without = self._playback.without if posed[1] else None
+                without = self.playback.without if posed[1] else None
                 self.arms.pose(q, q if without is None else without)
-            self.objects.pose(hand, self._playback.arrived)
-            self.drawing.pose(now, hand, self._playback.arrived)
+            self.objects.pose(hand, self.playback.arrived)
+            self.drawing.pose(now, hand, self.playback.arrived)
             self.pictures.rollouts.fade()
             if not view.replay:
                 self.way.show(now, hand, lambda: live.ahead)

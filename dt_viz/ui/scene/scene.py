@@ -136,7 +136,7 @@ def _jumped(before: Frame | None, frame: Frame) -> list[Array]:
 
 
 class Ghost(Picture):
-    """The undeformed rollouts, dashed, where no rollout covers them."""
+    """The undisturbed motion of the rollout that the arm follows, dashed, where no rollout covers it."""
 
     def __init__(self, scene: viser.SceneApi, covered: Covered) -> None:
         self._lines, self._covered = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012), covered
@@ -144,7 +144,8 @@ class Ghost(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        undisturbed = frame.ghost[: len(frame.ghost) - frame.num_added]
+        own = frame.ghost[: len(frame.ghost) - frame.num_added]
+        undisturbed = own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
         self._lines.show_segments(self._covered.beside(frame.rollouts, self._lines.segments(undisturbed)))
 
 

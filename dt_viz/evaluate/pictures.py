@@ -1,0 +1,130 @@
+"""Take a test picture of the first page and of each scene of the paper, in headless Chromium.
+
+Needs Chromium (Debian: apt-get install chromium) and the test extra. Each picture is the page as a visitor sees it, once
+every check is done, the arm stopped in the middle of its motion: to be looked at by a person.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from dt_viz.engine.frame import Stage
+from dt_viz.evaluate.options import InputError
+from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.motion.control import Phase
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.server import Server
+from dt_viz.ui.visitor import Visitor
+
+FIRST = "first"
+"""Name of the picture of the first page."""
+FIRST_TASK = "draw_s"
+MOMENT = 0.45
+"""Part of the time that the motion takes after which the arm is stopped."""
+PATIENCE = 180.0
+"""Longest wait for the page, seconds."""
+DRAWING = 8.0
+"""Time that software takes to draw the page, seconds."""
+ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+HIDE_NOTICES = "() => document.querySelectorAll('button.mantine-Notification-closeButton').forEach(b => b.click())"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the subcommand's arguments."""
+    names = (FIRST, *SCENES)
+    parser.add_argument("--only", choices=names, nargs="+", default=names, metavar="NAME", help=", ".join(names))
+    parser.add_argument("--size", type=_size, default=(1920, 1080), metavar="W,H", help="pixels (default: 1920,1080)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand: ends with status 1 where the page complains."""
+    try:
+        from playwright.sync_api import sync_playwright  # noqa: PLC0415 - of the test extra
+    except ImportError:
+        raise InputError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        raise InputError("Chromium", "not installed", "apt-get install chromium")
+    options.out.mkdir(parents=True, exist_ok=True)
+    width, height = options.size
+    complaints: list[str] = []
+    with sync_playwright() as playwright:
+        server = Server(TASKS, FitStore(default_cache_folder()), task=FIRST_TASK, port=0)
+        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        try:
+            for name in options.only:
+                page = browser.new_page(viewport={"width": width, "height": height})
+                page.on("console", lambda message: _complain(message, complaints))
+                page.goto(f"http://{server.host}:{server.port}")
+                _until(lambda: len(server.visitors) == 1 and _is_certified(server.visitors[0]))
+                (visitor,) = server.visitors
+                _begin(visitor, name)
+                _stop_in_the_middle(visitor)
+                page.evaluate(HIDE_NOTICES)
+                time.sleep(DRAWING)
+                file = options.out / f"{name}.png"
+                page.screenshot(path=file)
+                Image.open(file).convert("RGB").quantize(256).save(file, optimize=True)
+                page.close()
+                _until(lambda: not server.visitors)
+                print(f"{file}: {SCENES[name].title if name in SCENES else 'the first page'}")
+        finally:
+            browser.close()
+            server.close()
+    for complaint in complaints:
+        print(f"the page says: {complaint}", file=sys.stderr)
+    return 1 if complaints else 0
+
+
+def _begin(visitor: Visitor, name: str) -> None:
+    """Load a scene, and wait until it is certified."""
+    if name in SCENES:
+        visitor.session.load(SCENES[name].task, SCENES[name].scenario)
+    _until(lambda: visitor.session.wait_idle(0.1) and _is_certified(visitor))
+
+
+def _is_certified(visitor: Visitor) -> bool:
+    frame = visitor.shown
+    return frame is not None and frame.stage is Stage.CERTIFIED and frame.scenario.moves_like(visitor.session.scenario)
+
+
+def _stop_in_the_middle(visitor: Visitor) -> None:
+    """Let the arm set out from a start, and stop it later."""
+    live, frame = visitor.playback.live, visitor.shown
+    if frame is None or frame.arm is None or not frame.scenario.view.arm:
+        return
+    _until(lambda: live.phase is not Phase.MOVING)
+    _until(lambda: live.phase is Phase.MOVING)
+    time.sleep(MOMENT * float(frame.arm.times[-1]))
+    visitor.session.edit("play", view=replace(visitor.session.scenario.view, playing=False))
+
+
+def _until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"the page was not ready after {PATIENCE:.0f} s")
+        time.sleep(0.05)
+
+
+def _complain(message: Any, complaints: list[str]) -> None:  # noqa: ANN401 - of a library that may not be there
+    """Note what a page says; not that it draws by software, nor what the library of its 3-D view will replace."""
+    expected = ("software", "WebGL", "GPU", "THREE.Clock")
+    if message.type in ("error", "warning") and not any(word in message.text for word in expected):
+        complaints.append(message.text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition(",")
+    return int(width), int(height)
