@@ -257,7 +257,7 @@ class Avoidance(Transform):
         known = remembered(motion.before if plane is None else (), self.obstacles)
         margin, left = self._kept_margin(motion), math.inf if self.duration is None else self.duration
         for k, (obstacle, before) in enumerate(zip(self.obstacles, known, strict=True)):
-            passes = Passes.of(motion, obstacle, margin, plane)
+            passes = Passes.of(motion, obstacle, margin, self.obstacles[:k], plane)
             if passes is None:
                 continue
             ways[k] = way = passes.way(before, gradually=motion.gradual)

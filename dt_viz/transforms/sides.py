@@ -12,6 +12,7 @@ least detour; while an obstacle is dragged, it is kept until another one costs m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from dt_viz.flows.diffeomorphisms import AdaptiveFlow
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.occupancy import StretchedField
 from dt_viz.obstacles.shapes import Obstacle, golden_spiral
+from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import Way
 from dt_viz.transforms.base import MotionBelow
 
@@ -35,15 +37,15 @@ STAYING = 1.5
 """Cost of the side that was chosen before, relative to the least one, up to which it is kept."""
 ROUNDNESS = 1.1
 """Size of the ellipsoid that sides are compared by, relative to the obstacle's half sizes."""
-BREADTH = 0.6
+BREADTH = 0.7
 """Smallest half size that A⁻¹ has in any direction, relative to the longest way to the side."""
 GAIN = 2.0
 """g in mean half sizes of the obstacle, so that a motion through its middle takes somewhat less than a unit of time."""
 ASLEEP = 3.0
 """‖A(y − c)‖ from which on an end hardly moves, so that the field needs no factor for it."""
-END_RADIUS = 0.5
+END_RADIUS = 0.3
 """ρ_e relative to the distance of the end from the motions in the obstacle."""
-SLOWEST = 0.05
+SLOWEST = 0.3
 """Smallest speed, in g, that the duration allows for: samples beside an end are hardly carried."""
 NUM_STEPS, SHORTEST, REACHED = 16, 1e-3, 2e-4
 """Largest number of steps to a surface, the smallest step and the margin's part that may be missing, metres."""
@@ -108,11 +110,20 @@ class Passes:
     """(K, 3) unit vectors along the motions."""
     ends: Array
     """(E, 3) starts and goal outside the obstacle, metres."""
+    others: tuple[Obstacle, ...] = ()
+    """Obstacles whose sides have been chosen: the way out of this one does not end in them."""
     plane: Array | None = None
     """(3, 2) orthonormal columns: sides are in this plane; None is in space."""
 
     @classmethod
-    def of(cls, motion: MotionBelow, obstacle: Obstacle, margin: float, plane: Array | None = None) -> Passes | None:
+    def of(
+        cls,
+        motion: MotionBelow,
+        obstacle: Obstacle,
+        margin: float,
+        others: Sequence[Obstacle] = (),
+        plane: Array | None = None,
+    ) -> Passes | None:
         """The passes of a motion; None where no sample comes so near."""
         motion = motion.demonstrated
         inside = np.flatnonzero(obstacle.signed_distance(motion.positions) < margin)
@@ -126,7 +137,7 @@ class Passes:
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
         ends = np.concatenate([motion.starts, motion.goal[None]])
         ends = ends[obstacle.signed_distance(ends) >= 0]
-        return cls(obstacle, margin, motion.positions[inside], tangents, ends, plane)
+        return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
     def way(self, before: Way | None, *, gradually: bool) -> Way:
         """The way out on the side with the least detour, or on the side of before while that costs little more.
@@ -152,19 +163,28 @@ class Passes:
         return way.turned_from(before, [over if above - below < UPWARDS * over[2] else -over])
 
     def costs(self, directions: Array) -> Array:
-        """Longest way (D,), metres, of a sample along unit vectors (D, 3) out of an ellipsoid around the obstacle.
+        """Longest way (D,), metres, of a sample along unit vectors (D, 3) out of ellipsoids around the obstacles.
 
         It is longer by up to `SIDEWAYS` times itself for a direction along the motions.
         """
-        centre, axes = _ellipsoid(self.obstacle)
-        axes = axes * (ROUNDNESS + self.margin / np.linalg.norm(axes, axis=0))
-        inverse = np.linalg.inv(axes)
-        u, v = (self.points - centre) @ inverse.T, directions @ inverse.T
-        size, along, squared = (v * v).sum(axis=1)[:, None], v @ u.T, (u * u).sum(axis=1)
-        surface = max(1.0, float(squared.max()))  # it holds all samples: corners of a box stick out
-        way = (np.sqrt(along**2 + size * (surface - squared)) - along) / size
+        first, *others = (self._crossed(obstacle, directions) for obstacle in (self.obstacle, *self.others))
+        way = first[1]
+        for _ in others:
+            for begins, ends in others:
+                way = np.where((begins < way) & (way < ends), ends, way)
         parallel = np.abs(directions @ self.tangents.T).mean(axis=1)
         return way.max(axis=1) * (1 + SIDEWAYS * parallel) + TINY
+
+    def _crossed(self, obstacle: Obstacle, directions: Array) -> tuple[Array, Array]:
+        """Where rays from the samples along unit vectors (D, 3) enter and leave an ellipsoid, both (D, K), metres."""
+        centre, axes = _ellipsoid(obstacle)
+        inverse = np.linalg.inv(axes * (ROUNDNESS + self.margin / np.linalg.norm(axes, axis=0)))
+        u, v = (self.points - centre) @ inverse.T, directions @ inverse.T
+        size, along, squared = (v * v).sum(axis=1)[:, None], v @ u.T, (u * u).sum(axis=1)
+        # it holds all samples in the obstacle: corners of a box stick out
+        surface = max(1.0, float(squared.max())) if obstacle is self.obstacle else 1.0
+        half = np.sqrt(np.maximum(along**2 + size * (surface - squared), 0))
+        return (-half - along) / size, (half - along) / size
 
     def flow(self, direction: Array, tolerance: float) -> AdaptiveFlow:
         """The flow whose inverse carries all samples along a unit vector (3,) until they keep the margin."""
@@ -183,9 +203,9 @@ class Passes:
 
     def _lengths(self, direction: Array) -> Array:
         """How far (K,), metres, the samples have to go along a unit vector (3,) to keep the margin."""
-        length = np.zeros(len(self.points))
+        length, around = np.zeros(len(self.points)), Union((self.obstacle, *self.others))
         for _ in range(NUM_STEPS):
-            lacking = self.margin - self.obstacle.signed_distance(self.points + length[:, None] * direction)
+            lacking = self.margin - around.signed_distance(self.points + length[:, None] * direction)
             if lacking.max() <= REACHED:
                 break
             length += np.where(lacking > REACHED, np.maximum(lacking, SHORTEST), 0)
