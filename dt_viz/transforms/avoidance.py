@@ -288,7 +288,8 @@ class Avoidance(Transform):
         if satisfied or np.isinf(kept):
             return ()
         far = made.hopeless and not made.integration.by_hand
-        why = ": the field does not reach farther; a higher T or a smaller margin helps" if far else ""
+        hotter = "" if self.generator == "probability" else "a higher T or "  # that of the paper has no T
+        why = f": the field does not reach farther; {hotter}a smaller margin helps" if far else ""
         text = f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle{why}"
         return (motion.warning(Kind.TOO_NEAR, text),)
 

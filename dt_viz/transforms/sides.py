@@ -38,7 +38,7 @@ STAYING = 1.5
 ROUNDNESS = 1.1
 """Size of the ellipsoid that sides are compared by, relative to the obstacle's half sizes."""
 BREADTH = 0.7
-"""Smallest half size that A⁻¹ has in any direction, relative to the longest way to the side."""
+"""Smallest half size of A⁻¹, relative to the longest way to the side; else it is the obstacle's plus the margin."""
 GAIN = 2.0
 """g in mean half sizes of the obstacle, so that a motion through its middle takes somewhat less than a unit of time."""
 ASLEEP = 3.0
@@ -191,7 +191,7 @@ class Passes:
         way = self._lengths(direction)
         centre, axes = _ellipsoid(self.obstacle)
         half = np.linalg.norm(axes, axis=0)
-        inverse = np.linalg.inv(axes * np.maximum(1, BREADTH * way.max() / half))
+        inverse = np.linalg.inv(axes * (np.maximum(half + self.margin, BREADTH * way.max()) / half))
         ends = self.ends[np.linalg.norm((self.ends - centre) @ inverse.T, axis=1) < ASLEEP]
         distance = np.linalg.norm(self.points[:, None] - ends, axis=2).min(axis=0)
         gain = GAIN * float(half.mean())
