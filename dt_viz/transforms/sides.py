@@ -43,7 +43,7 @@ GAIN = 2.0
 """g in mean half sizes of the obstacle, so that a motion through its middle takes somewhat less than a unit of time."""
 ASLEEP = 3.0
 """‖A(y − c)‖ from which on an end hardly moves, so that the field needs no factor for it."""
-END_RADIUS = 0.3
+END_RADIUS = 0.5
 """ρ_e relative to the distance of the end from the motions in the obstacle."""
 SLOWEST = 0.3
 """Smallest speed, in g, that the duration allows for: samples beside an end are hardly carried."""
