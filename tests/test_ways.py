@@ -183,7 +183,7 @@ def test_motions_keep_their_side_until_another_costs_much_less_then_turn_togethe
         directions.append(way.direction)
         durations.append(passes.flow(way.direction, 1e-9).duration)
     beyond = np.array([direction @ Z for direction in directions])
-    assert (beyond[heights > -0.0105] > 0.9).all()  # there the other side is nearer, by less than it must be
+    assert (beyond[heights > -0.0155] > 0.9).all()  # there the other side is nearer, by less than it must be
     assert beyond[-1] < 0
     assert max(angle(a, b) for a, b in pairwise(directions)) <= TURNING * 1e-3 / RADIUS + 1e-6
     assert np.abs(np.diff(durations)).max() < 0.2
