@@ -60,11 +60,10 @@ def test_a_motion_through_the_obstacle_is_said_whatever_else_is(engine, middle, 
     assert says(frame, "Bias 1: the point is below the table") == misplaced
 
 
-@pytest.mark.parametrize("task", ["draw_s", "lift_box"])
-def test_a_missed_goal_is_said_beside_a_covered_start_unless_it_is_covered_itself(engine, task):
+def test_a_missed_goal_is_said_beside_a_covered_start_unless_it_is_covered_itself(engine, task="draw_s"):
     goal = stage(engine, avoiding(task)).goal
     start = Sphere(as_point(engine.task(task).starts[0]), 0.05)
-    beside = near(goal, engine.task(task).obstacle_position, 0.0005)
+    beside = near(goal, engine.task(task).obstacle_position, 2e-5)
     frame = stage(engine, avoiding(task, (beside, start)))
     missed = np.linalg.norm(frame.reached - frame.goal)
     assert missed > MAX_GOAL_MISS
@@ -98,18 +97,17 @@ def test_a_hopeless_bias_point_leaves_the_obstacle_avoided(engine, seed):
     assert with_it.certificates.clearance > 0.85 * min(without.certificates.clearance, 0.01)
 
 
-@pytest.mark.parametrize(("temperature", "diameter"), [(1.0, 0.04), (1.0, 0.10), (2.0, 0.06)])
-def test_a_margin_out_of_reach_is_said_with_what_is_kept_and_what_helps(engine, middle, temperature, diameter):
-    sphere = Sphere(as_point(np.add(middle, (0.01, 0.005, 0.0))), diameter)
-    scenario = avoiding("draw_s", sphere, temperature=temperature, margin=0.05)
+@pytest.mark.parametrize("diameter", [0.04, 0.06, 0.10])
+def test_a_margin_out_of_reach_is_said_with_what_is_kept_and_what_helps(engine, middle, diameter):
+    sphere = Sphere(as_point(np.add(middle, (0.0, diameter / 2 + 0.002, 0.0))), diameter)  # the motion passes beside it
+    scenario = avoiding("draw_s", sphere, generator="probability", margin=0.05)
     frame = stage(engine, scenario)
     kept = frame.certificates.clearance
     assert 0 < kept < 0.05
     (warning,) = frame.certificates.warnings
     assert warning.kind is Kind.TOO_NEAR
-    assert warning.text.startswith(f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle: the field does not")
-    hotter = stage(engine, changed(scenario, temperature=2 * temperature))
-    assert hotter.certificates.clearance > 1.2 * kept
+    told = "the field does not reach farther; a smaller margin helps"
+    assert warning.text == f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle: {told}"
     assert texts(stage(engine, changed(scenario, margin=0.8 * kept))) == ()
 
 

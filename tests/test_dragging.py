@@ -22,7 +22,7 @@ JUMP = 0.05
 DRAGS = {
     # task, who gives way: a place at which motions change sides, the direction of the drag, and the distance beyond the
     # place at which they have changed sides in a drag, too, metres
-    ("draw_s", "task"): ((0.0967, -0.4986, 0.2306), (0.74, 0.54, -0.40), 0.036),
+    ("draw_s", "task"): ((0.0908, -0.5029, 0.2338), (0.74, 0.54, -0.40), 0.042),
     ("push_box", "cspace"): ((0.2340, -0.4880, 0.1777), (-0.72, -0.42, 0.55), 0.056),
 }
 

@@ -351,6 +351,29 @@ def test_places_are_measured_on_the_meshes(lasa, tmp_path, capsys):
     assert number_after(capsys.readouterr().out, "M.C.D. of the whole arm") > 30
 
 
+def test_places_of_the_hand_are_measured_at_its_point(lasa, tmp_path, capsys):
+    out = tmp_path / "places.npz"
+    where = ["--count", "2", "--size", "0.1", "--space", "task", "--out", str(out)]
+    arguments = ["places", "--task", "Hook", "--lasa", str(lasa), *where]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    with np.load(out) as arrays:
+        assert arrays["clearance"].shape == arrays["turn"].shape == (3, NUM_DEMONSTRATIONS)
+        assert arrays["ends"].shape == (3, NUM_DEMONSTRATIONS + 1)
+        assert arrays["clearance_without"].min() < -0.02
+        assert number_after(printed, "at least 9 mm kept") == (arrays["clearance"].min(axis=1) >= 9e-3).sum() == 3
+        forced = arrays["frechet"].max(axis=1) / (0.01 - arrays["clearance_without"].min(axis=1))
+        assert number_after(printed.replace(",", " "), "F.D. / forced  median") == pytest.approx(
+            np.median(forced), abs=0.006
+        )
+        with_avoidance = arrays["turn"]
+    assert main([*arguments, "--no-avoidance"]) == 0
+    with np.load(out) as arrays:
+        np.testing.assert_allclose(arrays["clearance"], arrays["clearance_without"], atol=1e-4)
+        assert arrays["frechet"].max() < 1e-3
+        assert not np.allclose(arrays["turn"], with_avoidance)
+
+
 def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, tmp_path, capsys):
     out = tmp_path / "places.npz"
     where = ["--along", "0,1", "--spread", "0", "--shape", "any", "--number", "2", "--size", "0.06,0.25"]

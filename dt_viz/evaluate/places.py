@@ -1,5 +1,7 @@
 """Put obstacles at random places along the mean demonstration, and measure the whole arm for each.
 
+With ``--space task``, where the hand alone gives way, its motions are measured instead: see `dt_viz.evaluate.hand`.
+
 The npz file holds for each of K places with N obstacles in each:
 
 ``places`` (K, N, 3), ``sizes`` (K, N, 3), ``turns`` (K, N, 4), ``shapes`` (K, N)
@@ -31,6 +33,7 @@ from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.robot import NUM_JOINTS, Robot, load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame
+from dt_viz.evaluate import hand
 from dt_viz.evaluate.avoidance import Measured, measure
 from dt_viz.evaluate.options import (
     add_avoidance,
@@ -115,6 +118,14 @@ def run(options: argparse.Namespace) -> int:
     out = ready_to_write(options.out, ".npz")
     robot = load_jaco()
     engine = Engine(tasks, FitStore(default_cache_folder()), robot)
+    if options.space == "task":
+        unions = [Union(obstacles) for obstacles in _obstacles(task, options)]
+        scenarios = [scenario_around(union.parts, task, options) for union in unions]
+        passed = [hand.passed(engine, scenario, union) for scenario, union in zip(scenarios, unions, strict=True)]
+        write_npz(out, **_of_obstacles(unions), **hand.arrays(passed))
+        print(_title(task, options) + ", hand")
+        hand.print_places(passed, scenarios[0].avoidance.margin)
+        return 0
     places, rows = [], []
     margin = 0.0
     for k, obstacles in enumerate(_obstacles(task, options)):
@@ -125,9 +136,7 @@ def run(options: argparse.Namespace) -> int:
         places.append(_measured(engine, scenario, union, room, robot, only_blocked=options.only_blocked))
         rows.append((str(k), *_row(places[-1], margin)))
     write_npz(out, **_arrays(places, len(task.paths)))
-    low, high = options.size
-    size = f"{low:g} m" if low == high else f"{low:g} to {high:g} m"
-    print(f"{task.name}, {options.number} × {options.shape} of {size}; lengths in mm, the worst rollout of each place")
+    print(_title(task, options))
     header = (
         "place", "hand's room", "M.C.D. without", "M.C.D. arm", "clearance", "F.D.", "F.D./forced", "turn (without)",
         "goal missed", "outside limits", "",
@@ -135,6 +144,12 @@ def run(options: argparse.Namespace) -> int:
     print_table(header, rows)
     _summarise(places, margin)
     return 0
+
+
+def _title(task: Task, options: argparse.Namespace) -> str:
+    low, high = options.size
+    size = f"{low:g} m" if low == high else f"{low:g} to {high:g} m"
+    return f"{task.name}, {options.number} × {options.shape} of {size}; lengths in mm, the worst rollout of each place"
 
 
 def hand_room(robot: Robot, obstacle: Union, places: Array) -> Array:
@@ -237,13 +252,6 @@ def _row(place: Place, margin: float) -> tuple[str, ...]:
 
 def _arrays(places: Sequence[Place], num_rollouts: int) -> dict[str, Any]:
     """What is written."""
-    most = max(len(place.union.parts) for place in places)
-
-    def of_parts(value: Callable[[Obstacle], Any]) -> Array:
-        """Values of the obstacles, repeating the last one where a place has fewer."""
-        return np.array(
-            [[value(place.union.parts[min(k, len(place.union.parts) - 1)]) for k in range(most)] for place in places]
-        )
 
     def of_rollouts(value: Callable[[Measured], float]) -> Array:
         table = np.full((len(places), num_rollouts), np.nan)
@@ -254,10 +262,7 @@ def _arrays(places: Sequence[Place], num_rollouts: int) -> dict[str, Any]:
 
     names = ("hand_clearance", "frechet", "depth_without", "turn", "turn_without", "num_outside", "goal_miss")
     return {
-        "places": of_parts(lambda part: part.position),
-        "sizes": of_parts(_sizes),
-        "turns": of_parts(lambda part: part.wxyz),
-        "shapes": of_parts(lambda part: type(part).__name__.lower()),
+        **_of_obstacles([place.union for place in places]),
         "blocked": np.array([bool(place.frame.blocked) for place in places]),
         "left_out": np.array([num_rollouts - len(place.frame.rollouts) for place in places]),
         "no_way": np.array([place.no_way for place in places]),
@@ -265,6 +270,21 @@ def _arrays(places: Sequence[Place], num_rollouts: int) -> dict[str, Any]:
         "arm_depth": of_rollouts(lambda m: m.arm.depth),
         "arm_clearance": of_rollouts(lambda m: m.arm.obstacle.distance),
         **{name: of_rollouts(lambda m, name=name: getattr(m, name)) for name in names},
+    }
+
+
+def _of_obstacles(unions: Sequence[Union]) -> dict[str, Any]:
+    """What is written of the obstacles, repeating the last one where a place has fewer."""
+    most = max(len(union.parts) for union in unions)
+
+    def of_parts(value: Callable[[Obstacle], Any]) -> Array:
+        return np.array([[value(union.parts[min(k, len(union.parts) - 1)]) for k in range(most)] for union in unions])
+
+    return {
+        "places": of_parts(lambda part: part.position),
+        "sizes": of_parts(_sizes),
+        "turns": of_parts(lambda part: part.wxyz),
+        "shapes": of_parts(lambda part: type(part).__name__.lower()),
     }
 
 

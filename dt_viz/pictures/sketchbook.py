@@ -206,7 +206,7 @@ class Sketchbook:
         pieces = self._pieces.get(coarse)
         if pieces is None or not pieces.area.lies_like(area):
             pieces = self._pieces[coarse] = self._cut(area, coarse=coarse)
-        drawn = [replace(b, tolerance=TOLERANCE) if isinstance(b, AdaptiveFlow) else b for b in behaviours]
+        drawn = [_drawn(behaviour) for behaviour in behaviours]
 
         def lifted(positions: Array) -> Array:
             for transform in drawn:
@@ -371,3 +371,10 @@ def _runs(positions: Array, index: Indices, limit: float) -> tuple[Array, ...]:
     far = np.linalg.norm(np.diff(positions, axis=0), axis=1) > limit
     pieces = np.split(positions, np.flatnonzero(far | (np.diff(index) > 0)) + 1)
     return tuple(piece for piece in pieces if len(piece) > 1)
+
+
+def _drawn(behaviour: Diffeomorphism) -> Diffeomorphism:
+    """A transform, its flows as exact as a picture needs them."""
+    if isinstance(behaviour, Chain):
+        return Chain([_drawn(part) for part in behaviour.parts])
+    return replace(behaviour, tolerance=TOLERANCE) if isinstance(behaviour, AdaptiveFlow) else behaviour

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
@@ -204,24 +205,25 @@ class Avoidance(Transform):
         """
         obstacle = self.avoided
         field = self._field()
-        ways, nudges = self._kept_sides(motion)
-        motion = replace(motion, positions=Chain(nudges).inverse(motion.positions)) if nudges else motion
+        ways, aside, motion = self._aside(motion)
+        spent = sum(flow.duration for flow in aside)
+        at_least = max(0.0, motion.at_least - spent)
         num_demonstrated = len(motion.demonstrated.starts)
         covered = np.flatnonzero(_blocked(obstacle, motion))
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
-        duration, hopeless = self.duration, False
+        duration, hopeless = None if self.duration is None else self.duration - spent, False
         if duration is None:
             # the deepest samples leave last, or nearly so; if they were not enough at the last attempt, take all
             depth = np.where(self._avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
-            if motion.at_least:
+            if at_least:
                 points = motion.positions[np.isfinite(depth)]
             else:
                 crests = _crests(motion, depth, field, self._kept_margin(motion))
                 points = np.concatenate([_deepest(motion, depth), crests])
             margin = self._kept_margin(motion)
-            duration = clearing_duration(field, obstacle, points, margin, at_least=motion.at_least)
+            duration = clearing_duration(field, obstacle, points, margin, at_least=at_least)
             # a coarse flow that is not clear after the time of the exact one needs more steps, not more time
-            hopeless = duration is None or (self.integration.by_hand and 0 < duration <= motion.at_least)
+            hopeless = duration is None or (self.integration.by_hand and 0 < duration <= at_least)
             if duration is None:
                 duration = MAX_DURATION
                 carried, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
@@ -231,34 +233,41 @@ class Avoidance(Transform):
                     text = f"a motion does not leave the obstacle: {why}"
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
         flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
-        if nudges:
-            flow = Chain([*nudges, flow])
+        if aside:
+            flow = Chain([*aside, flow])
         goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
             end = "end beside it" if inside < BESIDE else f"end {1e3 * inside:.0f} mm deep in it"
             warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
-        chosen = {"duration": duration}
-        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, ways)
+        duration += spent
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, {"duration": duration}, ways)
 
-    def _kept_sides(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], list[Diffeomorphism]]:
-        """Return the ways out of the obstacles, and the flows that keep all motions on one side of each.
+    def _aside(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], list[AdaptiveFlow], MotionBelow]:
+        """Return the ways out of the obstacles, the flows that carry all motions to one side of each, and these there.
 
-        Without ways out before, there is no such flow: each motion goes to the side that it is nearer to. So it does
-        in a plane, where no way out turns from one side to the other.
+        A flow time by hand is spent on these first. In a plane no way out turns from one side to the other, so none is
+        remembered there. The paper's generator acts alone.
         """
-        known = remembered(motion.before if self.plane is None else (), self.obstacles)
-        ways: list[Way | None] = []
-        nudges: list[Diffeomorphism] = []
-        for obstacle, before in zip(self.obstacles, known, strict=True):
-            passes = Passes.of(motion, obstacle)
-            way = None if passes is None else passes.way(before, gradually=motion.gradual)
-            ways.append(way)
-            if passes is not None and way is not None and before is not None:
-                duration = passes.duration(way.direction)
-                if duration > 0:
-                    nudges.append(AdaptiveFlow(passes.field(way.direction), duration, motion.tolerance))
-        return tuple(ways), nudges
+        ways: list[Way | None] = [None] * len(self.obstacles)
+        aside: list[AdaptiveFlow] = []
+        if self.generator == "probability":
+            return tuple(ways), aside, motion
+        plane = None if self.plane is None else axes_of(self.plane)[:, :2]
+        known = remembered(motion.before if plane is None else (), self.obstacles)
+        margin, left = self._kept_margin(motion), math.inf if self.duration is None else self.duration
+        for k, (obstacle, before) in enumerate(zip(self.obstacles, known, strict=True)):
+            passes = Passes.of(motion, obstacle, margin, self.obstacles[:k], plane)
+            if passes is None:
+                continue
+            ways[k] = way = passes.way(before, gradually=motion.gradual)
+            flow = passes.flow(way.direction, motion.tolerance)
+            flow = replace(flow, duration=min(flow.duration, left))
+            left -= flow.duration
+            if flow.duration > 0:
+                aside.append(flow)
+                motion = replace(motion, positions=flow.inverse(motion.positions))
+        return tuple(ways), aside, motion
 
     def satisfied(self, motion: MotionBelow) -> bool:
         """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""
@@ -279,7 +288,8 @@ class Avoidance(Transform):
         if satisfied or np.isinf(kept):
             return ()
         far = made.hopeless and not made.integration.by_hand
-        why = ": the field does not reach farther; a higher T or a smaller margin helps" if far else ""
+        hotter = "" if self.generator == "probability" else "a higher T or "  # that of the paper has no T
+        why = f": the field does not reach farther; {hotter}a smaller margin helps" if far else ""
         text = f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle{why}"
         return (motion.warning(Kind.TOO_NEAR, text),)
 

@@ -1,133 +1,231 @@
-"""Sides: on which of them all motions of the end effector pass an obstacle that is dragged through them.
+"""Sides: on which of them all motions of the end effector pass an obstacle.
 
-The flow that avoids an obstacle takes each motion out on the side of the obstacle's middle on which it is. So motions
-would change sides one by one as the middle is dragged across them. While it is dragged, all keep the side on which they
-have been: a flow along it first carries those that are beyond the middle back,
+The flow out of an occupied region takes each sample out where it is nearest: a motion through the middle is pushed back
+along its own way and then turns sharply, and its neighbours leave on other sides. So all motions together are carried
+to one side n before, as far as they need to be clear, by a flow along it,
 
-    ẏ = n exp(−‖y − c‖²/2σ²),
+    ẏ = n g exp(−½ ‖A(y − c)‖²) Π_e (1 − exp(−‖y − e‖²/2ρ_e²)),
 
-until all pass the middle c on the side n. Where they do so already it is the identity. The two legs of a bend around
-the middle are left on their own sides.
+which is broad along the motions and leaves their free starts and goal e where they are. The side is the one with the
+least detour; while an obstacle is dragged, it is kept until another one costs much less.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erfi
 
-from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.occupancy import StretchedField
+from dt_viz.obstacles.shapes import Obstacle, golden_spiral
+from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import Way
 from dt_viz.transforms.base import MotionBelow
 
-ROOM = 0.1
-"""Distance of all motions from an obstacle's middle on the side on which they pass it, in its radii."""
-KEPT = 0.25
-"""Distance of the motions beyond the middle up to which they keep their side, in the obstacle's radii."""
-ALIKE = 0.5
-"""Cosine of the angle between a side and the one on which motions are, up to which they turn to it."""
-INNER, CORE = 0.6, 0.9
-"""Distances from the middle, in the obstacle's radii, up to which motions are carried all the way to the side, and from
-which on they are not carried at all."""
-SPREAD = 0.7
-"""σ, in the obstacle's radii."""
-ENDS = (1.0, 2.0)
-"""Distances of the nearest start or goal, in the obstacle's radii, from which on motions are carried a little, and all
-the way: what is carried there would have to begin or end elsewhere."""
+NUM_DIRECTIONS, MAX_SAMPLES = 128, 96
+"""Number of sides that are compared, and largest number of samples that they are compared by."""
+SIDEWAYS = 1.0
+"""Relative extra cost of a side along the motions against one across them: it would bend them sharply."""
+SELECTIVITY = 0.05
+"""Relative difference in cost over which a direction's share in a side falls by a factor e, for smooth drags."""
+ALIKE = 0.77
+"""Cosine of the largest angle between two directions of one side."""
+STAYING = 1.5
+"""Cost of the side that was chosen before, relative to the least one, up to which it is kept."""
+ROUNDNESS = 1.1
+"""Size of the ellipsoid that sides are compared by, relative to the obstacle's half sizes."""
+BREADTH = 0.7
+"""Smallest half size of A⁻¹, relative to the longest way to the side; else it is the obstacle's plus the margin."""
+GAIN = 2.0
+"""g in mean half sizes of the obstacle, so that a motion through its middle takes somewhat less than a unit of time."""
+ASLEEP = 3.0
+"""‖A(y − c)‖ from which on an end hardly moves, so that the field needs no factor for it."""
+END_RADIUS = 0.5
+"""ρ_e relative to the distance of the end from the motions in the obstacle."""
+SLOWEST = 0.3
+"""Smallest speed, in g, that the duration allows for: samples beside an end are hardly carried."""
+NUM_STEPS, SHORTEST, REACHED = 16, 1e-3, 2e-4
+"""Largest number of steps to a surface, the smallest step and the margin's part that may be missing, metres."""
+SIMPSON = np.array([1, *[4, 2] * 7, 4, 1]) / 48
+"""Weights of Simpson's rule, along the way of a sample to the side."""
 UPWARDS = 0.01
-"""Distance beside the middle, metres, that outweighs passing above it, where motions turn to the opposite side."""
+"""Length of a detour, metres, that passing above an obstacle outweighs, where motions turn to the opposite side."""
 TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Passes:
-    """Where motions pass the middle of an obstacle nearer than `CORE`."""
+class Sideways:
+    """The generator of the flow to a side; it is against n, since motions follow the reverse."""
 
-    obstacle: Obstacle
-    offsets: Array
-    """(K, 3) from the middle to the nearest point of each pass, metres."""
-    tangent: Array
-    """(3,) mean direction of the passes, a unit vector."""
-    share: float = 1.0
-    """Part of the way to the side that motions are carried."""
-
-    @classmethod
-    def of(cls, motion: MotionBelow, obstacle: Obstacle) -> Passes | None:
-        """The only passes of the rollouts that have a demonstration; None where none comes so near just once."""
-        motion = motion.demonstrated
-        offset = motion.positions - np.asarray(obstacle.position)
-        distance = np.linalg.norm(offset, axis=1)
-        inside = np.flatnonzero(distance < CORE * obstacle.radius)
-        if not len(inside):
-            return None
-        begins = np.flatnonzero(np.diff(inside, prepend=-2) + np.diff(motion.index[inside], prepend=-1) > 1)
-        parts, rollouts = np.split(inside, begins[1:]), motion.index[inside[begins]]
-        once = np.bincount(rollouts)[rollouts] == 1
-        nearest = np.array([part[distance[part].argmin()] for part, only in zip(parts, once, strict=True) if only])
-        if not len(nearest):
-            return None
-        is_last = np.diff(motion.index, append=-1) != 0
-        after = np.where(is_last[nearest], nearest, nearest + 1)
-        tangents = offset[after] - offset[after - 1]
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
-        offsets = offset[nearest]
-        offsets = offsets - (offsets * tangents).sum(axis=1, keepdims=True) * tangents
-        ends = np.concatenate([motion.starts, motion.goal[None]]) - np.asarray(obstacle.position)
-        nearest_end = np.linalg.norm(ends, axis=1).min() / obstacle.radius
-        share = float(np.interp(nearest_end, ENDS, (0, 1)))
-        return cls(obstacle, offsets, np.linalg.svd(tangents)[2][0], share)
+    centre: Array
+    """c, (3,), metres."""
+    inverse: Array
+    """A, (3, 3), 1/metre."""
+    velocity: Array
+    """n g, (3,), metres per unit of time."""
+    ends: Array
+    """e, (E, 3), metres."""
+    radii: Array
+    """ρ_e, (E,), metres."""
 
     @property
-    def mean(self) -> Array:
-        """(3,) mean offset, metres; the nearer ones count more."""
-        core = CORE * self.obstacle.radius
-        weights = np.maximum(1 - (self.offsets**2).sum(axis=1) / core**2, TINY)
-        return weights @ self.offsets / weights.sum()
+    def dim(self) -> int:
+        """Dimension of the space."""
+        return 3
+
+    def __call__(self, s: Array) -> Array:
+        """V at the points `s` (N, 3), as (N, 3)."""
+        u = (s - self.centre) @ self.inverse.T
+        weight = np.exp(-0.5 * (u * u).sum(axis=1))
+        for end, radius in zip(self.ends, self.radii, strict=True):
+            weight *= -np.expm1(-0.5 * ((s - end) ** 2).sum(axis=1) / radius**2)
+        return weight[:, None] * -self.velocity
+
+    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
+        """V (N, 3) and DV (N, 3, 3) at the points `s` (N, 3)."""
+        u = (s - self.centre) @ self.inverse.T
+        weight = np.exp(-0.5 * (u * u).sum(axis=1))
+        slope = -weight[:, None] * (u @ self.inverse)
+        for end, radius in zip(self.ends, self.radii, strict=True):
+            offset = (s - end) / radius
+            lost = np.exp(-0.5 * (offset * offset).sum(axis=1))
+            slope = (1 - lost)[:, None] * slope + (weight * lost / radius)[:, None] * offset
+            weight = weight * (1 - lost)
+        return weight[:, None] * -self.velocity, -self.velocity[:, None] * slope[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Passes:
+    """Where the motions that have a demonstration come nearer to an obstacle than a margin."""
+
+    obstacle: Obstacle
+    margin: float
+    """Metres."""
+    points: Array
+    """(K, 3) samples of the motions there, metres."""
+    tangents: Array
+    """(K, 3) unit vectors along the motions."""
+    ends: Array
+    """(E, 3) starts and goal outside the obstacle, metres."""
+    others: tuple[Obstacle, ...] = ()
+    """Obstacles whose sides have been chosen: the way out of this one does not end in them."""
+    plane: Array | None = None
+    """(3, 2) orthonormal columns: sides are in this plane; None is in space."""
+
+    @classmethod
+    def of(
+        cls,
+        motion: MotionBelow,
+        obstacle: Obstacle,
+        margin: float,
+        others: Sequence[Obstacle] = (),
+        plane: Array | None = None,
+    ) -> Passes | None:
+        """The passes of a motion; None where no sample comes so near."""
+        motion = motion.demonstrated
+        inside = np.flatnonzero(obstacle.signed_distance(motion.positions) < margin)
+        if not len(inside):
+            return None
+        inside = inside[:: -(-len(inside) // MAX_SAMPLES)]
+        of_next = motion.index[np.minimum(inside + 1, len(motion.index) - 1)] == motion.index[inside]
+        of_last = motion.index[np.maximum(inside - 1, 0)] == motion.index[inside]
+        after, before = (np.clip(inside + by, 0, len(motion.index) - 1) for by in (of_next, -1 * of_last))
+        tangents = motion.positions[after] - motion.positions[before]
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
+        ends = np.concatenate([motion.starts, motion.goal[None]])
+        ends = ends[obstacle.signed_distance(ends) >= 0]
+        return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
     def way(self, before: Way | None, *, gradually: bool) -> Way:
-        """The way out on the side on which the motions are, or on which they were before while they are near to it.
+        """The way out on the side with the least detour, or on the side of before while that costs little more.
 
         Args:
             before: the way out of the obstacle where it was just before; None where there was none.
             gradually: whether it turns there as the obstacle moves on; else it is there at once.
         """
-        mean = self.mean
-        nearest = self._across(mean)
+        directions = self._directions
+        cost = self.costs(directions)
+        alike = directions @ directions[cost.argmin()] > ALIKE
+        share = np.where(alike, np.exp((cost.min() - cost) / (SELECTIVITY * cost.min())), 0)
+        best = _unit(share @ directions)
         if before is None:
-            return Way(self.obstacle, nearest, nearest)
-        kept = self._across(before.side)
-        settled = float((self.offsets @ nearest).min()) >= ROOM * self.obstacle.radius
-        gone = -mean @ kept > KEPT * self.obstacle.radius
-        side = nearest if gone or (settled and nearest @ kept > ALIKE) else kept
+            return Way(self.obstacle, best, best)
+        keeps = best @ before.side < ALIKE and self.costs(before.side[None])[0] < STAYING * cost.min()
+        side = before.side if keeps else best
         way = Way(self.obstacle, side, side, kept=True)
         if not gradually:
             return way
-        over = np.cross(self.tangent, before.direction)
-        return way.turned_from(before, [self._across(over if mean @ over + UPWARDS * over[2] > 0 else -over)])
+        over = _unit(np.cross(np.linalg.svd(self.tangents, full_matrices=False)[2][0], before.direction))
+        above, below = self.costs(np.stack([over, -over]))
+        return way.turned_from(before, [over if above - below < UPWARDS * over[2] else -over])
 
-    def duration(self, direction: Array) -> float:
-        """Time, metres, for which the flow along a unit vector (3,) runs until all passes are on that side."""
-        radius, sigma = self.obstacle.radius, SPREAD * self.obstacle.radius
-        along = self.offsets @ direction
-        squared = (self.offsets**2).sum(axis=1)
-        aside = np.exp((squared - along**2) / (2 * sigma**2))
-        to_side = erfi(ROOM * radius / (np.sqrt(2) * sigma)) - erfi(along / (np.sqrt(2) * sigma))
-        carried = np.interp(np.sqrt(squared) / radius, (INNER, CORE), (1, 0))
-        return self.share * float((sigma * np.sqrt(np.pi / 2) * aside * to_side * carried).max(initial=0.0))
+    def costs(self, directions: Array) -> Array:
+        """Longest way (D,), metres, of a sample along unit vectors (D, 3) out of ellipsoids around the obstacles.
 
-    def field(self, direction: Array) -> GridRBF:
-        """The generator of that flow, (N, 3) of no unit; it is against the direction: motions follow the reverse."""
-        position = np.asarray(self.obstacle.position)
-        grid = GaussianGrid(tuple(np.array([c]) for c in position), 0.5 / (SPREAD * self.obstacle.radius) ** 2)
-        return GridRBF(grid, -direction[None])
+        It is longer by up to `SIDEWAYS` times itself for a direction along the motions.
+        """
+        first, *others = (self._crossed(obstacle, directions) for obstacle in (self.obstacle, *self.others))
+        way = first[1]
+        for _ in others:
+            for begins, ends in others:
+                way = np.where((begins < way) & (way < ends), ends, way)
+        parallel = np.abs(directions @ self.tangents.T).mean(axis=1)
+        return way.max(axis=1) * (1 + SIDEWAYS * parallel) + TINY
 
-    def _across(self, direction: Array) -> Array:
-        """A direction (3,) without what is along the passes, a unit vector."""
-        across = direction - (direction @ self.tangent) * self.tangent
-        size = float(np.linalg.norm(across))
-        if size > TINY:
-            return across / size
-        least = np.eye(3)[np.abs(self.tangent).argmin()]
-        return self._across(least)
+    def _crossed(self, obstacle: Obstacle, directions: Array) -> tuple[Array, Array]:
+        """Where rays from the samples along unit vectors (D, 3) enter and leave an ellipsoid, both (D, K), metres."""
+        centre, axes = _ellipsoid(obstacle)
+        inverse = np.linalg.inv(axes * (ROUNDNESS + self.margin / np.linalg.norm(axes, axis=0)))
+        u, v = (self.points - centre) @ inverse.T, directions @ inverse.T
+        size, along, squared = (v * v).sum(axis=1)[:, None], v @ u.T, (u * u).sum(axis=1)
+        # it holds all samples in the obstacle: corners of a box stick out
+        surface = max(1.0, float(squared.max())) if obstacle is self.obstacle else 1.0
+        half = np.sqrt(np.maximum(along**2 + size * (surface - squared), 0))
+        return (-half - along) / size, (half - along) / size
+
+    def flow(self, direction: Array, tolerance: float) -> AdaptiveFlow:
+        """The flow whose inverse carries all samples along a unit vector (3,) until they keep the margin."""
+        way = self._lengths(direction)
+        centre, axes = _ellipsoid(self.obstacle)
+        half = np.linalg.norm(axes, axis=0)
+        inverse = np.linalg.inv(axes * (np.maximum(half + self.margin, BREADTH * way.max()) / half))
+        ends = self.ends[np.linalg.norm((self.ends - centre) @ inverse.T, axis=1) < ASLEEP]
+        distance = np.linalg.norm(self.points[:, None] - ends, axis=2).min(axis=0)
+        gain = GAIN * float(half.mean())
+        field = Sideways(centre, inverse, gain * direction, ends, np.maximum(END_RADIUS * distance, TINY))
+        on_the_way = self.points + (np.linspace(0, 1, len(SIMPSON))[:, None] * way)[:, :, None] * direction
+        speed = -(field(on_the_way.reshape(-1, 3)) @ direction).reshape(len(SIMPSON), -1)
+        duration = way * (SIMPSON @ (1 / np.maximum(speed, SLOWEST * gain)))
+        return AdaptiveFlow(field, float(duration.max()), tolerance)
+
+    def _lengths(self, direction: Array) -> Array:
+        """How far (K,), metres, the samples have to go along a unit vector (3,) to keep the margin."""
+        length, around = np.zeros(len(self.points)), Union((self.obstacle, *self.others))
+        for _ in range(NUM_STEPS):
+            lacking = self.margin - around.signed_distance(self.points + length[:, None] * direction)
+            if lacking.max() <= REACHED:
+                break
+            length += np.where(lacking > REACHED, np.maximum(lacking, SHORTEST), 0)
+        return length
+
+    @property
+    def _directions(self) -> Array:
+        """(D, 3) unit vectors all around."""
+        if self.plane is None:
+            return golden_spiral(NUM_DIRECTIONS, 0.5)
+        turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
+        return np.stack([np.cos(turn), np.sin(turn)], axis=1) @ self.plane.T
+
+
+def _ellipsoid(obstacle: Obstacle) -> tuple[Array, Array]:
+    """Centre (3,) and half axes (3, 3), as columns, metres, of an ellipsoid about as large as an obstacle."""
+    placed = obstacle.field("free-space", 1.0)
+    axes = placed.scale * placed.axes
+    return placed.origin, axes @ placed.inner.axes if isinstance(placed.inner, StretchedField) else axes
+
+
+def _unit(direction: Array) -> Array:
+    return direction / max(float(np.linalg.norm(direction)), TINY)
