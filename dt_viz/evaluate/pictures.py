@@ -1,7 +1,7 @@
 """Take a test picture of the first page and of each scene of the paper, in headless Chromium.
 
-Needs Chromium (Debian: apt-get install chromium) and the test extra. Each picture is the page as a visitor sees it, once
-every check is done, the arm stopped in the middle of its motion: to be looked at by a person.
+Needs Chromium (Debian: apt-get install chromium) and the test extra. Each picture is the page as a visitor sees it,
+once every check is done and the arm stopped in the middle of its motion: to be looked at by a person.
 """
 
 from __future__ import annotations
