@@ -36,12 +36,12 @@ def poses(few, engine):
 
 
 def shown(poses, index, *, finest=False):
-    """The rollouts of a pose as a visitor is shown them."""
+    """The rollout of a pose as a visitor is shown them."""
     frames = poses._frames(index)
     frame = next(frames)
     if finest:
         *_, frame = frames
-    return poses._segments(frame)
+    return poses._middle(frame)
 
 
 def test_a_pose_is_found_by_its_rollouts(poses):

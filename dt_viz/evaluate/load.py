@@ -48,11 +48,12 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_json,
 )
-from dt_viz.evaluate.protocol_client import ROLLOUTS, LostError, ProtocolClient
+from dt_viz.evaluate.protocol_client import ROLLOUT, LostError, ProtocolClient
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.obstacles.shapes import Point, Sphere, as_point
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.ui.scene.tubes import evenly_bent
 
 EDITS_PER_SECOND = 20
 """Rate of a drag's edits; no page sends more."""
@@ -67,11 +68,12 @@ PATIENCE = 60.0
 SAME = 1e-4
 """Largest distance between equal rollouts, metres; those of neighbouring poses differ by 1 mm."""
 
-Segments = NDArray[np.float32]
+Middle = NDArray[np.float32]
+"""Points (K, 3) of the rollout that the arm follows, metres."""
 
 
 class Poses:
-    """Poses that the obstacle is dragged to, with the engine's rollouts for each; the whole arm avoids, as at first."""
+    """Poses that the obstacle is dragged to, with the rollout that the arm follows for each; the whole arm avoids."""
 
     def __init__(self, engine: Engine, task: Task) -> None:
         self._engine, self._task = engine, task
@@ -80,16 +82,16 @@ class Poses:
         centre = np.asarray(task.obstacle_position)
         self.positions: list[Point] = [as_point(place) for place in centre + circle @ task.slice.axes.T]
         """Positions of the obstacle's centre, metres."""
-        self._coarse = [self._segments(next(self._frames(index))) for index in range(NUM_POSES)]
+        self._coarse = [self._middle(next(self._frames(index))) for index in range(NUM_POSES)]
 
-    def find(self, shown: Segments) -> int | None:
-        """Return the index of the pose whose first frame has these rollouts."""
-        return next((index for index, segments in enumerate(self._coarse) if _same(segments, shown)), None)
+    def find(self, shown: Middle) -> int | None:
+        """Return the index of the pose whose first frame has this rollout."""
+        return next((index for index, middle in enumerate(self._coarse) if _same(middle, shown)), None)
 
-    def has(self, index: int, shown: Segments | None) -> bool:
-        """Return whether these rollouts are of this pose, in any of its frames."""
+    def has(self, index: int, shown: Middle | None) -> bool:
+        """Return whether this rollout is of this pose, in any of its frames."""
         for frame in self._frames(index):
-            if shown is not None and _same(self._segments(frame), shown):
+            if shown is not None and _same(self._middle(frame), shown):
                 return True
             if frame.stage >= Stage.FINE:
                 break
@@ -98,9 +100,8 @@ class Poses:
     def _frames(self, index: int) -> Iterator[Frame]:
         return self._engine.frames(avoiding(self._task, Avoidance(Sphere(self.positions[index]), space="cspace")))
 
-    def _segments(self, frame: Frame) -> Segments:
-        paths = frame.rollouts[: len(self._task.demonstrations)]
-        return np.concatenate([np.stack([path[:-1], path[1:]], axis=1) for path in paths]).astype(np.float32)
+    def _middle(self, frame: Frame) -> Middle:
+        return evenly_bent(frame.rollouts[frame.chosen or 0]).astype(np.float32)
 
 
 @dataclass
@@ -145,15 +146,15 @@ class Visit:
 
     def shows_the_last_pose(self) -> bool:
         """Return whether the current picture is of the last edit."""
-        return not self.lost and self.poses.has(self.pose(len(self.edits) - 1), self.client.rollouts)
+        return not self.lost and self.poses.has(self.pose(len(self.edits) - 1), self.client.rollout)
 
     _latest: int | None = None
 
     def _see(self, name: str, changes: Any, now: float) -> None:  # noqa: ANN401 - properties of a node
         """Find the edit that a new picture shows."""
-        if name != ROLLOUTS or "points" not in changes:
+        if name != ROLLOUT or "vertices" not in changes:
             return
-        shown = self.client.rollouts
+        shown = self.client.rollout
         self._latest = None if shown is None else self.poses.find(shown)
         if self._latest is None:
             self.num_others += 1
@@ -294,7 +295,7 @@ def _status(process: int | None, name: str) -> int | None:
     return None if found is None else int(found[1])
 
 
-def _same(expected: Segments, shown: Segments) -> bool:
+def _same(expected: Middle, shown: Middle) -> bool:
     return expected.shape == shown.shape and bool(np.abs(expected - shown).max() < SAME)
 
 

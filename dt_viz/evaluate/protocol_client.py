@@ -22,8 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-ROLLOUTS, OBSTACLE = "/rollouts", "/obstacles/0"
-"""Names of the rollouts' lines and of the first obstacle's gizmo in the scene tree."""
+from dt_viz.ui.scene.tubes import NUM_RINGS, NUM_SIDES
+
+ROLLOUT, OBSTACLE = "/rollouts/followed", "/obstacles/0"
+"""Names of the tube of the rollout that the arm follows and of the first obstacle's gizmo in the scene tree."""
 STATUS, CHECKED = "Smallest det J", "every check holds"
 """Texts in the status line of every frame, and of a frame whose certificates all hold."""
 MAX_MESSAGE = 64 * 2**20
@@ -126,12 +128,12 @@ class ProtocolClient:
         return True
 
     @property
-    def rollouts(self) -> NDArray[np.float32] | None:
-        """Segments (K, 2, 3) of the rollouts on the page, metres; None before there are any."""
-        points = self.nodes.get(ROLLOUTS, {}).get("points")
-        return (
-            points.reshape(-1, 2, 3) if points is not None and points.size > 6 else None
-        )  # at first there is one empty segment
+    def rollout(self) -> NDArray[np.float32] | None:
+        """Middle (`NUM_RINGS`, 3) of the tube of the rollout that the arm follows, metres; None without one."""
+        vertices = self.nodes.get(ROLLOUT, {}).get("vertices")
+        if vertices is None or vertices.size <= 3 * NUM_SIDES * NUM_RINGS:  # at first there is a triangle without size
+            return None
+        return vertices.reshape(-1, NUM_SIDES, 3)[-NUM_RINGS - 1 : -1].mean(axis=1)
 
     @property
     def status(self) -> str:
@@ -142,7 +144,7 @@ class ProtocolClient:
     @property
     def has_picture(self) -> bool:
         """Whether rollouts and status line are on the page."""
-        return self.rollouts is not None and bool(self.status)
+        return self.rollout is not None and bool(self.status)
 
     async def grab(self, name: str = OBSTACLE) -> None:
         """Begin to drag a gizmo."""
