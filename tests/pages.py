@@ -26,6 +26,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.bindings import Bindings
+from dt_viz.ui.panel.panel import Panel
 from dt_viz.ui.visitor import Visitor
 
 MIDDLE = (0.1, -0.5, 0.4)
@@ -48,6 +49,12 @@ def frame_of(scenario: Scenario, **changes: Any) -> Frame:
         "certificates": Certificates(0.01),
     }
     return Frame(scenario=scenario, **(given | changes))
+
+
+def panel_of(server: viser.ViserServer, notify: Any = lambda *_: None) -> Panel:
+    """A panel without a page."""
+    titles = {name: entry.title for name, entry in TASKS.items()}
+    return Panel(server.gui, titles, load_jaco(), lambda *_: None, notify, lambda: None)
 
 
 class NoFrames:

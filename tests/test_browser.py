@@ -22,6 +22,7 @@ from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.panel.verdict import Level
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.slice_layers import VOLUME
 from dt_viz.ui.server import Server
@@ -98,7 +99,7 @@ def open_page(browser, server):
     (visitor,) = set(server.visitors) - known
     visitor.session.edit("test", view=LIGHT)
     assert visitor.session.wait_idle(PATIENCE)
-    page.get_by_text("Smallest det J").wait_for()
+    page.get_by_text("· stable ·").wait_for()
     until_drawn(visitor)
     close_notices(page)
     return page, visitor
@@ -618,6 +619,27 @@ def test_who_avoids_is_chosen_in_the_page(visit):
     wait_until(lambda: page.get_by_role("button", name="Let the whole arm avoid").count() == 0, "the button to go")
 
 
+def test_nothing_moves_when_a_message_comes(visit):
+    page, visitor = visit
+    session, status = visitor.session, visitor._panel.status
+
+    def below():
+        until_drawn(visitor)
+        return page.get_by_text("Undo", exact=True).bounding_box()["y"]
+
+    before = below()
+    session.edit("test", view=replace(LIGHT, arm=True))
+    page.get_by_role("button", name="Let the whole arm avoid").wait_for()
+    places = [below()]
+    status.learn(0.4, "flow 2 of 3")
+    page.get_by_role("button", name="Cancel").wait_for()
+    places.append(below())
+    status.say(300 * "much to say ", Level.WARNING)
+    page.get_by_text("Much to say").wait_for()
+    places.append(below())
+    assert np.ptp([before, *places]) < 1.5
+
+
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     page, visitor = visit
 
@@ -631,12 +653,12 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     choose(page, visitor, "Settings of", "Imitation")
     wait_until(lambda: visitor.session.scenario.view.tuned == "Imitation", "its settings")
     choose(page, visitor, "Learn", "velocity")
-    page.get_by_text("Learning the motion: without end").wait_for()
+    page.get_by_text("Without end").wait_for()
     press(page.get_by_role("button", name="Cancel"))
     page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for()
     assert visitor.session.wait_idle(PATIENCE)
     assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
-    page.get_by_text("Smallest det J").wait_for()
+    page.get_by_text("· stable ·").wait_for()
     assert page.get_by_role("button", name="Cancel").count() == 0
 
 

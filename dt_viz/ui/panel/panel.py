@@ -1,4 +1,4 @@
-"""Controls ↔ scenario, and the status line."""
+"""Controls ↔ scenario, and the status."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
-from dt_viz.ui.panel.avoid import AvoidPanel
+from dt_viz.ui.panel.avoid import add_avoid_and_imitate
 from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.panel.disturbances import Disturbances
 from dt_viz.ui.panel.health_plots import HealthPlots
@@ -30,8 +30,10 @@ from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
 from dt_viz.ui.panel.starts import StartsPanel
-from dt_viz.ui.panel.status import AMBER, COMPUTING, PALE, RED, SMALL, TWO_LINES, alarm, hint, sentence, status_html
+from dt_viz.ui.panel.status import COLOURS, SMALL, TWO_LINES, hint, sentence
+from dt_viz.ui.panel.status_line import StatusLine
 from dt_viz.ui.panel.transforms import add_transform_controls
+from dt_viz.ui.panel.verdict import Level
 from dt_viz.ui.scene.arm_layers import NUM_ARMS
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
@@ -97,31 +99,25 @@ class Panel:
         self._gui = gui
         self._titles = dict(titles)
         self._bindings = Bindings()
-        self.notice = gui.add_html("", visible=False)
-        self._noticed: Scenario | None = None
-        self._shows = self._waits = False
-        """Whether a frame has been reported, and whether another task or scene than its own is being computed."""
         self._reported: Scenario | None = None
-        self._settled = "", ""
-        """Hint and status of the last reported scenario."""
+        self._settled = ""
+        """Hint of the last reported scenario."""
+        self._waits = False
+        """Whether another task or scene than the reported one is being computed."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
-        avoid = AvoidPanel(gui, self._bindings)
-        self.status = gui.add_html("")
-        self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
-
-        self._bindings.on(self._cancel, lambda session, _pressed: session.cancel())
-        avoid.add_remedy()
         self._build_task()
+        add_avoid_and_imitate(gui, self._bindings)
+        self.status = StatusLine(gui, self._bindings)
+        self._bindings.on(gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
         tabs = gui.add_tab_group()
         self._chores = Chores(self.fail)
         later = self._chores.later
         with tabs.add_tab("World"):
             self._obstacles = ObstaclePanel(
-                gui, self._bindings, lambda text, wrong: self._say(text, *(RED if wrong else AMBER)), later
+                gui, self._bindings, lambda text, wrong: self._say(text, Level.ALARM if wrong else Level.WARNING), later
             )
             add_transform_controls(gui, self._bindings, later)
-            StartsPanel(gui, self._bindings, lambda text: self._say(text, *AMBER), later)
+            StartsPanel(gui, self._bindings, lambda text: self._say(text, Level.WARNING), later)
         with tabs.add_tab("Stack"):
             self._stack = StackPanel(gui, self._bindings)
         with tabs.add_tab("Show"):
@@ -154,6 +150,7 @@ class Panel:
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
         self._bindings.adopt(scenario)
+        self.status.adopt(scenario)
         if self._reported is not None and not self._reported.begins_like(scenario):
             self._wait()
 
@@ -164,70 +161,54 @@ class Panel:
         adopted = self._bindings.scenario
         if adopted is not None and not frame.scenario.begins_like(adopted):
             return  # another task or scene was chosen meanwhile
-        self._reported, self._shows, self._waits = frame.scenario, True, False
-        self._learned()
-        if self._noticed is not None and frame.scenario != self._noticed:
-            self.notice.visible, self._noticed = False, None
-        self._give_hint(hint(frame))
+        self._reported, self._settled, self._waits = frame.scenario, hint(frame), False
+        self._give_hint(self._settled)
         self._bindings.report(frame)
         self.joints.follow(frame.arm)
         self.health.draw(frame.profiles)
-        self._settled = hint(frame), status_html(frame, pace)
-        self.status.content = self._settled[1]
+        self.status.report(frame, pace)
 
     def _wait(self) -> None:
-        """Show that another task or scene is being computed; the status of the last one turns pale."""
+        """Show that another task or scene is being computed."""
         if not self._waits:
             self._waits = True
             self._give_hint("")
-            said = f"<div style='{SMALL}'>{COMPUTING}</div>"
-            self.status.content = f"{said}<div style='{PALE}'>{self._settled[1]}</div>"
+            self.status.wait(waits=True)
 
     def _settle(self) -> None:
-        """Stop waiting for a report; show the last frame's status again if it is of the adopted task and scene."""
-        if self._waits:
+        """Stop waiting for a report, if the last frame is of the adopted task and scene."""
+        adopted = self._bindings.scenario
+        if self._waits and self._reported and adopted and self._reported.begins_like(adopted):
             self._waits = False
-            adopted = self._bindings.scenario
-            stays = self._reported and adopted and self._reported.begins_like(adopted)
-            said, self.status.content = self._settled if stays else ("", "")
-            self._give_hint(said)
+            self._give_hint(self._settled)
+            self.status.wait(waits=False)
 
     def _give_hint(self, text: str) -> None:
         self.hint.content = f"<div style='{SMALL};min-height:{TWO_LINES}'>{html.escape(text)}</div>"
 
     def learning(self, fraction: float, message: str) -> None:
         """Show the progress of learning a task."""
-        self._bar.visible = self._cancel.visible = True
-        self._bar.value = 100 * fraction
-        self.status.content = f"<div style='{SMALL}'>Learning the motion: {html.escape(message)}</div>"
+        self.status.learn(fraction, message)
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
         self._settle()
         expected = isinstance(error, DataError | ImitationError)
-        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *RED)
+        self._say(str(error) if expected else f"{type(error).__name__}: {error}", Level.ALARM)
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
         adopted = self._bindings.scenario
-        if self._shows and adopted is not None:
+        if self._reported is not None and adopted is not None:
             instead = f"This is “{self._titles[adopted.task]}” as before."
         else:
             instead = "Choose another task, or move the obstacle to start again."
-        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *AMBER)
+        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", Level.WARNING)
 
-    def _say(self, text: str, colour: Colour, background: Colour) -> None:
-        """Show a text until the next scenario is shown, and for a while beside the panel."""
-        self._learned()
-        self._notify(sentence(text), colour)
-        self.notice.content, self.notice.visible = alarm(text, colour, background), True
-        self._noticed = self._bindings.scenario
-
-    def _learned(self) -> None:
-        """Hide the progress of learning."""
-        if self._bar.visible:
-            self._bar.visible = self._cancel.visible = False
-            self.status.content = ""
+    def _say(self, text: str, level: Level) -> None:
+        """Show a text in the status until the next scenario is shown, and for a while beside the panel."""
+        self._notify(sentence(text), COLOURS[level][0])
+        self.status.say(text, level)
 
     def _build_task(self) -> None:
         names = {title: name for name, title in self._titles.items()}
@@ -238,7 +219,6 @@ class Panel:
         self._bindings.choice(
             self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
         )
-        self.hint = self._gui.add_html("")
         scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
 
         def load(session: Session, title: str) -> None:
@@ -252,7 +232,8 @@ class Panel:
             lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
             partial(self._begin, load),
         )
-        self._bindings.on(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+        self.hint = self._gui.add_html("")
+        self._give_hint("")
 
     def _begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         """Begin a task or a scene; if that fails, show why and stay."""
