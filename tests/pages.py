@@ -103,6 +103,15 @@ class Page:
         return [handle for handle in inputs if not isinstance(handle, GuiProgressBarHandle)]
 
     @property
+    def commands(self) -> dict[str, Any]:
+        """The commands of the palette, by name."""
+        return {command.label: command for command in self.gui._command_handle_from_uuid.values()}
+
+    def give(self, command: Any) -> None:
+        message = messages.CommandTriggerMessage(command._impl.uuid)
+        self.run(self.gui._handle_command_trigger(CLIENT, message))
+
+    @property
     def gizmos(self) -> dict[str, Any]:
         return self.scene._handle_from_transform_controls_name
 

@@ -527,7 +527,7 @@ def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
 
 SHOWN = {  # the layer's label in the page, the picture's name, and its handles that hold points
     "Warped grid ψ⁻¹(grid)": ("grid", lambda picture: [picture.lines.node]),
-    "Base attractor beside it": ("base", lambda picture: [picture.rays.node, picture.arrows.node]),
+    "Base attractor": ("base", lambda picture: [picture.rays.node, picture.arrows.node]),
     "Learned generator": ("generator", lambda picture: [picture.arrows.node]),
 }
 
@@ -652,7 +652,7 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     open_tab(page, "Stack")
     choose(page, visitor, "Settings of", "Imitation")
     wait_until(lambda: visitor.session.scenario.view.tuned == "Imitation", "its settings")
-    choose(page, visitor, "Learn", "velocity")
+    choose(page, visitor, "Objective", "velocity")
     page.get_by_text("Without end").wait_for()
     press(page.get_by_role("button", name="Cancel"))
     page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for()
@@ -696,10 +696,10 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
 def test_the_warp_is_played_in_the_page(visit):
     page, visitor = visit
     open_tab(page, "Stack")
-    press(page.get_by_text("0 → 1"))
+    press(page.get_by_text("▶ 0 → 1"))
     wait_until(lambda: visitor.shown.scenario.warp < 1, "a picture on its way")
     wait_until(lambda: visitor.session.scenario.warp == visitor.shown.scenario.warp == 1, "the full stack")
-    page.get_by_text("0 → 1").wait_for()
+    page.get_by_text("▶ 0 → 1").wait_for()
     visitor.session.undo()
     assert visitor.session.scenario.warp == 1  # it ended as it began
 

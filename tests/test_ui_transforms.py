@@ -66,15 +66,15 @@ FLOW = {"Settings of", "Flow time: auto", "Flow time t", "Integrator"}
 
 
 def test_only_what_the_chosen_transform_has_is_shown(controls):
-    assert visible(controls) == FLOW | {"Generator", "Reach T"}  # the outermost is the avoidance
+    assert visible(controls) == FLOW | {"Generator", "Temperature T"}  # the outermost is the avoidance
     controls.set("Settings of", "Bias 1")
     assert visible(controls) == STRENGTH  # as the paper calls the t of a bias point
     controls.set("Integrator", "Euler (the paper's)")
     assert visible(controls) == STRENGTH | {"Steps"}
     controls.set("Settings of", AVOIDANCE)
-    assert visible(controls) == FLOW | {"Generator", "Reach T"}
+    assert visible(controls) == FLOW | {"Generator", "Temperature T"}
     controls.set("Settings of", IMITATION)
-    assert visible(controls) == {"Settings of", "Learn"}
+    assert visible(controls) == {"Settings of", "Objective"}
 
 
 def test_settings_change_the_transform_that_they_are_shown_for(controls):
@@ -85,7 +85,7 @@ def test_settings_change_the_transform_that_they_are_shown_for(controls):
     assert controls.edited.scenario.avoidance == SCENARIO.avoidance
     controls.set("Settings of", AVOIDANCE)
     assert (controls["Integrator"].control.value, controls.inputs("Steps", visible=True)) == ("auto", [])
-    controls.set("Reach T", 9.0)
+    controls.set("Temperature T", 9.0)
     assert controls.edited.scenario.avoidance.temperature == 9.0
 
 

@@ -20,8 +20,10 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
+from dt_viz.ui.panel.about import add_about
 from dt_viz.ui.panel.avoid import add_avoid_and_imitate
 from dt_viz.ui.panel.bindings import KEEP, Bindings
+from dt_viz.ui.panel.commands import Command, Curtain, add_commands, numbered
 from dt_viz.ui.panel.disturbances import Disturbances
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
@@ -41,33 +43,37 @@ from dt_viz.ui.scene.picture import Colour
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
-    "ghost": "Undisturbed (dashed)",
+    "ghost": "Undisturbed motions",
     "demonstrations": "Demonstrations",
-    "field": "Point field",
+    "field": "Vector field",
     "streamlines": "Streamlines",
     "arm": "Arm",
     "ghost_arm": "Arm without avoidance",
     "onion": "Arms along the motion",
     "body_points": "Body points",
     "joint_plots": "Joint plots",
-    "health_plots": "Health plots",
+    "health_plots": "Plots along the path",
     "table": "Table",
     "grid": "Warped grid ψ⁻¹(grid)",
-    "base": "Base attractor beside it",
+    "base": "Base attractor",
     "generator": "Learned generator",
 }
 PLOTS = {"joint_plots", "health_plots"}
 """Fields of `View` whose pictures are in the panel, not in the scene."""
 VIEW_HINTS: Mapping[str, str] = {
-    "field": "on the slice: longer and darker is faster",
+    "field": "velocities on the slice: longer and darker is faster",
     "streamlines": "motions from all over the slice: exact, as images of straight rays",
     "ghost": "what was learned, without obstacles and bias points",
     "ghost_arm": "at the same moment; links that coincide are left out",
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
+    "grid": "straight lines of base space, as all transforms together bend them",
+    "base": "the motions before anything is learned, drawn beside the others: straight to the goal",
+    "generator": "vector field whose flow is the imitation",
     "joint_plots": "angles and speeds over time, with their limits",
     "health_plots": "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
 }
+FOLLOWS_HINT = "number of the rollout that the arm follows: first those of the demonstrations, then added ones"
 _NO_SCENE = "–"
 MAX_FLOWS = 3
 """Number of flows that ψ is composed of until a picture of the generator brings its own."""
@@ -98,6 +104,7 @@ class Panel:
         self._notify, self._look_home = notify, look_home
         self._gui = gui
         self._titles = dict(titles)
+        self._scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
         self._bindings = Bindings()
         self._reported: Scenario | None = None
         self._settled = ""
@@ -128,6 +135,9 @@ class Panel:
             self._build_arm()
         with tabs.add_tab("Picture"):
             self._build_export(save_png)
+        commands = self._commands(Curtain(gui))
+        add_commands(gui, self._bindings, commands)
+        add_about(gui, commands)
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -217,23 +227,34 @@ class Panel:
             session.choose_task(names[title])
 
         self._bindings.choice(
-            self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
+            self._gui.add_dropdown("Task", tuple(names), hint="what is learned from demonstrations"),
+            lambda s: self._titles[s.task],
+            partial(self._begin, choose),
         )
-        scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
-
-        def load(session: Session, title: str) -> None:
-            if title == _NO_SCENE:
-                session.leave_scene()
-            else:
-                session.load(scenes[title].task, prepared(scenes[title]))
-
         self._bindings.choice(
-            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="scenes of the paper's figures"),
+            self._gui.add_dropdown("Scene", (_NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
             lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
-            partial(self._begin, load),
+            partial(self._begin, self._load),
         )
         self.hint = self._gui.add_html("")
         self._give_hint("")
+
+    def _load(self, session: Session, title: str) -> None:
+        if title == _NO_SCENE:
+            session.leave_scene()
+        else:
+            session.load(self._scenes[title].task, prepared(self._scenes[title]))
+
+    def _commands(self, curtain: Curtain) -> list[Command]:
+        return [
+            Command("Pause, or play", lambda session: _play_or_pause(session, True), "space"),
+            Command("Reset the scene and the camera", lambda session: self._travel(session, "Reset"), "R"),
+            Command("Undo", lambda session: self._travel(session, "Undo"), "Z"),
+            Command("Redo", lambda session: self._travel(session, "Redo"), "Z", shifted=True),
+            Command("Frame: move the camera back", lambda _session: self._look_home(), "F"),
+            Command("Hide the panel, or show it", lambda _session: curtain.pull(), "H"),
+            *numbered(tuple(self._scenes), partial(self._begin, self._load)),
+        ]
 
     def _begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         """Begin a task or a scene; if that fails, show why and stay."""
@@ -260,7 +281,7 @@ class Panel:
         self._bindings.properties(play, label=lambda s: "Pause" if s.view.playing else "Play")
         self._bindings.on(play, _play_or_pause)
         self._bindings.input(
-            gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
+            gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0, hint="of the arm: 1 is real time"),
             lambda s: s.view.speed,
             lambda s, value: {"view": replace(s.view, speed=value)},
         )
@@ -273,7 +294,7 @@ class Panel:
             lambda s, value: {"view": replace(s.view, replay=value)},
         )
         self._disturbances = Disturbances(gui, self._bindings)
-        followed = gui.add_slider("Follows rollout", 1, 8, 1, 1)
+        followed = gui.add_slider("Follows rollout", 1, 8, 1, 1, hint=FOLLOWS_HINT)
         self._bindings.properties(followed, max=self._num_rollouts)
         self._bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})
 
@@ -305,8 +326,8 @@ class Panel:
         for name in VIEW_LABELS:
             if name not in PLOTS:
                 self._build_checkbox(name)
-        hint = "ψ is several flows, 1 is the first; 0: their mean"
-        flow = self._gui.add_slider("Of flow", 0, MAX_FLOWS, 1, 0, visible=False, hint=hint)
+        hint = "the imitation is several flows, one after the other: 1 is the first; 0: the mean of all"
+        flow = self._gui.add_slider("Generator of flow", 0, MAX_FLOWS, 1, 0, visible=False, hint=hint)
         self._bindings.properties(flow, visible=lambda s: s.view.generator, max=self._num_flows)
         self._bindings.input(
             flow,
