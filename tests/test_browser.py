@@ -640,6 +640,25 @@ def test_nothing_moves_when_a_message_comes(visit):
     assert np.ptp([before, *places]) < 1.5
 
 
+def test_keys_do_what_the_panel_does(visit):
+    page, visitor = visit
+    session = visitor.session
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("Space")
+    wait_until(lambda: session.scenario.view.playing, "the arm to move")
+    page.keyboard.press("Space")
+    wait_until(lambda: not session.scenario.view.playing, "the arm to rest")
+    session.edit("warp", warp=0.5)
+    for key, warp in (("z", 1), ("Shift+Z", 0.5), ("z", 1)):
+        page.keyboard.press(key)
+        wait_until(lambda warp=warp: session.scenario.warp == warp, f"the key {key}")
+    shown = page.get_by_text("Undo", exact=True)
+    page.keyboard.press("h")
+    shown.wait_for(state="hidden")
+    page.keyboard.press("h")
+    shown.wait_for()
+
+
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     page, visitor = visit
 

@@ -295,8 +295,7 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     page.give(by_key["space", None])
     assert page.session.scenario.view.playing is not before.view.playing
     page.give(by_key["space", None])
-    page.session.end_gesture()
-    page.session.edit("test", warp=0.5)
+    page.session.edit("warp", warp=0.5)
     page.give(by_key["Z", None])
     assert page.session.scenario.warp == 1
     page.give(by_key["Z", "shift"])
@@ -323,7 +322,7 @@ def test_a_command_brings_the_camera_back(page):
 def test_a_command_that_is_forged_or_disabled_is_not_given(page):
     before = page.busy()
     undo = page.commands["Undo"]
-    page.session.edit("test", warp=0.5)
+    page.session.edit("warp", warp=0.5)
     undo.disabled = True
     page.give(undo)
     page.run(page.gui._handle_command_trigger(CLIENT, messages.CommandTriggerMessage("no such command")))
