@@ -284,9 +284,9 @@ def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
     drag(page, (x - 18, y + 14), (x + 30, y - 20))
     wait_until(lambda: visitor.session.scenario != first and visitor.session.wait_idle(0.5), "the drag")
     second = visitor.session.scenario
-    press(page.get_by_text("Undo", exact=True))
+    press(page.get_by_role("button", name="Undo", exact=True))
     wait_until(lambda: visitor.session.scenario.obstacle == first.obstacle, "undo")
-    press(page.get_by_text("Redo", exact=True))
+    press(page.get_by_role("button", name="Redo", exact=True))
     wait_until(lambda: visitor.session.scenario.obstacle == second.obstacle, "redo")
     assert visitor.session.wait_idle(PATIENCE)
     assert_shows_the_obstacle_where_it_is(visitor)
@@ -625,7 +625,7 @@ def test_nothing_moves_when_a_message_comes(visit):
 
     def below():
         until_drawn(visitor)
-        return page.get_by_text("Undo", exact=True).bounding_box()["y"]
+        return page.get_by_role("button", name="Undo", exact=True).bounding_box()["y"]
 
     before = below()
     session.edit("test", view=replace(LIGHT, arm=True))
@@ -652,7 +652,7 @@ def test_keys_do_what_the_panel_does(visit):
     for key, warp in (("z", 1), ("Shift+Z", 0.5), ("z", 1)):
         page.keyboard.press(key)
         wait_until(lambda warp=warp: session.scenario.warp == warp, f"the key {key}")
-    shown = page.get_by_text("Undo", exact=True)
+    shown = page.get_by_role("button", name="Undo", exact=True)
     page.keyboard.press("h")
     shown.wait_for(state="hidden")
     page.keyboard.press("h")

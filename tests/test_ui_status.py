@@ -2,6 +2,7 @@
 
 import html
 import re
+import textwrap
 import threading
 from dataclasses import replace
 from typing import Any, cast
@@ -24,7 +25,7 @@ from dt_viz.scenario.stack import avoiding_with
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.remedies import remedy
-from dt_viz.ui.panel.status import CHANGED, PALE, details_html, error_text, hint
+from dt_viz.ui.panel.status import CHANGED, HINT, LEADING, PALE, details_html, error_text, hint
 from dt_viz.ui.panel.status_line import BUTTON, HEIGHT
 from dt_viz.ui.panel.verdict import COMPUTING, CONCERNS, HOLDS, WARP_HINT, Level, Verdict, concerns, verdict
 from dt_viz.warning import ARM, Kind, MotionWarning
@@ -332,6 +333,18 @@ def test_nothing_moves_when_a_message_comes_or_something_is_learned(panel):
         assert expected in text
     assert mends == (False, True, False, False, False) and cancels == (False, False, True, False, False)
     assert "learning the motion … 40 %" in texts[2]
+
+
+def test_hints_take_the_same_room_and_are_told_in_full(panel):
+    """A line of the panel holds about 44 characters."""
+    texts = [scene.line for scene in SCENES.values()] + [entry().hint for entry in TASKS.values()] + [CHANGED, ""]
+    rooms = set()
+    for text in texts:
+        panel._give_hint(text)
+        rooms |= set(re.findall(r"<div style='height:([\d.]+)em", panel.hint.content))
+        assert text in html.unescape(panel.hint.content)
+        assert len(textwrap.wrap(text, 44)) * LEADING <= HINT
+    assert rooms == {f"{HINT:.3f}"}
 
 
 def test_a_message_goes_with_the_next_scenario_that_is_shown(panel):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -32,7 +31,7 @@ from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
 from dt_viz.ui.panel.starts import StartsPanel
-from dt_viz.ui.panel.status import COLOURS, SMALL, TWO_LINES, hint, sentence
+from dt_viz.ui.panel.status import COLOURS, HINT, INK, hint, place_html, sentence
 from dt_viz.ui.panel.status_line import StatusLine
 from dt_viz.ui.panel.transforms import add_transform_controls
 from dt_viz.ui.panel.verdict import Level
@@ -194,7 +193,7 @@ class Panel:
             self.status.wait(waits=False)
 
     def _give_hint(self, text: str) -> None:
-        self.hint.content = f"<div style='{SMALL};min-height:{TWO_LINES}'>{html.escape(text)}</div>"
+        self.hint.content = place_html(text, INK, HINT)
 
     def learning(self, fraction: float, message: str) -> None:
         """Show the progress of learning a task."""

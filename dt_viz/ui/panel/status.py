@@ -29,8 +29,10 @@ LINE = 2.0
 """Height of the line of figures, em of its text."""
 LEADING = 1.35 * 0.8
 """Height of a line of small text, em."""
-TWO_LINES, WARNINGS = "2.7em", 5.2
-"""Heights of the hint, and of the place in which the details list warnings, em."""
+HINT, WARNINGS = 3.3, 5.2
+"""Heights of the places of the hint, and of the warnings in the details, em."""
+INK = (40, 44, 52)
+"""Colour of the hint."""
 ROUNDING = 1e-12
 """Length below which an error is rounding, metres."""
 SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
@@ -70,9 +72,8 @@ def line_html(verdict: Verdict) -> str:
     )
 
 
-def reason_html(text: str, level: Level, height: float, below: str = "") -> str:
+def place_html(text: str, ink: Colour, height: float, below: str = "") -> str:
     """Return a text in a place of a fixed height, em, with HTML below it; a tooltip has all of a text that is long."""
-    ink, _ = COLOURS[level]
     said = html.escape(sentence(text))
     clamp = f"display:-webkit-box;-webkit-box-orient:vertical;-webkit-line-clamp:{int(height / LEADING) or 1}"
     return (

@@ -11,7 +11,7 @@ from dt_viz.engine.session import Pace, Session
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.remedies import Remedy, remedy
-from dt_viz.ui.panel.status import PALE, details_html, line_html, progress_html, reason_html
+from dt_viz.ui.panel.status import COLOURS, PALE, details_html, line_html, place_html, progress_html
 from dt_viz.ui.panel.verdict import BUSY, Level, Verdict, verdict
 
 HEIGHT, BUTTON = 4.5, 2.25
@@ -92,7 +92,7 @@ class StatusLine:
             self.mend.label = mends.label
         self.mend.visible, self.cancel.visible = mends is not None, self._learning is not None
         room = HEIGHT - BUTTON if self.mend.visible or self.cancel.visible else HEIGHT
-        self.line.content = line_html(known) + reason_html(text, level, room, below)
+        self.line.content = line_html(known) + place_html(text, COLOURS[level][0], room, below)
         if self._reported is not None and self._adopted is not None:
             details = details_html(*self._reported, self._adopted.view)
             self.details.content = f"<div style='{PALE}'>{details}</div>" if self._stale else details
