@@ -27,7 +27,7 @@ from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.remedies import remedy
 from dt_viz.ui.panel.status import CHANGED, HINT, LEADING, PALE, details_html, error_text, hint
 from dt_viz.ui.panel.status_line import BUTTON, HEIGHT
-from dt_viz.ui.panel.verdict import COMPUTING, CONCERNS, HOLDS, WARP_HINT, Level, Verdict, concerns, verdict
+from dt_viz.ui.panel.verdict import COMPUTING, CONCERNS, FAILED, HOLDS, WARP_HINT, Level, Verdict, concerns, verdict
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 PACE = Pace(0.02, 10.0, 0)
@@ -148,7 +148,9 @@ def test_motions_through_an_obstacle_are_a_collision_also_where_nothing_warns():
     ):
         said = verdict_of(frame(scenario=scenario, certificates=inside))
         assert said.level is Level.ALARM and why in said.reason and "−30 mm" in said.line
-    said = verdict_of(frame(scenario=avoiding("draw_s", SPHERE, warp=0.5), certificates=inside))
+    warped = frame(scenario=avoiding("draw_s", SPHERE, warp=0.5), certificates=inside)
+    said = verdict_of(warped)
+    assert concerns(warped, View()) == ()
     assert said.level is Level.NOTE and said.reason == WARP_HINT.format(0.5)
 
 
@@ -394,6 +396,21 @@ def test_the_status_of_another_task_is_pale_and_says_what_is_done(panel):
     panel.report(said["lift_box"], PACE)
     assert COMPUTING not in status.line.content
     assert said["lift_box"].task.hint in html.unescape(panel.hint.content)
+    panel.adopt(scenario)
+    assert COMPUTING in status.line.content
+    panel.fail(ValueError("nothing comes"))
+    assert FAILED.line in status.line.content and COMPUTING not in status.line.content
+    panel.adopt(other)
+    panel.report(said["lift_box"], PACE)
+    assert FAILED.line not in status.line.content
+
+
+def test_what_fails_beside_a_motion_that_is_known_leaves_its_verdict(panel):
+    scenario = avoiding("draw_s", SPHERE)
+    panel.adopt(scenario)
+    panel.report(replace(frame(certificates=HOLDING), task=TASKS["draw_s"]()), PACE)
+    panel.fail(ValueError("no picture"))
+    assert "✓ safe" in panel.status.line.content and "no picture" in panel.status.line.content.lower()
 
 
 class Begun:

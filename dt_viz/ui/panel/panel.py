@@ -203,7 +203,7 @@ class Panel:
         """Show what went wrong; the picture stays as it was."""
         self._settle()
         expected = isinstance(error, DataError | ImitationError)
-        self._say(str(error) if expected else f"{type(error).__name__}: {error}", Level.ALARM)
+        self._say(str(error) if expected else f"{type(error).__name__}: {error}", Level.ALARM, failed=True)
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
@@ -214,10 +214,10 @@ class Panel:
             instead = "Choose another task, or move the obstacle to start again."
         self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", Level.WARNING)
 
-    def _say(self, text: str, level: Level) -> None:
+    def _say(self, text: str, level: Level, *, failed: bool = False) -> None:
         """Show a text in the status until the next scenario is shown, and for a while beside the panel."""
         self._notify(sentence(text), COLOURS[level][0])
-        self.status.say(text, level)
+        self.status.say(text, level, failed=failed)
 
     def _build_task(self) -> None:
         names = {title: name for name, title in self._titles.items()}

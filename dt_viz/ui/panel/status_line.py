@@ -12,7 +12,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.remedies import Remedy, remedy
 from dt_viz.ui.panel.status import COLOURS, PALE, details_html, line_html, place_html, progress_html
-from dt_viz.ui.panel.verdict import BUSY, Level, Verdict, verdict
+from dt_viz.ui.panel.verdict import BUSY, FAILED, Level, Verdict, verdict
 
 HEIGHT, BUTTON = 4.5, 2.25
 """Heights of the place of the reason and of a button in it, em."""
@@ -32,7 +32,7 @@ class StatusLine:
         self._learning: tuple[float, str] | None = None
         self._message: tuple[str, Level, Scenario | None] | None = None
         """A text, its level, and the scenario that it was said of."""
-        self._waits = False
+        self._waits = self._failed = False
         self.line = gui.add_html("")
         self.mend = gui.add_button("Mend", icon=viser.Icon.SHIELD_CHECK, visible=False)
         self.cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
@@ -45,13 +45,13 @@ class StatusLine:
     def adopt(self, scenario: Scenario) -> None:
         """Take a scenario as the one that is wanted."""
         with self._lock:
-            self._adopted = scenario
+            self._adopted, self._failed = scenario, False
             self._draw()
 
     def report(self, frame: Frame, pace: Pace) -> None:
         """Show a frame; a message of another scenario goes."""
         with self._lock:
-            self._reported, self._learning, self._waits = (frame, pace), None, False
+            self._reported, self._learning, self._waits, self._failed = (frame, pace), None, False, False
             if self._message is not None and self._message[2] != frame.scenario:
                 self._message = None
             self._draw()
@@ -68,10 +68,16 @@ class StatusLine:
             self._learning = fraction, message
             self._draw()
 
-    def say(self, text: str, level: Level) -> None:
-        """Show a message in the place of the reason, until a frame of another scenario is shown."""
+    def say(self, text: str, level: Level, *, failed: bool = False) -> None:
+        """Show a message in the place of the reason, until a frame of another scenario is shown.
+
+        Args:
+            text: the message.
+            level: its gravity.
+            failed: whether something has failed, so that what was being computed may never come.
+        """
         with self._lock:
-            self._learning, self._message = None, (text, level, self._adopted)
+            self._learning, self._message, self._failed = None, (text, level, self._adopted), failed
             self._draw()
 
     def _mend(self, session: Session) -> None:
@@ -104,9 +110,10 @@ class StatusLine:
     def _known(self) -> Verdict:
         if self._learning is not None:
             return Verdict(f"learning the motion … {100 * self._learning[0]:.0f} %", busy=True)
-        if self._waits or self._reported is None or self._adopted is None:
-            return BUSY
-        return verdict(*self._reported, self._adopted)
+        known = BUSY
+        if self._reported is not None and self._adopted is not None and not self._waits:
+            known = verdict(*self._reported, self._adopted)
+        return FAILED if known.busy and self._failed else known
 
     def _remedy(self) -> Remedy | None:
         if self._stale or self._message is not None or self._reported is None or self._adopted is None:

@@ -92,6 +92,8 @@ class Verdict:
 
 BUSY = Verdict(COMPUTING, busy=True)
 """Verdict while nothing is known yet."""
+FAILED = Verdict("✕ not computed", Level.ALARM)
+"""Verdict where something has failed before all was known."""
 
 
 def verdict(frame: Frame, pace: Pace, adopted: Scenario) -> Verdict:
