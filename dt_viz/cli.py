@@ -58,8 +58,11 @@ def _serve(options: argparse.Namespace) -> int:
             print(f"{PROG}: --task: found {options.task!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2
         fits = FitStore(default_cache_folder())
-        first = tasks[options.task]()
-        fits.get(first.demonstrations, progress=_Bar(first.title))
+        for name in tasks if options.prepare_all else (options.task,):
+            task = tasks[name]()
+            fits.get(task.demonstrations, progress=_Bar(task.title))
+            if options.prepare_all:
+                print(f"Ready: {task.title}", flush=True)
         unit_sphere_map()
         server = Server(
             tasks,
@@ -111,6 +114,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=_port, default=8080, help="port to listen on (default: %(default)s)")
     parser.add_argument("--task", default="draw_s", help="task to begin with (default: %(default)s)")
+    parser.add_argument(
+        "--prepare-all",
+        action="store_true",
+        help="learn every task before the first visitor comes, not when it is chosen",
+    )
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
     parser.add_argument(
         "--max-sessions", type=_positive, default=8, help="visitors at a time, each with a scene (default: %(default)s)"

@@ -26,6 +26,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.bindings import Bindings
+from dt_viz.ui.panel.panel import Panel
 from dt_viz.ui.visitor import Visitor
 
 MIDDLE = (0.1, -0.5, 0.4)
@@ -48,6 +49,12 @@ def frame_of(scenario: Scenario, **changes: Any) -> Frame:
         "certificates": Certificates(0.01),
     }
     return Frame(scenario=scenario, **(given | changes))
+
+
+def panel_of(server: viser.ViserServer, notify: Any = lambda *_: None) -> Panel:
+    """A panel without a page."""
+    titles = {name: entry.title for name, entry in TASKS.items()}
+    return Panel(server.gui, titles, load_jaco(), lambda *_: None, notify, lambda: None)
 
 
 class NoFrames:
@@ -101,6 +108,15 @@ class Page:
         """All but those whose value nobody reads."""
         inputs = self.gui._gui_input_handle_from_uuid.values()
         return [handle for handle in inputs if not isinstance(handle, GuiProgressBarHandle)]
+
+    @property
+    def commands(self) -> dict[str, Any]:
+        """The commands of the palette, by name."""
+        return {command.label: command for command in self.gui._command_handle_from_uuid.values()}
+
+    def give(self, command: Any) -> None:
+        message = messages.CommandTriggerMessage(command._impl.uuid)
+        self.run(self.gui._handle_command_trigger(CLIENT, message))
 
     @property
     def gizmos(self) -> dict[str, Any]:

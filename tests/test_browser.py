@@ -22,6 +22,7 @@ from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.panel.verdict import Level
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.camera import camera_for
 from dt_viz.ui.scene.slice_layers import VOLUME
@@ -99,7 +100,7 @@ def open_page(browser, server):
     (visitor,) = set(server.visitors) - known
     visitor.session.edit("test", view=LIGHT)
     assert visitor.session.wait_idle(PATIENCE)
-    page.get_by_text("Smallest det J").wait_for()
+    page.get_by_text("· stable ·").wait_for()
     until_drawn(visitor)
     close_notices(page)
     return page, visitor
@@ -289,9 +290,9 @@ def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
     drag(page, (x - 18, y + 14), (x + 30, y - 20))
     wait_until(lambda: visitor.session.scenario != first and visitor.session.wait_idle(0.5), "the drag")
     second = visitor.session.scenario
-    press(page.get_by_text("Undo", exact=True))
+    press(page.get_by_role("button", name="Undo", exact=True))
     wait_until(lambda: visitor.session.scenario.obstacle == first.obstacle, "undo")
-    press(page.get_by_text("Redo", exact=True))
+    press(page.get_by_role("button", name="Redo", exact=True))
     wait_until(lambda: visitor.session.scenario.obstacle == second.obstacle, "redo")
     assert visitor.session.wait_idle(PATIENCE)
     assert_shows_the_obstacle_where_it_is(visitor)
@@ -532,7 +533,7 @@ def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
 
 SHOWN = {  # the layer's label in the page, the picture's name, and its handles that hold points
     "Warped grid ψ⁻¹(grid)": ("grid", lambda picture: [picture.lines.node]),
-    "Base attractor beside it": ("base", lambda picture: [picture.rays.node, picture.arrows.node]),
+    "Base attractor": ("base", lambda picture: [picture.rays.node, picture.arrows.node]),
     "Learned generator": ("generator", lambda picture: [picture.arrows.node]),
 }
 
@@ -624,6 +625,46 @@ def test_who_avoids_is_chosen_in_the_page(visit):
     wait_until(lambda: page.get_by_role("button", name="Let the whole arm avoid").count() == 0, "the button to go")
 
 
+def test_nothing_moves_when_a_message_comes(visit):
+    page, visitor = visit
+    session, status = visitor.session, visitor._panel.status
+
+    def below():
+        until_drawn(visitor)
+        return page.get_by_role("button", name="Undo", exact=True).bounding_box()["y"]
+
+    before = below()
+    session.edit("test", view=replace(LIGHT, arm=True))
+    page.get_by_role("button", name="Let the whole arm avoid").wait_for()
+    places = [below()]
+    status.learn(0.4, "flow 2 of 3")
+    page.get_by_role("button", name="Cancel").wait_for()
+    places.append(below())
+    status.say(300 * "much to say ", Level.WARNING)
+    page.get_by_text("Much to say").wait_for()
+    places.append(below())
+    assert np.ptp([before, *places]) < 1.5
+
+
+def test_keys_do_what_the_panel_does(visit):
+    page, visitor = visit
+    session = visitor.session
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("Space")
+    wait_until(lambda: session.scenario.view.playing, "the arm to move")
+    page.keyboard.press("Space")
+    wait_until(lambda: not session.scenario.view.playing, "the arm to rest")
+    session.edit("warp", warp=0.5)
+    for key, warp in (("z", 1), ("Shift+Z", 0.5), ("z", 1)):
+        page.keyboard.press(key)
+        wait_until(lambda warp=warp: session.scenario.warp == warp, f"the key {key}")
+    shown = page.get_by_role("button", name="Undo", exact=True)
+    page.keyboard.press("h")
+    shown.wait_for(state="hidden")
+    page.keyboard.press("h")
+    shown.wait_for()
+
+
 def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     page, visitor = visit
 
@@ -636,13 +677,13 @@ def test_learning_can_be_cancelled_in_the_page(visit, monkeypatch):
     open_tab(page, "Stack")
     choose(page, visitor, "Settings of", "Imitation")
     wait_until(lambda: visitor.session.scenario.view.tuned == "Imitation", "its settings")
-    choose(page, visitor, "Learn", "velocity")
-    page.get_by_text("Learning the motion: without end").wait_for()
+    choose(page, visitor, "Objective", "velocity")
+    page.get_by_text("Without end").wait_for()
     press(page.get_by_role("button", name="Cancel"))
     page.get_by_text("was cancelled. This is “Draw S” as before.").first.wait_for()
     assert visitor.session.wait_idle(PATIENCE)
     assert visitor.session.scenario.objective == visitor.shown.scenario.objective == "trajectory"
-    page.get_by_text("Smallest det J").wait_for()
+    page.get_by_text("· stable ·").wait_for()
     assert page.get_by_role("button", name="Cancel").count() == 0
 
 
@@ -680,10 +721,10 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
 def test_the_warp_is_played_in_the_page(visit):
     page, visitor = visit
     open_tab(page, "Stack")
-    press(page.get_by_text("0 → 1"))
+    press(page.get_by_text("▶ 0 → 1"))
     wait_until(lambda: visitor.shown.scenario.warp < 1, "a picture on its way")
     wait_until(lambda: visitor.session.scenario.warp == visitor.shown.scenario.warp == 1, "the full stack")
-    page.get_by_text("0 → 1").wait_for()
+    page.get_by_text("▶ 0 → 1").wait_for()
     visitor.session.undo()
     assert visitor.session.scenario.warp == 1  # it ended as it began
 

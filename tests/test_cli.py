@@ -15,6 +15,10 @@ import pytest
 import dt_viz
 from dt_viz.cli import main
 from dt_viz.evaluate.protocol_client import LostError, ProtocolClient
+from dt_viz.learning import store
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui import server
+from dt_viz.ui.server import AddressError
 
 APP = Path(dt_viz.__file__).parent.parent / "app.py"
 PATIENCE = 120.0
@@ -85,6 +89,29 @@ def test_a_signal_ends_it_cleanly_while_it_learns(tmp_path):
         _, printed = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0
         assert printed == ""
+
+
+def test_every_task_is_learned_before_it_is_ready_if_asked_with_a_line_for_each(monkeypatch, capsys):
+    learned = []
+
+    class Fits:
+        def __init__(self, _folder):
+            pass
+
+        def get(self, demonstrations, progress):
+            learned.append(demonstrations)
+            progress(1.0, "done")
+
+    def serve(*_what, **_how):
+        assert learned == [entry().demonstrations for entry in TASKS.values()]
+        raise AddressError("it would be ready")
+
+    monkeypatch.setattr(store, "FitStore", Fits)
+    monkeypatch.setattr(server, "Server", serve)
+    assert main(["--prepare-all"]) == 2
+    printed, errors = capsys.readouterr()
+    assert re.findall("Ready: (.*)", printed) == [entry.title for entry in TASKS.values()]
+    assert "it would be ready" in errors
 
 
 def test_handlers_of_signals_are_as_before_when_it_returns(capsys):

@@ -12,6 +12,7 @@ import viser  # noqa: TID251 - forges what a browser sends
 from pages import CLIENT, MIDDLE, Page, frame_of
 from viser import _messages as messages  # noqa: TID251
 
+from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import controls, gestures
@@ -89,8 +90,13 @@ def test_nothing_that_a_page_sends_passes_by_the_border(page):
     callbacks += [(name, cb) for name, gizmo in page.gizmos.items() for cb in gizmo._impl_aux.update_cb]
     for name, node in page.nodes.items():
         callbacks += [(name, entry.callback) for entry in (*(node._impl.click_cb or ()), *(node._impl.drag_cb or ()))]
+    callbacks += [(label, cb) for label, command in page.commands.items() for cb in command._impl.trigger_cb]
     callbacks += [("scene", entry.callback) for entry in page.scene._scene_pointer_cb]
-    assert {name for name, _ in callbacks} > {"scene", "/obstacles/0/surface", "/bias/0/ball", "/starts/1", "/slice"}
+    assert {name for name, _ in callbacks} > {
+        *("scene", "/obstacles/0/surface", "/bias/0/ball", "/starts/1", "/slice"),
+        "Undo",
+        "Hide the panel, or show it",
+    }
     for name, callback in callbacks:
         assert callback.__module__ in BORDERS, name
         assert inspect.iscoroutinefunction(callback), f"{name} would wait in the pool that all visitors share"
@@ -113,16 +119,16 @@ def test_a_forged_value_is_refused_or_moved_to_the_limits(page, claim, selected)
         ("Height [cm]", -1.0, lambda s: s.obstacles[0].height, 0.03),
         ("Steps", 10**6, lambda s: s.avoidance.integration.steps, 50),
         ("Warp", 50.0, lambda s: s.warp, 1.0),
-        ("Of flow", -9, lambda s: s.view.generator_layer, 0),
-        ("Reach T", 1e9, lambda s: s.avoidance.temperature, 20.0),
+        ("Generator of flow", -9, lambda s: s.view.generator_layer, 0),
+        ("Temperature T", 1e9, lambda s: s.avoidance.temperature, 20.0),
         ("Warp", math.nan, lambda s: s.warp, 1.0),
-        ("Learn", "nonsense", lambda s: s.objective, "trajectory"),
+        ("Objective", "nonsense", lambda s: s.objective, "trajectory"),
         ("Task", "nonsense", lambda s: s.task, "draw_s"),
         ("Speed", math.inf, lambda s: s.view.speed, 1.0),
     ],
 )
 def test_what_is_forged_is_shown_as_what_it_has_become(page, label, claim, read, expected):
-    page.busy(selected=0, tuned="Imitation" if label == "Learn" else "Avoidance")
+    page.busy(selected=0, tuned="Imitation" if label == "Objective" else "Avoidance")
     (handle,) = (handle for handle in page.inputs if handle.label == label and handle.visible)
     told = []
     handle._queue_update = lambda name, value: told.append((name, value))
@@ -134,7 +140,7 @@ def test_what_is_forged_is_shown_as_what_it_has_become(page, label, claim, read,
 def test_controls_that_are_hidden_or_disabled_do_nothing(page):
     page.busy()
     hidden = [handle for handle in page.inputs if handle.disabled or not handle.visible]
-    assert {"Radius: auto", "Learn", "Back to the task's slice"} & {handle.label for handle in hidden}
+    assert {"Radius: auto", "Objective", "Back to the task's slice"} & {handle.label for handle in hidden}
     for handle in hidden:
         before, shown = page.session.scenario, handle.value
         for claim in (True, False, 1, 7, *getattr(handle, "options", ())):
@@ -276,3 +282,60 @@ def test_a_long_text_is_not_kept(page):
         if not isinstance(handle, UPLOAD):
             page.claim(handle, "x" * 1_000_000)
             assert not isinstance(handle.value, str) or len(handle.value) < 100
+
+
+def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
+    page.busy()
+    commands = page.commands
+    keys = [(command.hotkey, command.modifier) for command in commands.values() if command.hotkey is not None]
+    assert len(set(keys)) == len(keys)
+    named = {("space", None), ("R", None), ("Z", None), ("Z", "shift"), ("F", None), ("H", None)}
+    assert set(keys) == named | {(str(k), None) for k in range(1, 10)}
+    by_key = {(command.hotkey, command.modifier): command for command in commands.values()}
+    before = page.session.scenario
+    page.give(by_key["space", None])
+    assert page.session.scenario.view.playing is not before.view.playing
+    page.give(by_key["space", None])
+    page.session.edit("warp", warp=0.5)
+    page.give(by_key["Z", None])
+    assert page.session.scenario.warp == 1
+    page.give(by_key["Z", "shift"])
+    assert page.session.scenario.warp == 0.5
+    page.give(by_key["R", None])
+    assert page.session.scenario.warp == 1
+    titles = [command.label for command in commands.values()][len(named) :]
+    assert titles == [scene.title for scene in SCENES.values()]
+    page.give(by_key["2", None])
+    assert page.visitor._panel._beginnings.wait_idle(30)
+    assert page.session.scenario.scene == list(SCENES)[1]
+    page.session.leave_scene()
+
+
+def test_a_command_brings_the_camera_back(page):
+    task = TASKS["draw_s"]()
+    page.visitor.shown = frame_of(page.busy(), task=task)
+    page.camera.position = np.full(3, 9.0)
+    page.give(page.commands["Frame: move the camera back"])
+    np.testing.assert_array_equal(page.camera.position, task.camera[0])
+    page.visitor.shown = None
+
+
+def test_a_command_that_is_forged_or_disabled_is_not_given(page):
+    before = page.busy()
+    undo = page.commands["Undo"]
+    page.session.edit("warp", warp=0.5)
+    undo.disabled = True
+    page.give(undo)
+    page.run(page.gui._handle_command_trigger(CLIENT, messages.CommandTriggerMessage("no such command")))
+    assert page.session.scenario.warp == 0.5
+    undo.disabled = False
+    page.give(undo)
+    assert page.session.scenario == before
+
+
+def test_the_panel_is_folded_and_unfolded_by_a_command(page, monkeypatch):
+    told = []
+    monkeypatch.setattr(page.gui._websock_interface, "queue_message", told.append)
+    for folded in (True, False, True, False):
+        page.give(page.commands["Hide the panel, or show it"])
+        assert told[-1].collapsed is folded

@@ -45,7 +45,7 @@ def test_what_euler_loses_there_and_back_is_said_in_millimetres(steps):
     lost = 1e3 * np.linalg.norm(flow.inverse(flow.forward(Y)) - Y, axis=1).max()
     X = flow.forward(Y)
     assert integration_warnings("It", flow, AUTO, Y, X) == ()
-    text = f"It: Euler in {steps} steps loses {lost:.0f} mm there and back"
+    text = f"It: Euler in {steps} steps loses {lost:.0f} mm in a round trip"
     assert integration_warnings("It", flow, chosen, Y, X) == (MotionWarning(Kind.INEXACT_INVERSE, text, "It"),)
     (small,) = integration_warnings("It", flow, chosen, Y, X, unit=1e-3)
     assert f"{1e-3 * lost:.2g} mm" in small.text

@@ -1,35 +1,25 @@
 """What the page shows of the whole arm, without a browser: a scene takes handles also while nobody looks."""
 
-import html
 import re
-import threading
 from dataclasses import fields, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
 import trimesh
-from pages import frame_of
-from scenes import avoiding, beside, biases, changed
+from pages import frame_of, panel_of
+from scenes import avoiding, changed
 from viser import transforms  # noqa: TID251
 
 from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.collision import CollisionReport, Nearest
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import ArmMotion
-from dt_viz.engine.frame import Stage
-from dt_viz.engine.session import Pace, Session
-from dt_viz.learning.demonstrations import DemonstrationError
-from dt_viz.motion.certificates import Certificates
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
-from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS, Panel
+from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
-from dt_viz.ui.panel.status import CHANGED, COMPUTING, hint, status_html
 from dt_viz.ui.scene.arm import PEDESTAL, SEEN, ArmPicture
 from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.scene.legend import OCCUPANCY
@@ -37,7 +27,6 @@ from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
 from dt_viz.ui.scene.picture import Arrows, Lines
 from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, Rollouts, ScenePictures
 from dt_viz.ui.scene.starts import Starts
-from dt_viz.warning import ARM, Kind, MotionWarning
 
 ROBOT = load_jaco()
 REACHING = np.array([0.9, 3.6, 1.6, 0.4, 2.9, -0.3])
@@ -53,11 +42,6 @@ def motion(num=60, seconds=4.0, *, sway=0.0):
 
 def frame(arm=None, *, scenario=None, **changes):
     return frame_of(scenario or avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),)), arm=arm, **changes)
-
-
-def panel_of(server, notify=lambda *_: None):
-    titles = {name: entry.title for name, entry in TASKS.items()}
-    return Panel(server.gui, titles, ROBOT, lambda *_: None, notify, lambda: None)
 
 
 # --- Along the motion ---
@@ -277,67 +261,6 @@ def test_nothing_is_grey_while_something_is_dragged(drawn):
     assert not is_grey(pictures)
 
 
-def test_the_status_of_another_task_is_pale_and_says_what_is_done(server):
-    panel = panel_of(server)
-    scenario, other = avoiding("draw_s", ()), avoiding("lift_box", ())
-    said = {s.task: replace(frame(scenario=s), task=TASKS[s.task]()) for s in (scenario, other)}
-    panel.adopt(scenario)
-    panel.report(said["draw_s"], PACE)
-    settled = panel.status.content
-    assert COMPUTING not in settled and said["draw_s"].task.hint in html.unescape(panel.hint.content)
-    panel.adopt(other)
-    for _ in range(2):
-        waiting = panel.status.content
-        assert COMPUTING in waiting and f"opacity:0.3;filter:grayscale(1)'>{settled}" in waiting
-        assert said["draw_s"].task.hint not in html.unescape(panel.hint.content)
-        panel.report(said["draw_s"], PACE)  # what was under way when it was chosen
-    panel.report(said["lift_box"], PACE)
-    assert COMPUTING not in panel.status.content
-    assert said["lift_box"].task.hint in html.unescape(panel.hint.content)
-    panel.adopt(scenario)
-    assert COMPUTING in panel.status.content
-    panel.fail(ValueError("nothing comes"))
-    assert COMPUTING not in panel.status.content
-    panel.close()
-    server.gui.reset()
-
-
-class Begun:
-    """A session that begins what it is told to once it may."""
-
-    def __init__(self, scenario):
-        self.scenario, self.may, self.asked = scenario, threading.Event(), []
-        self.panel: Any = None
-
-    def choose_task(self, name):
-        assert self.may.wait(30)
-        self.asked.append(name)
-        if name == "push_box":
-            raise DemonstrationError("push.csv", "lines", "none", "two or more")
-        self.scenario = replace(self.scenario, task=name)
-        self.panel.adopt(self.scenario)
-
-
-@pytest.mark.parametrize(("chosen", "settles"), [("lift_box", False), ("draw_s", True), ("push_box", True)])
-def test_choosing_a_task_keeps_nobody_waiting_and_says_at_once_what_is_done(server, chosen, settles):
-    panel, session = panel_of(server), Begun(avoiding("draw_s", ()))
-    session.panel = panel
-    panel.connect(cast(Session, session))
-    panel.adopt(session.scenario)
-    panel.report(replace(frame(scenario=session.scenario), task=TASKS["draw_s"]()), PACE)
-    settled = panel.status.content, panel.hint.content
-    panel._begin(lambda session, name: session.choose_task(name), cast(Session, session), chosen)
-    assert COMPUTING in panel.status.content and session.asked == []
-    session.may.set()
-    assert panel._beginnings.wait_idle(30)
-    assert session.asked == [chosen]
-    assert (COMPUTING not in panel.status.content) == settles
-    assert ((panel.status.content, panel.hint.content) == settled) == settles
-    assert panel.notice.visible == (chosen == "push_box")
-    panel.close()
-    server.gui.reset()
-
-
 @pytest.mark.parametrize("num", [0, 1, 5])
 def test_the_browser_gets_a_colour_for_each_arrow_and_of_none_a_single_one(scene, num):
     lines = Lines(scene, "/lines", (10, 20, 30), 0.001)
@@ -417,135 +340,10 @@ def test_every_layer_has_a_checkbox():
     assert set(VIEW_LABELS) == switches - {"playing", "replay", "move_slice", "click_to_start", "handles"}
 
 
-PACE = Pace(0.02, 10.0, 0)
-CLOSE = CollisionReport(
-    Nearest(-0.008, ("link 5",), 2.5), Nearest(0.004, ("link 2", "hand"), 3.0), Nearest(-0.012, ("finger tip 1",), 4.0)
-)
-FAR = CollisionReport(Nearest(0.012, ("link 5",), 2.5), None, Nearest(0.034, ("hand",), 4.0))
-CLOSE_BY = Certificates(0.01, CLOSE, found=CLOSE.warnings)
-ODD = MotionWarning(Kind.OFF_MOTION, "it is odd")
-
-
-def test_the_line_of_a_scene_is_shown_only_while_it_is_as_it_was():
-    task = TASKS["draw_j"]()
-    scene, plain = SCENES["two_points"], avoiding("draw_j", ())
-    own = scene.scenario(task)
-    assert hint(frame(scenario=plain, task=task)) == task.hint
-    assert hint(frame(scenario=own, task=task)) == hint(frame(scenario=replace(own, warp=0.3), task=task)) == scene.line
-    assert hint(frame(scenario=changed(own, layers=beside(own)[:1]), task=task)) == CHANGED
-
-
-def test_what_is_refused_is_said_beside_the_panel_too(server):
-    said = []
-    panel = panel_of(server, notify=lambda *told: said.append(told))
-    panel.fail(DemonstrationError("file.csv", "points", "3", "at least 20"))
-    ((text, colour),) = said
-    assert "file.csv" in text and "at least 20" in text and text in html.unescape(panel.notice.content)
-    assert colour[0] > 2 * max(colour[1:])  # red
-
-
-def test_the_status_says_that_every_check_holds_only_when_all_are_made():
-    holds = Certificates(0.01, FAR)
-    assert "Every check holds" in status_html(frame(certificates=holds), PACE)
-    for other in (
-        frame(certificates=holds, stage=Stage.FINE),
-        frame(certificates=holds, blocked=("it is in the way",)),
-        frame(certificates=holds.warning(ODD)),
-        frame(certificates=CLOSE_BY),
-        frame(certificates=holds, scenario=avoiding("draw_s", (), warp=0.5)),
-    ):
-        assert "Every check holds" not in status_html(other, PACE)
-
-
-def test_the_status_says_what_the_arm_comes_near_to():
-    far = status_html(frame(certificates=Certificates(0.01, FAR)), PACE)
-    for text in ("12 mm, link 5", "over 50 mm", "34 mm, hand"):
-        assert text in far
-    close = status_html(frame(certificates=CLOSE_BY), PACE)
-    for text in ("enters by 8 mm, link 5", "4 mm, link 2 – hand", "below by 12 mm, finger tip 1"):
-        assert text in close
-    hit = replace(FAR, itself=Nearest(0.0, ("link 2", "hand"), 1.0))
-    assert "touches, link 2 – hand" in status_html(frame(certificates=Certificates(0.01, hit)), PACE)
-
-
-@pytest.mark.parametrize(
-    ("view", "told"), [(View(), True), (View(arm=False, onion=True), True), (View(arm=False), False)]
-)
-def test_nothing_is_said_against_an_arm_that_is_hidden(view, told):
-    known = CLOSE_BY.warning(MotionWarning(Kind.DAMPED, "the arm is odd", ARM))
-    said = status_html(frame(scenario=avoiding("draw_s", (), view=view), certificates=known), PACE)
-    assert ("The arm is odd" in said) == ("below the table" in said) == told
-    assert ("Every check holds" in said) == ("arm hidden" in said) == (not told)
-    odd = known.warning(ODD)
-    rollouts = status_html(frame(scenario=avoiding("draw_s", (), view=view), certificates=odd), PACE)
-    assert "It is odd" in rollouts
-
-
-@pytest.mark.parametrize(("space", "hinted"), [("task", True), ("both", False)])
-def test_where_the_hand_alone_gives_way_that_is_told(space, hinted):
-    scenario = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space)
-    said = status_html(frame(scenario=scenario, certificates=CLOSE_BY), PACE)
-    assert ("only the path of the hand" in said) == hinted
-
-
-@pytest.mark.parametrize(
-    ("hand", "arm", "said"),
-    [(0.85, None, ">0.85<"), (None, 0.5, ">0.50 arm<"), (0.85, 0.5, ">0.85 hand · 0.50 arm<"), (None, None, ">off<")],
-)
-def test_the_status_says_which_flow_runs_how_long(hand, arm, said):
-    assert said in status_html(frame(durations=(hand,), arm_duration=arm), PACE)
-
-
-@pytest.mark.parametrize(("hand", "flow_time"), [(None, False), (0.4, True)])
-def test_the_status_calls_what_a_bias_point_has_its_strength(hand, flow_time):
-    layers = biases(BiasPoint((0.0, -0.5, 0.4)), BiasPoint((0.1, -0.5, 0.4)))
-    scenario = avoiding("draw_s", (), layers=layers)
-    said = status_html(frame(scenario=scenario, durations=(0.8, None, hand)), PACE)
-    assert ">0.80 Bias 1<" in said and ">Strength<" in said
-    assert ("Flow time t" in said) == flow_time and ">off<" not in said
-
-
-def test_no_value_of_the_status_runs_out_of_the_panel_and_no_number_of_a_legend():
-    """What is too long for its column is broken; numbers at the ends of a scale end with it."""
-    said = status_html(frame(), PACE)
-    names, values = re.findall(r"<td style='([^']*)'>", said)[::2], re.findall(r"<td style='([^']*)'>", said)[1::2]
-    assert all("nowrap" in style for style in names) and not any("nowrap" in style for style in values)
+def test_no_number_of_a_legend_runs_out_of_the_panel():
+    """Numbers at the ends of a scale end with it."""
     ends = re.findall(r"left:([\d.]+)%;transform:translateX\(-([\d.]+)%\)", OCCUPANCY.html)
     assert [float(left) for left, _ in ends] == [float(shift) for _, shift in ends] == [0, 25, 50, 75, 100]
-
-
-@pytest.mark.parametrize(
-    ("space", "avoidance", "whose"),
-    [("task", True, "end effector"), ("cspace", True, "body points"), ("cspace", False, "end effector")],
-)
-def test_the_status_says_whose_clearance_it_is(space, avoidance, whose):
-    scenario = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),), space=space, avoids=avoidance)
-    assert f"10.0 mm, {whose}" in status_html(frame(scenario=scenario), PACE)
-
-
-def test_what_enters_is_said_once_also_if_a_rollout_is_known_to_enter():
-    enters, *others = CLOSE.warnings
-    known = CLOSE_BY.warning(MotionWarning(Kind.ROLLOUT_ENTERS, f"rollout 2: {enters}", ARM))
-    said = status_html(frame(certificates=known), PACE)
-    assert said.lower().count(enters.text.lower()) == 1
-    assert others and all(other.text[1:] in said for other in others)
-
-
-@pytest.mark.parametrize(("stage", "unknown"), [(Stage.LIVE, "…"), (Stage.CERTIFIED, "–")])
-def test_what_is_not_known_yet_and_what_will_not_be_known_differ(stage, unknown):
-    row = status_html(frame(stage=stage), PACE).split("Arm to obstacle")[1]
-    assert cast(str, row).split("</tr>")[0].count(unknown) == 1
-
-
-def test_a_scenario_without_motion_says_why_and_what_is_shown_instead():
-    texts = ("start 3 is inside the obstacle", "the obstacle touches the <base>")
-    reasons = tuple(MotionWarning(Kind.ARM_BLOCKED, text) for text in texts)
-    said = status_html(frame(blocked=reasons), PACE)
-    assert "start 3 is inside the obstacle; the obstacle touches the &lt;base&gt;" in said
-    assert "last good" in said
-    row = said.split("Clearance")[1].split("</tr>")[0]
-    assert "–" in row and "mm" not in row
-    assert "last good" not in status_html(frame(), PACE)
 
 
 def test_a_joint_is_drawn_once_its_turn_is_seen(scene, robot):

@@ -244,8 +244,8 @@ def opened(server):
 def test_the_colour_is_one_choice(opened):
     _, bound = opened
     for name in ("None", "det J", "Lyapunov value", "Learned occupancy"):
-        bound.set("Colour", name)
-        assert bound["Colour"].read(bound.edited.scenario) == name
+        bound.set("Slice colour", name)
+        assert bound["Slice colour"].read(bound.edited.scenario) == name
     assert bound["Move the slice"].change(SCENARIO, True)["view"] == View(move_slice=True)
 
 

@@ -1,5 +1,6 @@
 """What the page shows of bias points, the stack and pots, without a browser."""
 
+import re
 from dataclasses import replace
 from typing import Any, cast
 
@@ -9,11 +10,25 @@ from pages import Bound, Edited, frame_of
 from scenes import avoiding, beside, biases, changed
 
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import View
+from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, selected
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
-from dt_viz.ui.panel.stack import BASE, DOWN, OFF, ON, SEE, SEEN, UP, StackPanel, durations, legend_html, press, rows
+from dt_viz.ui.panel.stack import (
+    BASE,
+    DOWN,
+    OFF,
+    ON,
+    SHOW,
+    SHOWN,
+    UP,
+    StackPanel,
+    durations,
+    formula_html,
+    legend_html,
+    press,
+    rows,
+)
 from dt_viz.ui.panel.transforms import add, add_transform_controls, delete
 from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.levels import LevelRollouts
@@ -21,6 +36,7 @@ from dt_viz.ui.scene.tubes import NUM_SIDES
 
 PLANE = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 AVOIDANCE = "Avoidance"
+BALL = Sphere((0.0, -0.5, 0.4))
 SCENARIO = avoiding(
     "draw_s",
     Sphere((0.0, -0.5, 0.4)),
@@ -60,9 +76,9 @@ def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done
         "Bias 2",
         "Avoidance, t 0.40",
     ]
-    assert by_name["Bias 1"].buttons == (ON, UP, SEE)
-    assert by_name["Bias 2"].buttons == (ON, UP, DOWN, SEE)
-    assert by_name[AVOIDANCE].buttons == (ON, DOWN, SEE)
+    assert by_name["Bias 1"].buttons == (ON, UP, SHOW)
+    assert by_name["Bias 2"].buttons == (ON, UP, DOWN, SHOW)
+    assert by_name[AVOIDANCE].buttons == (ON, DOWN, SHOW)
 
 
 @pytest.fixture
@@ -82,7 +98,7 @@ def test_a_row_switches_its_transform_off_and_on_again(session, name):
     press(session, name, ON)
     assert session.scenario != SCENARIO
     row = listed(session.scenario)[name]
-    assert row.buttons[0] == OFF and (name == IMITATION or SEE not in row.buttons)
+    assert row.buttons[0] == OFF and (name == IMITATION or SHOW not in row.buttons)
     press(session, name, OFF)
     assert session.scenario == SCENARIO
 
@@ -100,12 +116,12 @@ def test_rows_move_their_transform_outwards_and_inwards(session):
 def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(session):
     assert legend_html(SCENARIO) == ""
     for name in (IMITATION, "Bias 1"):
-        press(session, name, SEE)
+        press(session, name, SHOW)
         assert session.scenario.view.level == name
-        assert [row.name for row in listed(session.scenario).values() if SEEN in row.buttons] == [name]
+        assert [row.name for row in listed(session.scenario).values() if SHOWN in row.buttons] == [name]
     assert "bias 1" in legend_html(session.scenario)
-    press(session, "Bias 1", SEEN)
-    press(session, BASE, SEE)
+    press(session, "Bias 1", SHOWN)
+    press(session, BASE, SHOW)
     assert session.scenario.view == View(base=True, tuned="Bias 1")  # and its settings stay in sight
 
 
@@ -196,3 +212,25 @@ def test_the_panel_shows_what_auto_chose(server):
     bound.report(frame())
     radius = bound["Radius [cm]"].control
     assert radius.value == 20.0 and radius.handle.disabled
+
+
+@pytest.mark.parametrize(
+    ("scenario", "formula"),
+    [
+        (Scenario("draw_s"), "z = ψi(y)"),
+        (avoiding("draw_s", BALL), "z = ψi(ψo(y))"),
+        (avoiding("draw_s", BALL, layers=biases(BiasPoint(BALL.position))), "z = ψi(ψb1(ψo(y)))"),
+        (replace(avoiding("draw_s", BALL), imitation=False), "z = ψo(y)"),
+        (avoiding("draw_s", BALL, avoids=False), "z = ψi(y)"),
+        (avoiding("draw_s", BALL, space="cspace"), "z = ψi(fk(ψq(q)))"),
+        (avoiding("draw_s", BALL, space="both"), "z = ψi(ψo(fk(ψq(q))))"),
+    ],
+)
+def test_the_formula_follows_the_stack_and_names_its_parts_in_their_colours(scenario, formula):
+    said = formula_html(scenario)
+    above, below, _ = re.sub(r"<(?!/div)[^>]*>", "", said).split("</div>")
+    assert above == formula
+    parts = re.findall(r"<b style='color:[^']*'>ψ<sub>[^<]*</sub></b>", said)
+    named = parts[len(parts) // 2 :]
+    assert parts[: len(parts) // 2] == named and below.count(" · ") == len(named)
+    assert len({part.split("'")[1] for part in named}) == len(named)  # each has a colour of its own

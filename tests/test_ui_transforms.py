@@ -22,8 +22,8 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, anchored
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel import warp as warp_module
-from dt_viz.ui.panel.status import status_html
 from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
+from dt_viz.ui.panel.verdict import Level, concerns, verdict
 from dt_viz.ui.panel.warp import grown
 from dt_viz.warning import Kind
 
@@ -66,15 +66,15 @@ FLOW = {"Settings of", "Flow time: auto", "Flow time t", "Integrator"}
 
 
 def test_only_what_the_chosen_transform_has_is_shown(controls):
-    assert visible(controls) == FLOW | {"Generator", "Reach T"}  # the outermost is the avoidance
+    assert visible(controls) == FLOW | {"Generator", "Temperature T"}  # the outermost is the avoidance
     controls.set("Settings of", "Bias 1")
     assert visible(controls) == STRENGTH  # as the paper calls the t of a bias point
     controls.set("Integrator", "Euler (the paper's)")
     assert visible(controls) == STRENGTH | {"Steps"}
     controls.set("Settings of", AVOIDANCE)
-    assert visible(controls) == FLOW | {"Generator", "Reach T"}
+    assert visible(controls) == FLOW | {"Generator", "Temperature T"}
     controls.set("Settings of", IMITATION)
-    assert visible(controls) == {"Settings of", "Learn"}
+    assert visible(controls) == {"Settings of", "Objective"}
 
 
 def test_settings_change_the_transform_that_they_are_shown_for(controls):
@@ -85,7 +85,7 @@ def test_settings_change_the_transform_that_they_are_shown_for(controls):
     assert controls.edited.scenario.avoidance == SCENARIO.avoidance
     controls.set("Settings of", AVOIDANCE)
     assert (controls["Integrator"].control.value, controls.inputs("Steps", visible=True)) == ("auto", [])
-    controls.set("Reach T", 9.0)
+    controls.set("Temperature T", 9.0)
     assert controls.edited.scenario.avoidance.temperature == 9.0
 
 
@@ -128,19 +128,11 @@ def report(obstacle):
 def test_a_warp_is_a_hint_and_what_it_enters_no_alarm():
     entered = report(-0.04)
     apart = tuple(warning for warning in entered.warnings if warning.kind is not Kind.ARM_ENTERS)
-    known = Certificates(-0.03, entered, found=apart)  # as the engine tells them of a warp
-    half = status_html(frame(replace(SCENARIO, warp=0.5), certificates=known), PACE)
-    assert "Warp at 0.50" in half and "-30.0 mm" in half
-    assert "finger 1 enters" not in half.lower() and "go through the obstacle" not in half
-    assert "Link 5 is 20 mm below the table" in half  # that is none of the obstacle's
-    full = status_html(frame(certificates=Certificates(-0.03, entered, found=entered.warnings)), PACE)
-    assert "Warp at" not in full and "Finger 1 enters" in full
-
-
-def test_what_is_lost_is_a_number_that_can_be_read():
-    lost = [status_html(frame(certificates=Certificates(0.01, round_trip_error=e)), PACE) for e in (0.0, 3e-8, 0.2471)]
-    for text, expected in zip(lost, (">0.0 mm<", ">3e-05 mm<", ">247.1 mm<"), strict=True):
-        assert expected in text
+    half = frame(replace(SCENARIO, warp=0.5), certificates=Certificates(-0.03, entered, found=apart))  # of a warp
+    assert verdict(half, PACE, half.scenario).level is Level.NOTE
+    assert [warning.kind for warning in concerns(half, half.scenario.view)] == [Kind.ARM_BELOW_TABLE]
+    full = frame(certificates=Certificates(-0.03, entered, found=entered.warnings))
+    assert "finger 1 enters" in verdict(full, PACE, full.scenario).reason
 
 
 class Sketches:

@@ -26,8 +26,8 @@ from dt_viz.ui.scene.tubes import NUM_RINGS, NUM_SIDES
 
 ROLLOUT, OBSTACLE = "/rollouts/followed", "/obstacles/0"
 """Names of the tube of the rollout that the arm follows and of the first obstacle's gizmo in the scene tree."""
-STATUS, CHECKED = "Smallest det J", "every check holds"
-"""Texts in the status line of every frame, and of a frame whose certificates all hold."""
+STATUS = "Smallest det J"
+"""Text in the details of every frame's status."""
 MAX_MESSAGE = 64 * 2**20
 """Largest size of a message from the server, bytes."""
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -137,13 +137,13 @@ class ProtocolClient:
 
     @property
     def status(self) -> str:
-        """The status line, as HTML; empty before there is one."""
+        """The details of the status, as HTML; empty before there are some."""
         texts = (str(control.get("content", "")) for control in self.controls.values())
         return next((text for text in texts if STATUS in text), "")
 
     @property
     def has_picture(self) -> bool:
-        """Whether rollouts and status line are on the page."""
+        """Whether rollouts and their status are on the page."""
         return self.rollout is not None and bool(self.status)
 
     async def grab(self, name: str = OBSTACLE) -> None:

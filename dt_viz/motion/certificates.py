@@ -254,7 +254,7 @@ def _with_map(known: Certificates, det: float, round_trip: float) -> Certificate
         text = f"det J falls to {det:.2g}: the map folds space, the stack is no diffeomorphism there"
         warnings.append(MotionWarning(Kind.NO_DIFFEOMORPHISM, text))
     if not round_trip <= MAX_ROUND_TRIP:
-        text = f"there and back again misses by {1e3 * round_trip:.3g} mm: steps too coarse"
+        text = f"a round trip through the stack misses by {1e3 * round_trip:.3g} mm: steps too coarse"
         warnings.append(MotionWarning(Kind.ROUND_TRIP, text))
     return replace(
         known,

@@ -193,7 +193,7 @@ def integration_warnings(
     folds = () if isinstance(flow, Conjugated) else fold_warnings(name, flow, integration, y[keep], x[keep])
     if lost <= MAX_ROUND_TRIP:
         return folds
-    text = f"{name}: {integration} loses {in_millimetres(lost)} there and back"
+    text = f"{name}: {integration} loses {in_millimetres(lost)} in a round trip"
     return (*folds, MotionWarning(Kind.INEXACT_INVERSE, text, name))
 
 

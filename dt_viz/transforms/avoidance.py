@@ -104,13 +104,13 @@ class Avoidance(Transform):
         Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
         Number(
             "temperature",
-            "Reach",
+            "Temperature",
             "T",
             MIN_TEMPERATURE,
             MAX_TEMPERATURE,
             0.5,
             6.0,
-            hint="temperature: higher bends more gently, from farther away",
+            hint="the higher, the more gently motions bend, and from farther away",
         ),
         Number(
             "duration",

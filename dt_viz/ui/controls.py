@@ -64,6 +64,14 @@ def on_press(button: viser.GuiButtonHandle, act: Callable[[], None]) -> None:
     Control(button, lambda _pressed: act())
 
 
+def on_command(command: viser.CommandHandle, act: Callable[[], None]) -> None:
+    """Call `act`, which must only submit, when a command is given; viser gives none that is disabled."""
+
+    @command.on_trigger
+    async def _(_event: viser.CommandEvent) -> None:
+        act()
+
+
 def allowed(handle: Any, claimed: Any) -> Any | None:  # noqa: ANN401 - handles and values of all kinds
     """Return the value that a control accepts for a browser's claim; None if the control cannot have sent it."""
     if handle.disabled or not handle.visible:

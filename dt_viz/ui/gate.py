@@ -48,6 +48,7 @@ SMALL, PART, IMAGE = 64 * 1024, 2**20, 16 * 2**20
 MAX_SIZES: Mapping[str, int] = {
     "ViewerCameraMessage": SMALL,
     "GuiUpdateMessage": SMALL,
+    "CommandTriggerMessage": SMALL,
     "TransformControlsDragStartMessage": SMALL,
     "TransformControlsUpdateMessage": SMALL,
     "TransformControlsDragEndMessage": SMALL,

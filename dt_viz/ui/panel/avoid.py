@@ -1,4 +1,4 @@
-"""Control of what avoids the obstacles: nothing, the hand's path, or the whole arm."""
+"""Controls of the two transforms of the method: what avoids the obstacles, and whether motions are learned ones."""
 
 from __future__ import annotations
 
@@ -7,45 +7,26 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with
 from dt_viz.transforms.avoidance import Space
 from dt_viz.ui.panel.bindings import Bindings
-from dt_viz.warning import Kind
 
 OFF = "Off"
 SPACES: Mapping[str, Space] = {"Hand": "task", "Arm": "cspace"}
 """Spaces of the avoidance, by their names on the page."""
-HINT = "Hand: its path gives way, the arm follows. Arm: the joints keep the whole arm clear."
-GESTURE = "Avoid"
+HINT = "what gives way to the obstacles. Hand: the path of the hand, and the arm follows it. Arm: the whole arm"
+IMITATE_HINT = "off: without what was learned, every motion is straight to the goal, and still avoids"
 
 
-class AvoidPanel:
-    """The dropdown "Avoid", and a button that has the whole arm avoid where a part of it would enter an obstacle."""
-
-    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
-        """Build the dropdown.
-
-        Args:
-            gui: controls of the visitor.
-            bindings: bindings of the visitor's panel.
-        """
-        self._gui, self._bindings = gui, bindings
-        bindings.input(gui.add_dropdown(GESTURE, (OFF, *SPACES), hint=HINT), avoids_with, _changed)
-
-    def add_remedy(self) -> None:
-        """Add the button; it shows while the frame has a warning that it mends."""
-        button = self._gui.add_button("Let the whole arm avoid", icon=viser.Icon.SHIELD_CHECK, visible=False)
-        self._bindings.properties(button, visible=self._mends)
-        self._bindings.on(button, _let_arm_avoid)
-
-    def _mends(self, scenario: Scenario) -> bool:
-        frame = self._bindings.frame
-        if frame is None or not frame.scenario.moves_like(scenario):
-            return False
-        enters = any(warning.kind is Kind.ARM_ENTERS for warning in frame.certificates.warnings)
-        return enters and scenario.avoids and scenario.arm_avoidance is None and scenario.view.arm
+def add_avoid_and_imitate(gui: viser.GuiApi, bindings: Bindings) -> None:
+    """Build the dropdown "Avoid" and the checkbox "Imitate" where the panel is being built."""
+    bindings.input(gui.add_dropdown("Avoid", (OFF, *SPACES), hint=HINT), avoids_with, _changed)
+    bindings.input(
+        gui.add_checkbox("Imitate", True, hint=IMITATE_HINT),
+        lambda s: s.imitation,
+        lambda _s, value: {"imitation": value},
+    )
 
 
 def avoids_with(scenario: Scenario) -> str:
@@ -56,7 +37,3 @@ def avoids_with(scenario: Scenario) -> str:
 
 def _changed(scenario: Scenario, name: str) -> dict[str, Any]:
     return {"stack": avoiding_with(scenario, SPACES.get(name))}
-
-
-def _let_arm_avoid(session: Session, _pressed: Any) -> None:  # noqa: ANN401 - a button has no value
-    session.edit(GESTURE, **_changed(session.scenario, "Arm"))

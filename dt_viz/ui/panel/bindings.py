@@ -11,7 +11,7 @@ from typing import Any
 from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.ui.controls import Control
+from dt_viz.ui.controls import Control, on_command
 
 KEEP: Any = object()
 """Value of a binding that leaves what is shown as it is."""
@@ -100,6 +100,10 @@ class Bindings:
                 act(self._session, value)
 
         return Control(handle, acts)
+
+    def on_command(self, command: Any, act: Callable[[Session], None]) -> None:  # noqa: ANN401
+        """Call `act`, which must only submit, when a command of the palette is given."""
+        on_command(command, lambda: act(self._session) if self._session is not None else None)
 
     def adopt(self, scenario: Scenario) -> None:
         """Show what is new in a scenario."""

@@ -12,11 +12,11 @@ from dt_viz.engine.session import Session
 from dt_viz.scenario.roaming import Chase, MovingGoal
 from dt_viz.ui.panel.bindings import Bindings
 
-SPEEDS: Mapping[str, float] = {"Slow": 0.08, "Fast": 0.25}
+SPEEDS: Mapping[str, float] = {"Obstacle": 0.08, "Fast obstacle": 0.25}
 """Speeds of the obstacle by their names on the page, m/s."""
 GOAL, STOP = "Goal", "Stop"
 NAME = "Disturb"
-HINT = "Slow, Fast: the selected obstacle crosses the motion again and again. Goal: the goal moves."
+HINT = "by itself: the selected obstacle crosses the motion again and again, or the goal moves"
 
 
 class Disturbances:
@@ -31,7 +31,7 @@ class Disturbances:
         """
         self._rng, self._player = np.random.default_rng(0), Player(self._show)
         self._bindings = bindings
-        self._buttons = gui.add_button_group("Chase me", (*SPEEDS, GOAL), hint=HINT)
+        self._buttons = gui.add_button_group("Disturb", (*SPEEDS, GOAL), hint=HINT)
         bindings.on(self._buttons, self._pressed)
 
     def close(self) -> None:

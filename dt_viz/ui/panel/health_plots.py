@@ -24,12 +24,12 @@ class HealthPlots(Shown):
     def __init__(self, gui: viser.GuiApi) -> None:
         """Make the folder, hidden."""
         self._drawn: Profiles | None = None
-        folder = gui.add_folder("Health", visible=False)
+        folder = gui.add_folder("Along the path", visible=False)
         super().__init__(folder)
         with folder:
             self.table = gui.add_html("")
             gui.add_html(_legend())
-            self.lyapunov = _plot(gui, "Lyapunov value, of its start’s", palette.LEVEL)
+            self.lyapunov = _plot(gui, "Lyapunov value, relative to that of the start", palette.LEVEL)
             self._to = gui.add_html("")
             self.distance = _plot(gui, "", palette.ROLLOUT)
             self._whose = gui.add_html("")

@@ -117,16 +117,23 @@ class ObstaclePanel:
                 lambda o, size: o.resized(size),
             )
             bindings.input(
-                gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that “auto” keeps"),
+                gui.add_slider(
+                    "Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint="clearance that the automatic flow time keeps"
+                ),
                 lambda s: round(100 * s.avoidance.margin, 3),
                 lambda s, value: {"stack": with_avoidance(s, margin=value / 100)},
             )
             with gui.add_folder("From a file", expand_by_default=False):
-                self.unit = Control(gui.add_dropdown("File is in", tuple(UNITS)))
+                self.unit = Control(gui.add_dropdown("Unit of the file", tuple(UNITS)))
                 hint = f"{FORMATS}; a mesh must be closed; a csv of points begins with x,y,z or x,y,z,occupied"
                 self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
                 bindings.properties(self._upload, visible=_has_room)
-                self.again = gui.add_button("", icon=viser.Icon.RULER, visible=False, hint="the file of that size")
+                self.again = gui.add_button(
+                    "",
+                    icon=viser.Icon.RULER,
+                    visible=False,
+                    hint="the file that was too large or too small in the other unit",
+                )
 
         @self._upload.on_upload
         async def _(_event: viser.GuiEvent) -> None:

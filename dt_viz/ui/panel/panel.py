@@ -1,8 +1,7 @@
-"""Controls ↔ scenario, and the status line."""
+"""Controls ↔ scenario, and the status."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -20,8 +19,10 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
-from dt_viz.ui.panel.avoid import AvoidPanel
+from dt_viz.ui.panel.about import add_about
+from dt_viz.ui.panel.avoid import add_avoid_and_imitate
 from dt_viz.ui.panel.bindings import KEEP, Bindings
+from dt_viz.ui.panel.commands import Command, Curtain, add_commands, numbered
 from dt_viz.ui.panel.disturbances import Disturbances
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
@@ -30,8 +31,10 @@ from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
 from dt_viz.ui.panel.starts import StartsPanel
-from dt_viz.ui.panel.status import AMBER, COMPUTING, PALE, RED, SMALL, TWO_LINES, alarm, hint, sentence, status_html
+from dt_viz.ui.panel.status import COLOURS, HINT, INK, hint, place_html, sentence
+from dt_viz.ui.panel.status_line import StatusLine
 from dt_viz.ui.panel.transforms import add_transform_controls
+from dt_viz.ui.panel.verdict import Level
 from dt_viz.ui.scene.arm_layers import NUM_ARMS
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
@@ -39,33 +42,37 @@ from dt_viz.ui.scene.picture import Colour
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
-    "ghost": "Undisturbed (dashed)",
+    "ghost": "Undisturbed motions",
     "demonstrations": "Demonstrations",
-    "field": "Point field",
+    "field": "Vector field",
     "streamlines": "Streamlines",
     "arm": "Arm",
     "ghost_arm": "Arm without avoidance",
     "onion": "Arms along the motion",
     "body_points": "Body points",
     "joint_plots": "Joint plots",
-    "health_plots": "Health plots",
+    "health_plots": "Plots along the path",
     "table": "Table",
     "grid": "Warped grid ψ⁻¹(grid)",
-    "base": "Base attractor beside it",
+    "base": "Base attractor",
     "generator": "Learned generator",
 }
 PLOTS = {"joint_plots", "health_plots"}
 """Fields of `View` whose pictures are in the panel, not in the scene."""
 VIEW_HINTS: Mapping[str, str] = {
-    "field": "on the slice: longer and darker is faster",
+    "field": "velocities on the slice: longer and darker is faster",
     "streamlines": "motions from all over the slice: exact, as images of straight rays",
     "ghost": "what was learned, without obstacles and bias points",
     "ghost_arm": "at the same moment; links that coincide are left out",
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
+    "grid": "straight lines of base space, as all transforms together bend them",
+    "base": "the motions before anything is learned, drawn beside the others: straight to the goal",
+    "generator": "vector field whose flow is the imitation",
     "joint_plots": "angles and speeds over time, with their limits",
     "health_plots": "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
 }
+FOLLOWS_HINT = "number of the rollout that the arm follows: first those of the demonstrations, then added ones"
 _NO_SCENE = "–"
 MAX_FLOWS = 3
 """Number of flows that ψ is composed of until a picture of the generator brings its own."""
@@ -96,32 +103,27 @@ class Panel:
         self._notify, self._look_home = notify, look_home
         self._gui = gui
         self._titles = dict(titles)
+        self._scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
         self._bindings = Bindings()
-        self.notice = gui.add_html("", visible=False)
-        self._noticed: Scenario | None = None
-        self._shows = self._waits = False
-        """Whether a frame has been reported, and whether another task or scene than its own is being computed."""
         self._reported: Scenario | None = None
-        self._settled = "", ""
-        """Hint and status of the last reported scenario."""
+        self._settled = ""
+        """Hint of the last reported scenario."""
+        self._waits = False
+        """Whether another task or scene than the reported one is being computed."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
-        avoid = AvoidPanel(gui, self._bindings)
-        self.status = gui.add_html("")
-        self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, visible=False)
-
-        self._bindings.on(self._cancel, lambda session, _pressed: session.cancel())
-        avoid.add_remedy()
         self._build_task()
+        add_avoid_and_imitate(gui, self._bindings)
+        self.status = StatusLine(gui, self._bindings)
+        self._bindings.on(gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
         tabs = gui.add_tab_group()
         self._chores = Chores(self.fail)
         later = self._chores.later
         with tabs.add_tab("World"):
             self._obstacles = ObstaclePanel(
-                gui, self._bindings, lambda text, wrong: self._say(text, *(RED if wrong else AMBER)), later
+                gui, self._bindings, lambda text, wrong: self._say(text, Level.ALARM if wrong else Level.WARNING), later
             )
             add_transform_controls(gui, self._bindings, later)
-            StartsPanel(gui, self._bindings, lambda text: self._say(text, *AMBER), later)
+            StartsPanel(gui, self._bindings, lambda text: self._say(text, Level.WARNING), later)
         with tabs.add_tab("Stack"):
             self._stack = StackPanel(gui, self._bindings)
         with tabs.add_tab("Show"):
@@ -132,6 +134,9 @@ class Panel:
             self._build_arm()
         with tabs.add_tab("Picture"):
             self._build_export(save_png)
+        commands = self._commands(Curtain(gui))
+        add_commands(gui, self._bindings, commands)
+        add_about(gui, commands)
 
     def connect(self, session: Session) -> None:
         """Let the controls edit this session."""
@@ -154,6 +159,7 @@ class Panel:
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices."""
         self._bindings.adopt(scenario)
+        self.status.adopt(scenario)
         if self._reported is not None and not self._reported.begins_like(scenario):
             self._wait()
 
@@ -164,70 +170,54 @@ class Panel:
         adopted = self._bindings.scenario
         if adopted is not None and not frame.scenario.begins_like(adopted):
             return  # another task or scene was chosen meanwhile
-        self._reported, self._shows, self._waits = frame.scenario, True, False
-        self._learned()
-        if self._noticed is not None and frame.scenario != self._noticed:
-            self.notice.visible, self._noticed = False, None
-        self._give_hint(hint(frame))
+        self._reported, self._settled, self._waits = frame.scenario, hint(frame), False
+        self._give_hint(self._settled)
         self._bindings.report(frame)
         self.joints.follow(frame.arm)
         self.health.draw(frame.profiles)
-        self._settled = hint(frame), status_html(frame, pace)
-        self.status.content = self._settled[1]
+        self.status.report(frame, pace)
 
     def _wait(self) -> None:
-        """Show that another task or scene is being computed; the status of the last one turns pale."""
+        """Show that another task or scene is being computed."""
         if not self._waits:
             self._waits = True
             self._give_hint("")
-            said = f"<div style='{SMALL}'>{COMPUTING}</div>"
-            self.status.content = f"{said}<div style='{PALE}'>{self._settled[1]}</div>"
+            self.status.wait(waits=True)
 
     def _settle(self) -> None:
-        """Stop waiting for a report; show the last frame's status again if it is of the adopted task and scene."""
-        if self._waits:
+        """Stop waiting for a report, if the last frame is of the adopted task and scene."""
+        adopted = self._bindings.scenario
+        if self._waits and self._reported and adopted and self._reported.begins_like(adopted):
             self._waits = False
-            adopted = self._bindings.scenario
-            stays = self._reported and adopted and self._reported.begins_like(adopted)
-            said, self.status.content = self._settled if stays else ("", "")
-            self._give_hint(said)
+            self._give_hint(self._settled)
+            self.status.wait(waits=False)
 
     def _give_hint(self, text: str) -> None:
-        self.hint.content = f"<div style='{SMALL};min-height:{TWO_LINES}'>{html.escape(text)}</div>"
+        self.hint.content = place_html(text, INK, HINT)
 
     def learning(self, fraction: float, message: str) -> None:
         """Show the progress of learning a task."""
-        self._bar.visible = self._cancel.visible = True
-        self._bar.value = 100 * fraction
-        self.status.content = f"<div style='{SMALL}'>Learning the motion: {html.escape(message)}</div>"
+        self.status.learn(fraction, message)
 
     def fail(self, error: Exception) -> None:
         """Show what went wrong; the picture stays as it was."""
         self._settle()
         expected = isinstance(error, DataError | ImitationError)
-        self._say(str(error) if expected else f"{type(error).__name__}: {error}", *RED)
+        self._say(str(error) if expected else f"{type(error).__name__}: {error}", Level.ALARM, failed=True)
 
     def cancelled(self, task: str) -> None:
         """Show that learning a task was cancelled, and what is shown instead."""
         adopted = self._bindings.scenario
-        if self._shows and adopted is not None:
+        if self._reported is not None and adopted is not None:
             instead = f"This is “{self._titles[adopted.task]}” as before."
         else:
             instead = "Choose another task, or move the obstacle to start again."
-        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", *AMBER)
+        self._say(f"Learning “{self._titles[task]}” was cancelled. {instead}", Level.WARNING)
 
-    def _say(self, text: str, colour: Colour, background: Colour) -> None:
-        """Show a text until the next scenario is shown, and for a while beside the panel."""
-        self._learned()
-        self._notify(sentence(text), colour)
-        self.notice.content, self.notice.visible = alarm(text, colour, background), True
-        self._noticed = self._bindings.scenario
-
-    def _learned(self) -> None:
-        """Hide the progress of learning."""
-        if self._bar.visible:
-            self._bar.visible = self._cancel.visible = False
-            self.status.content = ""
+    def _say(self, text: str, level: Level, *, failed: bool = False) -> None:
+        """Show a text in the status until the next scenario is shown, and for a while beside the panel."""
+        self._notify(sentence(text), COLOURS[level][0])
+        self.status.say(text, level, failed=failed)
 
     def _build_task(self) -> None:
         names = {title: name for name, title in self._titles.items()}
@@ -236,23 +226,34 @@ class Panel:
             session.choose_task(names[title])
 
         self._bindings.choice(
-            self._gui.add_dropdown("Task", tuple(names)), lambda s: self._titles[s.task], partial(self._begin, choose)
+            self._gui.add_dropdown("Task", tuple(names), hint="what is learned from demonstrations"),
+            lambda s: self._titles[s.task],
+            partial(self._begin, choose),
+        )
+        self._bindings.choice(
+            self._gui.add_dropdown("Scene", (_NO_SCENE, *self._scenes), hint="scenes of the paper's figures"),
+            lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
+            partial(self._begin, self._load),
         )
         self.hint = self._gui.add_html("")
-        scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
+        self._give_hint("")
 
-        def load(session: Session, title: str) -> None:
-            if title == _NO_SCENE:
-                session.leave_scene()
-            else:
-                session.load(scenes[title].task, prepared(scenes[title]))
+    def _load(self, session: Session, title: str) -> None:
+        if title == _NO_SCENE:
+            session.leave_scene()
+        else:
+            session.load(self._scenes[title].task, prepared(self._scenes[title]))
 
-        self._bindings.choice(
-            self._gui.add_dropdown("Scene", (_NO_SCENE, *scenes), hint="scenes of the paper's figures"),
-            lambda s: SCENES[s.scene].title if s.scene in SCENES else _NO_SCENE,
-            partial(self._begin, load),
-        )
-        self._bindings.on(self._gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+    def _commands(self, curtain: Curtain) -> list[Command]:
+        return [
+            Command("Pause, or play", lambda session: _play_or_pause(session, True), "space"),
+            Command("Reset the scene and the camera", lambda session: self._travel(session, "Reset"), "R"),
+            Command("Undo", lambda session: self._travel(session, "Undo"), "Z"),
+            Command("Redo", lambda session: self._travel(session, "Redo"), "Z", shifted=True),
+            Command("Frame: move the camera back", lambda _session: self._look_home(), "F"),
+            Command("Hide the panel, or show it", lambda _session: curtain.pull(), "H"),
+            *numbered(tuple(self._scenes), partial(self._begin, self._load)),
+        ]
 
     def _begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         """Begin a task or a scene; if that fails, show why and stay."""
@@ -279,7 +280,7 @@ class Panel:
         self._bindings.properties(play, label=lambda s: "Pause" if s.view.playing else "Play")
         self._bindings.on(play, _play_or_pause)
         self._bindings.input(
-            gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0),
+            gui.add_slider("Speed", 0.25, 3.0, 0.25, 1.0, hint="of the arm: 1 is real time"),
             lambda s: s.view.speed,
             lambda s, value: {"view": replace(s.view, speed=value)},
         )
@@ -292,7 +293,7 @@ class Panel:
             lambda s, value: {"view": replace(s.view, replay=value)},
         )
         self._disturbances = Disturbances(gui, self._bindings)
-        followed = gui.add_slider("Follows rollout", 1, 8, 1, 1)
+        followed = gui.add_slider("Follows rollout", 1, 8, 1, 1, hint=FOLLOWS_HINT)
         self._bindings.properties(followed, max=self._num_rollouts)
         self._bindings.input(followed, lambda s: s.arm_rollout + 1, lambda _s, value: {"arm_rollout": int(value) - 1})
 
@@ -324,8 +325,8 @@ class Panel:
         for name in VIEW_LABELS:
             if name not in PLOTS:
                 self._build_checkbox(name)
-        hint = "ψ is several flows, 1 is the first; 0: their mean"
-        flow = self._gui.add_slider("Of flow", 0, MAX_FLOWS, 1, 0, visible=False, hint=hint)
+        hint = "the imitation is several flows, one after the other: 1 is the first; 0: the mean of all"
+        flow = self._gui.add_slider("Generator of flow", 0, MAX_FLOWS, 1, 0, visible=False, hint=hint)
         self._bindings.properties(flow, visible=lambda s: s.view.generator, max=self._num_flows)
         self._bindings.input(
             flow,

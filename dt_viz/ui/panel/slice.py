@@ -31,7 +31,9 @@ class SlicePanel:
         self._bindings = bindings
         bindings.input(
             gui.add_checkbox(
-                "Move the slice", False, hint="handles that move and tilt the plane of arrows and colours"
+                "Move the slice",
+                False,
+                hint="handles that move and tilt the slice, the plane on which arrows and colours are shown",
             ),
             lambda s: s.view.move_slice,
             lambda s, value: {"view": replace(s.view, move_slice=value)},
@@ -41,7 +43,7 @@ class SlicePanel:
         bindings.on(self.back, _put_back)
         names = {label: name for name, label in COLOUR_LABELS.items()}
         bindings.input(
-            gui.add_dropdown("Colour", tuple(names), hint="quantity shown on the slice"),
+            gui.add_dropdown("Slice colour", tuple(names), hint="quantity shown as colour on the slice"),
             lambda s: COLOUR_LABELS[s.view.colour],
             lambda s, label: {"view": replace(s.view, colour=names[label])},
         )

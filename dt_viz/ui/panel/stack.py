@@ -23,16 +23,24 @@ from dt_viz.scenario.stack import (
     transform_of,
     tunable,
 )
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.base import Transform
+from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.transform_settings import add_transform_settings
 from dt_viz.ui.panel.warp import WarpControls
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.levels import manifold
+from dt_viz.ui.scene.picture import Colour
 
 BASE = "Base attractor"
 BELOW = 1e9
 """Order of the controls below the rows in their folder."""
-ON, OFF, UP, DOWN, SEE, SEEN = "● on", "○ off", "↑", "↓", "see", "● seen"
+ON, OFF, UP, DOWN, SHOW, SHOWN = "● on", "○ off", "↑", "↓", "show", "● shown"
+
+
+_COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.OBSTACLE, BiasPoint: palette.BIAS}
+"""Colours of kinds of transforms in the formula; those of what is drawn of them."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,7 @@ class StackPanel:
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Build an empty list, the warp and the settings."""
         self._gui, self._bindings = gui, bindings
+        bindings.properties(gui.add_html(""), content=formula_html)
         self._folder = gui.add_folder("Stack, the outermost on top")
         self.rows: list[Any] = []
         self._shown: tuple[Row, ...] = ()
@@ -114,7 +123,7 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row
         label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
         rows.append(Row(WHOLE_ARM, label, (ON if scenario.stack[place].on else OFF,)))
     imitation = Row(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
-    base = Row(BASE, BASE, (SEEN if scenario.view.base else SEE,))
+    base = Row(BASE, BASE, (SHOWN if scenario.view.base else SHOW,))
     return (*reversed(rows), imitation, base)
 
 
@@ -139,12 +148,43 @@ def legend_html(scenario: Scenario) -> str:
     )
 
 
+def formula_html(scenario: Scenario) -> str:
+    """Return how a place of the base attractor follows from one of the motion, with the names of the transforms.
+
+    The whole arm avoids in the space of its joints q, from which forward kinematics leads to the end effector.
+    """
+    parts = [(IMITATION, _part("i", palette.LEVEL))] if scenario.imitation else []
+    for _, layer in scenario.active:
+        colour = _COLOURS.get(type(layer.transform), palette.STREAMLINE)
+        parts.append((layer.name, _part(_index(layer.name), colour)))
+    inner = "y"
+    names = [f"{part} {html.escape(name)}" for name, part in parts]
+    if scenario.arm_avoidance is not None and scenario.obstacles:
+        whole = _part("q", palette.WAY)
+        inner, names = f"fk({whole}(q))", [*names, f"{whole} {WHOLE_ARM}"]
+    formula = "".join(f"{part}(" for _, part in parts) + inner + ")" * len(parts)
+    return (
+        f"<div style='padding:0.3em 0.9em 0;font-size:1.05em'>z = {formula}</div>"
+        f"<div style='font-size:0.8em;padding:0.1em 0.9em 0.5em'>{' · '.join((f'z {BASE}', *names))}</div>"
+    )
+
+
+def _index(name: str) -> str:
+    """Return the index of a transform's ψ: o for the avoidance of obstacles, or else its initial and number."""
+    word, _, number = name.partition(" ")
+    return "o" if name == Avoidance.title else html.escape(word[:1].lower() + number)
+
+
+def _part(index: str, colour: Colour) -> str:
+    return f"<b style='color:{palette.css(colour)}'>ψ<sub>{index}</sub></b>"
+
+
 def _label(name: str, duration: float | None, what: str = "t") -> str:
     return name if duration is None else f"{name}, {what} {duration:.2f}"
 
 
 def _look(scenario: Scenario, name: str) -> str:
-    return SEEN if scenario.view.level == name else SEE
+    return SHOWN if scenario.view.level == name else SHOW
 
 
 def _switch(scenario: Scenario, name: str) -> dict[str, Any]:
@@ -163,6 +203,6 @@ _ACTIONS: dict[str, Callable[[Scenario, str], dict[str, Any]]] = {
     OFF: _switch,
     UP: lambda scenario, name: {"stack": shifted(scenario, name, 1)},
     DOWN: lambda scenario, name: {"stack": shifted(scenario, name, -1)},
-    SEE: _select,
-    SEEN: _select,
+    SHOW: _select,
+    SHOWN: _select,
 }

@@ -33,7 +33,9 @@ class StartsPanel:
                 lambda s, value: {"view": replace(s.view, click_to_start=value)},
             )
             buttons = gui.add_button_group(
-                "Starts", ("Grid", "Remove", "Clear"), hint="Remove: the one that the arm follows, or else the newest"
+                "Starts",
+                ("Grid", "Remove", "Clear"),
+                hint="Grid: starts all over the slice. Remove: the start that the arm follows, or else the newest",
             )
         acts = {"Grid": self.add_grid, "Remove": remove, "Clear": clear}
         bindings.on(buttons, lambda session, name: later(partial(acts[name], session)))

@@ -1,30 +1,57 @@
-"""The status line of the panel, as HTML: figures and warnings of a frame."""
+"""What the panel says of a frame, as HTML: a line of figures, the reason that matters most, and all details."""
 
 from __future__ import annotations
 
 import html
+from collections.abc import Iterator, Mapping
 
 from dt_viz.arm.collision import SELF_REACH, CollisionReport
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Pace
 from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.scenario import View
+from dt_viz.ui.panel.verdict import Level, Verdict, concerns, shows_arm
 from dt_viz.ui.scene.palette import css
 from dt_viz.ui.scene.picture import Colour
-from dt_viz.warning import ARM, Kind
+from dt_viz.warning import in_millimetres
 
-COMPUTING = "Computing the motion…"
 CHANGED = "The scene is changed. “Reset” brings it back as it was."
-WARP_HINT = "warp at {:.2f}: each flow has run for that part of its time, so nothing is expected to be clear yet"
-HAND_ONLY = ": only the path of the hand gives way"
-OF_MESHES = frozenset({Kind.ARM_ENTERS, Kind.ARM_HITS_ITSELF, Kind.ARM_BELOW_TABLE})
-"""Kinds of warnings about collisions of the arm's meshes."""
-BLUE = ((29, 79, 124), (232, 241, 250))
-GREEN = ((0, 92, 66), (230, 245, 239))
-AMBER = ((138, 75, 0), (255, 244, 224))
-RED = ((179, 38, 30), (253, 236, 234))
+COLOURS: Mapping[Level, tuple[Colour, Colour]] = {
+    Level.GOOD: ((0, 92, 66), (230, 245, 239)),
+    Level.NOTE: ((29, 79, 124), (232, 241, 250)),
+    Level.WARNING: ((138, 75, 0), (255, 244, 224)),
+    Level.ALARM: ((179, 38, 30), (253, 236, 234)),
+}
+"""Ink and paper of each level."""
+BUSY_COLOURS = (84, 88, 96), (240, 242, 245)
 PALE = "opacity:0.3;filter:grayscale(1)"
-TWO_LINES, _WARNING = "2.7em", "2.6em"
+LINE = 2.0
+"""Height of the line of figures, em of its text."""
+LEADING = 1.35 * 0.8
+"""Height of a line of small text, em."""
+HINT, WARNINGS = 3.3, 5.2
+"""Heights of the places of the hint, and of the warnings in the details, em."""
+INK = (40, 44, 52)
+"""Colour of the hint."""
+ROUNDING = 1e-12
+"""Length below which an error is rounding, metres."""
 SMALL = "font-size:0.8em;line-height:1.35;padding:0.1em 0.9em 0.35em;opacity:0.85"
+ROWS: Mapping[str, str] = {
+    "Rebuild": "Time from the last change until its motion was shown. Changes that a newer one overtook are skipped.",
+    "Clearance": "Smallest distance from the obstacles of what gives way to them: the end effector, or the body points "
+    "(spheres that cover the arm).",
+    "Arm to obstacle": "Smallest distance of the arm’s surface from the obstacles, and which part of the arm it is.",
+    "Arm to itself": "Smallest distance between two parts of the arm that are not neighbours.",
+    "Arm to table": "Smallest height of the moving parts of the arm above the table.",
+    "Flow time t": "How long the flow of the avoidance runs: the longer, the more the motions give way.",
+    "Strength": "How long the flow of each bias point runs: the longer, the more the motions are pulled to it.",
+    "Smallest det J": "Volume that the transforms leave of a piece of space where they squeeze it most. Above 0, space "
+    "is not folded: the map is a diffeomorphism.",
+    "Round trip": "How far a place of the motions is missed by the transforms and then their inverses, at most.",
+    "Lyapunov value": "A value like the height in a valley whose lowest point is the goal. While it falls, the motion "
+    "is stable.",
+}
+"""Rows of the details, with their tooltips."""
 
 
 def hint(frame: Frame) -> str:
@@ -35,43 +62,66 @@ def hint(frame: Frame) -> str:
     return CHANGED if scene.is_changed(frame.scenario, frame.task) else scene.line
 
 
-def status_html(frame: Frame, pace: Pace) -> str:
-    """Return the status line: speed, clearance, certificates, and every warning."""
-    known, scenario = frame.certificates, frame.scenario
-    hides_arm = not (scenario.view.arm or scenario.view.onion)
+def line_html(verdict: Verdict) -> str:
+    """Return the one line of figures, in the colour of its gravity."""
+    ink, paper = BUSY_COLOURS if verdict.busy else COLOURS[verdict.level]
+    return (
+        f"<div role='status' style='margin:0.2em 0.7em 0.3em;padding:0 0.6em;height:{LINE}em;line-height:{LINE}em;"
+        f"font-size:0.85em;font-weight:600;white-space:nowrap;overflow:hidden;text-overflow:ellipsis;"
+        f"border-left:3px solid {css(ink)};color:{css(ink)};background:{css(paper)}'>{html.escape(verdict.line)}</div>"
+    )
+
+
+def place_html(text: str, ink: Colour, height: float, below: str = "") -> str:
+    """Return a text in a place of a fixed height, em, with HTML below it; a tooltip has all of a text that is long."""
+    said = html.escape(sentence(text))
+    clamp = f"display:-webkit-box;-webkit-box-orient:vertical;-webkit-line-clamp:{int(height / LEADING) or 1}"
+    return (
+        f"<div style='height:{height:.3f}em;overflow:hidden;margin:0 0.9em'>"
+        f"<div title='{html.escape(text)}' style='font-size:0.8em;line-height:1.35;color:{css(ink)};overflow:hidden;"
+        f"{clamp}'>{said}</div>{below}</div>"
+    )
+
+
+def progress_html(fraction: float) -> str:
+    """Return a bar of progress, from 0 to 1."""
+    ink, paper = COLOURS[Level.NOTE]
+    return (
+        f"<div style='height:0.35em;margin-top:0.25em;border-radius:2px;background:{css(paper)}'>"
+        f"<div style='height:100%;width:{100 * fraction:.0f}%;border-radius:2px;background:{css(ink)}'></div></div>"
+    )
+
+
+def details_html(frame: Frame, pace: Pace, view: View) -> str:
+    """Return all figures and warnings of a frame: a table whose rows explain themselves, above all that is told."""
+    cells = "".join(
+        f"<tr style='vertical-align:top' title='{html.escape(ROWS[name])}'>"
+        f"<td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
+        f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
+        for name, value in _rows(frame, pace, view)
+    )
+    told = concerns(frame, view)
+    said = "".join(alarm(str(warning), *COLOURS[Level.WARNING]) for warning in told)
+    if frame.blocked:
+        said = "".join(alarm(str(warning), *COLOURS[Level.ALARM]) for warning in frame.blocked) + said
+    # a place of its own height: warnings that come and go move nothing below them
+    return f"<table style='{SMALL}'>{cells}</table><div style='height:{WARNINGS}em;overflow-y:auto'>{said}</div>"
+
+
+def _rows(frame: Frame, pace: Pace, view: View) -> Iterator[tuple[str, str]]:
+    known = frame.certificates
     # figures that are missing after the last stage will not come
     unknown = "–" if frame.blocked or frame.stage is Stage.CERTIFIED else "…"
     off = "–" if frame.blocked else "off"
-    whole_arm = scenario.arm_avoidance is not None
-    rows = (
-        ("Rebuild", _rebuild(pace)),
-        ("Clearance", off if frame.blocked else clearance_text(known.clearance, whole_arm=whole_arm)),
-        *(collision_rows(None, "arm hidden") if hides_arm else collision_rows(known.collision, unknown)),
-        *_duration_rows(frame, off),
-        ("Smallest det J", unknown if known.min_det_jacobian is None else f"{known.min_det_jacobian:.2g}"),
-        ("There and back", unknown if known.round_trip_error is None else _tiny(known.round_trip_error)),
-        ("Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[known.lyapunov_falls]),
-    )
-    cells = "".join(
-        f"<tr style='vertical-align:top'><td style='opacity:0.65;padding-right:0.9em;white-space:nowrap'>{name}</td>"
-        f"<td style='font-weight:600;overflow-wrap:anywhere'>{html.escape(value)}</td></tr>"
-        for name, value in rows
-    )
-    seen = [warning for warning in known.warnings if not (hides_arm and warning.source == ARM)]
-    hand_only = scenario.avoids and not whole_arm
-    warnings = [f"{w}{HAND_ONLY}" if hand_only and w.kind is Kind.ARM_ENTERS else str(w) for w in seen]
-    of_motion = any(warning.kind not in OF_MESHES for warning in seen)
-    if known.clearance < 0 and scenario.avoids and scenario.warp == 1 and not (of_motion or frame.blocked):
-        warnings.insert(0, "the motions go through the obstacle at this flow time")
-    blocked = ""
-    if frame.blocked:
-        blocked = alarm(f"no motion: {'; '.join(map(str, frame.blocked))}. What is shown is the last good one.", *RED)
-    warp = "" if scenario.warp == 1 or frame.blocked else alarm(WARP_HINT.format(scenario.warp), *BLUE)
-    said = warp + "".join(alarm(warning, *AMBER) for warning in warnings)
-    if not (said or blocked) and frame.stage is Stage.CERTIFIED:
-        said = alarm("every check holds", *GREEN)
-    # the room for warnings stays during checks, so that controls below do not jump under the pointer
-    return f"{blocked}<table style='{SMALL}'>{cells}</table><div style='min-height:{_WARNING}'>{said}</div>"
+    whole_arm = frame.scenario.arm_avoidance is not None
+    yield "Rebuild", _rebuild(pace)
+    yield "Clearance", off if frame.blocked else clearance_text(known.clearance, whole_arm=whole_arm)
+    if shows_arm(view):
+        yield from collision_rows(known.collision, unknown)
+    yield from _duration_rows(frame, off)
+    yield "Smallest det J", unknown if known.min_det_jacobian is None else f"{known.min_det_jacobian:.2g}"
+    yield "Round trip", unknown if known.round_trip_error is None else error_text(known.round_trip_error)
+    yield "Lyapunov value", {None: unknown, True: "falls", False: "does not fall"}[known.lyapunov_falls]
 
 
 def _rebuild(pace: Pace) -> str:
@@ -80,9 +130,11 @@ def _rebuild(pace: Pace) -> str:
     return f"{1e3 * pace.latency:.0f} ms{rate} · {pace.num_skipped} skipped"
 
 
-def _tiny(length: float) -> str:
-    """Format a length, metres, that should be close to zero."""
-    return f"{1e3 * length:.0e} mm" if 0 < length < 1e-4 else f"{1e3 * length:.1f} mm"
+def error_text(length: float) -> str:
+    """Format a length, metres, that should be zero: rounding is exact."""
+    if length < ROUNDING:
+        return "exact"
+    return "< 0.001 mm" if length < 1e-6 else in_millimetres(length)
 
 
 def clearance_text(clearance: float, *, whole_arm: bool) -> str:

@@ -25,12 +25,12 @@ def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) 
         bindings: bindings of the visitor's panel.
         order: order of the first of them in the folder.
     """
-    which = gui.add_dropdown("Settings of", (IMITATION,), order=order)
+    which = gui.add_dropdown("Settings of", (IMITATION,), order=order, hint="the transform that is changed below")
     bindings.properties(which, options=tunable)
     bindings.input(which, tuned, lambda s, value: {"view": replace(s.view, tuned=value)})
     order += 1
-    hint = "objective of the fit: the motions, or the velocities (eq. (3))"
-    objective = gui.add_dropdown("Learn", OBJECTIVES, order=order, hint=hint)
+    hint = "what is fitted to the demonstrations: whole motions, or velocities as in eq. (3) of the paper"
+    objective = gui.add_dropdown("Objective", OBJECTIVES, order=order, hint=hint)
     bindings.input(objective, lambda s: s.objective, lambda _s, value: {"objective": value})
     note = gui.add_html("", order=order)
     bindings.properties(

@@ -11,7 +11,7 @@ from dt_viz.ui.panel.bindings import Bindings
 
 SECONDS = 5.0
 """Duration of playing."""
-PLAY, STOP = "0 → 1", "Stop"
+PLAY, STOP = "▶ 0 → 1", "Stop"
 NAME = "Warp"
 """Name of the slider, and of its gesture for undo."""
 
@@ -33,7 +33,7 @@ class WarpControls:
             order: order of the first of them in the folder.
         """
         self._player = Player(self._show)
-        hint = "part of its time that each flow runs: at 0 motions and space are straight, at 1 the stack is complete"
+        hint = "part of its time that each flow runs. 0: motions and space are straight; 1: the stack is complete"
         bindings.input(
             gui.add_slider(NAME, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint),
             lambda s: s.warp,

@@ -1,0 +1,49 @@
+"""The foot of the panel, without a browser."""
+
+import html
+import re
+
+from pages import panel_of
+
+from dt_viz.ui.panel.about import AUTHORS, LEGEND, LINK, TITLE, keys_html, legend_html, paper_html
+from dt_viz.ui.panel.commands import Command, numbered
+from dt_viz.ui.scene import palette
+
+
+def test_the_paper_is_named_with_all_authors_and_a_link_that_opens_beside_the_page():
+    said = html.unescape(paper_html())
+    assert TITLE in said and AUTHORS.count(",") == 3 and AUTHORS in said and "2022" in said
+    (link,) = re.findall(r"<a href='([^']*)' target='_blank' rel='noopener", said)
+    assert link == LINK and link.startswith("https://")
+
+
+def test_the_legend_has_each_colour_that_is_drawn_once():
+    colours = re.findall(r"background:(rgb[^']*)'", legend_html())
+    assert colours == [palette.css(colour) for colour in LEGEND.values()] and len(set(colours)) == len(colours)
+    wanted = {"DEMONSTRATION", "ROLLOUT", "GHOST", "OBSTACLE", "GOAL", "WAY"}
+    assert {getattr(palette, name) for name in wanted} <= set(LEGEND.values())
+
+
+def test_the_keys_are_those_of_the_commands():
+    undo = Command("Undo", lambda _: None, "Z"), Command("Redo", lambda _: None, "Z", shifted=True)
+    scenes = numbered([f"scene {k}" for k in range(1, 12)], lambda *_: None)
+    assert [scene.key for scene in scenes] == [*map(str, range(1, 10)), "", ""]
+    rows = re.findall(r"font-weight:600'>([^<]*)</td><td>([^<]*)</td>", keys_html((*undo, *scenes)))
+    assert rows == [
+        ("Z", "Undo"),
+        ("Shift Z", "Redo"),
+        ("1 – 9", "scenes, in their order"),
+        ("Ctrl K", "all commands by name"),
+    ]
+
+
+def test_what_is_told_is_in_a_folder_that_is_closed_at_first(server):
+    panel = panel_of(server)
+    folders = {
+        folder.label: folder for folder in server.gui._container_handle_from_uuid.values() if hasattr(folder, "label")
+    }
+    about, details = folders["About: paper, colours, keys"], folders["Details"]
+    assert not about.expand_by_default and not details.expand_by_default
+    assert about.order == max(folder.order for folder in folders.values())
+    panel.close()
+    server.gui.reset()
