@@ -75,20 +75,32 @@ def solve(
         solved = _solved(scenario, lacking, precision, follower, before)
         if solved.cleared:
             return solved
-    solved, avoidance = _solved(scenario, nominal, precision, follower, before), scenario.arm_avoidance
-    if avoidance is None or avoidance.duration is not None or solved.cleared:
+    avoidance = scenario.arm_avoidance
+    if avoidance is None or avoidance.duration is not None:
+        return _solved(scenario, nominal, precision, follower, before)
+    live = _with_a_way(scenario, nominal, follower, before)
+    return live if precision is LIVE else _solved(scenario, live.nominal, precision, follower, before)
+
+
+def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower, before: Solved | None) -> Solved:
+    """The motion at LIVE, in another stance or without the starts that have no way, where it finds none otherwise.
+
+    The same choice serves each precision: it is quick at this one.
+    """
+    solved, avoidance = _solved(scenario, nominal, LIVE, follower, before), scenario.arm_avoidance
+    if avoidance is None or solved.cleared:
         return solved
     for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
-        tried = _solved(scenario, other, LIVE, follower, before)  # quick; the same stance is found at each precision
+        tried = _solved(scenario, other, LIVE, follower, before)
         if tried.cleared:
-            return tried if precision is LIVE else _solved(scenario, other, precision, follower, before)
+            return tried
     assert solved.arm is not None
     others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
     if not (others < nominal.num_hosts).any():
         return solved
     numbers, how = np.array(nominal.numbers), "without a way around the obstacle for the arm"
     told = start_warnings(numbers[solved.arm.stuck], nominal.num_demonstrated, Kind.START_COVERED, how)
-    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), precision, follower, before)
+    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), LIVE, follower, before)
     return tried if tried.cleared else solved
 
 
