@@ -211,9 +211,9 @@ class WholeArm:
         """The motions around the obstacle.
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
-        margin, or what the start or goal beside it has. Of several ways out the first is taken that works soon, else the
-        one with the least detour, else the one that comes nearest to working. All this looks at the hosts only: guests
-        do not change their motions. The way out is chosen by coarse motions.
+        margin, or what the start or goal beside it has. Of several ways out the first is taken that works soon, else
+        the one with the least detour, else the one that comes nearest to working, all by coarse motions. All this looks
+        at the hosts only: guests do not change their motions.
 
         While an obstacle is dragged, the side on which all motions pass it is kept until another one is much shorter.
         Coarse motions then turn to that side as the obstacle moves on, instead of jumping there.
@@ -294,6 +294,11 @@ class WholeArm:
         """
         solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
         return replace(solver.through(full.transform.scaled(fraction), full.duration), ways=full.ways)
+
+    def touches(self, solution: ArmSolution, num_hosts: int, obstacle: Union) -> bool:
+        """Whether the arm's meshes touch the obstacle on the motions of the hosts, the first so many ones."""
+        p = solution.p[solution.index < num_hosts]
+        return bool((self.mesh_clearance(p, obstacle, np.full(len(p), ROUNDING)) < ROUNDING).any())
 
     def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
