@@ -74,7 +74,7 @@ TOLERANCE = 3e-9
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
 LONG = 1.0
-"""Flow time beyond which the other ways out are tried, too, and the one with the least detour is taken."""
+"""Flow time beyond which other ways out and stances are tried, too: such motions wind around the obstacle."""
 NUM_WAYS = 3
 """Largest number of ways out of each obstacle that are tried."""
 TOGETHER, OPPOSED = 0.05, -0.5
@@ -186,6 +186,11 @@ class ArmSolution:
         """Whether all hosts keep the clearance that is asked for."""
         return not len(self.stuck)
 
+    @property
+    def soon(self) -> bool:
+        """Whether they keep it after so short a flow that nothing better is looked for."""
+        return self.cleared and self.duration <= LONG
+
 
 class WholeArm:
     """Makes the arm's motions clear an obstacle, by a diffeomorphism of configuration space."""
@@ -263,7 +268,7 @@ class WholeArm:
                 return on_the_way
             if best is None or self._better(tried, best):
                 best = tried
-            if tried.cleared and (met or tried.duration <= LONG):
+            if tried.soon or (tried.cleared and met):
                 break
         if best is None:
             return self.undisturbed(lifted, avoidance, spacing)

@@ -89,16 +89,20 @@ def solve(
 def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower, before: Solved | None) -> Solved:
     """The motion at LIVE, in another stance or without the starts that have no way, where it finds none otherwise.
 
-    The same choice serves each precision: it is quick at this one.
+    The same choice serves each precision: it is quick at this one. A stance is also changed where the way is long,
+    but not while an obstacle is dragged.
     """
     solved, avoidance = _solved(scenario, nominal, LIVE, follower, before), scenario.arm_avoidance
-    if avoidance is None or solved.cleared:
+    if avoidance is None or solved.arm is None or solved.arm.soon:
+        return solved
+    if solved.cleared and before is not None and _goes_on(scenario, before):
         return solved
     for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
         tried = _solved(scenario, other, LIVE, follower, before)
-        if tried.cleared:
+        if tried.arm is not None and (tried.arm.soon if solved.cleared else tried.cleared):
             return tried
-    assert solved.arm is not None
+    if solved.cleared:
+        return solved
     others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
     if not (others < nominal.num_hosts).any():
         return solved
