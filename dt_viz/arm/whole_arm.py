@@ -341,7 +341,7 @@ class WholeArm:
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         places = points.transpose(0, 2, 1)
         distances = [part.signed_distance(places) - self.body.radius[:, None] for part in parts]
-        clearance = np.array([distance.min(axis=0) for distance in distances])  # (K, N)
+        clearance = np.array([distance.min(axis=0) for distance in distances]).reshape(len(parts), len(tangents))
         near: Mask = clearance < margin
 
         def escapes(which: Indices) -> list[Array]:
