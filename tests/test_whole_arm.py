@@ -9,12 +9,13 @@ from scenes import changed
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.tracking import track
-from dt_viz.arm.whole_arm import MAX_DURATION, MAX_EXTENSION, ROUNDING, ArmSolution, Lift, WholeArm
+from dt_viz.arm import whole_arm
+from dt_viz.arm.whole_arm import MAX_DURATION, MAX_EXTENSION, OPPOSED, ROUNDING, ArmSolution, Lift, WholeArm
 from dt_viz.flows.diffeomorphisms import Identity, min_det_jacobian
-from dt_viz.metrics import resample_by_arc_length
+from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.following import Follower
 from dt_viz.motion.stack import FINE, LIVE
-from dt_viz.obstacles.shapes import Box, Sphere
+from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 
 ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)
@@ -272,6 +273,75 @@ class TestNoWay:
         assert solution.duration <= MAX_DURATION
         image = solution.transform.inverse(push.arm.limits.inside(solution.q))
         np.testing.assert_allclose(image, solution.p, rtol=0, atol=1e-5)
+
+
+class TestTwoObstacles:
+    """Balls beside the path of the push, one after the other."""
+
+    @pytest.fixture(name="pair")
+    def _pair(self, push):
+        mean = push.nominal.task.mean_path
+        along = mean[60] - mean[40]
+        across = np.cross(along, [0, 0, 1]) / np.linalg.norm(np.cross(along, [0, 0, 1]))
+        ends = mean[45] + 0.02 * across, mean[58] - 0.02 * across
+        return tuple(Sphere(as_point(end), 0.11) for end in ends)
+
+    def alone(self, push, ball):
+        (way,) = push.avoiding(ball, coarse=True).ways
+        assert way is not None
+        return way.side
+
+    def test_opposed_ways_out_of_what_one_posture_meets_become_one(self, push, pair):
+        assert self.alone(push, pair[0]) @ self.alone(push, pair[1]) < OPPOSED
+        solution = push.avoiding(pair, coarse=True)
+        first, second = solution.ways
+        np.testing.assert_array_equal(first.side, second.side)
+        assert solution.cleared
+        hands = [push.robot.end_effector(p) for p in split(solution, solution.p)]
+        assert max(sharpest_turn(hand, 0.015) for hand in hands) < 90
+
+    def test_others_keep_their_own(self, push, pair):
+        x, y, z = push.nominal.task.mean_path[45]
+        alike = (pair[0], replace(pair[0], position=(x, y, z - 0.02)))
+        apart = (pair[0], ELBOW)
+        for balls in (alike, apart):
+            solution = push.avoiding(balls, coarse=True)
+            for way, ball in zip(solution.ways, balls, strict=True):
+                np.testing.assert_array_equal(way.side, self.alone(push, ball))
+
+
+class TestWaysOut:
+    def test_the_exact_flow_is_made_once_for_the_way_that_coarse_motions_find(self, push, monkeypatch):
+        made, solver = [], whole_arm._Solver
+
+        def recorded(*arguments, coarse):
+            made.append(coarse)
+            return solver(*arguments, coarse=coarse)
+
+        monkeypatch.setattr(whole_arm, "_Solver", recorded)
+        obstacle = Sphere((0.03, -0.13, 0.4), 0.14)  # no way is free
+        found = push.arm.avoiding(
+            push.lifted, changed(push.scenario, obstacles=obstacle).arm_avoidance, FINE.spacing, coarse=False
+        )
+        assert made == [True] * (len(made) - 1) + [False] and len(made) > 2
+        assert not found.cleared
+
+    def test_where_the_first_is_long_the_least_detour_is_taken(self, push, monkeypatch):
+        mean, found = push.nominal.task.mean_path, []
+        box = Box(as_point(mean[45]), (0.22, 0.22, 0.2), (0.8, 0.6, 0.0, 0.0))
+        avoidance = changed(push.scenario, obstacles=box).arm_avoidance
+        usual = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
+        better = push.arm._better
+
+        def kept(tried, best):
+            found.extend([best, tried])
+            return better(tried, best)
+
+        monkeypatch.setattr(whole_arm, "LONG", 0.0)
+        monkeypatch.setattr(push.arm, "_better", kept)
+        least = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
+        detours = [push.arm._detour(solution) for solution in found if solution.cleared]
+        assert least.cleared and push.arm._detour(least) == min(detours) < push.arm._detour(usual)
 
 
 class TestNearMisses:

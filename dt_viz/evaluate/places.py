@@ -103,9 +103,9 @@ class Place:
         """Largest Fréchet distance relative to the depth without avoidance plus the margin."""
         return self.largest(lambda m: m.frechet / (m.depth_without + margin))
 
-    def beside_shift(self) -> float:
-        """Largest Fréchet distance relative to the shortest straight shift."""
-        return self.largest(lambda m: m.frechet) / self.shift
+    def beside_shift(self, margin: float) -> float:
+        """Largest Fréchet distance relative to the shortest straight shift, or to the margin if that is larger."""
+        return self.largest(lambda m: m.frechet) / max(margin, self.shift)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -276,7 +276,7 @@ def _row(place: Place, margin: float) -> tuple[str, ...]:
         f"{1e3 * place.clearance():.1f}",
         f"{1e3 * place.largest(lambda m: m.frechet):.0f}",
         f"{place.detour(margin):.2f}",
-        f"{place.beside_shift():.2f}",
+        f"{place.beside_shift(margin):.2f}",
         f"{worst.turn:.0f}° ({worst.turn_without:.0f}°)",
         f"{1e3 * place.largest(lambda m: m.goal_miss):.3f}",
         f"{sum(m.num_outside for m in place.rollouts.values())}",
@@ -342,7 +342,7 @@ def _summarise(places: Sequence[Place], margin: float) -> None:
     print(
         f"collisions {_share(touched, open_)}, at least {1e3 * (margin - ALLOWANCE):.0f} mm kept {_share(kept, open_)}"
     )
-    shift = [place.beside_shift() for place in open_]
+    shift = [place.beside_shift(margin) for place in open_]
     print(f"F.D. / shortest shift, median {np.median(shift):.2f}, 95 % {np.percentile(shift, 95):.2f}")
     print(f"F.D. / forced, median {np.median(detour):.2f}, 95 % {np.percentile(detour, 95):.2f}")
     print(f"turns sharper than {SHARP:.0f}° {_share(sharp, open_)}, without avoidance {_share(sharp_without, open_)}")
