@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scenes import changed
 
+from dt_viz.arm import whole_arm
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.tracking import track
-from dt_viz.arm import whole_arm
 from dt_viz.arm.whole_arm import MAX_DURATION, MAX_EXTENSION, OPPOSED, ROUNDING, ArmSolution, Lift, WholeArm
 from dt_viz.flows.diffeomorphisms import Identity, min_det_jacobian
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
@@ -276,15 +276,12 @@ class TestNoWay:
 
 
 class TestTwoObstacles:
-    """Balls beside the path of the push, one after the other."""
+    """Balls above and below the path of the push, one after the other."""
 
     @pytest.fixture(name="pair")
     def _pair(self, push):
         mean = push.nominal.task.mean_path
-        along = mean[60] - mean[40]
-        across = np.cross(along, [0, 0, 1]) / np.linalg.norm(np.cross(along, [0, 0, 1]))
-        ends = mean[45] + 0.02 * across, mean[58] - 0.02 * across
-        return tuple(Sphere(as_point(end), 0.11) for end in ends)
+        return tuple(Sphere(as_point(mean[k] + [0.0, 0.0, z]), 0.1) for k, z in ((45, 0.03), (57, -0.03)))
 
     def alone(self, push, ball):
         (way,) = push.avoiding(ball, coarse=True).ways
@@ -301,8 +298,8 @@ class TestTwoObstacles:
         assert max(sharpest_turn(hand, 0.015) for hand in hands) < 90
 
     def test_others_keep_their_own(self, push, pair):
-        x, y, z = push.nominal.task.mean_path[45]
-        alike = (pair[0], replace(pair[0], position=(x, y, z - 0.02)))
+        x, y, z = pair[0].position
+        alike = (pair[0], replace(pair[0], position=(x, y, z + 0.001)))
         apart = (pair[0], ELBOW)
         for balls in (alike, apart):
             solution = push.avoiding(balls, coarse=True)
@@ -327,8 +324,7 @@ class TestWaysOut:
         assert not found.cleared
 
     def test_where_the_first_is_long_the_least_detour_is_taken(self, push, monkeypatch):
-        mean, found = push.nominal.task.mean_path, []
-        box = Box(as_point(mean[45]), (0.22, 0.22, 0.2), (0.8, 0.6, 0.0, 0.0))
+        box, found = Box((0.275, -0.457, 0.134), (0.217, 0.225, 0.206), (-0.182, -0.899, 0.319, -0.238)), []
         avoidance = changed(push.scenario, obstacles=box).arm_avoidance
         usual = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
         better = push.arm._better
