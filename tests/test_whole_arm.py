@@ -298,9 +298,10 @@ class TestTwoObstacles:
         hands = [push.robot.end_effector(p) for p in split(solution, solution.p)]
         assert max(sharpest_turn(hand, 0.015) for hand in hands) < 90
 
-    def test_others_keep_their_own(self, push, pair):
+    def test_ways_out_that_are_alike_or_that_no_posture_meets_both_of_stay_as_they_are(self, push, pair, monkeypatch):
         x, y, z = pair[0].position
-        for other in (replace(pair[0], position=(x, y, z + 0.001)), ELBOW):
+        for other, together in ((replace(pair[0], position=(x, y, z + 0.001)), 0.05), (pair[1], -1.0)):
+            monkeypatch.setattr(whole_arm, "TOGETHER", together)
             alone = [self.first(push, ball)[0] for ball in (pair[0], other)]
             np.testing.assert_array_equal(self.first(push, pair[0], other), alone)
 
