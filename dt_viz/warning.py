@@ -43,6 +43,8 @@ class Kind(Enum):
     """The arm cannot reach a place."""
     PATH_MISSED = auto()
     """The joints do not lead the hand along its path."""
+    NO_WAY = auto()
+    """The arm, free at its ends, finds no motion between them that does not touch an obstacle."""
     ARM_BLOCKED = auto()
     """The arm finds no way around an obstacle."""
     ROLLOUT_ENTERS = auto()

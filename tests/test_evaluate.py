@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 from PIL import Image
 
+from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.engine.frame import Stage
 from dt_viz.evaluate import drag, latency, rollouts
@@ -17,7 +18,7 @@ from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.options import with_negative_values
-from dt_viz.evaluate.places import hand_room
+from dt_viz.evaluate.places import hand_room, shortest_shift
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
 from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
 from dt_viz.flows.diffeomorphisms import Identity
@@ -372,6 +373,23 @@ def test_places_of_the_hand_are_measured_at_its_point(lasa, tmp_path, capsys):
         np.testing.assert_allclose(arrays["clearance"], arrays["clearance_without"], atol=1e-4)
         assert arrays["frechet"].max() < 1e-3
         assert not np.allclose(arrays["turn"], with_avoidance)
+
+
+@pytest.mark.parametrize("beside", [0.0, 0.06, 0.5])
+def test_no_shift_of_the_arm_is_much_shorter_than_the_shortest(robot, beside):
+    body, q = load_body_points().on_moving_links, robot.home[None] + 0.05 * np.eye(6)[:3]
+    hand = robot.end_effector(q[0])
+    obstacle = Union((Sphere(as_point(hand + np.array([0.0, 0.0, beside])), 0.1),))
+    found, clearance = shortest_shift(robot, obstacle, q, 0.003), 0.003
+    directions = np.random.default_rng(0).normal(size=(300, 1, 1, 3))
+    directions /= np.linalg.norm(directions, axis=3, keepdims=True)
+    points, tried = body.positions(robot, q), np.linspace(0, 0.4, 81)
+    free = [
+        ((obstacle.signed_distance(points + s * directions) - body.radius) >= clearance).all(axis=(1, 2)) for s in tried
+    ]
+    least = tried[np.array(free).any(axis=1).argmax()]
+    assert least - 0.005 - 1e-9 <= found <= 1.06 * least + 1e-3
+    assert (found == 0) == (beside == 0.5)
 
 
 def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, tmp_path, capsys):

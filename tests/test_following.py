@@ -9,7 +9,7 @@ from scenes import changed, kinds
 from dt_viz.arm.arm_system import Section
 from dt_viz.arm.collision import SELF_MARGIN, load_collision_model
 from dt_viz.arm.tracking import UnreachableError
-from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
+from dt_viz.arm.whole_arm import LONG, NUM_CONFIGURATIONS
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
@@ -201,6 +201,62 @@ class TestStance:
         assert len(np.unique(solved.arm.index)) == len(solved.stack.bundle.paths) == num - 1
         (warning,) = solved.nominal.warnings
         assert warning.text == "start 3 is without a way around the obstacle for the arm"
+
+    def test_other_stances_are_tried_where_the_way_is_long_but_not_in_a_drag(
+        self, engine, follower, initial, monkeypatch
+    ):
+        nominal = engine.nominal(initial("lift_box"))
+        scenario = placed(initial("lift_box"), around(np.mean(nominal.paths, axis=0)[90]))
+        avoiding, long = follower.whole_arm.avoiding, 1.01 * LONG
+
+        def long_here(lifted, *arguments, **options):
+            found = avoiding(lifted, *arguments, **options)
+            same = np.array_equal(lifted.reference, follower.reference(nominal))
+            return replace(found, duration=long) if same else found
+
+        monkeypatch.setattr(follower.whole_arm, "avoiding", long_here)
+        other = solve(scenario, nominal, LIVE, follower)
+        assert other.cleared and other.nominal.stance is not None
+        x, y, z = scenario.obstacle.parts[0].position
+        shown = replace(other, arm=avoiding(other.lifted, scenario.arm_avoidance, LIVE.spacing, coarse=True))
+        moved = changed(scenario, obstacles=Sphere((x, y, z + 0.003)))
+        assert solve(moved, nominal, LIVE, follower, shown).nominal is nominal
+
+    @pytest.mark.parametrize("precision", [LIVE, FINE])
+    def test_no_way_is_said_instead_of_shown_where_the_arm_would_touch(
+        self, engine, follower, initial, monkeypatch, precision
+    ):
+        nominal = engine.nominal(initial("lift_box"))
+        scenario = placed(initial("lift_box"), around(np.mean(nominal.paths, axis=0)[90]))
+        arm, avoiding = follower.whole_arm, follower.whole_arm.avoiding
+
+        def never(lifted, *arguments, **options):
+            return replace(avoiding(lifted, *arguments, **options), stuck=np.arange(lifted.num_hosts))
+
+        monkeypatch.setattr(arm, "avoiding", never)
+        assert solve(scenario, nominal, precision, follower).blocked == ()  # it comes near, but does not touch
+
+        def through(lifted, avoidance, spacing, **_):
+            return arm.undisturbed(lifted, avoidance, spacing)
+
+        monkeypatch.setattr(arm, "avoiding", through)
+        (warning,) = solve(scenario, nominal, precision, follower).blocked
+        assert warning.kind is Kind.NO_WAY
+        manual = changed(scenario, duration=0.0)  # what is asked for by hand is shown as it is
+        assert solve(manual, nominal, precision, follower).blocked == ()
+
+    def test_a_frame_is_blocked_where_there_is_no_way(self, new_engine, initial, monkeypatch):
+        engine = new_engine()
+        scenario = placed(initial("lift_box"), around(engine.task("lift_box").mean_path[50]))
+        arm = engine.follower.whole_arm
+
+        def through(lifted, avoidance, spacing, **_):
+            return arm.undisturbed(lifted, avoidance, spacing)
+
+        monkeypatch.setattr(arm, "avoiding", through)
+        frame, motions = engine.arm_motions(scenario)
+        assert kinds(frame.blocked) == {Kind.NO_WAY} and motions == ()
+        assert all(kinds(shown.blocked) == {Kind.NO_WAY} for shown in engine.frames(scenario))
 
     def test_a_start_left_out_leaves_the_arm_with_another(self, new_engine, initial):
         scenario = placed(initial("push_box"), around(new_engine().task("push_box").starts[0], 0.1))

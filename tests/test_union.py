@@ -26,6 +26,12 @@ def test_the_distance_is_that_of_the_nearest_part(points):
     assert np.isinf(Union().signed_distance(points)).all()
 
 
+def test_balls_cover_all_parts(points):
+    centres, radii = Union(PARTS).cover()
+    apart = np.linalg.norm(points[:, None] - centres, axis=2) - radii
+    assert apart[Union(PARTS).signed_distance(points) < 0].min(axis=1).max() <= ROUNDING
+
+
 def test_what_is_moved_out_is_outside_of_all(points):
     free = Union(PARTS).nearest_free(points)
     assert Union(PARTS).signed_distance(free).min() >= -ROUNDING

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from scenes import changed
 
+from dt_viz.arm import whole_arm
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.tracking import track
-from dt_viz.arm.whole_arm import MAX_DURATION, MAX_EXTENSION, ROUNDING, ArmSolution, Lift, WholeArm
+from dt_viz.arm.whole_arm import MAX_DURATION, MAX_EXTENSION, OPPOSED, ROUNDING, ArmSolution, Lift, WholeArm
 from dt_viz.flows.diffeomorphisms import Identity, min_det_jacobian
-from dt_viz.metrics import resample_by_arc_length
+from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.following import Follower
 from dt_viz.motion.stack import FINE, LIVE
-from dt_viz.obstacles.shapes import Box, Sphere
+from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 
 ELBOW = Sphere((0.04, -0.37, 0.38), 0.08)
@@ -272,6 +273,70 @@ class TestNoWay:
         assert solution.duration <= MAX_DURATION
         image = solution.transform.inverse(push.arm.limits.inside(solution.q))
         np.testing.assert_allclose(image, solution.p, rtol=0, atol=1e-5)
+
+
+class TestTwoObstacles:
+    """Balls above and below the path of the push, one after the other."""
+
+    @pytest.fixture(name="pair")
+    def _pair(self, push):
+        mean = push.nominal.task.mean_path
+        return tuple(Sphere(as_point(mean[k] + [0.0, 0.0, z]), 0.1) for k, z in ((45, 0.03), (57, -0.03)))
+
+    def first(self, push, *balls):
+        """The most promising way out of each ball (K, 3)."""
+        avoidance = changed(push.scenario, obstacles=balls).arm_avoidance
+        return np.array([found[0] for found in push.arm._sides(push.lifted, avoidance, (None,) * len(balls))])
+
+    def test_opposed_ways_out_of_what_one_posture_meets_become_one(self, push, pair):
+        one, other = (self.first(push, ball)[0] for ball in pair)
+        assert one @ other < OPPOSED
+        solution = push.avoiding(pair, coarse=True)
+        first, second = solution.ways
+        np.testing.assert_array_equal(first.side, second.side)
+        assert solution.cleared
+        hands = [push.robot.end_effector(p) for p in split(solution, solution.p)]
+        assert max(sharpest_turn(hand, 0.015) for hand in hands) < 90
+
+    def test_ways_out_that_are_alike_or_that_no_posture_meets_both_of_stay_as_they_are(self, push, pair, monkeypatch):
+        x, y, z = pair[0].position
+        for other, together in ((replace(pair[0], position=(x, y, z + 0.001)), 0.05), (pair[1], -1.0)):
+            monkeypatch.setattr(whole_arm, "TOGETHER", together)
+            alone = [self.first(push, ball)[0] for ball in (pair[0], other)]
+            np.testing.assert_array_equal(self.first(push, pair[0], other), alone)
+
+
+class TestWaysOut:
+    def test_the_exact_flow_is_made_once_for_the_way_that_coarse_motions_find(self, push, monkeypatch):
+        made, solver = [], whole_arm._Solver
+
+        def recorded(*arguments, coarse):
+            made.append(coarse)
+            return solver(*arguments, coarse=coarse)
+
+        monkeypatch.setattr(whole_arm, "_Solver", recorded)
+        obstacle = Sphere((0.03, -0.13, 0.4), 0.14)  # no way is free
+        found = push.arm.avoiding(
+            push.lifted, changed(push.scenario, obstacles=obstacle).arm_avoidance, FINE.spacing, coarse=False
+        )
+        assert made == [True] * (len(made) - 1) + [False] and len(made) > 2
+        assert not found.cleared
+
+    def test_where_the_first_is_long_the_least_detour_is_taken(self, push, monkeypatch):
+        box, found = Box((0.275, -0.457, 0.134), (0.217, 0.225, 0.206), (-0.182, -0.899, 0.319, -0.238)), []
+        avoidance = changed(push.scenario, obstacles=box).arm_avoidance
+        usual = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
+        better = push.arm._better
+
+        def kept(tried, best):
+            found.extend([best, tried])
+            return better(tried, best)
+
+        monkeypatch.setattr(whole_arm, "LONG", 0.0)
+        monkeypatch.setattr(push.arm, "_better", kept)
+        least = push.arm.avoiding(push.lifted, avoidance, LIVE.spacing, coarse=True)
+        detours = [push.arm._detour(solution) for solution in found if solution.cleared]
+        assert least.cleared and push.arm._detour(least) == min(detours) < push.arm._detour(usual)
 
 
 class TestNearMisses:

@@ -42,7 +42,7 @@ HAND_WEIGHT = 100.0
 """Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
 LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
 """Approximate motion of the hand for each joint's turning, m/rad: converts a distance of postures to a length."""
-PIN = 0.04
+PIN = 0.03
 """Size of the region around a pinned posture in which the field fades out, metres of that distance."""
 
 BLOCK = 256

@@ -6,6 +6,7 @@ import numpy as np
 
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle, golden_spiral
+from dt_viz.obstacles.union import Union
 
 NUM_DIRECTIONS = 128
 SIDEWAYS = 2.0
@@ -30,7 +31,7 @@ def escape_directions(
     points: Array,
     radius: Array,
     tangents: Array,
-    obstacle: Obstacle,
+    obstacle: Obstacle | Union,
     margin: float = 0.0,
     *,
     num: int = 3,

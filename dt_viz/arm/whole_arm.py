@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.sparse.csgraph import connected_components
 
 from dt_viz.arm.body_points import BodyPoints
 from dt_viz.arm.collision import load_collision_model
@@ -72,8 +73,13 @@ TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
+LONG = 1.0
+"""Flow time beyond which other ways out and stances are tried, too: such motions wind around the obstacle."""
 NUM_WAYS = 3
 """Largest number of ways out of each obstacle that are tried."""
+TOGETHER, OPPOSED = 0.05, -0.5
+"""Clearance from another obstacle, metres, up to which a colliding posture meets both, and cosine of the angle between
+their ways out beyond which both are left in one direction."""
 BESIDE = 0.20
 """Clearance up to which a sample is bent along with the colliding ones, metres."""
 
@@ -180,6 +186,11 @@ class ArmSolution:
         """Whether all hosts keep the clearance that is asked for."""
         return not len(self.stuck)
 
+    @property
+    def soon(self) -> bool:
+        """Whether they keep it after so short a flow that nothing better is looked for."""
+        return self.cleared and self.duration <= LONG
+
 
 class WholeArm:
     """Makes the arm's motions clear an obstacle, by a diffeomorphism of configuration space."""
@@ -205,8 +216,9 @@ class WholeArm:
         """The motions around the obstacle.
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
-        margin, or what the start or goal beside it has. Of several ways out the first is taken that works,
-        or the one that comes nearest to it. All this looks at the hosts only: guests do not change their motions.
+        margin, or what the start or goal beside it has. Of several ways out the first is taken that works soon, else
+        the one with the least detour, else the one that comes nearest to working, all by coarse motions. All this looks
+        at the hosts only: guests do not change their motions.
 
         While an obstacle is dragged, the side on which all motions pass it is kept until another one is much shorter.
         Coarse motions then turn to that side as the obstacle moves on, instead of jumping there.
@@ -222,10 +234,21 @@ class WholeArm:
         sides = self._sides(lifted, avoidance, known)
         pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
 
-        def solution(ways: Sequence[Way | None]) -> ArmSolution:
+        def solution(ways: Sequence[Way | None], *, coarse: bool = True) -> ArmSolution:
             generator = self._generator(ways, avoidance, pins)
             found = _Solver(self, lifted, avoidance, generator, spacing, coarse=coarse).solution()
             return replace(found, ways=tuple(ways))
+
+        def gradually(ways: Sequence[Way | None]) -> ArmSolution | None:
+            """The motions turning to these ways out; None where they are there, or cannot turn."""
+            turned = [
+                way.turned_from(last, found) if way is not None and last is not None else way
+                for way, last, found in zip(ways, known, sides, strict=True)
+            ]
+            if all(way is there for way, there in zip(turned, ways, strict=True)):
+                return None
+            tried = solution(turned)
+            return tried if tried.cleared else None
 
         best = None
         for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
@@ -234,26 +257,33 @@ class WholeArm:
                 None if side is None else Way(part, side, side, kept=last is not None)
                 for part, side, last in zip(parts, escapes, known, strict=True)
             ]
+            if avoidance.duration is not None or avoidance.generator == "probability":
+                return solution(ways, coarse=coarse)
             met = [(way, last) for way, last in zip(ways, known, strict=True) if way is not None and last is not None]
-            turned = [
-                way.turned_from(last, found) if coarse and way is not None and last is not None else way
-                for way, last, found in zip(ways, known, sides, strict=True)
-            ]
-            turns = any(way is not there for way, there in zip(turned, ways, strict=True))
-            if turns and all(way.side @ last.side > ALIKE for way, last in met):  # that there is a way is known
-                tried = solution(turned)
-                if tried.cleared:
-                    return tried
-                turns = False
+            alike = all(way.side @ last.side > ALIKE for way, last in met)
+            if coarse and alike and (tried := gradually(ways)):  # that there is a way is known
+                return tried
             tried = solution(ways)
-            if tried.cleared and turns:
-                on_the_way = solution(turned)
-                return on_the_way if on_the_way.cleared else tried
-            if best is None or tried.cleared or tried.clearance > best.clearance:
+            if coarse and not alike and tried.cleared and (on_the_way := gradually(ways)):
+                return on_the_way
+            if best is None or self._better(tried, best):
                 best = tried
-            if tried.cleared or avoidance.duration is not None or avoidance.generator == "probability":
+            if tried.soon or (tried.cleared and met):
                 break
-        return best or self.undisturbed(lifted, avoidance, spacing)
+        if best is None:
+            return self.undisturbed(lifted, avoidance, spacing)
+        return best if coarse else solution(best.ways, coarse=False)
+
+    def _better(self, tried: ArmSolution, best: ArmSolution) -> bool:
+        """Whether one solution's motions clear the obstacle with less detour than another's, or come nearer to it."""
+        if not (tried.cleared and best.cleared):
+            return tried.cleared or (not best.cleared and tried.clearance > best.clearance)
+        return self._detour(tried) < self._detour(best)
+
+    def _detour(self, solution: ArmSolution) -> float:
+        """Largest distance, metres, by which the hand is moved away from its undisturbed motion."""
+        hand = self.robot.end_effector
+        return float(np.linalg.norm(hand(solution.p) - hand(solution.q), axis=1).max())
 
     def warped(
         self, full: ArmSolution, lifted: Lift, avoidance: ArmAvoidance, fraction: float, spacing: float
@@ -269,6 +299,11 @@ class WholeArm:
         """
         solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
         return replace(solver.through(full.transform.scaled(fraction), full.duration), ways=full.ways)
+
+    def touches(self, solution: ArmSolution, num_hosts: int, obstacle: Union) -> bool:
+        """Whether the arm's meshes touch the obstacle on the motions of the hosts, the first so many ones."""
+        p = solution.p[solution.index < num_hosts]
+        return bool((self.mesh_clearance(p, obstacle, np.full(len(p), ROUNDING)) < ROUNDING).any())
 
     def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
@@ -295,43 +330,48 @@ class WholeArm:
         return Sum(tuple(WholeArmField(self.robot, self.body, w.obstacle, w.direction, pins, reach) for w in met))
 
     def _sides(self, lifted: Lift, avoidance: ArmAvoidance, before: Sequence[Way | None]) -> list[list[Array]]:
-        """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it."""
-        q = lifted.tracked.q[: lifted.num_hosts]
+        """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it.
+
+        Obstacles that one posture comes near to are left in one direction where their own ones are opposed: else their
+        flows would hold each other up, and motions turn back between them.
+        """
+        q, parts, margin = lifted.tracked.q[: lifted.num_hosts], avoidance.obstacle.parts, avoidance.margin
         points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-        return [
-            self._escapes(points, tangents, obstacle, avoidance.margin, None if way is None else way.side)
-            for obstacle, way in zip(avoidance.obstacle.parts, before, strict=True)
-        ]
+        places = points.transpose(0, 2, 1)
+        distances = [part.signed_distance(places) - self.body.radius[:, None] for part in parts]
+        clearance = np.array([distance.min(axis=0) for distance in distances]).reshape(len(parts), len(tangents))
+        near: Mask = clearance < margin
 
-    def _escapes(
-        self, points: Array, tangents: Array, obstacle: Obstacle, margin: float, before: Array | None
-    ) -> list[Array]:
-        """Ways out of one obstacle, the best first; none where nothing comes too near it.
+        def escapes(which: Indices) -> list[Array]:
+            """Directions that leave all of these obstacles."""
+            collides = np.flatnonzero(near[which].any(axis=0))
+            bent = np.flatnonzero((clearance[which] < BESIDE).any(axis=0))
+            return escape_directions(
+                points[:, :, collides[:: max(1, len(collides) // NUM_COMPARED)]],
+                self.body.radius,
+                tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
+                Union(tuple(parts[k] for k in which)),
+                margin,
+                num=NUM_WAYS,
+                before=next((way.side for way in (before[k] for k in which) if way is not None), None),
+            )
 
-        Args:
-            points: (P, 3, N) body points of all samples, metres.
-            tangents: (N, 3) directions of the end effector's motion there.
-            obstacle: to escape from.
-            margin: clearance below which a sample counts, metres.
-            before: (3,) way out of it that was chosen just before; None where none was.
-        """
-        distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-        clearance = distance.min(axis=0)
-        collides = np.flatnonzero(clearance < margin)
-        if not len(collides):
-            return []
-        bent = np.flatnonzero(clearance < BESIDE)
-        return escape_directions(
-            points[:, :, collides[:: max(1, len(collides) // NUM_COMPARED)]],
-            self.body.radius,
-            tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
-            obstacle,
-            margin,
-            num=NUM_WAYS,
-            before=before,
-        )
+        sides: list[list[Array]] = [[] for _ in parts]
+        met = np.flatnonzero(near.any(axis=1))
+        for k in met:
+            sides[k] = escapes(np.array([k]))
+        if len(met) > 1:
+            first = np.array([sides[k][0] for k in met])
+            together = (near[met, None] & (clearance[met] < TOGETHER)).any(axis=2)
+            num_groups, group = connected_components(together & (first @ first.T < OPPOSED), directed=False)
+            for which in (met[group == k] for k in range(num_groups)):
+                if len(which) > 1:
+                    shared = escapes(which)
+                    for k in which:
+                        sides[k] = shared
+        return sides
 
 
 class _Solver:
@@ -379,13 +419,13 @@ class _Solver:
             more = min(self._clearing_duration(p[lack > 0]), MAX_DURATION - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
-        for _ in range(0 if self._coarse else MAX_ROUNDS):
+        for _ in range(0 if self._coarse or duration >= MAX_DURATION else MAX_ROUNDS):
             p = (bundle.positions / LEVERS)[self._of_hosts(bundle)]
             lack = self._mesh_lack(p)
             worst = np.argsort(-lack)[:NUM_EXTENDED_FOR]
             if lack[worst[0]] <= MESH_ROUNDING:
                 break
-            more = min(self._extension(p[worst[lack[worst] > 0]]), MAX_DURATION - duration)
+            more = self._extension(p[worst[lack[worst] > 0]])
             if more <= 0:
                 break
             duration += more

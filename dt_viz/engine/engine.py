@@ -156,7 +156,7 @@ class Engine:
             DemonstrationError, ImitationError: as `frames`.
             UnreachableError: the arm cannot get to where the motions start.
         """
-        blocked = self._admission(scenario).blocked
+        blocked = self._blocked(scenario, FINE)
         if blocked:
             *_, frame = self._stages_without_motion(scenario, blocked)
             return frame, ()
@@ -201,6 +201,10 @@ class Engine:
         before = self._before(scenario, nominal.learned)
         return self.follower.admission(nominal, avoidance, before and kept_stance(scenario, before))
 
+    def _blocked(self, scenario: Scenario, precision: Precision) -> tuple[MotionWarning, ...]:
+        """Why the scenario has no motion, at the ends or between them; empty where it has one."""
+        return self._admission(scenario).blocked or self.solved(scenario, precision).blocked
+
     def _before(self, scenario: Scenario, learned: Learned) -> Solved | None:
         """The motion of the task that was shown last; None where it was not learned alike."""
         shown = self._shown.get(scenario.task)
@@ -208,7 +212,7 @@ class Engine:
 
     def _stages(self, scenario: Scenario, checkpoint: Checkpoint) -> Iterator[Frame]:
         with _in_turn():
-            blocked = self._admission(scenario).blocked
+            blocked = self._blocked(scenario, LIVE)
         if blocked:
             yield from self._stages_without_motion(scenario, blocked, checkpoint)
             return
@@ -223,6 +227,7 @@ class Engine:
         with _in_turn(checkpoint):
             frame, fine = self._with_arm(scenario, FINE), self.solved(scenario, FINE)
             frame = replace(frame, stage=Stage.FINE, pictures=self._pictures(scenario, fine, coarse=False))
+            frame = replace(frame, blocked=fine.blocked)
             if scenario.view.health_plots and frame.chosen is not None:
                 frame = replace(frame, profiles=compose.profiles(frame, fine, frame.chosen, self.follower))
             self._shown[scenario.task] = _Shown(frame, fine, live)

@@ -8,9 +8,11 @@ The npz file holds for each of K places with N obstacles in each:
     centres and side lengths, metres, of a cylinder its diameter twice and its height; unit quaternions wxyz; names.
     The first place is at the middle of the part of the mean demonstration that they are spread along.
 ``blocked`` (K,), ``left_out`` (K,)
-    whether the arm finds no room at the starts or at the goal, and the number of the task's starts left out.
+    whether the arm is said to have no motion, and the number of the task's starts left out.
 ``no_way`` (K,)
-    whether the arm says that it finds no way between them.
+    whether that is so although there is room at the ends.
+``shift`` (K,)
+    length of the shortest straight shift by which the undisturbed arm would clear the obstacles, metres.
 ``hand_room`` (K, R + 1)
     distance of the hand's covering spheres from the obstacles at the R starts and at the goal, metres, turned to where
     the hand has most room.
@@ -31,6 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.robot import NUM_JOINTS, Robot, load_jaco
+from dt_viz.arm.whole_arm import OVERSHOOT
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame
 from dt_viz.evaluate import hand
@@ -49,11 +52,12 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import FitStore, default_cache_folder
-from dt_viz.motion.stack import FINE, LIVE
-from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
+from dt_viz.motion.stack import FINE
+from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point, golden_spiral
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import Task
+from dt_viz.warning import Kind
 
 WITHIN = 0.05
 """Default of the largest distance of an obstacle from the mean demonstration, metres."""
@@ -62,6 +66,10 @@ ALLOWANCE = 1e-3
 SHARP = 90.0
 """Turn over `dt_viz.evaluate.avoidance.TURN_ARC` beyond which it is sharp, degrees."""
 SHAPES = ("sphere", "box", "cylinder")
+NUM_DIRECTIONS, NUM_STEPS, STRIDE = 128, 40, 6
+"""Number of directions of a shift, largest number of steps until it is long enough, and stride of the postures."""
+ROUNDING = 1e-3
+"""Tolerance of its length, metres."""
 NUM_TURNS = 500
 """Number of orientations of the hand that room is looked for in."""
 SEEDS = 1_000_003
@@ -76,10 +84,15 @@ class Place:
     hand_room: Array
     """(R + 1,) room that the hand has at the starts and at the goal, see `hand_room`."""
     frame: Frame
-    no_way: bool
-    """Whether the arm finds no way, though it is not blocked at the ends."""
     rollouts: dict[int, Measured]
     """By the numbers of their starts; empty where the arm is blocked."""
+    shift: float = np.nan
+    """Length of the shortest straight shift, see `shortest_shift`; NaN where the arm is blocked."""
+
+    @property
+    def no_way(self) -> bool:
+        """Whether the arm finds no way between free ends."""
+        return any(warning.kind is Kind.NO_WAY for warning in self.frame.blocked)
 
     def largest(self, value: Callable[[Measured], float]) -> float:
         """The largest value of the rollouts."""
@@ -92,6 +105,10 @@ class Place:
     def detour(self, margin: float) -> float:
         """Largest Fréchet distance relative to the depth without avoidance plus the margin."""
         return self.largest(lambda m: m.frechet / (m.depth_without + margin))
+
+    def beside_shift(self, margin: float) -> float:
+        """Largest Fréchet distance relative to the shortest straight shift, or to the margin if that is larger."""
+        return self.largest(lambda m: m.frechet) / max(margin, self.shift)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -138,8 +155,8 @@ def run(options: argparse.Namespace) -> int:
     write_npz(out, **_arrays(places, len(task.paths)))
     print(_title(task, options))
     header = (
-        "place", "hand's room", "M.C.D. without", "M.C.D. arm", "clearance", "F.D.", "F.D./forced", "turn (without)",
-        "goal missed", "outside limits", "",
+        "place", "hand's room", "M.C.D. without", "M.C.D. arm", "clearance", "F.D.", "F.D./forced", "F.D./shift",
+        "turn (without)", "goal missed", "outside limits", "",
     )  # fmt: skip
     print_table(header, rows)
     _summarise(places, margin)
@@ -168,21 +185,52 @@ def hand_room(robot: Robot, obstacle: Union, places: Array) -> Array:
     return distance.min(axis=2).max(axis=1)
 
 
+def shortest_shift(robot: Robot, obstacle: Union, q: Array, clearance: float) -> float:
+    """Length, metres, of the shortest shift of the whole arm in one direction after which no posture is too near.
+
+    It is about the least detour that there can be: a depth is that of a single point, which may leave a plate on its
+    other side, or a hole in the hand. No shift leads below the table.
+
+    Args:
+        robot: the arm.
+        obstacle: what is in the way.
+        q: (N, 6) the undisturbed postures, rad.
+        clearance: distance that its covering spheres are to have, metres.
+    """
+    body, directions = load_body_points().on_moving_links, golden_spiral(NUM_DIRECTIONS, 0.5)
+    points = body.positions(robot, q)  # (N, P, 3)
+    points = points[(obstacle.signed_distance(points) - body.radius).min(axis=1) < clearance]
+    if not len(points):
+        return 0.0
+    length = np.zeros((NUM_DIRECTIONS, len(points)))
+    shifted = np.broadcast_to(points, (NUM_DIRECTIONS, *points.shape))
+    for _ in range(NUM_STEPS):
+        lack = clearance - (obstacle.signed_distance(shifted) - body.radius).min(axis=2)
+        if (lack < ROUNDING).all():
+            break
+        length += np.maximum(lack, 0)
+        shifted = points + (length[..., None] * directions[:, None])[:, :, None]  # (directions, N', P, 3)
+    lowest = (shifted[..., 2] - body.radius).min(axis=(1, 2))
+    return float(length.max(axis=1)[lowest > -ROUNDING].min(initial=np.inf))
+
+
 def _measured(
     engine: Engine, scenario: Scenario, union: Union, room: Array, robot: Robot, *, only_blocked: bool
 ) -> Place:
     if only_blocked:
-        frame = next(engine.frames(scenario))
-        return Place(union, room, frame, not frame.blocked and not engine.solved(scenario, LIVE).cleared, {})
+        return Place(union, room, next(engine.frames(scenario)), {})
     frame, motions = engine.arm_motions(scenario)
     if not motions:
-        return Place(union, room, frame, no_way=False, rollouts={})
-    solved, paths = engine.solved(scenario, FINE), frame.task.paths
+        return Place(union, room, frame, {})
+    numbers, paths = engine.solved(scenario, FINE).nominal.numbers, frame.task.paths
     of_rollouts = {
         number: measure(motion, paths[number], frame.goal, union, robot)
-        for number, motion in zip(solved.nominal.numbers, motions, strict=True)
+        for number, motion in zip(numbers, motions, strict=True)
     }
-    return Place(union, room, frame, not solved.cleared, of_rollouts)
+    q = np.concatenate([motion.without[::STRIDE] for motion in motions])
+    avoidance = scenario.arm_avoidance
+    shift = np.nan if avoidance is None else shortest_shift(robot, union, q, avoidance.margin - OVERSHOOT)
+    return Place(union, room, frame, of_rollouts, shift)
 
 
 def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, ...]]:
@@ -234,7 +282,7 @@ def _row(place: Place, margin: float) -> tuple[str, ...]:
     room = f"{1e3 * place.hand_room.min():.0f}"
     said = "; ".join(map(str, (place.frame.blocked or place.frame.certificates.warnings)[:1]))
     if not place.rollouts:
-        return (room, *[""] * 8, said)
+        return (room, *[""] * 9, said)
     worst = max(place.rollouts.values(), key=lambda m: m.turn)
     return (
         room,
@@ -243,6 +291,7 @@ def _row(place: Place, margin: float) -> tuple[str, ...]:
         f"{1e3 * place.clearance():.1f}",
         f"{1e3 * place.largest(lambda m: m.frechet):.0f}",
         f"{place.detour(margin):.2f}",
+        f"{place.beside_shift(margin):.2f}",
         f"{worst.turn:.0f}° ({worst.turn_without:.0f}°)",
         f"{1e3 * place.largest(lambda m: m.goal_miss):.3f}",
         f"{sum(m.num_outside for m in place.rollouts.values())}",
@@ -266,6 +315,7 @@ def _arrays(places: Sequence[Place], num_rollouts: int) -> dict[str, Any]:
         "blocked": np.array([bool(place.frame.blocked) for place in places]),
         "left_out": np.array([num_rollouts - len(place.frame.rollouts) for place in places]),
         "no_way": np.array([place.no_way for place in places]),
+        "shift": np.array([place.shift for place in places]),
         "hand_room": np.array([place.hand_room for place in places]),
         "arm_depth": of_rollouts(lambda m: m.arm.depth),
         "arm_clearance": of_rollouts(lambda m: m.arm.obstacle.distance),
@@ -295,10 +345,7 @@ def _summarise(places: Sequence[Place], margin: float) -> None:
     print(f"\n{len(free)} of {len(places)} places leave the hand free at the starts and at the goal")
     print(f"called blocked: {_share(sum(bool(p.frame.blocked) for p in free), free)} of these", end=", ")
     print(f"{_share(len(places) - len(open_), places)} of all")
-    print(
-        f"without a way that the arm finds: {_share(sum(place.no_way for place in open_), open_)} of the others",
-        end=", ",
-    )
+    print(f"between free ends: {_share(sum(place.no_way for place in free), free)}", end=", ")
     some = sum(len(place.frame.rollouts) < len(place.hand_room) - 1 for place in open_)
     print(f"only from some of the starts: {_share(some, open_)}")
     if not any(place.rollouts for place in places):
@@ -315,6 +362,8 @@ def _summarise(places: Sequence[Place], margin: float) -> None:
     print(
         f"collisions {_share(touched, open_)}, at least {1e3 * (margin - ALLOWANCE):.0f} mm kept {_share(kept, open_)}"
     )
+    shift = [place.beside_shift(margin) for place in open_]
+    print(f"F.D. / shortest shift, median {np.median(shift):.2f}, 95 % {np.percentile(shift, 95):.2f}")
     print(f"F.D. / forced, median {np.median(detour):.2f}, 95 % {np.percentile(detour, 95):.2f}")
     print(f"turns sharper than {SHARP:.0f}° {_share(sharp, open_)}, without avoidance {_share(sharp_without, open_)}")
     print(f"F.D. mean {1e3 * np.mean([m.frechet for place in open_ for m in place.rollouts.values()]):.0f} mm")

@@ -243,7 +243,7 @@ class Follower:
         )
         at_starts, on_path = known.clearance(obstacle)  # of the spheres, which are larger than the arm
         clearance = np.concatenate([at_starts, on_path[:, -1:]], axis=1)
-        free, ample = clearance >= 0, clearance >= asked
+        free, ample = clearance >= 0, clearance >= margin
         free[0], ample[0] = room >= 0, room >= margin
         kept = np.zeros(len(free), bool) if before is None else (known.references == before).all(axis=1)
         # the goal first, then as many starts as possible, then as much room as is asked for

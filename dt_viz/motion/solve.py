@@ -16,7 +16,7 @@ from dt_viz.motion.warp import warped_stack
 from dt_viz.obstacles.ways import remembered
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.transforms.base import start_warnings
-from dt_viz.warning import Kind
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 NUM_ALTERNATIVES = 3
 """Number of other stances that are tried where the arm finds no way around the obstacle."""
@@ -38,6 +38,8 @@ class Solved:
     """None where only the end effector avoids."""
     lifted: Lift | None = None
     """Joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
+    blocked: tuple[MotionWarning, ...] = ()
+    """Why there is no motion to show, though its ends are free; empty where there is one."""
 
     @property
     def cleared(self) -> bool:
@@ -75,21 +77,50 @@ def solve(
         solved = _solved(scenario, lacking, precision, follower, before)
         if solved.cleared:
             return solved
-    solved, avoidance = _solved(scenario, nominal, precision, follower, before), scenario.arm_avoidance
-    if avoidance is None or avoidance.duration is not None or solved.cleared:
+    avoidance = scenario.arm_avoidance
+    if avoidance is None or avoidance.duration is not None:
+        return _solved(scenario, nominal, precision, follower, before)
+    solved = _with_a_way(scenario, nominal, follower, before)
+    if precision is not LIVE:
+        solved = _solved(scenario, solved.nominal, precision, follower, before)
+    return _unless_it_touches(solved, follower)
+
+
+def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower, before: Solved | None) -> Solved:
+    """The motion at LIVE, in another stance or without the starts that have no way, where it finds none otherwise.
+
+    The same choice serves each precision: it is quick at this one. A stance is also changed where the way is long,
+    but not while an obstacle is dragged.
+    """
+    solved, avoidance = _solved(scenario, nominal, LIVE, follower, before), scenario.arm_avoidance
+    if avoidance is None or solved.arm is None or solved.arm.soon:
+        return solved
+    if solved.cleared and before is not None and _goes_on(scenario, before):
         return solved
     for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
-        tried = _solved(scenario, other, LIVE, follower, before)  # quick; the same stance is found at each precision
-        if tried.cleared:
-            return tried if precision is LIVE else _solved(scenario, other, precision, follower, before)
-    assert solved.arm is not None
+        tried = _solved(scenario, other, LIVE, follower, before)
+        if tried.arm is not None and (tried.arm.soon if solved.cleared else tried.cleared):
+            return tried
+    if solved.cleared:
+        return solved
     others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
     if not (others < nominal.num_hosts).any():
         return solved
     numbers, how = np.array(nominal.numbers), "without a way around the obstacle for the arm"
     told = start_warnings(numbers[solved.arm.stuck], nominal.num_demonstrated, Kind.START_COVERED, how)
-    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), precision, follower, before)
+    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), LIVE, follower, before)
     return tried if tried.cleared else solved
+
+
+def _unless_it_touches(solved: Solved, follower: Follower) -> Solved:
+    """The motion, marked as blocked where the arm finds no way and touches the obstacle."""
+    avoidance = solved.scenario.arm_avoidance
+    if solved.cleared or solved.arm is None or avoidance is None:
+        return solved
+    if not follower.whole_arm.touches(solved.arm, solved.nominal.num_hosts, avoidance.obstacle):
+        return solved
+    text = "the arm finds no way around the obstacle between starts and goal"
+    return replace(solved, blocked=(MotionWarning(Kind.NO_WAY, text, ARM),))
 
 
 def kept_stance(scenario: Scenario, before: Solved) -> Stance | None:

@@ -57,6 +57,11 @@ class Union:
         nearest = length.argmin()
         return s + length[nearest] * directions[nearest]
 
+    def cover(self) -> tuple[Array, Array]:
+        """Cover all parts by balls: centres (K, 3) and radii (K,), metres."""
+        centres, radii = zip(*(part.cover() for part in self.parts), strict=True)
+        return np.concatenate(centres), np.concatenate(radii)
+
     def field(self, generator: Generator, temperature: float) -> VectorField:
         """Return the sum of the parts' generators (sec. 4.4)."""
         spheres = tuple(part.field(generator, temperature) for part in self.parts if isinstance(part, Sphere))
