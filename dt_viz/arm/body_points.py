@@ -35,6 +35,12 @@ class BodyPoints:
         """Points of the base and link 1, which no motion moves away from anything."""
         return self._where(self.joint < 1)
 
+    def with_end_effector(self, robot: Robot, radius: float) -> BodyPoints:
+        """The same and the robot's end effector, where the hand holds something, as a sphere of a radius, metres."""
+        joint = np.append(self.joint, NUM_JOINTS - 1)
+        offset = np.concatenate([self.offset, robot.end_effector_offset[None]])
+        return BodyPoints(joint, offset, np.append(self.radius, radius))
+
     def _where(self, keep: Mask) -> BodyPoints:
         return BodyPoints(self.joint[keep], self.offset[keep], self.radius[keep])
 

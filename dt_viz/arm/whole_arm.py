@@ -197,7 +197,7 @@ class WholeArm:
 
     def __init__(self, robot: Robot, body: BodyPoints) -> None:
         self.robot = robot
-        self.body = body.on_moving_links
+        self.body = body.on_moving_links.with_end_effector(robot, OVERSHOOT)
         self.limits = JointLimits(robot.lower, robot.upper)
 
     def undisturbed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float) -> ArmSolution:

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from dt_viz.errors import check_between
-from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
 from dt_viz.flows.integrators import integrate_adaptive, rk4
 from dt_viz.obstacles.occupancy import Generator
@@ -243,14 +243,14 @@ class Avoidance(Transform):
         duration += spent
         return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, {"duration": duration}, ways)
 
-    def _aside(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], list[AdaptiveFlow], MotionBelow]:
+    def _aside(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], list[AdaptiveFlow | Flow], MotionBelow]:
         """Return the ways out of the obstacles, the flows that carry all motions to one side of each, and these there.
 
         A flow time by hand is spent on these first. In a plane no way out turns from one side to the other, so none is
         remembered there. The paper's generator acts alone.
         """
         ways: list[Way | None] = [None] * len(self.obstacles)
-        aside: list[AdaptiveFlow] = []
+        aside: list[AdaptiveFlow | Flow] = []
         if self.generator == "probability":
             return tuple(ways), aside, motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
@@ -262,7 +262,7 @@ class Avoidance(Transform):
                 continue
             ways[k] = way = passes.way(before, gradually=motion.gradual)
             flow = passes.flow(way.direction, motion.tolerance)
-            flow = replace(flow, duration=min(flow.duration, left))
+            flow = self.integration.of(replace(flow, duration=min(flow.duration, left)))
             left -= flow.duration
             if flow.duration > 0:
                 aside.append(flow)
