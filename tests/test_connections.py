@@ -36,17 +36,6 @@ NUM_PLACES = 2
 class Client(ProtocolClient):
     """A visitor who also sets controls and sends files."""
 
-    def find(self, label: str) -> str:
-        """Return the identifier of the control with this label. Raises KeyError."""
-        for uuid, control in self.controls.items():
-            if control.get("label") == label:
-                return uuid
-        raise KeyError(label)
-
-    async def set(self, label: str, value: bool | float | str) -> None:
-        """Set the value of a control."""
-        await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
-
     async def upload(
         self, label: str, name: str, content: bytes, *, announced: int | None = None, transfer: str = "transfer"
     ) -> None:

@@ -100,7 +100,8 @@ def of_kind(certificates, *kinds):
 
 @pytest.mark.parametrize(("duration", "folds"), [(None, True), (0.1, False)])
 def test_euler_in_few_steps_is_warned_of_during_a_drag_and_certificates_agree(engine, initial, duration, folds):
-    scenario = changed(initial("draw_s"), integration=Integration("euler", 3), duration=duration)
+    coarse = {"integration": Integration("euler", 3), "generator": "probability", "duration": duration}
+    scenario = changed(initial("draw_s"), **coarse)
     live, last = certified(engine, scenario)
     kinds = [Kind.FOLDS, Kind.INEXACT_INVERSE] if folds else [Kind.INEXACT_INVERSE]
     expected = [(kind, Avoidance.title) for kind in kinds]
@@ -118,7 +119,8 @@ def test_euler_in_few_steps_is_warned_of_during_a_drag_and_certificates_agree(en
 
 def test_a_fold_of_what_is_drawn_is_said_and_certified(engine):
     """Here ψ keeps its orientation along the rollouts, and ψ⁻¹, which draws them, does not."""
-    scenario = changed(random_scenario(engine, 300), integration=Integration("euler", 1))
+    coarse = {"integration": Integration("euler", 1), "generator": "probability"}
+    scenario = changed(random_scenario(engine, 300), **coarse)
     live, last = certified(engine, scenario)
     assert of_kind(live, Kind.FOLDS) == [(Kind.FOLDS, Avoidance.title)]
     assert last.min_det_jacobian < 0

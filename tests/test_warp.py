@@ -126,7 +126,8 @@ def test_a_warp_through_the_obstacle_is_told_and_not_warned_of(engine):
 
 def test_no_warp_of_the_whole_arm_leaves_the_joint_limits(engine, robot):
     for warp in WARPS:
-        frame = stage(engine, replace(stacked(engine, "push_box", space="cspace"), warp=warp), Stage.LIVE)
+        scenario = replace(stacked(engine, "push_box", space="cspace"), warp=warp, view=View(replay=True))
+        frame = stage(engine, scenario, Stage.LIVE)
         assert (frame.arm.q > robot.lower).all() and (frame.arm.q < robot.upper).all()
 
 
@@ -143,7 +144,7 @@ def test_a_goal_that_the_stack_moves_moves_along(engine):
 
 
 def test_the_undeformed_rollouts_and_their_joints_stay_those_of_the_demonstrations(engine):
-    scenario = stacked(engine, "draw_s")
+    scenario = replace(stacked(engine, "draw_s"), view=View(replay=True))
     full, half = (stage(engine, replace(scenario, warp=warp), Stage.LIVE) for warp in (1.0, 0.5))
     for a, b in zip(full.ghost, half.ghost, strict=True):
         np.testing.assert_array_equal(a, b)

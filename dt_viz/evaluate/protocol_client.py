@@ -146,8 +146,20 @@ class ProtocolClient:
         """Whether rollouts and their status are on the page."""
         return self.rollout is not None and bool(self.status)
 
+    def find(self, label: str) -> str:
+        """Return the identifier of the control with this label. Raises KeyError."""
+        for uuid, control in self.controls.items():
+            if control.get("label") == label:
+                return uuid
+        raise KeyError(label)
+
+    async def set(self, label: str, value: bool | float | str) -> None:
+        """Set the value of a control."""
+        await self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
+
     async def grab(self, name: str = OBSTACLE) -> None:
-        """Begin to drag a gizmo."""
+        """Show the handles of the obstacle, and begin to drag a gizmo."""
+        await self.set("Handles", True)
         await self.send("TransformControlsDragStartMessage", name=name, owner=self.nodes[name]["owner"])
 
     async def move(self, position: ArrayLike, name: str = OBSTACLE) -> None:
