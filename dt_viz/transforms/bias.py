@@ -69,7 +69,7 @@ PLACED_BESIDE = 0.08
 """Distance of a new bias point from the mean path, metres."""
 APART = 0.25
 """Wanted distance of a new bias point from the others, metres: about the size of a region."""
-ROOM = 0.04
+ROOM = 0.11
 """Distance of a new bias point from obstacles, metres."""
 PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
 """Places along the mean path, as fractions of its length, beside which new bias points are placed."""
