@@ -149,8 +149,15 @@ class TestPositions:
         assert parts[0].joint.max() == 0
         assert parts[1].joint.min() == 1
 
-    def test_those_of_each_joint_are_together(self, body):
-        for part in (body, body.on_moving_links, body.on_pedestal):
+    def test_the_end_effector_is_one_more(self, body, robot):
+        q, more = random_configurations(robot, 1, (3,)), body.with_end_effector(robot, 0.01)
+        positions = more.positions(robot, q)
+        np.testing.assert_array_equal(positions[:, :-1], body.positions(robot, q))
+        np.testing.assert_allclose(positions[:, -1], robot.end_effector(q), atol=1e-12)
+        assert more.radius[-1] == 0.01
+
+    def test_those_of_each_joint_are_together(self, body, robot):
+        for part in (body, body.on_moving_links, body.on_pedestal, body.with_end_effector(robot, 0.01)):
             covered = np.concatenate([np.arange(len(part.joint))[points] for _, points in part.by_joint])
             np.testing.assert_array_equal(covered, np.arange(len(part.joint)))
             for joint, points in part.by_joint:

@@ -115,6 +115,8 @@ class TestAroundTheMiddle:
         assert solution.clearance > 0
         assert solution.clearance == pytest.approx(case.arm.clearance(solution.p, case.middle).min())
         assert case.truth(split(solution, solution.p), case.middle) > 0
+        held = case.arm.robot.end_effector(solution.p)  # between the fingers, which may pass on both sides
+        assert case.middle.signed_distance(held).min() > case.scenario.arm_avoidance.margin - ROUNDING
         assert case.truth(case.lifted.tracked.q, case.middle) < -0.05  # so there was something to do
 
     def test_start_and_goal_stay(self, case, coarse):
