@@ -531,17 +531,17 @@ def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
     assert len(visitor.shown.rollouts) == 8
 
 
-SHOWN = {  # the layer's label in the page, the picture's name, and its handles that hold points
-    "Warped grid ψ⁻¹(grid)": ("grid", lambda picture: [picture.lines.node]),
-    "Base attractor": ("base", lambda picture: [picture.rays.node, picture.arrows.node]),
-    "Learned generator": ("generator", lambda picture: [picture.arrows.node]),
+SHOWN = {  # the layer's label in the page, the picture's name, and the points that it holds
+    "Warped grid ψ⁻¹(grid)": ("grid", lambda picture: [picture.lines.node.points]),
+    "Base attractor": ("base", lambda picture: [picture.rays.node.vertices, picture.arrows.node.points]),
+    "Learned generator": ("generator", lambda picture: [picture.arrows.node.points]),
 }
 
 
 def test_each_layer_of_the_transform_is_drawn_once_it_is_switched_on(visit):
     page, visitor = visit
     open_tab(page, "Show")
-    for label, (name, handles) in SHOWN.items():
+    for label, (name, drawn) in SHOWN.items():
         picture = visitor.pictures.layer(name)
         assert not picture.visible
 
@@ -549,11 +549,10 @@ def test_each_layer_of_the_transform_is_drawn_once_it_is_switched_on(visit):
         wait_until(lambda name=name: getattr(visitor.session.scenario.view, name), f"the checkbox of {name}")
         assert visitor.session.wait_idle(PATIENCE)
         assert picture.visible
-        for handle in handles(picture):
-            assert np.isfinite(handle.points).all()
-            assert len(handle.points) >= len(visitor.shown.rollouts)
-            assert np.ptp(handle.points, axis=(0, 1)).max() > 0.1
-            assert len(handle.colors) == len(handle.points)
+        for points in drawn(picture):
+            assert np.isfinite(points).all()
+            assert len(points) >= len(visitor.shown.rollouts)
+            assert np.ptp(points.reshape(-1, 3), axis=0).max() > 0.1
 
 
 def pixels(page):

@@ -21,8 +21,8 @@ def _arm(engine):
 
 def distances(arm: WholeArm, q, avoidance, moved=0.0, velocities=None):
     """Distances h of the moving links' spheres from the parts, for all pairs, after the parts have moved."""
-    points = arm.body.on_moving_links.positions(arm.robot, q)
-    radius = arm.body.on_moving_links.radius
+    points = arm.links.positions(arm.robot, q)
+    radius = arm.links.radius
     parts = avoidance.obstacle.parts
     shifts = np.zeros((len(parts), 3)) if velocities is None else moved * velocities
     kept = min(KEPT, avoidance.margin / 2)
@@ -36,7 +36,7 @@ def scenes(arm: WholeArm, num):
     rng = np.random.default_rng(5)
     for k in range(num):
         q = arm.robot.home + rng.normal(scale=0.5, size=6)
-        place = arm.body.positions(arm.robot, q)[rng.integers(5, len(arm.body.radius))]
+        place = arm.links.positions(arm.robot, q)[rng.integers(5, len(arm.links.radius))]
         way = rng.normal(size=3)
         place = place + way / np.linalg.norm(way) * rng.uniform(0.12, 0.2)
         at = as_point(place)
@@ -53,7 +53,7 @@ def test_no_distance_falls_faster_than_it_may(arm):
         later = distances(arm, q + STEP * v, avoidance, STEP, velocities)
         rate, near = (later - h) / STEP, h < WINDOW
         assert (rate[near] >= -RATE * np.maximum(h[near], 0) - 0.02).all()
-        everywhere = avoidance.obstacle.signed_distance(arm.body.positions(arm.robot, q)) - arm.body.radius
+        everywhere = avoidance.obstacle.signed_distance(arm.links.positions(arm.robot, q)) - arm.links.radius
         assert nearest == pytest.approx(everywhere.min() + OVERSHOOT)
         unguarded = (distances(arm, q + STEP * wanted, avoidance, STEP, velocities) - h) / STEP
         if (unguarded[near] >= -RATE * np.maximum(h[near], 0)).all():

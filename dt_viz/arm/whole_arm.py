@@ -197,7 +197,10 @@ class WholeArm:
 
     def __init__(self, robot: Robot, body: BodyPoints) -> None:
         self.robot = robot
-        self.body = body.on_moving_links.with_end_effector(robot, OVERSHOOT)
+        self.links = body.on_moving_links
+        """Points of the links."""
+        self.body = self.links.with_end_effector(robot, OVERSHOOT)
+        """The same, and what the hand holds."""
         self.limits = JointLimits(robot.lower, robot.upper)
 
     def undisturbed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float) -> ArmSolution:

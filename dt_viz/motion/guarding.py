@@ -45,10 +45,10 @@ def guarded(arm: WholeArm, q: Array, wanted: Array, avoidance: ArmAvoidance, vel
         The velocity (6,), rad/s, and the distance of the arm from the nearest obstacle, about, metres.
     """
     chain = arm.robot.chain(q[:, None])
-    points, kept = arm.body.of_chain(chain), _kept(avoidance)
+    points, kept = arm.links.of_chain(chain), _kept(avoidance)
     slopes, bounds, nearest = [], [], np.inf
     for part, velocity in zip(avoidance.obstacle.parts, velocities, strict=True):
-        distance = part.signed_distance(points[:, :, 0]) - arm.body.radius + OVERSHOOT
+        distance = part.signed_distance(points[:, :, 0]) - arm.links.radius + OVERSHOOT
         nearest = min(nearest, float(distance.min()))
         near = np.argsort(distance)[:NUM_POINTS]
         near = near[distance[near] - kept <= WINDOW]
@@ -70,9 +70,9 @@ def is_allowed(
         Whether it does, for sure; and the distance of the arm from the nearest obstacle at the last posture, metres.
     """
     chain = arm.robot.chain(q.T)
-    points, kept, nearest = arm.body.of_chain(chain), _kept(avoidance), np.inf
+    points, kept, nearest = arm.links.of_chain(chain), _kept(avoidance), np.inf
     for part, velocity in zip(avoidance.obstacle.parts, velocities, strict=True):
-        distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.body.radius[:, None] + OVERSHOOT
+        distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.links.radius[:, None] + OVERSHOOT
         nearest = min(nearest, float(distance[:, -1].min()))
         near, posture = np.nonzero(distance - kept <= WINDOW)
         if len(near):
@@ -104,7 +104,7 @@ def _constraints(
     at = points[near, :, posture]
     normal = _outward(part, at)
     lever = cross(chain.axes[:, 2][..., posture], at.T - chain.origins[..., posture])  # (6, 3, K)
-    slopes = (arm.body.is_beyond[:, near] * (lever * normal.T).sum(axis=1)).T
+    slopes = (arm.links.is_beyond[:, near] * (lever * normal.T).sum(axis=1)).T
     mobile = (slopes * slopes).sum(axis=1) > IMMOBILE
     return slopes * mobile[:, None], np.where(mobile, normal @ velocity - RATE * np.maximum(h, 0.0), -np.inf)
 

@@ -255,7 +255,8 @@ class Avoidance(Transform):
             return tuple(ways), aside, motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
         known = remembered(motion.before if plane is None else (), self.obstacles)
-        margin, left = self._kept_margin(motion), math.inf if self.duration is None else self.duration
+        margin = self._kept_margin(motion.demonstrated)
+        left = math.inf if self.duration is None else self.duration
         for k, (obstacle, before) in enumerate(zip(self.obstacles, known, strict=True)):
             passes = Passes.of(motion, obstacle, margin, self.obstacles[:k], plane)
             if passes is None:

@@ -69,8 +69,8 @@ PLACED_BESIDE = 0.08
 """Distance of a new bias point from the mean path, metres."""
 APART = 0.25
 """Wanted distance of a new bias point from the others, metres: about the size of a region."""
-ROOM = 0.11
-"""Distance of a new bias point from obstacles, metres."""
+ROOM, LEAST_ROOM = 0.11, 0.04
+"""Distances of a new bias point from obstacles, metres: beyond what is carried aside, and where that is nowhere."""
 PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
 """Places along the mean path, as fractions of its length, beside which new bias points are placed."""
 SMALLEST_REGION, LARGEST_REGION = 0.04, 0.40
@@ -240,14 +240,21 @@ class BiasPoint(Transform):
             sides = [mean[k] + sign * PLACED_BESIDE * aside / np.linalg.norm(aside) for sign in (-1, 1)]
             # first the side that is farther from the rest of the motion
             places += sorted(sides, key=lambda place: -np.linalg.norm(mean - place, axis=1).min())
-        # off other strokes, and where obstacles leave room
+        # off other strokes
         free = [place for place in places if np.linalg.norm(mean - place, axis=1).min() > PLACED_BESIDE / 2]
-        room = [place for place in free if surroundings.obstacle.signed_distance(place) > ROOM] or free or places
         # two whose regions overlap pull against each other: first where no other one is near, then as far as there is
         taken = np.asarray(surroundings.anchors).reshape(-1, 3)
-        apart = [float(np.linalg.norm(place - taken, axis=1).min(initial=np.inf)) for place in room]
-        far = [place for place, distance in zip(room, apart, strict=True) if distance > APART]
-        return cls(as_point(far[0] if far else room[int(np.argmax(apart))]), plane=plane)
+
+        def apart(place: Array) -> float:
+            return float(np.linalg.norm(place - taken, axis=1).min(initial=np.inf))
+
+        room = free
+        for least in (ROOM, LEAST_ROOM):  # where obstacles leave room
+            room = [place for place in free if surroundings.obstacle.signed_distance(place) > least]
+            far = [place for place in room if apart(place) > APART]
+            if far:
+                return cls(as_point(far[0]), plane=plane)
+        return cls(as_point(max(room or free or places, key=apart)), plane=plane)
 
     def distances(self, motion: MotionBelow) -> Array:
         """(R,) metres from the target: of the motions that have a demonstration, or of their ends if the goal moves."""

@@ -47,6 +47,8 @@ END_RADIUS = 0.5
 """ρ_e relative to the distance of the end from the motions in the obstacle."""
 SLOWEST = 0.3
 """Smallest speed, in g, that the duration allows for: samples beside an end are hardly carried."""
+LONGEST = 2.0
+"""Longest time of the flow, in the same unit: beside covered starts a longer one would squeeze space to nothing."""
 NUM_STEPS, SHORTEST, REACHED = 16, 1e-3, 2e-4
 """Largest number of steps to a surface, the smallest step and the margin's part that may be missing, metres."""
 SIMPSON = np.array([1, *[4, 2] * 7, 4, 1]) / 48
@@ -199,7 +201,7 @@ class Passes:
         on_the_way = self.points + (np.linspace(0, 1, len(SIMPSON))[:, None] * way)[:, :, None] * direction
         speed = -(field(on_the_way.reshape(-1, 3)) @ direction).reshape(len(SIMPSON), -1)
         duration = way * (SIMPSON @ (1 / np.maximum(speed, SLOWEST * gain)))
-        return AdaptiveFlow(field, float(duration.max()), tolerance)
+        return AdaptiveFlow(field, min(float(duration.max()), LONGEST), tolerance)
 
     def _lengths(self, direction: Array) -> Array:
         """How far (K,), metres, the samples have to go along a unit vector (3,) to keep the margin."""

@@ -51,8 +51,8 @@ OBJECT = (240, 200, 90)
 """What the hand moves."""
 INK, BOARD = (24, 44, 92), (40, 70, 80)
 TABLE = (233, 231, 229)
-ZENITH, HORIZON = (212, 221, 234), (238, 241, 245)
-"""Background, from above down to where the table fades into it."""
+ZENITH, HORIZON = (205, 214, 227), (227, 227, 228)
+"""Background, from above down to the horizon: that is the colour of the table in this light."""
 ARM = (206, 210, 216)
 ARM_RING = (62, 66, 74)
 ONION = (70, 116, 168)
@@ -66,7 +66,7 @@ BRAND = (0, 114, 178)
 
 
 def linear(colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Return the value that shows as this colour in fog and on lines and arrows of many colours: linear light."""
+    """Return the value that shows as this colour on lines and arrows of many colours: linear light."""
     red, green, blue = (round(255 * (c / 255) ** 2.2) for c in colour)
     return red, green, blue
 

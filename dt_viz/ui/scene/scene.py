@@ -283,6 +283,11 @@ class ScenePictures:
 
     @contextmanager
     def without_handles(self) -> Iterator[None]:
-        """Hide all handles for as long as a picture takes."""
-        with self.obstacles.without_handles(), self.anchors.without_handles(), self.slice.without_handles():
-            yield
+        """Hide all handles for as long as a picture takes, and the table: on white it would end at the horizon."""
+        table = self._by_view["table"]
+        shown, table.visible = table.visible, False
+        try:
+            with self.obstacles.without_handles(), self.anchors.without_handles(), self.slice.without_handles():
+                yield
+        finally:
+            table.visible = shown

@@ -1,4 +1,4 @@
-"""The stage: lights, a background with a slight gradient, and the table, which fades into it without an edge."""
+"""The stage: lights, a background with a slight gradient, and a table without an edge, of the horizon's colour."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from dt_viz.engine.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Picture
 
-TABLE_RADIUS, TABLE_HEIGHT = 8.0, 0.02
-"""Radius of the table, metres: its edge is beyond the fog; and its thickness."""
+TABLE_RADIUS, TABLE_HEIGHT = 40.0, 0.02
+"""Radius of the table, metres, whose edge is far away, and its thickness."""
 BELOW = 5e-4
 """Distance of the table's top below the plane of the arm's base, metres: coinciding surfaces would flicker."""
-FOG = (2.2, 5.5)
-"""Distances from the camera at which things begin to fade, and have faded, into the background, metres."""
 BACKGROUND_HEIGHT = 128
 """Number of rows of the background image."""
 
@@ -23,16 +21,15 @@ BACKGROUND_HEIGHT = 128
 def background() -> NDArray[np.uint8]:
     """Return the background (H, W, 3), from the top down."""
     low, high = np.array(palette.HORIZON, float), np.array(palette.ZENITH, float)
-    height = np.clip(np.linspace(1, -2, BACKGROUND_HEIGHT), 0, 1)[:, None] ** 1.5
+    height = np.clip(np.linspace(1, -3, BACKGROUND_HEIGHT), 0, 1)[:, None] ** 1.5
     rows = np.round(low + height * (high - low)).astype(np.uint8)
     return np.repeat(rows[:, None], 2 * BACKGROUND_HEIGHT, axis=1)
 
 
 def set_stage(scene: viser.SceneApi) -> None:
-    """Set lights, fog and background; the lights look the same in an exported picture, without an environment map."""
+    """Set lights and background; the lights look the same in an exported picture, without an environment map."""
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map(hdri=None)
-    scene.configure_fog(*FOG, color=palette.linear(palette.HORIZON))
     scene.set_background_image(background(), "png")
     scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(206, 204, 204), intensity=1.5)
     scene.add_light_directional("/lights/key", position=(0.9, -1.5, 2.4), intensity=2.3, cast_shadow=True)
