@@ -110,3 +110,13 @@ def test_what_is_not_known_is_kept_until_a_frame_tells_it(server):
     for seconds in (0.1, 0.1, 0.2):
         bound.report(frame_of(SCENARIO, seconds=seconds))
     assert shown == [0.1, 0.2]
+
+
+def test_what_is_assigned_is_shown_and_calls_nothing_back(server):
+    """A call back would wait for a loop that may have ended with the server."""
+    slider, called = server.gui.add_slider("s", 0.0, 1.0, 0.1, 0.0), []
+    slider.on_update(called.append)
+    control = Control(slider, called.append)
+    control.value = 0.5
+    assert control.value == slider.value == 0.5
+    assert called == []

@@ -39,7 +39,9 @@ class Control:
 
     @value.setter
     def value(self, value: Any) -> None:  # noqa: ANN401
-        self._value = self.handle.value = value
+        self._value = value
+        if self.handle.value != value:
+            self._put_back()
 
     async def _changed(self, event: viser.GuiEvent) -> None:
         if event.client is None:  # assigned here, not in a browser
@@ -53,7 +55,7 @@ class Control:
             self._act(value)
 
     def _put_back(self) -> None:
-        # not by viser's setter, which casts to the type of the claim
+        # not by viser's setter, which casts to the type of the claim, and calls back on a loop that may have ended
         self.handle._impl.value = self._value
         if not _is_button(self.handle):
             self.handle._queue_update("value", self._value)
