@@ -21,7 +21,7 @@ BACKGROUND_HEIGHT = 128
 def background() -> NDArray[np.uint8]:
     """Return the background (H, W, 3), from the top down."""
     low, high = np.array(palette.HORIZON, float), np.array(palette.ZENITH, float)
-    height = np.clip(np.linspace(1, -3, BACKGROUND_HEIGHT), 0, 1)[:, None] ** 1.5
+    height = np.clip(np.linspace(1, -6, BACKGROUND_HEIGHT), 0, 1)[:, None] ** 1.5
     rows = np.round(low + height * (high - low)).astype(np.uint8)
     return np.repeat(rows[:, None], 2 * BACKGROUND_HEIGHT, axis=1)
 
