@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.shapes import Box, lathe
+from dt_viz.obstacles.shapes import Box, Sphere, lathe
 
 GRAVITY = 9.81
 """Acceleration of gravity, m/s²."""
@@ -101,8 +101,7 @@ class Ball(TaskObject):
 
     def surface(self) -> tuple[Array, Indices]:
         """See `TaskObject`."""
-        turn = np.linspace(0, np.pi, 17)
-        return lathe(list(zip(self.radius * np.sin(turn), -self.radius * np.cos(turn), strict=True)), 24)
+        return Sphere((0.0, 0.0, 0.0), 2 * self.radius).surface()
 
     def moved(self, place: Array, hand: Hand) -> Array:
         """See `TaskObject`."""
@@ -141,9 +140,8 @@ class PushedBox(TaskObject):
     def surface(self) -> tuple[Array, Indices]:
         """See `TaskObject`."""
         vertices, faces = Box((0.0, 0.0, 0.0), self.sizes).surface()
-        (x, y), z = self.direction, np.zeros(len(vertices))
-        turned = vertices[:, :1] * [x, y, 0.0] + vertices[:, 1:2] * [-y, x, 0.0]
-        return turned + np.stack([z, z, vertices[:, 2]], axis=1), faces
+        x, y = self.direction
+        return vertices @ np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]]), faces
 
     def moved(self, place: Array, hand: Hand) -> Array:
         """See `TaskObject`."""

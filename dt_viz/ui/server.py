@@ -30,7 +30,7 @@ MAX_SLEEP = 0.5
 """Longest sleep of the main thread, seconds. Only this thread runs signal handlers, and a signal that arrives just
 before a sleep, or on another thread, is handled after it."""
 CLOSING = 2.0
-"""Longest wait for what is drawn on a page while the server closes, seconds."""
+"""Longest wait for pages that are being built or drawn while the server closes, seconds."""
 
 # a visitor may leave between two pictures of the arm; a picture without a receiver is no problem
 warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
@@ -74,8 +74,12 @@ class Server:
         self._titles = {name: entry.title for name, entry in tasks.items()}
         self._max_sessions = max_sessions
         self._robot = load_jaco()
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
+        """Those with a page, and None for those whose page is being built."""
+        self._num_building = 0
+        """Number of pages that are being built, also for visitors who have left meanwhile."""
+        self._closed = False
         gate = Gate(
             Origins(host, allowed), max_connections=max_sessions + MAX_WAITING, max_upload=MAX_BYTES, refused=_refuse
         )
@@ -100,20 +104,24 @@ class Server:
 
     def close(self) -> None:
         """Close all pages and stop listening."""
+        with self._lock:
+            self._closed = True
+            self._lock.wait_for(lambda: not self._num_building, CLOSING)  # a page that is being built needs the server
         visitors = self.visitors
         for visitor in visitors:
             visitor.close()
-        for visitor in visitors:  # what they are drawing needs the server
+        for visitor in visitors:  # and so does what they are drawing
             visitor.session.wait_idle(CLOSING)
         self._server.stop()
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            if client.client_id not in self._server.get_clients():
+            if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
             full = len(self._visitors) >= self._max_sessions
             if not full:
                 self._visitors[client.client_id] = None  # a place is taken before the page is built
+                self._num_building += 1
         if full:
             client.gui.add_markdown(
                 f"**All {self._max_sessions} places are taken.** Close another tab of this demo, or reload in a while. "
@@ -121,9 +129,16 @@ class Server:
             )
             return
         try:
-            visitor = Visitor(
-                client, Engine(self._tasks, self._fits, self._robot), self._robot, self._titles, self._task
-            )
+            self._build_page(client)
+        finally:
+            with self._lock:
+                self._num_building -= 1
+                self._lock.notify_all()
+
+    def _build_page(self, client: viser.ClientHandle) -> None:
+        engine = Engine(self._tasks, self._fits, self._robot)
+        try:
+            visitor = Visitor(client, engine, self._robot, self._titles, self._task)
         except Exception as error:
             logger.exception("the page of visitor %d could not be built", client.client_id)
             client.gui.add_markdown(f"**The page could not be built.** {type(error).__name__}: {error}")
