@@ -172,7 +172,7 @@ class Page:
         """A scenario in which most controls are shown, and most things stand in the scene."""
         task = TASKS["draw_s"]()
         obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
-        avoidance = {"space": "both", "duration": 0.5, "integration": Integration("rk4", 8)}
+        avoidance = {"space": "cspace", "duration": 0.5, "integration": Integration("rk4", 8)}
         layers = biases(BiasPoint(MIDDLE, radius=0.1, strength=0.5))
         self.session.edit(
             "test",

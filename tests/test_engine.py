@@ -298,7 +298,7 @@ def test_refining_ends_where_a_checkpoint_says_so(engine, scenario):
     assert stage(engine, scenario, Stage.CERTIFIED).certificates.lyapunov_falls  # nothing is left locked
 
 
-@pytest.mark.parametrize("space", ["task", "both"])
+@pytest.mark.parametrize("space", ["task", "cspace"])
 def test_what_follows_a_hand_ends_where_the_thread_is_interrupted(new_engine, initial, space):
     class ClosedError(Exception):
         pass
@@ -401,7 +401,7 @@ def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_turn(new_eng
         assert ended.wait(PATIENCE)
 
 
-@pytest.mark.parametrize("space", ["task", "both"])
+@pytest.mark.parametrize("space", ["task", "cspace"])
 def test_engines_that_take_turns_at_every_checkpoint_all_get_their_first_frames(
     new_engine, initial, monkeypatch, space
 ):
@@ -486,7 +486,7 @@ def test_a_task_is_loaded_once(engine):
     assert all(isinstance(d, Demonstration) for d in engine.task("draw_s").demonstrations)
 
 
-@pytest.mark.parametrize("space", ["task", "cspace", "both"])
+@pytest.mark.parametrize("space", ["task", "cspace"])
 def test_a_bias_point_that_motions_pass_giving_way_is_said_with_the_distance(engine, initial, space):
     scenario = initial("draw_s")
     target = np.add(scenario.obstacles[0].position, (0.10, 0.0, 0.0))

@@ -282,7 +282,7 @@ class TestFollowing:
 
     @pytest.mark.parametrize(("exact", "tolerance"), [(False, 1e-3), (True, 1e-8)])
     def test_behaviours_of_the_hand_are_followed(self, follower, nominal, initial, robot, exact, tolerance):
-        solution = build_stack(nominal, changed(initial("push_box"), space="both").active, LIVE)
+        solution = build_stack(nominal, changed(initial("push_box"), space="task").active, LIVE)
         lifted = follower.behaving(nominal, solution, exact=exact)
         assert lifted.fractions.shape == (7, NUM_CONFIGURATIONS)
         assert (np.diff(lifted.fractions, axis=1) > 0).all()
@@ -295,9 +295,9 @@ class TestFollowing:
     def test_what_was_followed_before_changes_nothing_that_is_seen(
         self, follower, nominal, initial, robot, exact, tolerance
     ):
-        wanted = build_stack(nominal, changed(initial("push_box"), space="both").active, LIVE)
+        wanted = build_stack(nominal, changed(initial("push_box"), space="task").active, LIVE)
         x, y, z = initial("push_box").obstacles[0].position
-        other = changed(initial("push_box"), space="both", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
+        other = changed(initial("push_box"), space="task", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
         before = follower.behaving(nominal, build_stack(nominal, other.active, LIVE), exact=False)
         again = follower.behaving(nominal, wanted, exact=exact, before=before).tracked.q
         fresh = follower.behaving(nominal, wanted, exact=exact).tracked.q

@@ -30,7 +30,7 @@ def profiled(engine, scenario):
     return frame, frame.profiles
 
 
-@pytest.fixture(scope="module", params=["task", "cspace", "both"])
+@pytest.fixture(scope="module", params=["task", "cspace"])
 def shown(request, engine, initial):
     return profiled(engine, changed(initial("draw_s"), space=request.param, arm_rollout=1))
 

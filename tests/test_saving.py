@@ -149,7 +149,7 @@ TRANSFORMS = st.one_of(
     st.builds(
         dt.Avoidance,
         st.lists(OBSTACLES, max_size=3),
-        space=st.sampled_from(["task", "cspace", "both"]),
+        space=st.sampled_from(["task", "cspace"]),
         generator=st.sampled_from(["free-space", "probability"]),
         temperature=st.floats(0.5, 50),
         margin=st.floats(0, 0.5),

@@ -613,9 +613,9 @@ def test_what_is_drawn_from_the_motion_itself_needs_no_new_frame(opened, layer):
 
 
 def test_who_avoids_can_be_undone(opened):
-    opened.edit("Avoid with", space="both")
+    opened.edit("Avoid with", space="cspace")
     opened.settle()
-    assert opened.shown.avoidance.space == "both"
+    assert opened.shown.avoidance.space == "cspace"
     opened.session.undo()
     opened.settle()
     assert opened.shown.avoidance.space == "task"

@@ -206,11 +206,11 @@ def test_two_new_bias_points_do_not_pull_against_each_other(task, engine, initia
 # settings
 
 
-TUNED = stack(2, space="both", duration=0.4)
+TUNED = stack(2, space="cspace", duration=0.4)
 
 
 def test_transforms_are_listed_from_the_outermost_inwards_where_they_have_something_to_do():
-    assert tunable(TUNED) == (WHOLE_ARM, AVOIDANCE, "Bias 2", "Bias 1", IMITATION)
+    assert tunable(TUNED) == (WHOLE_ARM, "Bias 2", "Bias 1", IMITATION)
     assert tunable(changed(TUNED, space="task", level=0)) == ("Bias 2", "Bias 1", AVOIDANCE, IMITATION)
     assert tunable(changed(TUNED, obstacles=())) == ("Bias 2", "Bias 1", IMITATION)
 
@@ -231,12 +231,11 @@ def test_what_is_set_is_what_is_read_and_the_others_stay(name):
     after = replace(own, integration=EULER)
     edited = replace(TUNED, stack=with_transform(TUNED, name, after))
     for other, transform in before.items():
-        shared = {name, other} <= {WHOLE_ARM, AVOIDANCE}
-        assert transform_of(edited, other) == (after if other == name or shared else transform)
+        assert transform_of(edited, other) == (after if other == name else transform)
     assert replace(edited, stack=TUNED.stack) == TUNED
     assert listed(edited) == listed(TUNED)
     assert edited.arm_avoidance is not None
-    assert (edited.arm_avoidance.integration == EULER) == (name in {WHOLE_ARM, AVOIDANCE})
+    assert (edited.arm_avoidance.integration == EULER) == (name == WHOLE_ARM)
 
 
 @pytest.mark.parametrize("kind", KINDS)

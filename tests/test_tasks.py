@@ -53,7 +53,7 @@ OTHER_LETTERS = [name for name in TASKS if name.startswith("draw_") and name != 
 
 def is_slow(name, space):
     """Whether this is as well shown by S."""
-    return (space != "task" and name in OTHER_LETTERS) or (space == "both" and name != "draw_s")
+    return space != "task" and name in OTHER_LETTERS
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,8 @@ from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly
 from dt_viz.ui.scene.legend import OCCUPANCY
 from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
 from dt_viz.ui.scene.picture import Arrows, Lines
-from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, Rollouts, ScenePictures
+from dt_viz.ui.scene.rollouts import Middles, Rollouts
+from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, ScenePictures
 from dt_viz.ui.scene.starts import Starts
 
 ROBOT = load_jaco()
@@ -179,7 +180,7 @@ def test_a_stale_arm_is_translucent_says_so_and_recovers(scene):
 
 
 def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
-    rollouts = Rollouts(scene)
+    rollouts = Rollouts(scene, Middles())
     paths = tuple(np.linspace([x, 0.0, 0.0], [x, 1.0, 0.0], 5) for x in (0.0, 0.1))
 
     def colours(blocked):
@@ -237,6 +238,18 @@ def is_grey(pictures):
     grey = bool(np.ptp(rollouts.hero.colour) < 20)
     assert shown == {not grey}
     return grey
+
+
+def test_lines_that_rollouts_cover_are_drawn_where_the_rollouts_are_hidden(drawn):
+    pictures, scenario = drawn
+    ghost, demonstrations = (pictures.layer(name).node for name in ("ghost", "demonstrations"))
+    before = ghost.points, demonstrations.points
+    pictures.adopt(replace(scenario, view=replace(scenario.view, rollouts=False)))
+    assert len(ghost.points) > len(before[0])
+    assert len(demonstrations.points) == sum(len(path) - 1 for path in TASKS["draw_s"]().paths)
+    pictures.adopt(scenario)
+    np.testing.assert_array_equal(ghost.points, before[0])
+    np.testing.assert_array_equal(demonstrations.points, before[1])
 
 
 @pytest.mark.parametrize("changes", [{"task": "lift_box"}, {"scene": "cloud"}, {"objective": "velocity"}], ids=str)

@@ -64,7 +64,6 @@ def listed(scenario):
 
 def test_the_outermost_transform_is_on_top_and_the_base_at_the_bottom():
     assert list(listed(SCENARIO)) == [AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
-    assert list(listed(changed(SCENARIO, space="both"))) == [WHOLE_ARM, AVOIDANCE, "Bias 2", "Bias 1", IMITATION, BASE]
     assert list(listed(changed(SCENARIO, space="cspace"))) == [WHOLE_ARM, "Bias 2", "Bias 1", IMITATION, BASE]
     assert list(listed(changed(SCENARIO, obstacles=()))) == ["Bias 2", "Bias 1", IMITATION, BASE]
 
@@ -223,7 +222,7 @@ def test_the_panel_shows_what_auto_chose(server):
         (replace(avoiding("draw_s", BALL), imitation=False), "z = ψo(y)"),
         (avoiding("draw_s", BALL, avoids=False), "z = ψi(y)"),
         (avoiding("draw_s", BALL, space="cspace"), "z = ψi(fk(ψq(q)))"),
-        (avoiding("draw_s", BALL, space="both"), "z = ψi(ψo(fk(ψq(q))))"),
+        (avoiding("draw_s", BALL, space="cspace", layers=biases(BiasPoint(BALL.position))), "z = ψi(ψb1(fk(ψq(q))))"),
     ],
 )
 def test_the_formula_follows_the_stack_and_names_its_parts_in_their_colours(scenario, formula):

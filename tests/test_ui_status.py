@@ -134,7 +134,7 @@ def test_nothing_is_said_of_an_arm_that_is_hidden(view, told):
     assert "It is odd" in details_of(rollouts)
 
 
-@pytest.mark.parametrize(("space", "hinted"), [("task", True), ("both", False)])
+@pytest.mark.parametrize(("space", "hinted"), [("task", True), ("cspace", False)])
 def test_where_the_hand_alone_gives_way_that_is_told(space, hinted):
     told = frame(scenario=avoiding("draw_s", (SPHERE,), space=space), certificates=CLOSE_BY)
     assert ("only the path of the hand" in verdict_of(told).reason) == hinted

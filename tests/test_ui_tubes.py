@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.ui.scene import scene as scene_module
-from dt_viz.ui.scene.scene import COVERED, JUMP, OPACITY, Covered, Demonstrations, Ghost, Rollouts
+from dt_viz.ui.scene import rollouts as rollouts_module
+from dt_viz.ui.scene.rollouts import COVERED, JUMP, OPACITY, Demonstrations, Ghost, Middles, Rollouts
 from dt_viz.ui.scene.tubes import NUM_RINGS, NUM_SIDES, Tubes, evenly_bent, tube_faces, tubes
 
 RADIUS, BALL = 0.003, 0.007
@@ -69,11 +69,11 @@ def test_points_are_denser_where_a_path_bends():
 
 def test_faces_are_sent_only_when_the_number_of_paths_changes(scene):
     shown = Tubes(scene, "/tubes", (10, 20, 30), RADIUS)
-    shown.show(list(PATHS))
+    shown.show(PATHS)
     faces = shown.node.faces
-    shown.show([path + 0.1 for path in PATHS])
+    shown.show(PATHS + 0.1)
     assert shown.node.faces is faces
-    shown.show([])
+    shown.show(PATHS[:0])
     assert len(shown.node.faces) == 1 and np.ptp(shown.node.vertices) == 0
 
 
@@ -83,8 +83,8 @@ def frame(*rollouts, **changes):
 
 
 def test_lines_are_drawn_only_beside_the_rollouts(scene):
-    task, covered = TASKS["draw_s"](), Covered()
-    demonstrations, ghost = Demonstrations(scene, covered), Ghost(scene, covered)
+    task, tubes = TASKS["draw_s"](), Middles()
+    demonstrations, ghost = Demonstrations(scene, tubes), Ghost(scene, tubes)
     first = frame(*task.paths)
     demonstrations.draw(first)
     ghost.draw(first)
@@ -95,18 +95,21 @@ def test_lines_are_drawn_only_beside_the_rollouts(scene):
     middles = demonstrations._lines.node.points.mean(axis=1)
     samples = np.concatenate([evenly_bent(path) for path in half.rollouts])
     assert len(middles) > 100 and KDTree(samples).query(middles)[0].min() > 0.99 * COVERED
+    tubes.shown = False
+    ghost.draw(first)
+    assert len(ghost._lines.node.points) > 10  # nothing covers it any more
 
 
 class TestJumps:
     @pytest.fixture
     def clock(self, monkeypatch):
         times = [100.0]
-        monkeypatch.setattr(scene_module.time, "monotonic", lambda: times[0])
+        monkeypatch.setattr(rollouts_module.time, "monotonic", lambda: times[0])
         return times
 
     @pytest.mark.parametrize(("by", "fades"), [(0.9 * JUMP, False), (1.1 * JUMP, True)])
     def test_what_jumps_fades_where_it_was(self, scene, clock, by, fades):
-        rollouts, paths = Rollouts(scene), (helix(0.5), helix(0.7))
+        rollouts, paths = Rollouts(scene, Middles()), (helix(0.5), helix(0.7))
         former = rollouts.former.node
         rollouts.draw(frame(*paths))
         rollouts.fade()
@@ -124,7 +127,7 @@ class TestJumps:
         np.testing.assert_allclose(middles[1:-1], evenly_bent(paths[1]), atol=1e-6)
 
     def test_another_task_fades_nothing(self, scene, clock):
-        rollouts = Rollouts(scene)
+        rollouts = Rollouts(scene, Middles())
         rollouts.draw(frame(helix(0.5)))
         rollouts.draw(replace(frame(helix(0.5) + 1.0), task=TASKS["lift_box"]()))
         rollouts.fade()

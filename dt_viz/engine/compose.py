@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,16 +22,18 @@ from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import Applied, Solution, cut_off
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
-from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
+from dt_viz.pictures.panels import PanelPicture, generator_panel, system_panel
+from dt_viz.pictures.sketchbook import BASE_TITLE, Pictures, Sketchbook, in_frame
 from dt_viz.pictures.slice_fields import (
     ARROW_SPACING,
-    Clearance,
     FieldPicture,
     Samples,
     arrows_and_colour,
     streamlines,
 )
+from dt_viz.scenario.panels import BASE_PANEL, Panel, offsets
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import levels
 from dt_viz.scenario.starts import followed
 from dt_viz.warning import MotionWarning
@@ -150,13 +152,20 @@ def profiles(frame: Frame, solved: Solved, chosen: int, follower: Follower) -> P
     )
 
 
-def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, arrows: bool, coarse: bool) -> Pictures:
+def pictures(
+    scenario: Scenario,
+    solved: Solved,
+    books: Mapping[str, Sketchbook],
+    *,
+    arrows: bool,
+    coarse: bool,
+) -> Pictures:
     """The pictures that the view shows, on its slice and of its level.
 
     Args:
         scenario: whose view it is.
         solved: the motion.
-        book: makes the pictures of ψ, as far as the motion is warped.
+        books: make the pictures of ψ: for its own task as far as the motion is warped, and for those on its panels.
         arrows: whether the hand's velocities are among them.
         coarse: whether they are to follow a drag.
     """
@@ -165,7 +174,7 @@ def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, arrows: bo
     level = level_of(scenario, stack)
     built = stack.built[:level]
     system = stack.system if level is None else cut_off(nominal, stack, level)
-    clearance = _clearance(built)
+    clearance, book = _avoided(built).signed_distance, books[scenario.task]
     field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=arrows, coarse=coarse)
     return Pictures(
         field=field,
@@ -173,7 +182,7 @@ def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, arrows: bo
         colour=colour,
         generator=book.generator(area, view.generator_layer) if view.generator else None,
         grid=book.grid(area, [applied.made.transform for applied in built], coarse=coarse) if view.grid else None,
-        base=book.base(stack.rays) if view.base else None,
+        panels=_panels(scenario, solved, books, coarse=coarse) if view.panels else (),
         occupancy=occupancy_picture(area, scenario.obstacles, coarse=coarse) if view.colour == "occupancy" else None,
     )
 
@@ -181,12 +190,65 @@ def pictures(scenario: Scenario, solved: Solved, book: Sketchbook, *, arrows: bo
 def field(scenario: Scenario, solved: Solved) -> FieldPicture:
     """The hand's velocities on the view's slice, of the whole stack below the arm's avoidance."""
     area = solved.below.task.slice.posed(scenario.view.slice)
-    return Samples(solved.stack.system, area, _clearance(solved.stack.built), ARROW_SPACING, jacobian=False).field
+    clearance = _avoided(solved.stack.built).signed_distance
+    return Samples(solved.stack.system, area, clearance, ARROW_SPACING, jacobian=False).field
 
 
-def _clearance(built: Sequence[Applied]) -> Clearance:
-    """Distance from what these transforms avoid: no motion comes into it."""
-    return Union(tuple(part for applied in built for part in applied.transform.avoided.parts)).signed_distance
+def _panels(
+    scenario: Scenario, solved: Solved, books: Mapping[str, Sketchbook], *, coarse: bool
+) -> tuple[PanelPicture, ...]:
+    """The panels of a view, side by side, and the frame of the scene's own slice."""
+    task, names = solved.below.task, levels(scenario)[: 1 + len(solved.stack.built)]
+    area = task.slice.posed(scenario.view.slice)
+    made = [_panel(panel, solved, books, area, names, coarse=coarse) for panel in scenario.view.panels]
+    shown = [picture for picture in made if picture is not None]
+    places = offsets(area, len(shown), task.camera)
+    beside = [picture.moved(area.centre - picture.area.centre + by) for picture, by in zip(shown, places, strict=True)]
+    top = names[-1] if scenario.imitation or len(names) > 1 else BASE_TITLE
+    return (*beside, PanelPicture(_title(top), area))
+
+
+def _panel(
+    panel: Panel,
+    solved: Solved,
+    books: Mapping[str, Sketchbook],
+    area: Slice,
+    names: Sequence[str],
+    *,
+    coarse: bool,
+) -> PanelPicture | None:
+    """A panel where the slice is; None for that of a level which is off."""
+    book, stack = books[panel.task or solved.below.task.name], solved.stack
+    if panel.task:
+        return book.imitation(book.task.slice, book.task.title)
+    if panel == BASE_PANEL:
+        return book.base(area, grid=solved.scenario.view.grid)
+    if panel.level not in names:
+        return None
+    level = names.index(panel.level)
+    if panel.generator:
+        transform = stack.built[level - 1].made.transform if level else solved.below.system.transform
+        return generator_panel(f"generator of {_title(panel.level)}", transform, area)
+    if level == 0:
+        return book.imitation(area, _title(panel.level))
+    return system_panel(
+        _title(panel.level),
+        cut_off(solved.below, stack, level),
+        stack.bundle.split(stack.bundle.levels[:, level]),
+        area,
+        _avoided(stack.built[:level]),
+        coarse=coarse,
+    )
+
+
+def _title(level: str) -> str:
+    """What is written over the panel of a level."""
+    return level[:1].lower() + level[1:]
+
+
+def _avoided(built: Sequence[Applied]) -> Union:
+    """What these transforms avoid: no motion comes into it."""
+    return Union(tuple(part for applied in built for part in applied.transform.avoided.parts))
 
 
 def _chosen(scenario: Scenario, nominal: Nominal) -> int | None:

@@ -35,6 +35,9 @@ _turns = Turns()
 """Engines take turns. Small array operations of several threads would fight for the interpreter, and all would lose:
 four sessions that drag at once get twice as many frames this way."""
 
+NUM_BOOKS = 8
+"""Number of learned motions whose pictures are kept."""
+
 
 def let_drags_pass(longest: float) -> None:
     """Wait while an engine follows a hand, at most so many seconds; called often by what takes long beside engines."""
@@ -112,6 +115,9 @@ class Engine:
             ImitationError: nothing can be learned from them.
         """
         self.nominal(scenario, progress)
+        for panel in scenario.view.panels:
+            if panel.task:
+                self._imitated(panel.task, progress)
         began = time.perf_counter()
         for frame in self._stages(scenario, checkpoint):
             yield replace(frame, seconds=time.perf_counter() - began)
@@ -123,6 +129,10 @@ class Engine:
         strand = learned.strand  # a start that is dragged leaves nothing behind
         added = [self.memo("strand", (learned, s), lambda s=s: strand(s), newest=NEWEST) for s in scenario.starts]
         return self.memo("nominal", (learned, scenario.starts), lambda: learned.nominal(added), newest=4)
+
+    def _imitated(self, task: str, progress: Progress | None = None) -> Nominal:
+        """The undisturbed motion of another task."""
+        return self.nominal(Scenario(task), progress)
 
     def solved(self, scenario: Scenario, precision: Precision) -> Solved:
         """The motion of a scenario that is not blocked, at a precision; what it raises see `frames`.
@@ -270,11 +280,14 @@ class Engine:
         return shown.frame.arm.q if same_learned and shown.frame.scenario.arm_rollout == scenario.arm_rollout else None
 
     def _pictures(self, scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
-        learned = solved.below.learned
-        book = self.memo("sketchbook", learned, lambda: _sketchbook(learned), newest=2)
+        others = {panel.task: self._imitated(panel.task).learned for panel in scenario.view.panels if panel.task}
+        books = {
+            name: self.memo("sketchbook", learned, lambda learned=learned: _sketchbook(learned), newest=NUM_BOOKS)
+            for name, learned in {**others, scenario.task: solved.below.learned}.items()
+        }
         arm, view = solved.arm, scenario.view
         carried = view.field and arm is not None and not view.level
-        pictures = compose.pictures(scenario, solved, book, arrows=view.field and not carried, coarse=coarse)
+        pictures = compose.pictures(scenario, solved, books, arrows=view.field and not carried, coarse=coarse)
         if arm is None or not carried:
             return pictures
         layers, robot = tuple(layer for _, layer in scenario.active), self.follower.robot
@@ -328,4 +341,5 @@ def _avoids(transform: Transform) -> bool:
 
 def _sketchbook(learned: Learned) -> Sketchbook:
     """The maker of pictures of ψ."""
-    return Sketchbook(learned.task, in_frame(learned.system.transform), learned.system, learned.demonstrated.rays)
+    shown = learned.demonstrated
+    return Sketchbook(learned.task, in_frame(learned.system.transform), learned.system, shown.rays, shown.paths)

@@ -146,7 +146,7 @@ def _print(
 ) -> None:
     measured = list(by_number.values())
     x, y, z = options.obstacle
-    who = {"task": "end effector", "cspace": "whole arm", "both": "end effector and whole arm"}[options.space]
+    who = {"task": "end effector", "cspace": "whole arm"}[options.space]
     avoidance = "without avoidance" if options.no_avoidance else f"avoidance by the {who}"
     print(f"{task}, sphere of {options.diameter:g} m at ({x:g}, {y:g}, {z:g}) m, {avoidance}; lengths in mm")
     rows = [

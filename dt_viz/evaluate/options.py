@@ -33,7 +33,7 @@ def add_task(parser: argparse.ArgumentParser) -> None:
 
 def add_space(parser: argparse.ArgumentParser, default: str = "task") -> None:
     """Add `--space`."""
-    what = "what avoids: the end effector (task), the whole arm (cspace), or both (default: %(default)s)"
+    what = "what avoids: the end effector (task) or the whole arm (cspace) (default: %(default)s)"
     parser.add_argument("--space", choices=SPACES, default=default, help=what)
 
 

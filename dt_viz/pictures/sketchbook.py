@@ -1,8 +1,8 @@
-"""Pictures of ψ: the learned generator, the grid warped by ψ⁻¹, and the base attractor beside it."""
+"""Pictures of ψ: the learned generator, the grid warped by ψ⁻¹, and panels that no obstacle changes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +13,8 @@ from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.pictures.occupancy import OccupancyPicture
+from dt_viz.pictures.panels import Fit, PanelPicture, base_panel, system_panel
 from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture
-from dt_viz.properties import cached_property
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 
@@ -37,14 +37,8 @@ TOLERANCE = 1e-6
 MAX_NEWTON, MAX_STEP, MIN_SLOPE, ON_SLICE = 6, 0.05, 0.1, 1e-6
 """Largest number of Newton steps of the grid to the slice, their largest length, metres, the smallest slope of the
 preimage that they use, and the distance, metres, that counts as on the slice."""
-INSET_GAP = 0.06
-"""Distance between the slice and the inset, metres."""
-INSET_HALF_WIDTH = 0.21
-"""Largest half width of the inset, metres, which is all visible from the task's camera."""
-INSET_MARGIN = 0.18
-"""Margin around the rays in the inset, relative to their extent."""
-INSET_ARROWS = 13
-"""Number of arrows along the longer side of the inset."""
+BASE_TITLE = "base attractor"
+"""What is written over the base attractor."""
 
 
 @dataclass(frozen=True)
@@ -73,24 +67,6 @@ class GridPicture:
 
 
 @dataclass(frozen=True)
-class BasePicture:
-    """The base system in an inset beside the slice, scaled down if necessary; metres in the world unless stated."""
-
-    rays: tuple[Array, ...]
-    """(2, 3) from ψ(start) to ψ(goal)."""
-    points: Array
-    """(N, 3) places of the vector field's arrows."""
-    velocities: Array
-    """(N, 3) m/s in base space."""
-    grid: tuple[Array, ...]
-    """(2, 3) lines of the lattice whose image is the warped grid."""
-    border: Array
-    """(5, 3) closed outline of the inset."""
-    labels: tuple[Array, Array]
-    """(3,) places of the labels of the inset and of the learned system."""
-
-
-@dataclass(frozen=True)
 class Pictures:
     """The pictures of a view; None for those that are not shown, or not computed yet."""
 
@@ -100,7 +76,8 @@ class Pictures:
     colour: ColourPicture | None = None
     generator: GeneratorPicture | None = None
     grid: GridPicture | None = None
-    base: BasePicture | None = None
+    panels: tuple[PanelPicture, ...] = ()
+    """Those that the view shows; the last is the frame of the scene's own slice, if there are any."""
     occupancy: OccupancyPicture | None = None
 
 
@@ -126,24 +103,12 @@ class _Pieces:
         return start + (place - before)[:, None] * (end - start)
 
 
-@dataclass(frozen=True)
-class _Inset:
-    """Base space → world: z ↦ centre + scale·(z − middle)."""
-
-    middle: Array
-    centre: Array
-    scale: float
-    half: Array
-    """(2,) half the sides of the rectangle, metres in base space."""
-
-    def __call__(self, z: Array) -> Array:
-        return self.centre + self.scale * (z - self.middle)
-
-
 class Sketchbook:
     """Makes pictures of one learned motion; parts that do not depend on the obstacle are computed once."""
 
-    def __init__(self, task: Task, flows: Chain | None, system: DiffeomorphicSystem, rays: Rays) -> None:
+    def __init__(
+        self, task: Task, flows: Chain | None, system: DiffeomorphicSystem, rays: Rays, paths: tuple[Array, ...]
+    ) -> None:
         """Begin with no picture.
 
         Args:
@@ -151,8 +116,12 @@ class Sketchbook:
             flows: flows that ψ is composed of, in the demonstrations' own units; None without an imitation.
             system: system of the motion without further transforms, in the world.
             rays: rays from ψ(starts) to ψ(goal).
+            paths: (T_i, 3) their preimages, the rollouts, metres.
         """
-        self._task, self._flows, self._system, self._rays = task, flows, system, rays
+        self.task = task
+        """Task of the motion."""
+        self._flows, self._system, self._rays, self._paths = flows, system, rays, paths
+        self._panels: dict[tuple[str | bool, ...], PanelPicture] = {}
         self._generators: dict[int, tuple[Slice, GeneratorPicture]] = {}
         self._pieces: dict[bool, _Pieces] = {}
         """Coarse (True) and fine pieces."""
@@ -169,7 +138,7 @@ class Sketchbook:
         return made[1]
 
     def _generator(self, area: Slice, flows: Sequence[Diffeomorphism], number: int) -> GeneratorPicture:
-        task, chosen = self._task, [flows[number - 1]] if number else flows
+        task, chosen = self.task, [flows[number - 1]] if number else flows
         motions: list[Array] = []
         if number:
             for demonstration in task.demonstrations:
@@ -285,57 +254,37 @@ class Sketchbook:
         found[todo] = False
         return x, z, found
 
-    def base(self, rays: Rays) -> BasePicture:
-        """Return the base system; `rays` are those of the whole stack."""
-        task, inset = self._task, self._inset
-        goal = rays.base.goal
-        spacing = 2 * inset.half.max() / INSET_ARROWS
-        corner = inset.half - spacing / 2
-        z = inset.middle + _lattice(-corner, corner, spacing) @ task.slice.axes.T
-        border = replace(task.slice, centre=inset.middle, half_size=tuple(inset.half)).border
-        above = inset.centre + inset.scale * (task.slice.axes @ np.array([0.0, inset.half[1]]))
-        return BasePicture(
-            rays=tuple(inset(np.stack([z0, goal])) for z0 in rays.z0),
-            points=inset(z),
-            velocities=rays.base.velocity(z),
-            grid=self._inset_grid,
-            border=inset(border),
-            labels=(above, task.slice.at(np.array([0.0, task.slice.half_size[1]]))),
+    def base(self, area: Slice, *, grid: bool) -> PanelPicture:
+        """Return the base attractor on a panel where the slice is, with the lattice of the warped grid or without."""
+        return self._panel(BASE_TITLE, area, lambda: self._base(area, grid=grid), (grid,))
+
+    def imitation(self, area: Slice, title: str) -> PanelPicture:
+        """Return the imitation, and what it imitates, on a panel where the slice is."""
+        return self._panel(
+            title,
+            area,
+            lambda: system_panel(title, self._system, self._paths, area, demonstrations=self.task.paths, coarse=False),
         )
 
-    @cached_property
-    def _inset_grid(self) -> tuple[Array, ...]:
-        task, inset = self._task, self._inset
-        middle, pieces = task.slice.across(inset.middle), []
-        for a, b in zip(*self._lines(task.slice), strict=True):
-            ends = np.stack([a, b]) - middle
-            cut = np.clip(ends, -inset.half, inset.half)
-            fixed = np.abs(ends[0] - ends[1]) < 1e-9  # the coordinate along which the line does not run
-            if (np.abs(ends[0] - cut[0])[fixed] < 1e-9).all():
-                pieces.append(inset(inset.middle + cut @ task.slice.axes.T))
-        return tuple(pieces)
+    def _panel(
+        self, title: str, area: Slice, make: Callable[[], PanelPicture], key: tuple[bool, ...] = ()
+    ) -> PanelPicture:
+        """Return a panel that no obstacle changes, made once."""
+        made = self._panels.get((title, *key))
+        if made is None or not made.area.lies_like(area):
+            made = self._panels[(title, *key)] = make()
+        return made
 
-    @cached_property
-    def _inset(self) -> _Inset:
-        """Inset beside the slice, on the left as seen from the task's camera, no larger than the slice."""
-        task = self._task
-        plane = task.slice.axes
-        ends = np.concatenate([self._rays.z0, [self._rays.base.goal]])
-        across = task.slice.across(ends)
-        lower, upper = across.min(axis=0), across.max(axis=0)
-        half = (upper - lower) / 2
-        half = half + INSET_MARGIN * half.max()
-        half = np.maximum(half, 0.45 * half.max())
-        # the plane of the inset contains the goal, where all rays meet
-        normal = task.slice.normal
-        offset = (self._rays.base.goal - task.slice.centre) @ normal
-        middle = task.slice.at((lower + upper) / 2) + offset * normal
-        scale = min(1.0, INSET_HALF_WIDTH / half[0], task.slice.half_size[1] / half[1])
-        eye, target = (np.array(point) for point in task.camera)
-        right = np.cross(target - eye, [0.0, 0.0, 1.0])
-        side = -np.sign(right @ plane[:, 0])
-        centre = task.slice.centre + side * (task.slice.half_size[0] + INSET_GAP + scale * half[0]) * plane[:, 0]
-        return _Inset(middle, centre, scale, half)
+    def _base(self, area: Slice, *, grid: bool) -> PanelPicture:
+        fit, lines = Fit.of(self._rays, area), []
+        seen = fit.base_area
+        for ends in zip(*self._lines(area), strict=True) if grid else ():
+            across = seen.across(area.at(np.stack(ends)))
+            cut = np.clip(across, -np.array(seen.half_size), seen.half_size)
+            fixed = np.abs(across[0] - across[1]) < 1e-9  # the coordinate along which the line does not run
+            if (np.abs(across[0] - cut[0])[fixed] < 1e-9).all():
+                lines.append(seen.at(cut))
+        return base_panel(BASE_TITLE, self._rays, fit, lines, coarse=False)
 
 
 def in_frame(transform: Diffeomorphism) -> Chain | None:

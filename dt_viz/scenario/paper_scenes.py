@@ -14,8 +14,9 @@ from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Point, Sphere, as_point
 from dt_viz.scenario.objects import Pot
+from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario, View
-from dt_viz.scenario.stack import plane_of, with_added
+from dt_viz.scenario.stack import IMITATION, plane_of, with_added
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
@@ -30,17 +31,16 @@ CLOVER_LOBES = 0.4
 """Height of the clover's three lobes, relative to the mean radius."""
 NUM_LABELS = 4000
 """Number of labelled points of the clover."""
-STROKE_SPHERE = 0.10
-"""Diameter of the sphere in the strokes of fig. 5, metres."""
-STROKE_TEMPERATURE = 2.0
-"""T of that sphere: its field ends soon, so that the rest of the letter stays."""
-STROKE_PLACES = {"draw_w": 0.20}
-"""Places of that sphere, as fractions of the letter's length, other than the task's obstacle position: in the middle of
-the W the arm would have to give way to it along the other strokes, too."""
 J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
 """Places of the two points beside the J: fraction of its length, and offset to the right and up, metres."""
+OTHER_LETTERS = "CGJWZ"
+"""Letters of fig. 5 beside the S."""
 HAND_ONLY = {"arm": False}
 """View of scenes where only the path of the hand gives way: the fingers would be in the obstacle."""
+FIGURE = HAND_ONLY | {"field": False, "streamlines": True, "table": False, "ghost": False, "demonstrations": False}
+"""View of panels side by side: flat figures of the motion alone."""
+FIRST_BIAS = f"{BiasPoint.title} 1"
+"""Name of the layer of the first bias point."""
 ABOVE = 0.16
 """Height over a pot's opening at which the object is released, metres, as in the demonstrations."""
 
@@ -86,9 +86,20 @@ def _bottle_in_the_way(task: Task) -> Scenario:
     return _avoiding(task, Avoidance(Cylinder((x, y, height / 2), diameter, height), space="cspace"))
 
 
-def _cube_in_the_letter(task: Task) -> Scenario:
-    """Fig. 3 (a)."""
-    return _avoiding(task, Avoidance(Box(task.obstacle_position, (CUBE, CUBE, CUBE))))
+def _sphere_in_the_letter(task: Task) -> Scenario:
+    """Fig. 2."""
+    return _avoiding(task, Avoidance(Sphere(task.obstacle_position)))
+
+
+def _cube_before_the_attractor(task: Task) -> Scenario:
+    """Fig. 3 (a): motions that are straight but for the cube."""
+    middle = (task.starts.mean(axis=0) + task.mean_path[-1]) / 2
+    return replace(_avoiding(task, Avoidance(Box(as_point(middle), (CUBE, CUBE, CUBE)))), imitation=False)
+
+
+def _alone(task: Task) -> Scenario:
+    """Fig. 3 (b), 5 and 8: what was learned, and nothing in its way."""
+    return Scenario(task.name, ())
 
 
 def in_clover(s: Array) -> Mask:
@@ -106,16 +117,8 @@ def clover() -> Cloud:
 
 
 def _cloud_in_the_letter(task: Task) -> Scenario:
-    """Fig. 3 (b)."""
+    """Sec. 4.4."""
     return _avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, clover())))
-
-
-def _sphere_in_the_stroke(task: Task) -> Scenario:
-    """Fig. 5."""
-    u = STROKE_PLACES.get(task.name)
-    place = task.obstacle_position if u is None else as_point(task.mean_path[round(100 * u)])
-    sphere = Sphere(place, STROKE_SPHERE)
-    return _avoiding(task, Avoidance(sphere, space="both", temperature=STROKE_TEMPERATURE))
 
 
 def _two_points(task: Task) -> Scenario:
@@ -158,37 +161,64 @@ SCENES: Mapping[str, PaperScene] = {
             _bottle_in_the_way,
         ),
         PaperScene(
-            "cube",
-            "Fig. 3 (a): a cube in the S",
-            "Every stroke leaves the cube, the rest stays. Only the path of the hand gives way here.",
+            "steps",
+            "Fig. 2: attractor, imitation, avoidance",
+            "Each step is a diffeomorphism on the one before it: straight motions, the S, the S around the sphere. "
+            "Drag the sphere.",
             "draw_s",
-            _cube_in_the_letter,
-            view=HAND_ONLY,
+            _sphere_in_the_letter,
+            view=FIGURE | {"panels": (BASE_PANEL, Panel(IMITATION))},
+        ),
+        PaperScene(
+            "cube",
+            "Fig. 3 (a): a cube before an attractor",
+            "Nothing is learned here: straight motions, and the same ones led around the cube. Drag the cube.",
+            "draw_s",
+            _cube_before_the_attractor,
+            view=FIGURE | {"panels": (BASE_PANEL,)},
+        ),
+        PaperScene(
+            "learned",
+            "Fig. 3 (b): how the S is learned",
+            "The flow of the vector field in the middle turns straight motions (left) into the S (right).",
+            "draw_s",
+            _alone,
+            view=FIGURE | {"panels": (BASE_PANEL, Panel(IMITATION, generator=True)), "demonstrations": True},
+        ),
+        PaperScene(
+            "two_points",
+            "Fig. 4: a J biased to two points",
+            "The J, the field that leads it to the first point, the J through that point, and through both: drag them.",
+            "draw_j",
+            _two_points,
+            view=FIGURE | {"panels": (Panel(IMITATION), Panel(FIRST_BIAS, generator=True), Panel(FIRST_BIAS))},
+        ),
+        PaperScene(
+            "letters",
+            "Fig. 5: letters",
+            "Motions learned from seven drawings of each letter (pale), and where they lead from elsewhere.",
+            "draw_s",
+            _alone,
+            view=FIGURE
+            | {
+                "panels": tuple(Panel(task=f"draw_{letter.lower()}") for letter in OTHER_LETTERS),
+                "demonstrations": True,
+            },
         ),
         PaperScene(
             "cloud",
-            "Fig. 3 (b): labelled points in the S",
+            "Sec. 4.4: labelled points in the S",
             "Known of the clover is only which points lie in it (dark). Strokes leave the occupancy learned from them.",
             "draw_s",
             _cloud_in_the_letter,
             view=HAND_ONLY | {"colour": "occupancy", "field": False, "demonstrations": False},
         ),
         PaperScene(
-            "two_points",
-            "Fig. 4: a J biased to two points",
-            "Every stroke passes both points within a centimetre: drag them.",
-            "draw_j",
-            _two_points,
-        ),
-        *(
-            PaperScene(
-                f"letter_{character.lower()}",
-                f"Fig. 5: the letter {character}",
-                "Every stroke goes around the sphere, and the arm with it. Far from it the letter hardly changes.",
-                f"draw_{character.lower()}",
-                _sphere_in_the_stroke,
-            )
-            for character in "CGWZ"
+            "centre_pot",
+            "Fig. 8: into the centre pot",
+            "All demonstrations end over the centre pot: let go there, the object falls into it.",
+            "drop_pots",
+            _alone,
         ),
         PaperScene(
             "left_pot",

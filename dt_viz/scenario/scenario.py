@@ -8,6 +8,7 @@ from typing import Literal
 from dt_viz.learning.imitation import Objective
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
+from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import ArmAvoidance, Transform
@@ -25,7 +26,7 @@ MAX_STARTS = 36
 MAX_MARGIN = 0.05
 """Largest margin, metres."""
 
-COMPUTED_VIEWS = ("field", "streamlines", "generator", "grid", "base", "health_plots")
+COMPUTED_VIEWS = ("field", "streamlines", "generator", "grid", "health_plots")
 """Fields of `View` whose pictures are computed only while they are shown."""
 
 
@@ -68,8 +69,8 @@ class View:
     """Number of the flow of ψ that is shown: 1 is applied first; 0 is the mean of all over time."""
     grid: bool = False
     """The warped grid: lines of base space seen through ψ⁻¹."""
-    base: bool = False
-    """The base attractor beside the learned system."""
+    panels: tuple[Panel, ...] = ()
+    """Systems beside the scene, such as the base attractor."""
     click_to_start: bool = False
     """Whether a click on the slice adds a start."""
     playing: bool = True
@@ -198,4 +199,5 @@ class Scenario:
         same_layer = not after.generator or after.generator_layer == before.generator_layer
         same_colour = after.colour in {"none", before.colour}
         same_place = (after.slice, after.level) == (before.slice, before.level)
-        return self.moves_like(other) and shows_no_more and same_layer and same_colour and same_place
+        same_panels = after.panels in ((), before.panels)
+        return self.moves_like(other) and shows_no_more and same_layer and same_colour and same_place and same_panels

@@ -9,6 +9,7 @@ import numpy as np
 
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
+from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance, Space
@@ -113,6 +114,12 @@ def listed(scenario: Scenario) -> tuple[str, ...]:
 def levels(scenario: Scenario) -> tuple[str, ...]:
     """Names of the levels of the end effector's stack that are on, as `Frame.levels` has them."""
     return (IMITATION, *(layer.name for _, layer in scenario.active))
+
+
+def side_by_side(scenario: Scenario) -> tuple[Panel, ...]:
+    """Return panels of the base attractor and of each level below that of the whole stack."""
+    below = levels(scenario)[:-1]
+    return (BASE_PANEL, *(Panel(level) for level in below if level != IMITATION or scenario.imitation))
 
 
 def tunable(scenario: Scenario) -> tuple[str, ...]:

@@ -33,8 +33,8 @@ from dt_viz.transforms.base import (
 from dt_viz.transforms.sides import Passes
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
-Space = Literal["task", "cspace", "both"]
-"""Space of the avoidance: that of the end effector (sec. 4.4), configuration space (sec. 4.5), or both."""
+Space = Literal["task", "cspace"]
+"""Space of the avoidance: that of the end effector (sec. 4.4), or configuration space (sec. 4.5)."""
 SPACES: tuple[Space, ...] = get_args(Space)
 GENERATOR_NAMES: Mapping[Generator, str] = {
     "free-space": "Free space (−∇log(1−p))",
@@ -73,7 +73,7 @@ place: such a path arrives at up to 60° from the straight way out."""
 
 @dataclass(frozen=True, init=False)
 class Avoidance(Transform):
-    """Motions are led around obstacles: those of the end effector, those of the whole arm, or both.
+    """Motions are led around obstacles: those of the end effector or those of the whole arm.
 
     Raises:
         FormatError: a number makes no sense, such as a negative margin.
@@ -82,7 +82,7 @@ class Avoidance(Transform):
     obstacles: tuple[Obstacle, ...]
     """Obstacles that are avoided together; there may be none."""
     space: Space
-    """Who gives way: the end effector, the whole arm, or both."""
+    """Who gives way: the end effector, or the whole arm."""
     generator: Generator
     temperature: float
     """T of the occupancy potential; a higher one reaches farther and bends more gently."""
@@ -159,7 +159,7 @@ class Avoidance(Transform):
     @property
     def acts(self) -> bool:
         """See `Transform`."""
-        return self.space != "cspace" and bool(self.obstacles)
+        return self.space == "task" and bool(self.obstacles)
 
     @property
     def arm_avoidance(self) -> ArmAvoidance | None:

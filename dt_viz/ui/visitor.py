@@ -18,7 +18,7 @@ from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.slices import SlicePose
+from dt_viz.scenario.slices import Slice, SlicePose
 from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.scenario.tasks import Task
@@ -93,6 +93,8 @@ class Visitor:
         self._robot = robot
         self._stand, self._window = (np.zeros(3), np.zeros(3)), (0, 0)
         """Position and look-at of the camera where it was put last, metres, and the size of the window, pixels."""
+        self._beside: tuple[Slice, ...] = ()
+        """Panels that the camera was put to show, the scene's own rectangle among them."""
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
         self.playback = Playback(engine.arm, self._pose, self.fail)
@@ -112,8 +114,10 @@ class Visitor:
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         """See `Display`."""
-        if self.shown is None or frame.task is not self.shown.task:
-            self._look_at(frame.task)
+        beside = tuple(panel.area for panel in frame.pictures.panels)
+        others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._beside)
+        if self.shown is None or frame.task is not self.shown.task or others:
+            self._look_at(frame.task, beside)
         with self.client.atomic():
             self.pictures.draw(frame)
             self.objects.stand(frame.task)
@@ -156,10 +160,11 @@ class Visitor:
         """See `Display`."""
         self._panel.cancelled(task)
 
-    def _look_at(self, task: Task) -> None:
-        """Move the camera to where the task is seen best."""
+    def _look_at(self, task: Task, beside: tuple[Slice, ...]) -> None:
+        """Move the camera to where the task, or the panels beside it, are seen best."""
         camera = self.client.camera
-        self._stand, self._window = camera_for(task, camera), window(camera)
+        self._beside = beside
+        self._stand, self._window = camera_for(task, camera, panels=beside), window(camera)
         camera.position, camera.look_at = self._stand
         camera.fov = FIELD_OF_VIEW
 
@@ -170,11 +175,11 @@ class Visitor:
         self._window = window(camera)
         place = gestures.vector(camera.position, 3, gestures.MAX_SIGHT)
         if place is not None and np.abs(place - self._stand[0]).max() < MOVED:
-            self._look_at(self.shown.task)
+            self._look_at(self.shown.task, self._beside)
 
     def _look_home(self) -> None:
         if self.shown is not None:
-            self._look_at(self.shown.task)
+            self._look_at(self.shown.task, self._beside)
 
     def close(self) -> None:
         """Stop all threads: the visitor has left."""

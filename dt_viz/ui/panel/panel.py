@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import viser
 
@@ -16,6 +17,7 @@ from dt_viz.errors import DataError
 from dt_viz.learning.imitation import ImitationError
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene
 from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.stack import side_by_side
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
@@ -54,7 +56,7 @@ VIEW_LABELS: Mapping[str, str] = {
     "health_plots": "Plots along the path",
     "table": "Table",
     "grid": "Warped grid ψ⁻¹(grid)",
-    "base": "Base attractor",
+    "panels": "Stack side by side",
     "generator": "Learned generator",
 }
 PLOTS = {"joint_plots", "health_plots"}
@@ -67,7 +69,7 @@ VIEW_HINTS: Mapping[str, str] = {
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",
     "body_points": "spheres that cover the arm; lines from where each would be without avoidance",
     "grid": "straight lines of base space, as all transforms together bend them",
-    "base": "the motions before anything is learned, drawn beside the others: straight to the goal",
+    "panels": "the base attractor, with motions straight to the goal, and each level of the stack",
     "generator": "vector field whose flow is the imitation",
     "joint_plots": "angles and speeds over time, with their limits",
     "health_plots": "Lyapunov value, distance to the demonstration and clearance along the arm's rollout",
@@ -315,10 +317,14 @@ class Panel:
         self._bindings.properties(self.health, visible=lambda s: s.view.health_plots)
 
     def _build_checkbox(self, name: str) -> None:
+        def change(scenario: Scenario, value: bool) -> dict[str, Any]:
+            chosen = (side_by_side(scenario) if value else ()) if name == "panels" else value
+            return {"view": replace(scenario.view, **{name: chosen})}
+
         self._bindings.input(
-            self._gui.add_checkbox(VIEW_LABELS[name], getattr(View(), name), hint=VIEW_HINTS.get(name)),
-            lambda s: getattr(s.view, name),
-            lambda s, value: {"view": replace(s.view, **{name: value})},
+            self._gui.add_checkbox(VIEW_LABELS[name], bool(getattr(View(), name)), hint=VIEW_HINTS.get(name)),
+            lambda s: bool(getattr(s.view, name)),
+            change,
         )
 
     def _build_view(self) -> None:

@@ -11,6 +11,7 @@ import viser
 
 from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
+from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import (
     IMITATION,
@@ -123,7 +124,7 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row
         label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
         rows.append(Row(WHOLE_ARM, label, (ON if scenario.stack[place].on else OFF,)))
     imitation = Row(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
-    base = Row(BASE, BASE, (SHOWN if scenario.view.base else SHOW,))
+    base = Row(BASE, BASE, (SHOWN if BASE_PANEL in scenario.view.panels else SHOW,))
     return (*reversed(rows), imitation, base)
 
 
@@ -194,7 +195,7 @@ def _switch(scenario: Scenario, name: str) -> dict[str, Any]:
 def _select(scenario: Scenario, name: str) -> dict[str, Any]:
     view = scenario.view
     if name == BASE:
-        return {"view": replace(view, base=not view.base)}
+        return {"view": replace(view, panels=() if BASE_PANEL in view.panels else (BASE_PANEL,))}
     return {"view": replace(view, level="" if view.level == name else name, tuned=name)}
 
 

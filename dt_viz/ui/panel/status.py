@@ -153,10 +153,9 @@ def _duration_rows(frame: Frame, off: str) -> tuple[tuple[str, str], ...]:
             hand = duration
         else:
             strengths.append(f"{duration:.2f} {layer.name}")
-    both = hand is not None and frame.arm_duration is not None
-    parts = ((hand, " hand" if both else ""), (frame.arm_duration, " arm"))
-    flow_time = " · ".join(f"{t:.2f}{whose}" for t, whose in parts if t is not None)
-    times = (("Flow time t", flow_time or off),) if flow_time or not strengths else ()
+    flow_time = hand if frame.arm_duration is None else frame.arm_duration
+    shown = off if flow_time is None else f"{flow_time:.2f}"
+    times = () if flow_time is None and strengths else (("Flow time t", shown),)
     return (*times, *((("Strength", " · ".join(strengths)),) if strengths else ()))
 
 

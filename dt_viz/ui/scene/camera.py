@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.scenario.panels import TITLE_ROOM, directions
+from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui import gestures
 
@@ -34,17 +37,27 @@ OBSTACLE_ROOM = 0.09
 """Room around the obstacle's first place, metres."""
 
 
-def camera_for(task: Task, camera: Any, view: str = "Home") -> tuple[Array, Array]:  # noqa: ANN401
+def camera_for(
+    task: Task,
+    camera: Any,  # noqa: ANN401
+    view: str = "Home",
+    panels: Sequence[Slice] = (),
+) -> tuple[Array, Array]:
     """Return position (3,) and look-at (3,), metres, for a view of a task.
 
     Args:
         task: its motions and its usual direction of sight are taken.
         camera: viser's, of which the size of the window is taken.
-        view: one of `VIEWS`, or else the task's own.
+        view: one of `VIEWS`, or else the task's own: for panels straight onto them.
+        panels: rectangles that are to be seen instead of the task.
     """
     position, look_at = (np.asarray(place) for place in task.camera)
-    direction = np.asarray(VIEWS[view]) if view in VIEWS else look_at - position
-    return framed(shown(task), direction, *free_part(window(camera)))
+    direction, places = look_at - position, shown(task)
+    if panels:
+        right, up = directions(panels[0], task.camera)
+        direction, above = np.cross(up, right), TITLE_ROOM * up
+        places = np.concatenate([area.border + offset for area in panels for offset in (np.zeros(3), above)])
+    return framed(places, np.asarray(VIEWS.get(view, direction)), *free_part(window(camera)))
 
 
 def shown(task: Task) -> Array:

@@ -12,7 +12,7 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Picture
-from dt_viz.ui.scene.tubes import Tubes
+from dt_viz.ui.scene.tubes import Tubes, middles_of
 
 LABEL_GAP = 0.03
 """Height of the label above the slice, metres."""
@@ -35,7 +35,7 @@ class LevelRollouts(Picture):
         """See `Picture`."""
         if frame.level is not None:
             paths = frame.levels[frame.level]
-            self.tubes.show(paths)
+            self.tubes.show(middles_of(paths))
             self.tubes.colour = palette.STALE if frame.blocked else palette.LEVEL
             self._mark(paths[0][-1], frame.goal)
             self.label.text, area = manifold(frame.scenario), frame.slice

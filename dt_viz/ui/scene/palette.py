@@ -45,7 +45,7 @@ GENERATOR = (230, 159, 0)
 GRID = (0, 114, 178)
 GRID_BESIDE = (158, 196, 222)
 """Warped grid, and the same beside the rollouts of a level."""
-INSET = (120, 126, 136)
+PANEL = (120, 126, 136)
 POT = (176, 132, 98)
 OBJECT = (240, 200, 90)
 """What the hand moves."""

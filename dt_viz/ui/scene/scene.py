@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import viser
-from scipy.spatial import KDTree
 
 from dt_viz.arm.robot import Robot
 from dt_viz.engine.frame import Frame
-from dt_viz.flows.fields import Array
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
@@ -25,128 +21,23 @@ from dt_viz.ui.scene.anchors import Moved as AnchorMoved
 from dt_viz.ui.scene.arm_layers import Onion
 from dt_viz.ui.scene.handles import Moved as SliceMoved
 from dt_viz.ui.scene.levels import LevelRollouts
-from dt_viz.ui.scene.manifold import BaseInset, Generator, WarpedGrid
+from dt_viz.ui.scene.manifold import Generator, WarpedGrid
 from dt_viz.ui.scene.obstacles import Moved, Obstacles
-from dt_viz.ui.scene.picture import Lines, Picture
+from dt_viz.ui.scene.panels import Panels
+from dt_viz.ui.scene.picture import Picture
+from dt_viz.ui.scene.rollouts import Demonstrations, Ghost, Middles, Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
 from dt_viz.ui.scene.stage import Table, set_stage
 from dt_viz.ui.scene.starts import Starts
-from dt_viz.ui.scene.tubes import Tubes, evenly_bent
 
-BOLD, THIN = 0.0034, 0.0020
-"""Radius of the rollout that the arm follows, and of the others, metres."""
-BESIDE = 0.7
-"""Thickness of rollouts beside those of a level, relative to the usual one."""
-OPACITY = 0.55
-"""Opacity of the rollouts that the arm does not follow."""
-COVERED = 0.0035
-"""Distance of a line from the middle of a rollout up to which it counts as inside its tube, metres."""
-NUM_COMPARED = 400
-"""Number of points of a rollout that lines are compared with."""
-JUMP, FADING = 0.05, 0.15
-"""Distance by which a rollout jumps, metres, where it then fades out where it was, and the time that takes, seconds."""
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
 """Labels of the demonstrations' end: where motions end there, and where they end elsewhere."""
 OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
 """Fields of `View` whose pictures are hidden while there is no motion: unlike the rollouts they cannot turn grey."""
-OF_A_TASK = {"demonstrations", "ghost"}
+OF_A_TASK = {"demonstrations", "ghost", "panels"}
 """Fields of `View` whose pictures are hidden while another task or scene is being computed."""
 COMPUTING = "computing"
-
-
-class Covered:
-    """Where lines run inside the rollouts' tubes: there they are not drawn."""
-
-    def __init__(self) -> None:
-        self._rollouts: tuple[Array, ...] = ()
-        self._samples = KDTree(np.zeros((1, 3)))
-
-    def beside(self, rollouts: tuple[Array, ...], segments: Array) -> Array:
-        """Those of the segments (K, 2, 3), metres, that are beside all rollouts (T_i, 3)."""
-        if rollouts is not self._rollouts:
-            samples = np.concatenate([evenly_bent(path, NUM_COMPARED) for path in rollouts])
-            self._rollouts, self._samples = rollouts, KDTree(samples)
-        distance, _ = self._samples.query(segments.mean(axis=1))
-        return segments[distance > COVERED]
-
-
-class Demonstrations(Picture):
-    """The demonstrations, as thin lines, where no rollout covers them."""
-
-    def __init__(self, scene: viser.SceneApi, covered: Covered) -> None:
-        self._lines, self._covered = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018), covered
-        super().__init__(self._lines.node)
-
-    def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
-        self._lines.show_segments(self._covered.beside(frame.rollouts, self._lines.segments(frame.task.paths)))
-
-
-class Rollouts(Picture):
-    """The rollouts as tubes: the one that the arm follows thick, the others thin and translucent.
-
-    Where some of them jump elsewhere, as when a drag takes them past the other side of an obstacle, they fade out
-    where they were.
-    """
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        super().__init__(scene.add_frame("/rollouts", show_axes=False))
-        self.hero = Tubes(scene, "/rollouts/followed", palette.ROLLOUT, BOLD, ball=2.4 * BOLD)
-        self.others = Tubes(scene, "/rollouts/others", palette.ROLLOUT, THIN, ball=2.6 * THIN, opacity=OPACITY)
-        self.added = Tubes(scene, "/rollouts/added", palette.ADDED, THIN)
-        self.former = Tubes(scene, "/rollouts/former", palette.ROLLOUT, THIN, opacity=OPACITY)
-        self._drawn: Frame | None = None
-        self._jumped = -math.inf
-        """Time at which some jumped, seconds."""
-
-    def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
-        num, paths = len(frame.rollouts) - frame.num_added, frame.rollouts
-        followed = frame.chosen if frame.level is None else None
-        self.hero.show([] if followed is None else [paths[followed]])
-        self.others.show([paths[k] for k in range(num) if k != followed], scale=1.0 if frame.level is None else BESIDE)
-        self.added.show([paths[k] for k in range(num, len(paths)) if k != followed])
-        for tubes, colour in (
-            (self.hero, palette.ROLLOUT),
-            (self.others, palette.ROLLOUT),
-            (self.added, palette.ADDED),
-        ):
-            tubes.colour = palette.STALE if frame.blocked else colour
-        jumped = _jumped(self._drawn, frame)
-        if jumped:
-            self.former.show(jumped)
-            self._jumped = time.monotonic()
-        self._drawn = frame
-
-    def fade(self) -> None:
-        """Let what has jumped fade; called again and again."""
-        left = 1 - (time.monotonic() - self._jumped) / FADING
-        self.former.node.visible = left > 0
-        if left > 0:
-            self.former.node.opacity = OPACITY * left
-
-
-def _jumped(before: Frame | None, frame: Frame) -> list[Array]:
-    """The rollouts of a frame that are far from where they are in the next one."""
-    if before is None or before.task is not frame.task or len(before.rollouts) != len(frame.rollouts):
-        return []
-    pairs = zip(before.rollouts, frame.rollouts, strict=True)
-    return [old for old, new in pairs if np.linalg.norm(evenly_bent(old) - evenly_bent(new), axis=1).max() > JUMP]
-
-
-class Ghost(Picture):
-    """The undisturbed motion of the rollout that the arm follows, dashed, where no rollout covers it."""
-
-    def __init__(self, scene: viser.SceneApi, covered: Covered) -> None:
-        self._lines, self._covered = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012), covered
-        super().__init__(self._lines.node)
-
-    def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
-        own = frame.ghost[: len(frame.ghost) - frame.num_added]
-        undisturbed = own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
-        self._lines.show_segments(self._covered.beside(frame.rollouts, self._lines.segments(undisturbed)))
 
 
 class Goal(Picture):
@@ -203,17 +94,18 @@ class ScenePictures:
             LevelRollouts(scene),
             Goal(scene),
         )
-        covered, self.rollouts = Covered(), Rollouts(scene)
+        self._middles = Middles()
+        self.rollouts = Rollouts(scene, self._middles)
         self._by_view: dict[str, Picture] = {
-            "demonstrations": Demonstrations(scene, covered),
+            "demonstrations": Demonstrations(scene, self._middles),
             "rollouts": self.rollouts,
-            "ghost": Ghost(scene, covered),
+            "ghost": Ghost(scene, self._middles),
             "field": FieldArrows(scene),
             "streamlines": Streamlines(scene),
             "table": Table(scene),
             "generator": Generator(scene),
             "grid": WarpedGrid(scene),
-            "base": BaseInset(scene),
+            "panels": Panels(scene),
             "onion": Onion(scene, robot),
         }
         self._view, self._blocked = View(), False
@@ -248,6 +140,7 @@ class ScenePictures:
     def _draw(self, frame: Frame) -> None:
         """Draw a frame, a stale one grey: as one that there is no motion for."""
         before, self._grey = (self._blocked, self._grey), self.stale
+        self._middles.shown = self._view.rollouts
         if self._grey:
             frame = replace(frame, blocked=(*frame.blocked, COMPUTING))
         for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
@@ -267,7 +160,8 @@ class ScenePictures:
         with self._showing:
             self._view = scenario.view
             self._show()
-        if self.stale != self._grey:  # a thread that is drawing has seen the new scenario, or is waited for
+        # a thread that is drawing has seen the new scenario, or is waited for
+        if (self.stale, scenario.view.rollouts) != (self._grey, self._middles.shown):
             with self._drawing:
                 if self._frame is not None:
                     self._draw(self._frame)
@@ -276,7 +170,7 @@ class ScenePictures:
         """Show what the view says; nothing that belongs to another motion while the scenario has none."""
         for name, picture in self._by_view.items():
             hidden = (self._blocked and name in OF_A_MOTION) or (self._grey and name in OF_A_TASK)
-            picture.visible = getattr(self._view, name) and not hidden
+            picture.visible = bool(getattr(self._view, name)) and not hidden
         shown = None if self._blocked else self._by_colour.get(self._view.colour)
         for picture in self._by_colour.values():
             picture.visible = picture is shown

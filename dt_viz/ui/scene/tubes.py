@@ -56,16 +56,15 @@ class Tubes:
     def colour(self, colour: Colour) -> None:
         self.node.color = colour
 
-    def show(self, paths: Sequence[Array], *, scale: float = 1.0) -> None:
+    def show(self, middles: Array, *, scale: float = 1.0) -> None:
         """Show paths: two messages where their number changes, so the caller must hold an atomic block.
 
         Args:
-            paths: (T_i, 3), metres.
+            middles: (R, `NUM_RINGS`, 3), as of `middles_of`, metres.
             scale: thickness of tubes and balls, relative to the usual one.
         """
         vertices, faces = _NOTHING
-        if paths:
-            middles = np.stack([evenly_bent(path) for path in paths])
+        if len(middles):
             vertices = tubes(middles, scale * self._radius, scale * self._ball)
             faces = tube_faces(*vertices.shape[:3])
         if len(faces) != len(self.node.faces):
@@ -125,6 +124,11 @@ def evenly_bent(path: Array, num: int = NUM_RINGS) -> Array:
     turn = np.linalg.norm(np.diff(directions, axis=0, prepend=directions[:1]), axis=1)
     measure = np.concatenate([[0.0], np.cumsum(np.maximum(length + TURN * turn, 1e-12))])
     return interpolate(np.linspace(0, measure[-1], num), measure, path)
+
+
+def middles_of(paths: Sequence[Array]) -> Array:
+    """Return the middles (R, `NUM_RINGS`, 3) of the rings of tubes around paths (T_i, 3), metres."""
+    return np.stack([evenly_bent(path) for path in paths]) if len(paths) else np.zeros((0, NUM_RINGS, 3))
 
 
 def _reflected(across: Array, vectors: Array) -> Array:

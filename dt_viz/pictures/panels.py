@@ -1,0 +1,171 @@
+"""Pictures of systems on panels beside the scene: the base attractor, levels of the stack, and other tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dt_viz.flows.diffeomorphisms import Diffeomorphism, Identity
+from dt_viz.flows.fields import Array
+from dt_viz.flows.rollouts import Rays
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.obstacles.union import Union
+from dt_viz.pictures.slice_fields import Clearance, streamlines
+from dt_viz.scenario.slices import Slice, level_line
+
+MARGIN = 0.18
+"""Margin around the base attractor's rays, relative to their extent."""
+ARROW_SPACING = 0.030
+"""Spacing of a generator's arrows, metres."""
+NEGLIGIBLE = 0.03
+"""Length of an arrow, relative to the longest, below which it is left out."""
+OUTLINE_SPACING = 0.006
+"""Spacing of the lattice in which an obstacle's outline is found, metres."""
+
+
+@dataclass(frozen=True)
+class PanelPicture:
+    """A system on a rectangle; all places in metres in the world."""
+
+    title: str
+    area: Slice
+    goal: Array | None = None
+    """(3,) where its motions end."""
+    rollouts: tuple[Array, ...] = ()
+    """(T_i, 3)."""
+    streamlines: tuple[Array, ...] = ()
+    """(T_i, 3)."""
+    demonstrations: tuple[Array, ...] = ()
+    """(T_i, 3)."""
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """(N, 3) middles of arrows."""
+    vectors: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """(N, 3) of any unit."""
+    outlines: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    """(K, 2, 3) segments where obstacles cross the rectangle."""
+    grid: tuple[Array, ...] = ()
+    """(2, 3) lines of the lattice whose image is the warped grid."""
+
+    def moved(self, by: Array) -> PanelPicture:
+        """Return the same picture elsewhere; `by` (3,), metres."""
+
+        def all_moved(paths: tuple[Array, ...]) -> tuple[Array, ...]:
+            return tuple(path + by for path in paths)
+
+        return replace(
+            self,
+            area=replace(self.area, centre=self.area.centre + by),
+            goal=None if self.goal is None else self.goal + by,
+            rollouts=all_moved(self.rollouts),
+            streamlines=all_moved(self.streamlines),
+            demonstrations=all_moved(self.demonstrations),
+            points=self.points + by,
+            outlines=self.outlines + by,
+            grid=all_moved(self.grid),
+        )
+
+
+def system_panel(
+    title: str,
+    system: DiffeomorphicSystem,
+    rollouts: tuple[Array, ...],
+    area: Slice,
+    obstacle: Union | None = None,
+    demonstrations: tuple[Array, ...] = (),
+    *,
+    coarse: bool,
+) -> PanelPicture:
+    """Return the picture of a system.
+
+    Args:
+        title: what is written over it.
+        system: what it shows.
+        rollouts: (T_i, 3) motions of the system, metres.
+        area: its rectangle.
+        obstacle: what no motion comes into.
+        demonstrations: (T_i, 3) drawn beside the rollouts.
+        coarse: whether it is soon replaced.
+    """
+    outlines = np.zeros((0, 2, 3))
+    clearance: Clearance = _everywhere
+    if obstacle is not None and obstacle.parts:
+        clearance, lattice = obstacle.signed_distance, area.grid(OUTLINE_SPACING)
+        distance = clearance(lattice.reshape(-1, 3)).reshape(lattice.shape[:2])
+        outlines = level_line(lattice, np.minimum(distance, 1e3))
+    return PanelPicture(
+        title,
+        area,
+        rollouts[0][-1],
+        rollouts,
+        streamlines(system, area, clearance, coarse=coarse),
+        demonstrations,
+        outlines=outlines,
+    )
+
+
+def generator_panel(title: str, transform: Diffeomorphism, area: Slice) -> PanelPicture:
+    """Return the picture of how a transform ψ moves motions: the displacements from x to ψ⁻¹(x)."""
+    points = area.lattice(ARROW_SPACING)
+    vectors = transform.inverse(points) - points
+    size = np.linalg.norm(vectors, axis=1)
+    seen = size > NEGLIGIBLE * size.max(initial=0.0)
+    return PanelPicture(title, area, points=points[seen], vectors=vectors[seen])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Base space scaled to a rectangle: z ↦ centre + scale·(z − middle)."""
+
+    area: Slice
+    middle: Array
+    """(3,)."""
+    scale: float
+
+    @classmethod
+    def of(cls, rays: Rays, area: Slice) -> Fit:
+        """Return the largest scale up to 1 at which rays fit the rectangle, whose plane then holds their goal."""
+        ends = area.across(np.concatenate([rays.z0, [rays.base.goal]]))
+        lower, upper = ends.min(axis=0), ends.max(axis=0)
+        half = (upper - lower) / 2
+        half = np.maximum(half + MARGIN * half.max(), 1e-3)
+        offset = (rays.base.goal - area.centre) @ area.normal
+        middle = area.at((lower + upper) / 2) + offset * area.normal
+        return cls(area, middle, min(1.0, float((area.half_size / half).min())))
+
+    @property
+    def base_area(self) -> Slice:
+        """The part of base space that is seen."""
+        width, height = (half / self.scale for half in self.area.half_size)
+        return replace(self.area, centre=self.middle, half_size=(width, height))
+
+    def __call__(self, z: Array) -> Array:
+        """Return places (*B, 3) on the rectangle of points `z` (*B, 3) of base space, metres."""
+        return self.area.centre + self.scale * (z - self.middle)
+
+
+def base_panel(title: str, rays: Rays, fit: Fit, grid: Sequence[Array], *, coarse: bool) -> PanelPicture:
+    """Return the picture of the base attractor, whose motions are straight.
+
+    Args:
+        title: what is written over it.
+        rays: its motions.
+        fit: how base space is scaled.
+        grid: (2, 3) lines in base space, metres.
+        coarse: whether it is soon replaced.
+    """
+    system = DiffeomorphicSystem(Identity(rays.base.dim), rays.base)
+    return PanelPicture(
+        title,
+        fit.area,
+        fit(rays.base.goal),
+        tuple(fit(np.stack([z0, rays.base.goal])) for z0 in rays.z0),
+        tuple(fit(line) for line in streamlines(system, fit.base_area, _everywhere, coarse=coarse)),
+        grid=tuple(fit(line) for line in grid),
+    )
+
+
+def _everywhere(points: Array) -> Array:
+    """Return the distance (N,) of points (N, 3) from an obstacle that is not there."""
+    return np.full(len(points), np.inf)

@@ -1,0 +1,62 @@
+"""Panels: systems that are shown beside the scene, each on a rectangle like the scene's slice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.shapes import Point
+from dt_viz.scenario.slices import Slice
+
+MOST_IN_A_ROW = 4
+"""Largest number of rectangles in one row, the scene's own included; more are in two rows."""
+GAP = 0.06
+"""Distance between rectangles beside each other, metres."""
+TITLE_ROOM = 0.07
+"""Room for the title over each rectangle, metres."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What a panel shows: the base attractor, unless it says otherwise."""
+
+    level: str = ""
+    """Name of a level of the stack, from the imitation up."""
+    generator: bool = False
+    """Whether it shows the vector field that leads to this level from the one below it."""
+    task: str = ""
+    """Name of another task, of which it shows the imitation."""
+
+
+BASE_PANEL = Panel()
+
+
+def offsets(area: Slice, num: int, camera: tuple[Point, Point]) -> Array:
+    """Return where panels stand: in reading order, with the scene's own rectangle as the last one.
+
+    Args:
+        area: the scene's rectangle, which all panels are as large as.
+        num: number of panels.
+        camera: position (3,) and look-at (3,) of the camera that reads them, metres.
+
+    Returns:
+        (num, 3) offsets from the scene's rectangle, metres.
+    """
+    columns = num + 1 if num < MOST_IN_A_ROW else -(-(num + 1) // 2)
+    row, column = np.divmod(np.arange(num + 1), columns)
+    # a last row that is not full ends with the scene, too
+    column = np.where(row == row[-1], column + columns - 1 - column[-1], column)
+    right, up = directions(area, camera)
+    width, height = 2 * np.array(area.half_size) + (GAP, GAP + TITLE_ROOM)
+    return ((column[:-1] - columns + 1) * width)[:, None] * right + ((row[-1] - row[:-1]) * height)[:, None] * up
+
+
+def directions(area: Slice, camera: tuple[Point, Point]) -> tuple[Array, Array]:
+    """Return the unit vectors (3,) along a rectangle that point to the right and up for a camera; see `offsets`."""
+    position, look_at = (np.asarray(place) for place in camera)
+    right = np.cross(look_at - position, [0.0, 0.0, 1.0])
+    up = np.cross(right, look_at - position)
+    first, second = area.axes.T
+    return first * (1 if right @ first >= 0 else -1), second * (1 if up @ second >= 0 else -1)

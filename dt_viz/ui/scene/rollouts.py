@@ -1,0 +1,139 @@
+"""The rollouts as tubes, and the lines beside them: demonstrations and the undisturbed motion."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import viser
+from scipy.spatial import KDTree
+
+from dt_viz.engine.frame import Frame
+from dt_viz.flows.fields import Array
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.picture import Lines, Picture
+from dt_viz.ui.scene.tubes import NUM_RINGS, Tubes, middles_of
+
+BOLD, THIN = 0.0034, 0.0020
+"""Radius of the rollout that the arm follows, and of the others, metres."""
+BESIDE = 0.7
+"""Thickness of rollouts beside those of a level, relative to the usual one."""
+OPACITY = 0.55
+"""Opacity of the rollouts that the arm does not follow."""
+COVERED = 0.0035
+"""Distance of a line from the middle of a rollout up to which it counts as inside its tube, metres."""
+BETWEEN = 5
+"""Number of points from one ring of a tube to the next that lines are compared with."""
+JUMP, FADING = 0.05, 0.15
+"""Distance by which a rollout jumps, metres, where it then fades out where it was, and the time that takes, seconds."""
+
+
+class Middles:
+    """The middles of the tubes that a frame's rollouts are drawn with, worked out once, and what the tubes cover."""
+
+    def __init__(self) -> None:
+        self.shown = True
+        """Whether the tubes are shown; hidden ones cover nothing."""
+        self._rollouts: tuple[Array, ...] = ()
+        self._middles = np.zeros((0, NUM_RINGS, 3))
+        self._samples: KDTree | None = None
+
+    def of(self, rollouts: tuple[Array, ...]) -> Array:
+        """The middles (R, `NUM_RINGS`, 3) of tubes around rollouts (T_i, 3), metres."""
+        if rollouts is not self._rollouts:
+            self._rollouts, self._middles, self._samples = rollouts, middles_of(rollouts), None
+        return self._middles
+
+    def beside(self, rollouts: tuple[Array, ...], segments: Array) -> Array:
+        """Those of the segments (K, 2, 3), metres, that are beside the tubes of all rollouts (T_i, 3)."""
+        middles = self.of(rollouts)
+        if not self.shown or not middles.size:
+            return segments
+        if self._samples is None:
+            part = np.arange(BETWEEN)[:, None] / BETWEEN
+            pieces = middles[:, :-1, None] + part * np.diff(middles, axis=1)[:, :, None]
+            self._samples = KDTree(np.concatenate([pieces.reshape(-1, 3), middles[:, -1]]))
+        distance, _ = self._samples.query(segments.mean(axis=1), distance_upper_bound=COVERED)
+        return segments[np.isinf(distance)]
+
+
+class Demonstrations(Picture):
+    """The demonstrations, as thin lines, where no rollout covers them."""
+
+    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
+        self._lines, self._middles = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018), middles
+        super().__init__(self._lines.node)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        self._lines.show_segments(self._middles.beside(frame.rollouts, self._lines.segments(frame.task.paths)))
+
+
+class Ghost(Picture):
+    """The undisturbed motion of the rollout that the arm follows, dashed, where no rollout covers it."""
+
+    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
+        self._lines, self._middles = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012), middles
+        super().__init__(self._lines.node)
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        own = frame.ghost[: len(frame.ghost) - frame.num_added]
+        undisturbed = own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
+        self._lines.show_segments(self._middles.beside(frame.rollouts, self._lines.segments(undisturbed)))
+
+
+class Rollouts(Picture):
+    """The rollouts as tubes: the one that the arm follows thick, the others thin and translucent.
+
+    Where some of them jump elsewhere, as when a drag takes them past the other side of an obstacle, they fade out
+    where they were.
+    """
+
+    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
+        super().__init__(scene.add_frame("/rollouts", show_axes=False))
+        self._middles = middles
+        self.hero = Tubes(scene, "/rollouts/followed", palette.ROLLOUT, BOLD, ball=2.4 * BOLD)
+        self.others = Tubes(scene, "/rollouts/others", palette.ROLLOUT, THIN, ball=2.6 * THIN, opacity=OPACITY)
+        self.added = Tubes(scene, "/rollouts/added", palette.ADDED, THIN)
+        self.former = Tubes(scene, "/rollouts/former", palette.ROLLOUT, THIN, opacity=OPACITY)
+        self._drawn: tuple[object, Array] | None = None
+        """Task and middles drawn last."""
+        self._jumped = -math.inf
+        """Time at which some jumped, seconds."""
+
+    def draw(self, frame: Frame) -> None:
+        """See `Picture`."""
+        middles = self._middles.of(frame.rollouts)
+        number = np.arange(len(middles))
+        followed = number == (frame.chosen if frame.level is None else None)
+        added = number >= len(middles) - frame.num_added
+        scale = 1.0 if frame.level is None else BESIDE
+        self.hero.show(middles[followed])
+        self.others.show(middles[~added & ~followed], scale=scale)
+        self.added.show(middles[added & ~followed])
+        for tubes, colour in (
+            (self.hero, palette.ROLLOUT),
+            (self.others, palette.ROLLOUT),
+            (self.added, palette.ADDED),
+        ):
+            tubes.colour = palette.STALE if frame.blocked else colour
+        self._fade_what_jumped(frame.task, middles)
+
+    def _fade_what_jumped(self, task: object, middles: Array) -> None:
+        """Begin to let those fade that were drawn far from where they are now, of the same task."""
+        before, self._drawn = self._drawn, (task, middles)
+        if before is None or before[0] is not task or before[1].shape != middles.shape:
+            return
+        jumped = np.linalg.norm(before[1] - middles, axis=2).max(axis=1, initial=0) > JUMP
+        if jumped.any():
+            self.former.show(before[1][jumped])
+            self._jumped = time.monotonic()
+
+    def fade(self) -> None:
+        """Let what has jumped fade; called again and again."""
+        left = 1 - (time.monotonic() - self._jumped) / FADING
+        self.former.node.visible = left > 0
+        if left > 0:
+            self.former.node.opacity = OPACITY * left
