@@ -8,19 +8,11 @@ from scenes import changed
 
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.clouds import Cloud
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
+from dt_viz.obstacles.shapes import CloudObstacle, Cylinder, Sphere
 from dt_viz.scenario.paper_scenes import SCENES, clover, in_clover
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import POTS, TASKS
-
-OTHER_LETTERS = [f"letter_{letter}" for letter in "cgz"]
-"""Scenes of the same kind as that of the W."""
-
-
-def all_but_slow(names):
-    """Each name, those of the other letters marked."""
-    return [pytest.param(name, marks=[pytest.mark.slow] * (name in OTHER_LETTERS)) for name in names]
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +29,7 @@ def certified(engine):
     return frame
 
 
-@pytest.mark.parametrize("name", all_but_slow(SCENES))
+@pytest.mark.parametrize("name", SCENES)
 def test_a_scene_is_computed_without_warnings(certified, name):
     frame, scene = certified(name), SCENES[name]
     assert frame.scenario.scene == name == scene.name
@@ -70,18 +62,6 @@ def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certi
     assert frame.arm_duration > 0
     assert frame.certificates.collision.warnings == ()
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
-
-
-def test_every_stroke_leaves_the_cube_and_the_ends_of_the_letter_stay(certified):
-    frame = certified("cube")
-    (cube,) = frame.scenario.obstacles
-    assert isinstance(cube, Box) and len(set(cube.sizes)) == 1
-    assert max(maximum_collision_distance(path, cube.signed_distance) for path in frame.ghost) > 0.02
-    assert max(maximum_collision_distance(path, cube.signed_distance) for path in frame.rollouts) == 0
-    for path, before in zip(frame.rollouts, frame.ghost, strict=True):
-        np.testing.assert_allclose(path[[0, -1]], before[[0, -1]], atol=1e-3)
-        last = before[np.linalg.norm(before - before[-1], axis=1) < 0.05]
-        assert max(np.linalg.norm(path - point, axis=1).min() for point in last) < 0.01
 
 
 def assert_only_the_stroke_gives_way(frame, obstacle, until):
@@ -120,15 +100,25 @@ def test_the_clover_is_the_same_every_time():
     assert clover() == before == Cloud(before.points, before.labels)
 
 
-@pytest.mark.parametrize("name", all_but_slow(["letter_w", *OTHER_LETTERS]))
-def test_every_stroke_of_a_letter_goes_around_the_sphere_and_the_arm_with_it(certified, name):
+@pytest.mark.parametrize("name", ["steps", "cube"])
+def test_motions_of_a_flat_figure_give_way_in_its_plane(certified, name):
     frame = certified(name)
-    (sphere,) = frame.scenario.obstacles
-    assert isinstance(sphere, Sphere) and frame.task.name == name.replace("letter", "draw")
-    assert min(maximum_collision_distance(path, sphere.signed_distance) for path in frame.ghost) > 0.02  # on each
-    assert max(maximum_collision_distance(path, sphere.signed_distance) for path in frame.rollouts) == 0
-    assert frame.certificates.collision.warnings == ()
-    assert_only_the_stroke_gives_way(frame, sphere, 0.06)
+    assert min(maximum_collision_distance(path, frame.scenario.obstacle.signed_distance) for path in frame.ghost) > 0.02
+    clearance = [frame.scenario.obstacle.signed_distance(path).min() for path in frame.rollouts]
+    assert min(clearance) > 0.009
+    for path, before in zip(frame.rollouts, frame.ghost, strict=True):
+        height, usual = ((part - frame.slice.centre) @ frame.slice.normal for part in (path, before))
+        assert np.abs(height).max() <= np.abs(usual).max() + 1e-4
+
+
+def test_panels_show_each_step_from_the_base_attractor(certified):
+    titles = {name: [panel.title for panel in certified(name).pictures.panels] for name in SCENES}
+    assert titles["steps"] == ["base attractor", "imitation", "avoidance"]
+    assert titles["cube"] == ["base attractor", "avoidance"]
+    assert titles["learned"] == ["base attractor", "field −V of imitation", "imitation"]
+    assert titles["two_points"] == ["imitation", "field −V of bias 1", "bias 1", "bias 2"]
+    assert titles["letters"] == [f"Draw {letter}" for letter in "CGJWZS"]
+    assert titles["lift"] == titles["left_pot"] == []
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -138,7 +128,7 @@ def test_a_scene_is_changed_by_what_acts_in_it_not_by_how_it_is_looked_at(engine
     own = scene.scenario(task)
     for same in ({}, {"view": View(grid=True)}, {"warp": 0.5}, {"starts": ((0.0, -0.5, 0.3),)}, {"arm_rollout": 2}):
         assert not scene.is_changed(replace(own, **same), task)
-    for other in ({"margin": 0.02}, {"obstacles": (Sphere((0.0, -0.5, 0.3)),)}, {"imitation": False}):
+    for other in ({"margin": 0.02}, {"obstacles": (Sphere((0.0, -0.5, 0.3)),)}, {"imitation": not own.imitation}):
         assert scene.is_changed(changed(own, **other), task)
 
 
@@ -147,13 +137,13 @@ def test_every_stroke_of_the_j_passes_both_points_within_a_centimetre(certified)
     points = anchored(frame.scenario)
     assert len(points) == 2
     for point in points.values():
-        assert min(np.linalg.norm(path - point.anchor, axis=1).min() for path in frame.ghost) > 0.05
+        assert min(np.linalg.norm(path - point.anchor, axis=1).min() for path in frame.ghost) > 0.03
         for path in frame.rollouts:
             assert np.linalg.norm(path - point.anchor, axis=1).min() <= 0.0105  # between samples, too
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
 
 
-@pytest.mark.parametrize(("name", "chosen"), [("left_pot", 0), ("right_pot", 2)])
+@pytest.mark.parametrize(("name", "chosen"), [("left_pot", 0), ("centre_pot", 1), ("right_pot", 2)])
 def test_the_object_falls_into_the_chosen_pot(certified, name, chosen):
     frame = certified(name)
     assert frame.task.pots == POTS

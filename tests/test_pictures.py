@@ -11,11 +11,12 @@ from dt_viz.engine.frame import Stage
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.pictures.sketchbook import FINE_SPACING, LINE_SPACING
+from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import SlicePose
 
 TASK_NAMES = ["draw_s", "lift_box"]
-ALL = View(generator=True, grid=True, base=True)
+ALL = View(generator=True, grid=True, panels=(BASE_PANEL,))
 
 
 @pytest.fixture(params=TASK_NAMES, name="scenario")
@@ -41,9 +42,9 @@ def straightness(lines):
 
 def test_pictures_are_worked_out_only_while_they_are_shown_and_never_before_the_rollouts(engine, scenario):
     hidden = [frame.pictures for frame in engine.frames(replace(scenario, view=View()))]
-    assert all((p.generator, p.grid, p.base) == (None, None, None) for p in hidden)
+    assert all((p.generator, p.grid, p.panels) == (None, None, ()) for p in hidden)
     for frame in engine.frames(scenario):
-        shown = (frame.pictures.generator, frame.pictures.grid, frame.pictures.base)
+        shown = (frame.pictures.generator, frame.pictures.grid, frame.pictures.panels or None)
         assert all((picture is not None) == (frame.stage >= Stage.LIVE) for picture in shown)
 
 
@@ -170,27 +171,10 @@ def test_a_flow_that_there_is_not_is_the_last(engine, scenario):
     assert picture_at(engine, last, Stage.LIVE)[1].generator is many
 
 
-def test_the_inset_shows_straight_rays_to_one_goal_beside_the_slice(engine, scenario):
-    frame, pictures = picture_at(engine, scenario)
-    base, task = pictures.base, frame.task
-    assert len(base.rays) == len(frame.rollouts)
-    goal = base.rays[0][1]
-    for ray in base.rays:
-        np.testing.assert_allclose(ray[1], goal, atol=1e-12)
-    for line in (*base.rays, base.border, base.points, *base.grid):
-        across = on_slice(task, np.asarray(line))
-        assert (np.abs(across[:, 0]) > task.slice.half_size[0]).all()  # nothing hides the learned system
-    # velocities point to the goal, as those of a base attractor do
-    to_goal = goal - base.points
-    cosine = (
-        (to_goal * base.velocities).sum(1) / np.linalg.norm(to_goal, axis=1) / np.linalg.norm(base.velocities, axis=1)
-    )
-    assert cosine.min() > 0.9
-
-
 def test_pictures_are_remembered_where_the_obstacle_does_not_matter(engine, scenario):
     first = picture_at(engine, scenario, Stage.LIVE)[1]
     x, y, z = scenario.obstacles[0].position
     moved = picture_at(engine, changed(scenario, obstacles=(Sphere((x, y, z + 0.02)),)), Stage.LIVE)[1]
     assert moved.generator is first.generator
-    assert moved.base.grid is first.base.grid
+    for a, b in zip(moved.panels[0].streamlines, first.panels[0].streamlines, strict=True):
+        np.testing.assert_array_equal(a, b)

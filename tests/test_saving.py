@@ -203,7 +203,7 @@ def test_what_could_not_be_read_is_not_written(flat, tmp_path):
     path = tmp_path / "a.npz"
     for wrong, words in (
         (dt.Avoidance(dt.Sphere((0.0, 1e9, 0.0))), "distance of an obstacle: found 1e\\+09; accepted: 0 to 100"),
-        (dt.Avoidance(space="tsk"), "'tsk'; accepted: 'task' or 'cspace' or 'both'"),  # pyright: ignore[reportArgumentType]
+        (dt.Avoidance(space="tsk"), "'tsk'; accepted: 'task' or 'cspace'"),  # pyright: ignore[reportArgumentType]
         (dt.BiasPoint((0.0, np.nan, 0.0)), re.escape("position[1]: found nan; accepted: a finite number")),
     ):
         with pytest.raises(dt.DataError, match=words):

@@ -16,6 +16,7 @@ from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
@@ -226,7 +227,9 @@ def drawn(engine, initial, scene):
 
     starts = Starts(scene, ignored, ignored, ignored)
     pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, ignored, starts)
-    scenario = replace(initial("draw_s"), view=View(field=True, streamlines=True, grid=True, onion=True))
+    scenario = replace(
+        initial("draw_s"), view=View(field=True, streamlines=True, grid=True, onion=True, panels=(BASE_PANEL,))
+    )
     pictures.adopt(scenario)
     pictures.draw(next(engine.frames(scenario)))
     return pictures, scenario
@@ -350,7 +353,8 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
 
 def test_every_layer_has_a_checkbox():
     switches = {f.name for f in fields(View) if f.type == "bool"}
-    assert set(VIEW_LABELS) == switches - {"playing", "replay", "move_slice", "click_to_start", "handles"}
+    switches -= {"playing", "replay", "move_slice", "click_to_start", "handles"}
+    assert set(VIEW_LABELS) == switches | {"panels"}
 
 
 def test_no_number_of_a_legend_runs_out_of_the_panel():

@@ -24,7 +24,7 @@ from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.export import as_png
 from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
 from dt_viz.ui.scene.obstacles import Obstacles
-from dt_viz.ui.scene.scene import Rollouts
+from dt_viz.ui.scene.rollouts import Middles, Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import VOLUME, ColourSlice, FieldArrows, Streamlines, painted, scale_of
 from dt_viz.ui.scene.tubes import NUM_SIDES
@@ -154,7 +154,7 @@ def test_rollouts_of_the_whole_stack_are_translucent_and_thinner_beside_a_level(
         meshes = (tubes.node.vertices for tubes in (rollouts.hero, rollouts.others))
         return [np.ptp(mesh[-2 * NUM_SIDES :, 1]) for mesh in meshes]  # at the end
 
-    rollouts = Rollouts(scene)
+    rollouts = Rollouts(scene, Middles())
     rollouts.draw(frame())
     hero, others = widths()
     assert hero > others > 0

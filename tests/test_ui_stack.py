@@ -10,6 +10,7 @@ from pages import Bound, Edited, frame_of
 from scenes import avoiding, beside, biases, changed
 
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, selected
 from dt_viz.scenario.tasks import TASKS
@@ -121,7 +122,7 @@ def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(session):
     assert "bias 1" in legend_html(session.scenario)
     press(session, "Bias 1", SHOWN)
     press(session, BASE, SHOW)
-    assert session.scenario.view == View(base=True, tuned="Bias 1")  # and its settings stay in sight
+    assert session.scenario.view == View(panels=(BASE_PANEL,), tuned="Bias 1")  # and its settings stay in sight
 
 
 def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):

@@ -200,37 +200,41 @@ def _panels(
     """The panels of a view, side by side, and the frame of the scene's own slice."""
     task, names = solved.below.task, levels(scenario)[: 1 + len(solved.stack.built)]
     area = task.slice.posed(scenario.view.slice)
-    made = [_panel(panel, solved, books, area, names, coarse=coarse) for panel in scenario.view.panels]
+    made = [_panel(panel, scenario, solved, books, area, coarse=coarse) for panel in scenario.view.panels]
     shown = [picture for picture in made if picture is not None]
-    places = offsets(area, len(shown), task.camera)
+    widest = np.max([area.half_size, *(picture.area.half_size for picture in shown)], axis=0)
+    places = offsets(area, widest, len(shown), task.camera)
     beside = [picture.moved(area.centre - picture.area.centre + by) for picture, by in zip(shown, places, strict=True)]
-    top = names[-1] if scenario.imitation or len(names) > 1 else BASE_TITLE
-    return (*beside, PanelPicture(_title(top), area))
+    if any(panel.task for panel in scenario.view.panels):
+        title = task.title
+    else:
+        title = _title(names[-1]) if scenario.imitation or len(names) > 1 else BASE_TITLE
+    return (*beside, PanelPicture(title, area))
 
 
 def _panel(
     panel: Panel,
+    scenario: Scenario,
     solved: Solved,
     books: Mapping[str, Sketchbook],
     area: Slice,
-    names: Sequence[str],
     *,
     coarse: bool,
 ) -> PanelPicture | None:
     """A panel where the slice is; None for that of a level which is off."""
-    book, stack = books[panel.task or solved.below.task.name], solved.stack
+    book, stack = books[panel.task or scenario.task], solved.stack
+    names = levels(scenario)[: 1 + len(stack.built)]
     if panel.task:
         return book.imitation(book.task.slice, book.task.title)
     if panel == BASE_PANEL:
-        return book.base(area, grid=solved.scenario.view.grid)
+        return book.base(area, grid=scenario.view.grid)
     if panel.level not in names:
         return None
-    level = names.index(panel.level)
-    if panel.generator:
-        transform = stack.built[level - 1].made.transform if level else solved.below.system.transform
-        return generator_panel(f"generator of {_title(panel.level)}", transform, area)
+    level, title = names.index(panel.level), f"field −V of {_title(panel.level)}"
     if level == 0:
-        return book.imitation(area, _title(panel.level))
+        return book.generating(area, title) if panel.generator else book.imitation(area, _title(panel.level))
+    if panel.generator:
+        return generator_panel(title, stack.built[level - 1].made.transform, area)
     return system_panel(
         _title(panel.level),
         cut_off(solved.below, stack, level),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import Diffeomorphism, Identity
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
@@ -106,9 +106,19 @@ def system_panel(
 
 
 def generator_panel(title: str, transform: Diffeomorphism, area: Slice) -> PanelPicture:
-    """Return the picture of how a transform ψ moves motions: the displacements from x to ψ⁻¹(x)."""
-    points = area.lattice(ARROW_SPACING)
-    vectors = transform.inverse(points) - points
+    """Return the picture of what leads motions by ψ⁻¹: −t·V of the flows that ψ is composed of, added up.
+
+    Args:
+        title: what is written over it.
+        transform: ψ; what is in it besides flows is left out.
+        area: its rectangle.
+    """
+    half = np.array(area.half_size) - ARROW_SPACING / 2
+    points = replace(area, half_size=(float(half[0]), float(half[1]))).lattice(ARROW_SPACING)
+    vectors = np.zeros_like(points)
+    for flow in transform.parts if isinstance(transform, Chain) else [transform]:
+        if isinstance(flow, Flow | AdaptiveFlow):
+            vectors -= flow.duration * flow.field(points)
     size = np.linalg.norm(vectors, axis=1)
     seen = size > NEGLIGIBLE * size.max(initial=0.0)
     return PanelPicture(title, area, points=points[seen], vectors=vectors[seen])

@@ -266,6 +266,14 @@ class Sketchbook:
             lambda: system_panel(title, self._system, self._paths, area, demonstrations=self.task.paths, coarse=False),
         )
 
+    def generating(self, area: Slice, title: str) -> PanelPicture | None:
+        """Return what leads the base attractor's motions to the imitation: −V, the mean of all its flows."""
+        picture = self.generator(area, 0)
+        if picture is None:
+            return None
+        inside = (np.abs(area.across(picture.points)) < np.array(area.half_size) - ARROW_SPACING / 2).all(axis=1)
+        return PanelPicture(title, area, points=picture.points[inside], vectors=-picture.displacements[inside])
+
     def _panel(
         self, title: str, area: Slice, make: Callable[[], PanelPicture], key: tuple[bool, ...] = ()
     ) -> PanelPicture:

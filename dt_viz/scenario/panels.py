@@ -33,11 +33,12 @@ class Panel:
 BASE_PANEL = Panel()
 
 
-def offsets(area: Slice, num: int, camera: tuple[Point, Point]) -> Array:
+def offsets(area: Slice, half_size: Array, num: int, camera: tuple[Point, Point]) -> Array:
     """Return where panels stand: in reading order, with the scene's own rectangle as the last one.
 
     Args:
-        area: the scene's rectangle, which all panels are as large as.
+        area: the scene's rectangle.
+        half_size: (2,) half the size of the largest rectangle, metres.
         num: number of panels.
         camera: position (3,) and look-at (3,) of the camera that reads them, metres.
 
@@ -49,7 +50,7 @@ def offsets(area: Slice, num: int, camera: tuple[Point, Point]) -> Array:
     # a last row that is not full ends with the scene, too
     column = np.where(row == row[-1], column + columns - 1 - column[-1], column)
     right, up = directions(area, camera)
-    width, height = 2 * np.array(area.half_size) + (GAP, GAP + TITLE_ROOM)
+    width, height = 2 * half_size + (GAP, GAP + TITLE_ROOM)
     return ((column[:-1] - columns + 1) * width)[:, None] * right + ((row[-1] - row[:-1]) * height)[:, None] * up
 
 

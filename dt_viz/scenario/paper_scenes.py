@@ -31,7 +31,7 @@ CLOVER_LOBES = 0.4
 """Height of the clover's three lobes, relative to the mean radius."""
 NUM_LABELS = 4000
 """Number of labelled points of the clover."""
-J_OFFSETS = ((0.30, (0.09, 0.0)), (0.70, (0.0, -0.09)))
+J_OFFSETS = ((0.30, (0.05, 0.0)), (0.70, (0.0, -0.05)))
 """Places of the two points beside the J: fraction of its length, and offset to the right and up, metres."""
 OTHER_LETTERS = "CGJWZ"
 """Letters of fig. 5 beside the S."""
@@ -88,13 +88,14 @@ def _bottle_in_the_way(task: Task) -> Scenario:
 
 def _sphere_in_the_letter(task: Task) -> Scenario:
     """Fig. 2."""
-    return _avoiding(task, Avoidance(Sphere(task.obstacle_position)))
+    return _avoiding(task, Avoidance(Sphere(task.obstacle_position), plane=plane_of(task)))
 
 
 def _cube_before_the_attractor(task: Task) -> Scenario:
     """Fig. 3 (a): motions that are straight but for the cube."""
     middle = (task.starts.mean(axis=0) + task.mean_path[-1]) / 2
-    return replace(_avoiding(task, Avoidance(Box(as_point(middle), (CUBE, CUBE, CUBE)))), imitation=False)
+    cube = Box(as_point(middle), (CUBE, CUBE, CUBE))
+    return replace(_avoiding(task, Avoidance(cube, plane=plane_of(task))), imitation=False)
 
 
 def _alone(task: Task) -> Scenario:
