@@ -96,9 +96,9 @@ def test_each_level_has_its_own_rollouts_and_streamlines(engine, initial):
     assert [panel.title for panel in frame.pictures.panels] == [
         "base attractor",
         "imitation",
-        "bias 1",
-        "avoidance",
-        "avoidance",
+        "+ bias 1",
+        "+ avoidance",
+        "+ avoidance",
     ]
     for panel, paths in ((imitation, frame.ghost), (bias, frame.levels[1]), (avoidance, frame.levels[2])):
         moved = panel.area.centre - own.area.centre
@@ -132,7 +132,7 @@ def test_the_field_between_two_levels_leads_from_one_to_the_other(engine, initia
 def test_a_level_that_is_off_has_no_panel(engine, initial):
     scenario = biased(engine, initial, Panel(BIAS), Panel(BIAS, generator=True), BASE_PANEL)
     off = replace(scenario, stack=switched(scenario, BIAS))
-    assert [panel.title for panel in frame_of(engine, off).pictures.panels] == ["base attractor", "avoidance"]
+    assert [panel.title for panel in frame_of(engine, off).pictures.panels] == ["base attractor", "+ avoidance"]
     assert len(frame_of(engine, scenario).pictures.panels) == 4
 
 

@@ -34,7 +34,7 @@ from dt_viz.pictures.slice_fields import (
 from dt_viz.scenario.panels import BASE_PANEL, Panel, offsets
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
-from dt_viz.scenario.stack import levels
+from dt_viz.scenario.stack import IMITATION, levels
 from dt_viz.scenario.starts import followed
 from dt_viz.warning import MotionWarning
 
@@ -230,7 +230,7 @@ def _panel(
         return book.base(area, grid=scenario.view.grid)
     if panel.level not in names:
         return None
-    level, title = names.index(panel.level), f"field −V of {_title(panel.level)}"
+    level, title = names.index(panel.level), f"field −V of {_name(panel.level)}"
     if level == 0:
         return book.generating(area, title) if panel.generator else book.imitation(area, _title(panel.level))
     if panel.generator:
@@ -246,7 +246,12 @@ def _panel(
 
 
 def _title(level: str) -> str:
-    """What is written over the panel of a level."""
+    """What is written over the panel of a level: what is added to the one before."""
+    return ("" if level == IMITATION else "+ ") + _name(level)
+
+
+def _name(level: str) -> str:
+    """Name of a level within a line."""
     return level[:1].lower() + level[1:]
 
 

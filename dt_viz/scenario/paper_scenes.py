@@ -31,7 +31,7 @@ CLOVER_LOBES = 0.4
 """Height of the clover's three lobes, relative to the mean radius."""
 NUM_LABELS = 4000
 """Number of labelled points of the clover."""
-J_OFFSETS = ((0.30, (0.05, 0.0)), (0.70, (0.0, -0.05)))
+J_OFFSETS = ((0.30, (0.05, 0.0)), (0.70, (0.0, -0.03)))
 """Places of the two points beside the J: fraction of its length, and offset to the right and up, metres."""
 OTHER_LETTERS = "CGJWZ"
 """Letters of fig. 5 beside the S."""
