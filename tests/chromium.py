@@ -1,12 +1,12 @@
-"""Chromium for tests, headless and drawing by software."""
+"""Chromium for tests."""
 
 import os
-import shutil
 
 import pytest
 
-CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+from dt_viz.evaluate.pictures import ARGUMENTS, CHROMIUM
+
+__all__ = ["ARGUMENTS", "CHROMIUM", "needs_chromium"]
 
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None and "DT_VIZ_REQUIRE_BROWSER" not in os.environ,

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scenes import changed
 
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.clouds import Cloud
-from dt_viz.obstacles.shapes import CloudObstacle, Cylinder, Sphere
+from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Sphere
 from dt_viz.scenario.paper_scenes import SCENES, clover, in_clover
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
@@ -52,8 +53,12 @@ def test_scenes_have_titles_of_their_own():
 def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certified, name):
     frame = certified(name)
     (bottle,) = frame.scenario.obstacles
-    assert isinstance(bottle, Cylinder)
-    assert bottle.position[2] == pytest.approx(bottle.height / 2)  # stands on the table
+    assert isinstance(bottle, MeshObstacle)
+    vertices, faces = bottle.surface()
+    assert trimesh.Trimesh(vertices, faces).is_volume
+    assert vertices[:, 2].min() == bottle.position[2] == 0  # stands on the table
+    radius = np.linalg.norm(vertices[:, :2], axis=1)
+    assert radius[vertices[:, 2] > 0.2].max() < 0.5 * radius.max()  # and has a neck
     assert frame.scenario.avoidance.space == "cspace"
     assert bottle.signed_distance(frame.pictures.field.points).min() > 0
     undisturbed = max(maximum_collision_distance(path, bottle.signed_distance) for path in frame.ghost)

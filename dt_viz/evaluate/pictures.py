@@ -7,6 +7,7 @@ once every check is done and the arm stopped in the middle of its motion: to be 
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import sys
 import time
@@ -35,7 +36,10 @@ PATIENCE = 180.0
 """Longest wait for the page, seconds."""
 DRAWING = 8.0
 """Time that software takes to draw the page, seconds."""
-ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+"""Chromium's command; None where it is not installed."""
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+"""Arguments with which it draws by software, without a screen."""
 HIDE_NOTICES = "() => document.querySelectorAll('button.mantine-Notification-closeButton').forEach(b => b.click())"
 
 
@@ -53,15 +57,14 @@ def run(options: argparse.Namespace) -> int:
         from playwright.sync_api import sync_playwright  # noqa: PLC0415 - of the test extra
     except ImportError:
         raise InputError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
+    if CHROMIUM is None:
         raise InputError("Chromium", "not installed", "apt-get install chromium")
     options.out.mkdir(parents=True, exist_ok=True)
     width, height = options.size
     complaints: list[str] = []
     with sync_playwright() as playwright:
         server = Server(TASKS, FitStore(default_cache_folder()), task=FIRST_TASK, port=0)
-        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         try:
             for name in options.only:
                 page = browser.new_page(viewport={"width": width, "height": height})

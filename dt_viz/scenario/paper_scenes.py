@@ -12,7 +12,8 @@ import numpy as np
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Point, Sphere, as_point
+from dt_viz.obstacles.shapes import Box, CloudObstacle, MeshObstacle, Point, Sphere, as_point, lathe
+from dt_viz.obstacles.solids import Solid
 from dt_viz.scenario.objects import Pot
 from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario, View
@@ -21,8 +22,10 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
 
-BOTTLE = (0.07, 0.24)
-"""Diameter and height of the bottle, metres."""
+BODY, NECK, RIM = (0.035, 0.145), (0.013, 0.225), (0.0155, 0.240)
+"""Radius of the bottle's body, neck and rim, and the height at which each ends, metres."""
+SHOULDER, NUM_SHOULDER = 0.05, 8
+"""Height of the shoulder between body and neck, metres, and number of rings of the mesh along it."""
 CUBE = 0.10
 """Edge of the cube, metres."""
 CLOVER_RADIUS, CLOVER_THICKNESS = 0.06, 0.06
@@ -80,10 +83,20 @@ def _biased(task: Task, *points: BiasPoint) -> Scenario:
     return scenario
 
 
+@lru_cache(maxsize=1)
+def bottle() -> Solid:
+    """Return a bottle that stands in the origin."""
+    (body, top), (neck, under), (rim, height) = BODY, NECK, RIM
+    part = np.linspace(0, 1, NUM_SHOULDER + 1)
+    shoulder = zip(neck + (body - neck) * (1 + np.cos(np.pi * part)) / 2, top + SHOULDER * part, strict=True)
+    bottom, mouth = [(0.0, 0.0), (body, 0.0)], [(neck, under), (rim, under), (rim, height), (0.0, height)]
+    return Solid(*lathe([*bottom, *shoulder, *mouth], 32))
+
+
 def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
-    (x, y, _), (diameter, height) = task.obstacle_position, BOTTLE
-    return _avoiding(task, Avoidance(Cylinder((x, y, height / 2), diameter, height), space="cspace"))
+    x, y, _ = task.obstacle_position
+    return _avoiding(task, Avoidance(MeshObstacle((x, y, 0.0), bottle()), space="cspace"))
 
 
 def _sphere_in_the_letter(task: Task) -> Scenario:

@@ -30,12 +30,12 @@ class Panels(Picture):
         self._scene = scene
         self._borders = Lines(scene, "/panels/borders", palette.PANEL, 0.0016)
         self._grid = Lines(scene, "/panels/grid", palette.GRID, 0.0010)
-        self._streamlines = Lines(scene, "/panels/streamlines", palette.STREAMLINE, 0.0011)
+        self.streamlines = Lines(scene, "/panels/streamlines", palette.STREAMLINE, 0.0011)
         self._demonstrations = Lines(scene, "/panels/demonstrations", palette.DEMONSTRATION, 0.0018)
         self._outlines = Lines(scene, "/panels/outlines", palette.OUTLINE, 0.0030)
         weak, strong = palette.linear(palette.GENERATOR_WEAK), palette.linear(palette.GENERATOR)
         self._arrows = Arrows(scene, "/panels/arrows", weak, strong, ARROW_LENGTH)
-        self._rollouts = Tubes(scene, "/panels/rollouts", palette.ROLLOUT, 0.0022, ball=0.0055)
+        self.rollouts = Tubes(scene, "/panels/rollouts", palette.ROLLOUT, 0.0022, ball=0.0055)
         self._goals: list[viser.IcosphereHandle] = []
         self._titles: list[viser.LabelHandle] = []
         self._drawn: tuple[PanelPicture, ...] = ()
@@ -48,10 +48,10 @@ class Panels(Picture):
         self._drawn = panels
         self._borders.show([panel.area.border for panel in panels])
         self._grid.show([line for panel in panels for line in panel.grid])
-        self._streamlines.show([line for panel in panels for line in panel.streamlines])
+        self.streamlines.show([line for panel in panels for line in panel.streamlines])
         self._demonstrations.show([path for panel in panels for path in panel.demonstrations])
         self._outlines.show_segments(np.concatenate([panel.outlines for panel in panels]))
-        self._rollouts.show(middles_of([path for panel in panels for path in panel.rollouts]))
+        self.rollouts.show(middles_of([path for panel in panels for path in panel.rollouts]))
         lengths = [np.linalg.norm(panel.vectors, axis=1).max(initial=1e-12) for panel in panels]
         vectors = [panel.vectors / length for panel, length in zip(panels, lengths, strict=True)]
         self._arrows.show(np.concatenate([panel.points for panel in panels]), np.concatenate(vectors))
