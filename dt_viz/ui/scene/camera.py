@@ -154,4 +154,4 @@ def framed(points: Array, direction: Array, across: Array, upright: Array) -> Po
     w = min((most - least) / (high - low) for least, most, low, high in bounds)
     x, y = ((least + high * w + most + low * w) / 2 for least, most, low, high in bounds)
     position = x * right + y * up + w * ahead
-    return position, position + float(np.median(depth) - w) * ahead
+    return position, position + float((depth.min() + depth.max()) / 2 - w) * ahead
