@@ -27,6 +27,7 @@ from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.panel import Panel
+from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.visitor import Visitor
 
 MIDDLE = (0.1, -0.5, 0.4)
@@ -51,10 +52,33 @@ def frame_of(scenario: Scenario, **changes: Any) -> Frame:
     return Frame(scenario=scenario, **(given | changes))
 
 
+class CameraClient:
+    """A visitor with a camera only."""
+
+    def __init__(self) -> None:
+        self._reported: Any = None
+        self.camera = SimpleNamespace(
+            position=np.array([0.8, -1.6, 0.8]),
+            look_at=np.zeros(3),
+            fov=0.75,
+            image_width=1280,
+            image_height=720,
+            on_update=lambda reported: setattr(self, "_reported", reported),
+        )
+        self.atomic = contextlib.nullcontext
+
+    def moves(self, position: Any, look_at: Any = (0.0, 0.0, 0.0)) -> None:
+        """Report where the browser has moved the camera to."""
+        self.camera.position, self.camera.look_at = np.array(position), np.array(look_at)
+        asyncio.run(self._reported(self.camera))
+
+
 def panel_of(server: viser.ViserServer, notify: Any = lambda *_: None) -> Panel:
     """A panel without a page."""
     titles = {name: entry.title for name, entry in TASKS.items()}
-    return Panel(server.gui, titles, load_jaco(), lambda *_: None, notify, lambda: None)
+    return Panel(
+        server.gui, titles, load_jaco(), lambda *_: None, notify, Tripod(cast(Any, CameraClient()), lambda: None)
+    )
 
 
 class NoFrames:
@@ -78,14 +102,7 @@ class Page:
 
     def __init__(self, server: viser.ViserServer, robot: Any) -> None:
         self.gui, self.scene = server.gui, server.scene
-        self.camera = SimpleNamespace(
-            position=np.array([0.8, -1.6, 0.8]),
-            look_at=np.zeros(3),
-            fov=0.75,
-            image_width=1280,
-            image_height=720,
-            on_update=lambda _moved: None,
-        )
+        self.camera = CameraClient().camera
         self.client = SimpleNamespace(
             client_id=0,
             gui=server.gui,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import viser  # noqa: TID251 - forges what a browser sends
-from pages import CLIENT, MIDDLE, Page, frame_of
+from pages import CLIENT, MIDDLE, Page
 from viser import _messages as messages  # noqa: TID251
 
 from dt_viz.scenario.paper_scenes import SCENES
@@ -246,7 +246,7 @@ def test_a_ray_that_is_none_adds_no_start(page, ray):
 
 def test_reset_brings_the_camera_back(page):
     task = TASKS["draw_s"]()
-    page.visitor.shown = frame_of(page.busy(), task=task)
+    page.visitor._tripod.look(task)
     page.camera.position, page.camera.look_at = np.full(3, 9.0), np.ones(3)
     (history,) = (handle for handle in page.inputs if handle.label == "History")
     page.claim(history, "Undo")
@@ -255,7 +255,6 @@ def test_reset_brings_the_camera_back(page):
     position, look_at = camera_for(task, page.camera)
     np.testing.assert_array_equal(page.camera.position, position)
     np.testing.assert_array_equal(page.camera.look_at, look_at)
-    page.visitor.shown = None
 
 
 def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(page, monkeypatch):
@@ -289,7 +288,16 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     commands = page.commands
     keys = [(command.hotkey, command.modifier) for command in commands.values() if command.hotkey is not None]
     assert len(set(keys)) == len(keys)
-    named = {("space", None), ("R", None), ("Z", None), ("Z", "shift"), ("F", None), ("H", None)}
+    named = {
+        ("space", None),
+        ("R", None),
+        ("Z", None),
+        ("Z", "shift"),
+        ("F", None),
+        ("H", None),
+        ("O", None),
+        ("L", None),
+    }
     assert set(keys) == named | {(str(k), None) for k in range(1, 10)}
     by_key = {(command.hotkey, command.modifier): command for command in commands.values()}
     before = page.session.scenario
@@ -303,7 +311,7 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     assert page.session.scenario.warp == 0.5
     page.give(by_key["R", None])
     assert page.session.scenario.warp == 1
-    titles = [command.label for command in commands.values()][len(named) :]
+    titles = [command.label for command in commands.values()][-len(SCENES) :]
     assert titles == [scene.title for scene in SCENES.values()]
     page.give(by_key["2", None])
     assert page.visitor._panel._beginnings.wait_idle(30)
@@ -313,11 +321,31 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
 
 def test_a_command_brings_the_camera_back(page):
     task = TASKS["draw_s"]()
-    page.visitor.shown = frame_of(page.busy(), task=task)
-    page.camera.position = np.full(3, 9.0)
-    page.give(page.commands["Frame: move the camera back"])
-    np.testing.assert_array_equal(page.camera.position, camera_for(task, page.camera)[0])
-    page.visitor.shown = None
+    page.visitor._tripod.look(task)
+    for command, view in (("View: Top", "Top"), ("Frame: move the camera back", "Home")):
+        page.camera.position = np.full(3, 9.0)
+        page.give(page.commands[command])
+        np.testing.assert_array_equal(page.camera.position, camera_for(task, page.camera, view)[0])
+
+
+@pytest.mark.parametrize(
+    ("command", "label", "name"),
+    [
+        ("Orbit: turn the camera slowly, or stop", "Orbit", "orbits"),
+        ("Lock the camera, or let it go", "Lock camera", "locked"),
+    ],
+)
+def test_a_switch_of_the_camera_and_its_command_are_one(page, command, label, name):
+    tripod = page.visitor._tripod
+    (switch,) = (handle for handle in page.inputs if handle.label == label)
+    page.claim(switch, True)
+    assert getattr(tripod, name) is True
+    page.give(page.commands[command])
+    assert (getattr(tripod, name), switch.value) == (False, False)
+    page.give(page.commands[command])
+    assert (getattr(tripod, name), switch.value) == (True, True)
+    page.claim(switch, False)
+    assert getattr(tripod, name) is False
 
 
 def test_a_command_that_is_forged_or_disabled_is_not_given(page):

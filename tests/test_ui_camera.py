@@ -10,15 +10,20 @@ from hypothesis import strategies as st
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.scene.camera import (
     FIELD_OF_VIEW,
+    HAND,
+    HOME,
     MARGIN,
     NARROW,
     PANEL,
     UNDER,
     USUAL,
     VIEWS,
+    axes,
     camera_for,
     framed,
+    free_part,
     shown,
+    turned,
     window,
 )
 
@@ -34,7 +39,7 @@ def pixels(points, position, look_at, size):
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080), (844, 390), (390, 844), (900, 560)], ids=str)
-@pytest.mark.parametrize("view", ["Home", *VIEWS])
+@pytest.mark.parametrize("view", [HOME, *VIEWS])
 @pytest.mark.parametrize("task", TASKS)
 def test_a_task_is_seen_beside_the_panel_and_as_large_as_can_be(task, view, size):
     task = TASKS[task]()
@@ -47,6 +52,34 @@ def test_a_task_is_seen_beside_the_panel_and_as_large_as_can_be(task, view, size
     assert (at.min(axis=0) > low + room - 1).all() and (at.max(axis=0) < high - room + 1).all()
     empty = (high - low - 2 * room - np.ptp(at, axis=0)) / (high - low)
     assert empty.min() < 0.01
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_hand_is_seen_from_near_in_the_middle_of_the_free_part_and_from_the_side_of_the_task(task):
+    size = 1280, 720
+    task, camera, hand = TASKS[task](), SimpleNamespace(image_width=size[0], image_height=size[1]), (0.1, -0.4, 0.3)
+    near, home = (camera_for(task, camera, view, hand=np.array(hand)) for view in (HAND, HOME))
+    assert np.linalg.norm(near[0] - hand) < 0.8 * np.linalg.norm(home[0] - home[1])
+    assert np.cross(near[1] - near[0], home[1] - home[0]) == pytest.approx(np.zeros(3), abs=1e-9)
+    (at,), _ = pixels(np.array([hand]), *near, size)
+    assert at == pytest.approx([(size[0] - PANEL) / 2, size[1] / 2], abs=60)
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (390, 844)], ids=str)
+def test_what_is_in_the_middle_of_the_free_part_stays_there_while_the_camera_turns(size):
+    pose = np.array([0.8, -1.6, 0.8]), np.array([0.0, -0.3, 0.3])
+    across, upright = (tangents.mean() for tangents in free_part(size))
+    focal = size[1] / 2 / np.tan(FIELD_OF_VIEW / 2)
+    middle = np.array(size) / 2 + focal * np.array([across, -upright])
+    places = []
+    for angle in (0.0, 0.4, 2.0, 2 * np.pi):
+        position, look_at = turned(pose, size, angle)
+        ahead, right, up = axes(look_at - position)
+        places.append(position + np.linalg.norm(look_at - position) * (ahead + across * right + upright * up))
+        assert pixels(places[:1], position, look_at, size)[0] == pytest.approx(middle[None], abs=1e-6)
+        assert position[2] == pose[0][2] and look_at[2] == pose[1][2]
+    assert places == pytest.approx(np.tile(places[0], (4, 1)))
+    assert position == pytest.approx(pose[0]) and turned(pose, size, 1.0)[0] != pytest.approx(pose[0], abs=0.1)
 
 
 @given(st.integers(0, 1000))

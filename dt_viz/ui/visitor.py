@@ -6,9 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
@@ -18,17 +16,14 @@ from dt_viz.engine.session import Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.slices import Slice, SlicePose
+from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
-from dt_viz.scenario.tasks import Task
-from dt_viz.ui import gestures
 from dt_viz.ui.panel.panel import Panel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import ArmPicture
 from dt_viz.ui.scene.arm_layers import Arms
-from dt_viz.ui.scene.camera import FIELD_OF_VIEW, camera_for, window
 from dt_viz.ui.scene.drawing import Drawing
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
@@ -36,10 +31,9 @@ from dt_viz.ui.scene.objects import Objects
 from dt_viz.ui.scene.picture import Colour
 from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.starts import Starts
+from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.scene.way import Way
 
-MOVED = 1e-3
-"""Distance of the camera from where it was put, metres, from which on the user has moved it."""
 NOTICE_SECONDS = 12.0
 """Time after which a notification closes by itself, seconds."""
 
@@ -91,21 +85,16 @@ class Visitor:
             self.way = Way(client.scene)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
-        self._stand, self._window = (np.zeros(3), np.zeros(3)), (0, 0)
-        """Position and look-at of the camera where it was put last, metres, and the size of the window, pixels."""
-        self._beside: tuple[Slice, ...] = ()
-        """Panels that the camera was put to show, the scene's own rectangle among them."""
         self._posed: tuple[bytes, bool] | None = None
         """The posture that was drawn last, and whether with that without avoidance."""
         self.playback = Playback(engine.arm, self._pose, self.fail)
         """What moves the arm."""
-        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._look_home)
+        self._tripod = Tripod(client, self._hand)
+        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._tripod)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(engine.arm.push)
         self.playback.begin()
-        moved: Any = self._camera_moved  # viser takes coroutines, too, against its type hints
-        client.camera.on_update(moved)
 
     @property
     def arm(self) -> ArmPicture:
@@ -115,9 +104,9 @@ class Visitor:
     def draw(self, frame: Frame, pace: Pace) -> None:
         """See `Display`."""
         beside = tuple(panel.area for panel in frame.pictures.panels)
-        others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._beside)
+        others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._tripod.panels)
         if self.shown is None or frame.task is not self.shown.task or others:
-            self._look_at(frame.task, beside)
+            self._tripod.look(frame.task, beside)
         with self.client.atomic():
             self.pictures.draw(frame)
             self.objects.stand(frame.task)
@@ -159,27 +148,6 @@ class Visitor:
     def cancelled(self, task: str) -> None:
         """See `Display`."""
         self._panel.cancelled(task)
-
-    def _look_at(self, task: Task, beside: tuple[Slice, ...]) -> None:
-        """Move the camera to where the task, or the panels beside it, are seen best."""
-        camera = self.client.camera
-        self._beside = beside
-        self._stand, self._window = camera_for(task, camera, panels=beside), window(camera)
-        camera.position, camera.look_at = self._stand
-        camera.fov = FIELD_OF_VIEW
-
-    async def _camera_moved(self, camera: viser.CameraHandle) -> None:
-        """Fit the picture to a window of another size, unless the user has moved the camera."""
-        if self.shown is None or window(camera) == self._window:
-            return
-        self._window = window(camera)
-        place = gestures.vector(camera.position, 3, gestures.MAX_SIGHT)
-        if place is not None and np.abs(place - self._stand[0]).max() < MOVED:
-            self._look_at(self.shown.task, self._beside)
-
-    def _look_home(self) -> None:
-        if self.shown is not None:
-            self._look_at(self.shown.task, self._beside)
 
     def close(self) -> None:
         """Stop all threads: the visitor has left."""
@@ -251,10 +219,11 @@ class Visitor:
 
     def _pose(self) -> None:
         """Draw the arm in its posture, its way, and what it carries."""
-        q, view = self.playback.q, self._view
+        q, view, now = self.playback.q, self._view, time.monotonic()
+        self._tripod.turn(now)
         if q is None:
             return
-        hand, live, now = self._robot.end_effector(q), self.playback.live, time.monotonic()
+        hand, live = self._robot.end_effector(q), self.playback.live
         posed = q.tobytes(), view.ghost_arm or view.body_points
         moves = posed != self._posed
         # a block wakes the connection, also if nothing is sent

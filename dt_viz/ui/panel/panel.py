@@ -24,6 +24,7 @@ from dt_viz.ui.controls import Control, on_press
 from dt_viz.ui.panel.about import add_about
 from dt_viz.ui.panel.avoid import add_avoid_and_imitate
 from dt_viz.ui.panel.bindings import KEEP, Bindings
+from dt_viz.ui.panel.camera import CameraControls
 from dt_viz.ui.panel.commands import Command, Curtain, add_commands, numbered
 from dt_viz.ui.panel.disturbances import Disturbances
 from dt_viz.ui.panel.health_plots import HealthPlots
@@ -41,6 +42,7 @@ from dt_viz.ui.scene.arm_layers import NUM_ARMS
 from dt_viz.ui.scene.export import RESOLUTIONS, PictureSaver
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.picture import Colour
+from dt_viz.ui.scene.tripod import Tripod
 
 VIEW_LABELS: Mapping[str, str] = {
     "rollouts": "Rollouts",
@@ -90,7 +92,7 @@ class Panel:
         robot: Robot,
         save_png: Callable[[str, bool], None],
         notify: Callable[[str, Colour], None],
-        look_home: Callable[[], None],
+        tripod: Tripod,
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
@@ -100,9 +102,9 @@ class Panel:
             robot: robot whose joints are plotted.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
             notify: shows a text in a colour beside the panel, however far that is scrolled.
-            look_home: moves the camera back to the task's view.
+            tripod: stand of the visitor's camera.
         """
-        self._notify, self._look_home = notify, look_home
+        self._notify, self._tripod = notify, tripod
         self._gui = gui
         self._titles = dict(titles)
         self._scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
@@ -135,6 +137,7 @@ class Panel:
         with tabs.add_tab("Arm"):
             self._build_arm()
         with tabs.add_tab("Picture"):
+            self._camera = CameraControls(gui, tripod)
             self._build_export(save_png)
         commands = self._commands(Curtain(gui))
         add_commands(gui, self._bindings, commands)
@@ -252,7 +255,7 @@ class Panel:
             Command("Reset the scene and the camera", lambda session: self._travel(session, "Reset"), "R"),
             Command("Undo", lambda session: self._travel(session, "Undo"), "Z"),
             Command("Redo", lambda session: self._travel(session, "Redo"), "Z", shifted=True),
-            Command("Frame: move the camera back", lambda _session: self._look_home(), "F"),
+            *self._camera.commands,
             Command("Hide the panel, or show it", lambda _session: curtain.pull(), "H"),
             *numbered(tuple(self._scenes), partial(self._begin, self._load)),
         ]
@@ -274,7 +277,7 @@ class Panel:
     def _travel(self, session: Session, button: str) -> None:
         {"Undo": session.undo, "Redo": session.redo, "Reset": session.reset}[button]()
         if button == "Reset":
-            self._look_home()
+            self._tripod.view()
 
     def _build_arm(self) -> None:
         gui = self._gui

@@ -27,33 +27,42 @@ MIN_SIZE, MAX_SIZE = 100, 20_000
 """Sides of a window that are believed, pixels."""
 USUAL = (1280, 720)
 """Width and height that are taken for a window whose size is not known, pixels."""
+HOME, HAND = "Home", "Hand"
+"""Names of the views from the task's own direction: of all of it, and of the hand, from near."""
 VIEWS = {"Front": (0.0, 1.0, -0.12), "Side": (-1.0, 0.12, -0.12), "Top": (0.0, 0.02, -1.0)}
 """Directions of sight, by name."""
 ARM_SPACE = ((-0.10, -0.10, 0.0), (0.10, 0.10, 0.0), (-0.08, -0.12, 0.80), (0.08, 0.0, 0.80))
 """Places, metres, between which the arm's base, shoulder and elbow are."""
 HAND_ROOM = (0.0, 0.08, 0.12)
 """Offset of the wrist from a place of the hand, about, metres."""
-OBSTACLE_ROOM = 0.09
-"""Room around the obstacle's first place, metres."""
+OBSTACLE_ROOM, HAND_AROUND = 0.09, 0.15
+"""Room around the obstacle's first place, and around the hand in the view of it, metres."""
+
+Pose = tuple[Array, Array]
+"""Position (3,) and look-at (3,) of a camera, metres."""
 
 
 def camera_for(
     task: Task,
     camera: Any,  # noqa: ANN401
-    view: str = "Home",
+    view: str = HOME,
     panels: Sequence[Slice] = (),
-) -> tuple[Array, Array]:
+    hand: Array | None = None,
+) -> Pose:
     """Return position (3,) and look-at (3,), metres, for a view of a task.
 
     Args:
         task: its motions and its usual direction of sight are taken.
         camera: viser's, of which the size of the window is taken.
-        view: one of `VIEWS`, or else the task's own: for panels straight onto them.
+        view: one of `VIEWS`, `HAND`, or else the task's own: for panels straight onto them.
         panels: rectangles that are to be seen instead of the task.
+        hand: (3,) where the hand is, metres; without it the view of the hand is that of the task.
     """
     position, look_at = (np.asarray(place) for place in task.camera)
     direction, places = look_at - position, shown(task)
-    if panels:
+    if view == HAND and hand is not None:
+        places = hand + around(HAND_AROUND)
+    elif panels:
         right, up = directions(panels[0], task.camera)
         direction, above = np.cross(up, right), TITLE_ROOM * up
         places = np.concatenate([area.border + offset for area in panels for offset in (np.zeros(3), above)])
@@ -63,10 +72,14 @@ def camera_for(
 def shown(task: Task) -> Array:
     """Return the places (N, 3) that are to be seen of a task, metres."""
     paths = np.concatenate(task.paths)
-    around = OBSTACLE_ROOM * np.concatenate([np.eye(3), -np.eye(3)])
+    obstacle = np.asarray(task.obstacle_position) + around(OBSTACLE_ROOM)
     pots = [(pot.x + side * pot.radius, pot.y, z) for pot in task.pots for side in (-1, 1) for z in (0, pot.height)]
-    obstacle = np.asarray(task.obstacle_position) + around
     return np.concatenate([paths, paths + HAND_ROOM, obstacle, ARM_SPACE, np.reshape(pots, (-1, 3))])
+
+
+def around(distance: float) -> Array:
+    """Return the offsets (6, 3), metres, of the corners of an octahedron."""
+    return distance * np.concatenate([np.eye(3), -np.eye(3)])
 
 
 def free_part(size: tuple[int, int]) -> tuple[Array, Array]:
@@ -94,7 +107,32 @@ def window(camera: Any) -> tuple[int, int]:  # noqa: ANN401
     return USUAL if size is None or size.min() < MIN_SIZE else (int(size[0]), int(size[1]))
 
 
-def framed(points: Array, direction: Array, across: Array, upright: Array) -> tuple[Array, Array]:
+def turned(pose: Pose, size: tuple[int, int], angle: float) -> Pose:
+    """Return a camera's position and look-at, metres, turned around the vertical through the middle of its picture.
+
+    Args:
+        pose: position (3,) and look-at (3,), metres.
+        size: width and height of the window, pixels; the picture is the part of it that the panel leaves.
+        angle: rad.
+    """
+    position, look_at = pose
+    across, upright = free_part(size)
+    ahead, right, up = axes(look_at - position)
+    depth = np.linalg.norm(look_at - position)
+    middle = position + depth * (ahead + across.mean() * right + upright.mean() * up)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return middle + turn @ (position - middle), middle + turn @ (look_at - middle)
+
+
+def axes(direction: Array) -> tuple[Array, Array, Array]:
+    """Return the unit vectors (3,) ahead, to the right, and up in the picture of a camera that looks this way."""
+    ahead = direction / np.linalg.norm(direction)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return ahead, right, np.cross(right, ahead)
+
+
+def framed(points: Array, direction: Array, across: Array, upright: Array) -> Pose:
     """Return the nearest camera that sees all points within a part of its picture.
 
     Args:
@@ -106,10 +144,7 @@ def framed(points: Array, direction: Array, across: Array, upright: Array) -> tu
     Returns:
         Position (3,) and look-at (3,), metres.
     """
-    ahead = direction / np.linalg.norm(direction)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, ahead)
+    ahead, right, up = axes(direction)
     depth = points @ ahead
     # a camera at depth w and x across sees a point at X, Z between a and b where a (Z − w) ≤ X − x ≤ b (Z − w)
     bounds = []
@@ -119,4 +154,4 @@ def framed(points: Array, direction: Array, across: Array, upright: Array) -> tu
     w = min((most - least) / (high - low) for least, most, low, high in bounds)
     x, y = ((least + high * w + most + low * w) / 2 for least, most, low, high in bounds)
     position = x * right + y * up + w * ahead
-    return position, position + float(np.median(depth) - w) * ahead
+    return position, position + float((depth.min() + depth.max()) / 2 - w) * ahead

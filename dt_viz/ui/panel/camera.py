@@ -1,0 +1,41 @@
+"""Controls of the camera: its views, the orbit, the lock."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import viser
+
+from dt_viz.ui.controls import Control
+from dt_viz.ui.panel.commands import Command
+from dt_viz.ui.scene.camera import HAND, HOME, VIEWS
+from dt_viz.ui.scene.tripod import Tripod
+
+ORBIT_HINT = "turns slowly around what is shown; where you move the camera, it goes on from there"
+LOCK_HINT = "no drag, wheel or key moves the camera; its views, the orbit and another scene do"
+
+
+class CameraControls:
+    """The controls of one visitor's camera, and the same as commands."""
+
+    def __init__(self, gui: viser.GuiApi, tripod: Tripod) -> None:
+        """Build the controls where the panel is being built."""
+        self._tripod = tripod
+        Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
+        self._orbit = Control(gui.add_checkbox("Orbit", False, hint=ORBIT_HINT), partial(setattr, tripod, "orbits"))
+        self._lock = Control(gui.add_checkbox("Lock camera", False, hint=LOCK_HINT), partial(setattr, tripod, "locked"))
+
+    @property
+    def commands(self) -> list[Command]:
+        """What the controls do; Home, which frames all again, comes first."""
+        views = [Command(f"View: {name}", lambda _, name=name: self._tripod.view(name)) for name in (*VIEWS, HAND)]
+        return [
+            Command("Frame: move the camera back", lambda _: self._tripod.view(), "F"),
+            *views,
+            Command("Orbit: turn the camera slowly, or stop", lambda _: self._switch(self._orbit, "orbits"), "O"),
+            Command("Lock the camera, or let it go", lambda _: self._switch(self._lock, "locked"), "L"),
+        ]
+
+    def _switch(self, control: Control, name: str) -> None:
+        control.value = not control.value
+        setattr(self._tripod, name, control.value)
