@@ -58,7 +58,9 @@ def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certi
     assert trimesh.Trimesh(vertices, faces).is_volume
     assert vertices[:, 2].min() == bottle.position[2] == 0  # stands on the table
     radius = np.linalg.norm(vertices[:, :2], axis=1)
-    assert radius[vertices[:, 2] > 0.2].max() < 0.5 * radius.max()  # and has a neck
+    assert radius[vertices[:, 2] > 0.25].max() < 0.5 * radius.max()  # and has a neck
+    (box,) = frame.task.objects
+    assert bottle.signed_distance(box.start + box.surface()[0]).min() > 0.005  # beside the box
     assert frame.scenario.avoidance.space == "cspace"
     assert bottle.signed_distance(frame.pictures.field.points).min() > 0
     undisturbed = max(maximum_collision_distance(path, bottle.signed_distance) for path in frame.ghost)

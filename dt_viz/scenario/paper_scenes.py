@@ -22,10 +22,12 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
 
-BODY, NECK, RIM = (0.035, 0.145), (0.013, 0.225), (0.0155, 0.240)
+BODY, NECK, RIM = (0.035, 0.180), (0.013, 0.265), (0.0155, 0.280)
 """Radius of the bottle's body, neck and rim, and the height at which each ends, metres."""
 SHOULDER, NUM_SHOULDER = 0.05, 8
 """Height of the shoulder between body and neck, metres, and number of rings of the mesh along it."""
+BOTTLE_PLACES = {"lift_box": 0.34, "push_box": 0.55}
+"""Place of the bottle, as a fraction of the motion's length, for each task: beside the box."""
 CUBE = 0.10
 """Edge of the cube, metres."""
 CLOVER_RADIUS, CLOVER_THICKNESS = 0.06, 0.06
@@ -95,8 +97,8 @@ def bottle() -> Solid:
 
 def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
-    x, y, _ = task.obstacle_position
-    return _avoiding(task, Avoidance(MeshObstacle((x, y, 0.0), bottle()), space="cspace"))
+    x, y, _ = task.mean_path[round(100 * BOTTLE_PLACES[task.name])]
+    return _avoiding(task, Avoidance(MeshObstacle((float(x), float(y), 0.0), bottle()), space="cspace"))
 
 
 def _sphere_in_the_letter(task: Task) -> Scenario:

@@ -73,8 +73,9 @@ def shown(task: Task) -> Array:
     """Return the places (N, 3) that are to be seen of a task, metres."""
     paths = np.concatenate(task.paths)
     obstacle = np.asarray(task.obstacle_position) + around(OBSTACLE_ROOM)
-    pots = [(pot.x + side * pot.radius, pot.y, z) for pot in task.pots for side in (-1, 1) for z in (0, pot.height)]
-    return np.concatenate([paths, paths + HAND_ROOM, obstacle, ARM_SPACE, np.reshape(pots, (-1, 3))])
+    pots = [pot.surface()[0] + (pot.x, pot.y, 0.0) for pot in task.pots]
+    objects = [thing.surface()[0] + thing.start for thing in task.objects if thing.start is not None]
+    return np.concatenate([paths, paths + HAND_ROOM, obstacle, ARM_SPACE, *pots, *objects])
 
 
 def around(distance: float) -> Array:
