@@ -533,7 +533,7 @@ def test_a_task_chosen_in_the_page_is_learned_and_shown(visit):
 
 SHOWN = {  # the layer's label in the page, the picture's name, and the points that it holds
     "Warped grid ψ⁻¹(grid)": ("grid", lambda picture: [picture.lines.node.points]),
-    "Stack side by side": ("panels", lambda picture: [picture.rollouts.node.vertices, picture.streamlines.node.points]),
+    "Stack side by side": ("panels", lambda picture: [picture.panels[0].rollouts.node.vertices]),
     "Learned generator": ("generator", lambda picture: [picture.arrows.node.points]),
 }
 

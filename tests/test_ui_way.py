@@ -4,14 +4,20 @@ import numpy as np
 import pytest
 
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.way import PERIOD, STEP, TRAIL_SECONDS, Way
+from dt_viz.ui.scene.rollouts import Middles
+from dt_viz.ui.scene.way import BESIDE, PERIOD, STEP, TRAIL_SECONDS, Way
 
 AHEAD = np.linspace([0.0, 0.0, 0.3], [0.2, 0.0, 0.3], 5)
 
 
+@pytest.fixture(name="middles")
+def _middles():
+    return Middles()
+
+
 @pytest.fixture(name="way")
-def _way(scene):
-    return Way(scene)
+def _way(scene, middles):
+    return Way(scene, middles)
 
 
 def moved(way, seconds, speed=0.1, begins=0.0):
@@ -29,6 +35,13 @@ def test_the_way_ahead_is_drawn_as_it_is(way):
     assert len(way.ahead.node.points) == 4  # it is sent a few times a second only
     way.show(PERIOD, AHEAD[1], lambda: AHEAD[1:])
     assert len(way.ahead.node.points) == 3
+
+
+@pytest.mark.parametrize(("off", "drawn"), [(0.5 * BESIDE, 0), (1.5 * BESIDE, 4)])
+def test_the_way_ahead_is_not_drawn_along_a_rollout(way, middles, off, drawn):
+    middles.of((AHEAD + np.array([0.0, off, 0.0]),))
+    way.show(0.0, AHEAD[0], lambda: AHEAD)
+    assert len(way.ahead.node.points) == drawn
 
 
 def test_the_trail_is_where_the_hand_was_and_fades(way):

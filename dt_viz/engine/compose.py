@@ -204,7 +204,10 @@ def _panels(
     shown = [picture for picture in made if picture is not None]
     widest = np.max([area.half_size, *(picture.area.half_size for picture in shown)], axis=0)
     places = offsets(area, widest, len(shown), task.camera)
-    beside = [picture.moved(area.centre - picture.area.centre + by) for picture, by in zip(shown, places, strict=True)]
+    beside = [
+        replace(picture, offset=area.centre - picture.area.centre + by)
+        for picture, by in zip(shown, places, strict=True)
+    ]
     if any(panel.task for panel in scenario.view.panels):
         title = task.title
     else:

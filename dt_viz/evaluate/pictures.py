@@ -69,8 +69,11 @@ def run(options: argparse.Namespace) -> int:
             for name in options.only:
                 page = browser.new_page(viewport={"width": width, "height": height})
                 page.on("console", lambda message: _complain(message, complaints))
+                opened = time.monotonic()
                 page.goto(f"http://{server.host}:{server.port}")
-                _until(lambda: len(server.visitors) == 1 and _is_certified(server.visitors[0]))
+                _until(lambda: any(visitor.shown is not None for visitor in server.visitors))
+                waited = time.monotonic() - opened
+                _until(lambda: _is_certified(server.visitors[0]))
                 (visitor,) = server.visitors
                 _begin(visitor, name)
                 _stop_in_the_middle(visitor)
@@ -81,7 +84,8 @@ def run(options: argparse.Namespace) -> int:
                 Image.open(file).convert("RGB").quantize(256).save(file, optimize=True)
                 page.close()
                 _until(lambda: not server.visitors)
-                print(f"{file}: {SCENES[name].title if name in SCENES else 'the first page'}")
+                title = SCENES[name].title if name in SCENES else "the first page"
+                print(f"{file}: {title}; the first motion was sent {waited:.1f} s after the page was opened")
         finally:
             browser.close()
             server.close()

@@ -27,7 +27,7 @@ OUTLINE_SPACING = 0.006
 
 @dataclass(frozen=True)
 class PanelPicture:
-    """A system on a rectangle; all places in metres in the world."""
+    """A system on a rectangle; all places in metres in the world, before the rectangle is moved aside."""
 
     title: str
     area: Slice
@@ -48,23 +48,13 @@ class PanelPicture:
     grid: tuple[Array, ...] = ()
     """(2, 3) lines of the lattice whose image is the warped grid."""
 
-    def moved(self, by: Array) -> PanelPicture:
-        """Return the same picture elsewhere; `by` (3,), metres."""
+    offset: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) from all these places to where they are shown, metres."""
 
-        def all_moved(paths: tuple[Array, ...]) -> tuple[Array, ...]:
-            return tuple(path + by for path in paths)
-
-        return replace(
-            self,
-            area=replace(self.area, centre=self.area.centre + by),
-            goal=None if self.goal is None else self.goal + by,
-            rollouts=all_moved(self.rollouts),
-            streamlines=all_moved(self.streamlines),
-            demonstrations=all_moved(self.demonstrations),
-            points=self.points + by,
-            outlines=self.outlines + by,
-            grid=all_moved(self.grid),
-        )
+    @property
+    def shown(self) -> Slice:
+        """Its rectangle where it is shown."""
+        return replace(self.area, centre=self.area.centre + self.offset)
 
 
 def system_panel(

@@ -82,7 +82,7 @@ class Visitor:
             self.arms = Arms(client.scene, robot)
             self.objects = Objects(client.scene)
             self.drawing = Drawing(client.scene, self.arm.frames[-1].name, robot.end_effector_offset)
-            self.way = Way(client.scene)
+            self.way = Way(client.scene, self.pictures.middles)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
         self._posed: tuple[bytes, bool] | None = None
@@ -103,7 +103,7 @@ class Visitor:
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         """See `Display`."""
-        beside = tuple(panel.area for panel in frame.pictures.panels)
+        beside = tuple(panel.shown for panel in frame.pictures.panels)
         others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._tripod.panels)
         if self.shown is None or frame.task is not self.shown.task or others:
             self._tripod.look(frame.task, beside)

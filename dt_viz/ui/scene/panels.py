@@ -1,14 +1,13 @@
-"""Panels beside the scene, drawn together: one node for each look."""
+"""Panels beside the scene: each draws again only what has changed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from typing import Any
 
-import numpy as np
 import viser
 
 from dt_viz.engine.frame import Frame
-from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Point
 from dt_viz.pictures.panels import PanelPicture
 from dt_viz.scenario.panels import directions
@@ -22,57 +21,67 @@ TITLE_GAP = 0.015
 """Distance of a title from its panel, metres."""
 
 
+class PanelNodes:
+    """The nodes of one panel."""
+
+    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+        """Make an empty panel of this name in the scene tree."""
+        self.frame = scene.add_frame(name, show_axes=False)
+        self._border = Lines(scene, f"{name}/border", palette.PANEL, 0.0016)
+        grid = Lines(scene, f"{name}/grid", palette.GRID, 0.0010)
+        self.streamlines = Lines(scene, f"{name}/streamlines", palette.STREAMLINE, 0.0011)
+        demonstrations = Lines(scene, f"{name}/demonstrations", palette.DEMONSTRATION, 0.0018)
+        outlines = Lines(scene, f"{name}/outlines", palette.OUTLINE, 0.0030)
+        weak, strong = palette.linear(palette.GENERATOR_WEAK), palette.linear(palette.GENERATOR)
+        self._arrows = Arrows(scene, f"{name}/arrows", weak, strong, ARROW_LENGTH)
+        self.rollouts = Tubes(scene, f"{name}/rollouts", palette.ROLLOUT, 0.0022, ball=0.0055)
+        self._goal = scene.add_icosphere(f"{name}/goal", radius=0.009, color=palette.GOAL)
+        self._title = scene.add_label(f"{name}/title", "", anchor="bottom-center", font_screen_scale=1.1)
+        self._show: dict[str, Callable[[Any], None]] = {
+            "grid": grid.show,
+            "streamlines": self.streamlines.show,
+            "demonstrations": demonstrations.show,
+            "outlines": outlines.show_segments,
+            "rollouts": lambda paths: self.rollouts.show(middles_of(paths)),
+        }
+        """What shows each field of a `PanelPicture`."""
+        self._drawn: PanelPicture | None = None
+
+    def draw(self, panel: PanelPicture, camera: tuple[Point, Point]) -> None:
+        """Show a panel, read by a camera with this position and look-at, metres."""
+        before, self._drawn = self._drawn, panel
+        self.frame.position = panel.offset
+        for name, show in self._show.items():
+            if before is None or getattr(before, name) is not getattr(panel, name):
+                show(getattr(panel, name))
+        if before is None or before.points is not panel.points:
+            self._arrows.show(panel.points, panel.vectors)
+        self._goal.visible = panel.goal is not None
+        if panel.goal is not None:
+            self._goal.position = panel.goal
+        if before is None or not before.area.lies_like(panel.area):
+            self._border.show([panel.area.border])
+        _, up = directions(panel.area, camera)
+        self._title.text = panel.title
+        self._title.position = panel.area.centre + (panel.area.half_size[1] + TITLE_GAP) * up
+
+
 class Panels(Picture):
     """Systems on panels beside the scene, and a frame with a title around the scene's own slice."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/panels", show_axes=False))
         self._scene = scene
-        self._borders = Lines(scene, "/panels/borders", palette.PANEL, 0.0016)
-        self._grid = Lines(scene, "/panels/grid", palette.GRID, 0.0010)
-        self.streamlines = Lines(scene, "/panels/streamlines", palette.STREAMLINE, 0.0011)
-        self._demonstrations = Lines(scene, "/panels/demonstrations", palette.DEMONSTRATION, 0.0018)
-        self._outlines = Lines(scene, "/panels/outlines", palette.OUTLINE, 0.0030)
-        weak, strong = palette.linear(palette.GENERATOR_WEAK), palette.linear(palette.GENERATOR)
-        self._arrows = Arrows(scene, "/panels/arrows", weak, strong, ARROW_LENGTH)
-        self.rollouts = Tubes(scene, "/panels/rollouts", palette.ROLLOUT, 0.0022, ball=0.0055)
-        self._goals: list[viser.IcosphereHandle] = []
-        self._titles: list[viser.LabelHandle] = []
-        self._drawn: tuple[PanelPicture, ...] = ()
+        self.panels: list[PanelNodes] = []
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
         panels = frame.pictures.panels
-        if not panels or panels is self._drawn:
+        if not panels:
             return
-        self._drawn = panels
-        self._borders.show([panel.area.border for panel in panels])
-        self._grid.show([line for panel in panels for line in panel.grid])
-        self.streamlines.show([line for panel in panels for line in panel.streamlines])
-        self._demonstrations.show([path for panel in panels for path in panel.demonstrations])
-        self._outlines.show_segments(np.concatenate([panel.outlines for panel in panels]))
-        self.rollouts.show(middles_of([path for panel in panels for path in panel.rollouts]))
-        lengths = [np.linalg.norm(panel.vectors, axis=1).max(initial=1e-12) for panel in panels]
-        vectors = [panel.vectors / length for panel, length in zip(panels, lengths, strict=True)]
-        self._arrows.show(np.concatenate([panel.points for panel in panels]), np.concatenate(vectors))
-        self._mark([panel.goal for panel in panels if panel.goal is not None])
-        self._write(panels, frame.task.camera)
-
-    def _mark(self, goals: Sequence[Array]) -> None:
-        for k in range(len(self._goals), len(goals)):
-            self._goals.append(self._scene.add_icosphere(f"/panels/goal {k}", radius=0.009, color=palette.GOAL))
-        for k, ball in enumerate(self._goals):
-            ball.visible = k < len(goals)
-            if ball.visible:
-                ball.position = goals[k]
-
-    def _write(self, panels: Sequence[PanelPicture], camera: tuple[Point, Point]) -> None:
-        for k in range(len(self._titles), len(panels)):
-            label = self._scene.add_label(f"/panels/title {k}", "", anchor="bottom-center", font_screen_scale=1.1)
-            self._titles.append(label)
-        for k, label in enumerate(self._titles):
-            label.visible = k < len(panels)
-            if label.visible:
-                area = panels[k].area
-                _, up = directions(area, camera)
-                label.text, label.position = panels[k].title, area.centre + (area.half_size[1] + TITLE_GAP) * up
+        for k in range(len(self.panels), len(panels)):
+            self.panels.append(PanelNodes(self._scene, f"/panels/{k}"))
+        for k, nodes in enumerate(self.panels):
+            nodes.frame.visible = k < len(panels)
+            if k < len(panels):
+                nodes.draw(panels[k], frame.task.camera)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -11,9 +12,10 @@ from scipy.spatial import KDTree
 
 from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
+from dt_viz.properties import cached_property
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Lines, Picture
-from dt_viz.ui.scene.tubes import NUM_RINGS, Tubes, middles_of
+from dt_viz.ui.scene.tubes import Tubes, middles_of
 
 BOLD, THIN = 0.0034, 0.0020
 """Radius of the rollout that the arm follows, and of the others, metres."""
@@ -29,33 +31,44 @@ JUMP, FADING = 0.05, 0.15
 """Distance by which a rollout jumps, metres, where it then fades out where it was, and the time that takes, seconds."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Tubes:
+    """Where the tubes of rollouts lie."""
+
+    rollouts: tuple[Array, ...]
+    """(T_i, 3), metres."""
+    middles: Array
+    """(R, K, 3), metres."""
+
+    @cached_property
+    def samples(self) -> KDTree:
+        """Points along the middles."""
+        part = np.arange(BETWEEN)[:, None] / BETWEEN
+        pieces = self.middles[:, :-1, None] + part * np.diff(self.middles, axis=1)[:, :, None]
+        return KDTree(np.concatenate([pieces.reshape(-1, 3), self.middles[:, -1]]))
+
+
 class Middles:
     """The middles of the tubes that a frame's rollouts are drawn with, worked out once, and what the tubes cover."""
 
     def __init__(self) -> None:
         self.shown = True
         """Whether the tubes are shown; hidden ones cover nothing."""
-        self._rollouts: tuple[Array, ...] = ()
-        self._middles = np.zeros((0, NUM_RINGS, 3))
-        self._samples: KDTree | None = None
+        self._newest = _Tubes((), middles_of(()))
 
     def of(self, rollouts: tuple[Array, ...]) -> Array:
-        """The middles (R, `NUM_RINGS`, 3) of tubes around rollouts (T_i, 3), metres."""
-        if rollouts is not self._rollouts:
-            self._rollouts, self._middles, self._samples = rollouts, middles_of(rollouts), None
-        return self._middles
+        """The middles (R, K, 3) of tubes around rollouts (T_i, 3), metres."""
+        if rollouts is not self._newest.rollouts:
+            self._newest = _Tubes(rollouts, middles_of(rollouts))
+        return self._newest.middles
 
-    def beside(self, rollouts: tuple[Array, ...], segments: Array) -> Array:
-        """Those of the segments (K, 2, 3), metres, that are beside the tubes of all rollouts (T_i, 3)."""
-        middles = self.of(rollouts)
-        if not self.shown or not middles.size:
+    def beside(self, segments: Array, distance: float = COVERED) -> Array:
+        """Those of the segments (K, 2, 3) farther than a distance from the middles asked for last, all in metres."""
+        newest = self._newest
+        if not self.shown or not newest.rollouts:
             return segments
-        if self._samples is None:
-            part = np.arange(BETWEEN)[:, None] / BETWEEN
-            pieces = middles[:, :-1, None] + part * np.diff(middles, axis=1)[:, :, None]
-            self._samples = KDTree(np.concatenate([pieces.reshape(-1, 3), middles[:, -1]]))
-        distance, _ = self._samples.query(segments.mean(axis=1), distance_upper_bound=COVERED)
-        return segments[np.isinf(distance)]
+        away, _ = newest.samples.query(segments.mean(axis=1), distance_upper_bound=distance)
+        return segments[np.isinf(away)]
 
 
 class Demonstrations(Picture):
@@ -67,7 +80,8 @@ class Demonstrations(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
-        self._lines.show_segments(self._middles.beside(frame.rollouts, self._lines.segments(frame.task.paths)))
+        self._middles.of(frame.rollouts)
+        self._lines.show_segments(self._middles.beside(self._lines.segments(frame.task.paths)))
 
 
 class Ghost(Picture):
@@ -81,7 +95,8 @@ class Ghost(Picture):
         """See `Picture`."""
         own = frame.ghost[: len(frame.ghost) - frame.num_added]
         undisturbed = own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
-        self._lines.show_segments(self._middles.beside(frame.rollouts, self._lines.segments(undisturbed)))
+        self._middles.of(frame.rollouts)
+        self._lines.show_segments(self._middles.beside(self._lines.segments(undisturbed)))
 
 
 class Rollouts(Picture):

@@ -94,12 +94,13 @@ class ScenePictures:
             LevelRollouts(scene),
             Goal(scene),
         )
-        self._middles = Middles()
-        self.rollouts = Rollouts(scene, self._middles)
+        self.middles = Middles()
+        """Of the rollouts that are drawn."""
+        self.rollouts = Rollouts(scene, self.middles)
         self._by_view: dict[str, Picture] = {
-            "demonstrations": Demonstrations(scene, self._middles),
+            "demonstrations": Demonstrations(scene, self.middles),
             "rollouts": self.rollouts,
-            "ghost": Ghost(scene, self._middles),
+            "ghost": Ghost(scene, self.middles),
             "field": FieldArrows(scene),
             "streamlines": Streamlines(scene),
             "table": Table(scene),
@@ -140,7 +141,7 @@ class ScenePictures:
     def _draw(self, frame: Frame) -> None:
         """Draw a frame, a stale one grey: as one that there is no motion for."""
         before, self._grey = (self._blocked, self._grey), self.stale
-        self._middles.shown = self._view.rollouts
+        self.middles.shown = self._view.rollouts
         if self._grey:
             frame = replace(frame, blocked=(*frame.blocked, COMPUTING))
         for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
@@ -161,7 +162,7 @@ class ScenePictures:
             self._view = scenario.view
             self._show()
         # a thread that is drawing has seen the new scenario, or is waited for
-        if (self.stale, scenario.view.rollouts) != (self._grey, self._middles.shown):
+        if (self.stale, scenario.view.rollouts) != (self._grey, self.middles.shown):
             with self._drawing:
                 if self._frame is not None:
                     self._draw(self._frame)

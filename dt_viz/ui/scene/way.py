@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Lines, Shown, assign
+from dt_viz.ui.scene.rollouts import Middles
 
 TRAIL_SECONDS = 2.5
 """Time after which the trail has faded, seconds."""
 STEP = 0.006
 """Shortest way of the hand that becomes a piece of the trail, metres."""
+BESIDE = 0.008
+"""Distance from a rollout up to which the way ahead counts as along it, and is not drawn, metres."""
 PERIOD = 0.2
 """Time between two drawings, seconds: each sends the whole line to the browser."""
 
@@ -24,7 +27,9 @@ PERIOD = 0.2
 class Way(Shown):
     """A line from the hand to where it is going, and a fading one to where it was."""
 
-    def __init__(self, scene: viser.SceneApi) -> None:
+    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
+        """Make an empty one; the way ahead is drawn where the rollouts of these middles are not."""
+        self._middles = middles
         super().__init__(scene.add_frame("/way", show_axes=False, visible=False))
         self.ahead = Lines(scene, "/way/ahead", palette.WAY, 0.0055)
         self._trail = scene.add_line_segments(
@@ -53,7 +58,7 @@ class Way(Shown):
         self._when, ahead = moment, going()
         if not np.array_equal(ahead, self._drawn):
             self._drawn = ahead
-            self.ahead.show([ahead])
+            self.ahead.show_segments(self._middles.beside(self.ahead.segments([ahead]), BESIDE))
         while self._came and moment - self._came[0][0] > TRAIL_SECONDS:
             self._came.popleft()
         times, places = np.array([t for t, _ in self._came]), [*(place for _, place in self._came), hand]
