@@ -109,11 +109,26 @@ def test_nothing_of_the_first_controls_is_cut_or_overlaps(visit):
     assert faults(boxes(page)) == []
 
 
+@in_all_windows
+def test_the_presentation_has_a_caption_and_buttons_in_place_of_the_panel(visit):
+    page, visitor = visit
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("p")
+    page.get_by_role("heading", name="Draw S").wait_for()
+    page.get_by_label("Task", exact=True).wait_for(state="hidden")
+    shown = {name: page.get_by_role("button", name=name, exact=True) for name in ("Previous", "Next", "End")}
+    shown |= {"title": page.get_by_role("heading"), "caption": page.locator(".dt-caption p")}
+    assert faults({name: element.evaluate(BOX) for name, element in shown.items()}) == []
+    until_drawn(visitor)
+    page.keyboard.press("Escape")
+    page.get_by_label("Task", exact=True).wait_for()
+
+
 SPOILT = {
     "Task is cut": "input {margin-left: 120px}",
     "name of Imitate is cut": "label {position: relative; left: -60px}",
     "Scene is too narrow": "input {padding-left: 400px !important}",
-    "status is cut": "body {zoom: 2.6}",
+    "status is cut": "[role=status] {margin-left: 200px !important; width: 300px}",
     "Scene overlaps name of Scene": "input {position: relative; left: -90px}",
 }
 """What the check must find, and the style that does it."""
@@ -152,6 +167,7 @@ def test_a_touch_drags_the_sphere(visit):
     home, _ = camera_for(TASKS["draw_s"](), camera)
     session.edit("test", view=View(**{**vars(LIGHT), "handles": False}))
     (before,) = session.scenario.obstacles
+    x, y, shift = 0.0, 0.0, np.zeros(3)
     for _ in range(TRIES):  # a page drawn by software may not show the sphere in its place yet
         visitor._tripod.view()
         wait_until(lambda: np.abs(camera.position - home).max() < 1e-3, "the camera to be back")
