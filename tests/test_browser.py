@@ -3,12 +3,26 @@
 import io
 import itertools
 import time
-from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
+from browsing import (
+    LIGHT,
+    OF_VISER,
+    PATIENCE,
+    TRIES,
+    begin,
+    close_notices,
+    close_page,
+    open_page,
+    page_errors,
+    press,
+    project,
+    until_drawn,
+    wait_until,
+)
 from chromium import needs_chromium
 from PIL import Image
 from scenes import beside, changing
@@ -19,7 +33,7 @@ from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.control import Phase
 from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.obstacles.shapes import MeshObstacle
-from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel.verdict import Level
@@ -32,22 +46,7 @@ from dt_viz.ui.visitor import Visitor, initial_scenario
 WIDTH, HEIGHT = 900, 560
 CORNER = (5, 5)
 """CSS pixels where the mouse touches nothing."""
-PATIENCE = 240.0
-"""Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
-TRIES = 8
-"""Drags or clicks until the page, which may still be on its way to what was asked of it, has taken one."""
-HIDDEN = ("playing", "rollouts", "ghost", "field", "arm", "table", "demonstrations")
-LIGHT = View(handles=True, **dict.fromkeys(HIDDEN, False))
-"""The obstacle only: drawing the lines by software takes a tenth of a second, and the arm most of one."""
-
 pytestmark = [pytest.mark.browser, needs_chromium]
-
-
-UNHURRIED = """
-    const draw = window.requestAnimationFrame.bind(window);
-    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 200);
-"""
-"""Five pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
 
 
 @pytest.fixture(scope="module")
@@ -56,59 +55,6 @@ def server():
     server = Server(TASKS, FitStore(None), task="draw_s", port=0, max_sessions=2)
     yield server
     server.close()
-
-
-def wait_until(condition, what):
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for {what}"
-        time.sleep(0.05)
-
-
-def until_drawn(visitor):
-    """Until the page has drawn what it was sent, and what it has sent itself has arrived: messages keep their order."""
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        visitor.client.flush()
-        with suppress(TimeoutError):  # a page that is busy may lose what it is asked
-            visitor.client.get_render(height=16, width=16, timeout=PATIENCE / TRIES)
-            return
-    pytest.fail("the page draws nothing")
-
-
-page_errors: list[str] = []
-"""What pages have complained of in their consoles."""
-OF_VISER = "Unable to preventDefault inside passive event listener"
-"""Said by viser's own page of any drag; nothing is lost."""
-
-
-def close_notices(page):
-    """They cover the scene; the one about software rendering may come late, and go by itself at any moment."""
-    page.locator("button.mantine-Notification-closeButton").evaluate_all("all => all.forEach(button => button.click())")
-
-
-def open_page(browser, server):
-    """A new tab and the visitor that the server made for it, once its first scenario is drawn, without the arm."""
-    known = set(server.visitors)
-    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-    page.set_default_timeout(1000 * PATIENCE)
-    page.on("console", lambda message: page_errors.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: page_errors.append(str(error)))
-    page.add_init_script(UNHURRIED)
-    page.goto(f"http://127.0.0.1:{server.port}")
-    wait_until(lambda: set(server.visitors) - known, "the page of a visitor")
-    (visitor,) = set(server.visitors) - known
-    visitor.session.edit("test", view=LIGHT)
-    assert visitor.session.wait_idle(PATIENCE)
-    page.get_by_text("· stable ·").wait_for()
-    until_drawn(visitor)
-    close_notices(page)
-    return page, visitor
-
-
-def close_page(page, server, visitor):
-    page.close()
-    wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
 
 
 class Tab:
@@ -123,7 +69,7 @@ class Tab:
         if not self.sound:
             self.close()
         if self._opened is None:
-            self._opened = open_page(self._browser, self._server)
+            self._opened = open_page(self._browser, self._server, (WIDTH, HEIGHT))
         self.sound = False
         return self._opened
 
@@ -159,14 +105,6 @@ def visit(tab, initial, request):
     assert [error for error in page_errors if OF_VISER not in error] == []
 
 
-def begin(visitor: Visitor, scenario: Scenario) -> None:
-    """Begin with a scenario, and wait until it is shown."""
-    visitor.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(Scenario)})
-    visitor.session.end_gesture()
-    assert visitor.session.wait_idle(PATIENCE)
-    assert visitor.shown is not None and visitor.shown.scenario.moves_like(scenario)
-
-
 def look_home(visitor: Visitor) -> None:
     camera = visitor.client.camera
     camera.position, camera.look_at = camera_for(TASKS["draw_s"](), camera)
@@ -176,22 +114,6 @@ def camera_rests(visitor: Visitor) -> bool:
     camera = visitor.client.camera
     wanted, _ = camera_for(TASKS["draw_s"](), camera)
     return bool(np.abs(np.asarray(camera.position) - wanted).max() < 1e-3)
-
-
-def project(visitor: Visitor, point) -> tuple[float, float]:
-    """CSS pixels of a world point: the camera looks along its z axis, y down, vertical field of view."""
-    camera = visitor.client.camera
-    w, x, y, z = camera.wxyz
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    seen = rotation.T @ (np.asarray(point) - camera.position)
-    focal = HEIGHT / 2 / np.tan(camera.fov / 2)
-    return WIDTH / 2 + focal * seen[0] / seen[2], HEIGHT / 2 + focal * seen[1] / seen[2]
 
 
 def seen_at(visitor: Visitor) -> tuple[float, float]:
@@ -301,11 +223,6 @@ def test_undo_takes_a_drag_back_and_redo_does_it_again(visit):
 def open_tab(page, name):
     """A tab of the panel."""
     press(page.get_by_role("tab", name=name, exact=True))
-
-
-def press(locator):
-    """Click without waiting for two alike pictures of the page, which may be long in coming."""
-    locator.click(force=True)
 
 
 def choose(page, visitor, dropdown, option):
@@ -509,7 +426,7 @@ def test_reset_brings_back_the_scene_and_the_camera(visit, engine):
 
 def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):
     _, first = visit
-    page, second = open_page(browser, server)
+    page, second = open_page(browser, server, (WIDTH, HEIGHT))
     third = browser.new_page()
     third.set_default_timeout(1000 * PATIENCE)
     try:

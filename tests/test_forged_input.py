@@ -44,6 +44,12 @@ def page(server, robot):
     page.visitor.close()
 
 
+@pytest.fixture(autouse=True)
+def _without_presentation(page):
+    """Something forged may have begun it."""
+    page.visitor._panel._presentation.on = False
+
+
 def values_of(value: Any):
     """All plain values in a scenario, but for what obstacles keep of files."""
     if dataclasses.is_dataclass(value):
@@ -288,16 +294,9 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     commands = page.commands
     keys = [(command.hotkey, command.modifier) for command in commands.values() if command.hotkey is not None]
     assert len(set(keys)) == len(keys)
-    named = {
-        ("space", None),
-        ("R", None),
-        ("Z", None),
-        ("Z", "shift"),
-        ("F", None),
-        ("H", None),
-        ("O", None),
-        ("L", None),
-    }
+    letters = "RZFHOLP"
+    special = ("space", "escape", "pagedown", "pageup")
+    named = {(key, None) for key in (*letters, *special)} | {("Z", "shift")}
     assert set(keys) == named | {(str(k), None) for k in range(1, 10)}
     by_key = {(command.hotkey, command.modifier): command for command in commands.values()}
     before = page.session.scenario
@@ -359,6 +358,37 @@ def test_a_command_that_is_forged_or_disabled_is_not_given(page):
     undo.disabled = False
     page.give(undo)
     assert page.session.scenario == before
+
+
+def test_the_presentation_goes_from_scene_to_scene_and_folds_no_panel(page, monkeypatch):
+    presentation, scenes = page.visitor._panel._presentation, list(SCENES)
+    page.session.leave_scene()
+
+    def shown():
+        assert page.visitor._panel._beginnings.wait_idle(30)
+        return page.session.scenario.scene
+
+    (buttons,) = (handle for handle in page.inputs if handle.label == "Presentation" and hasattr(handle, "options"))
+    assert (presentation.on, buttons.visible, page.visitor._tripod.alone) == (False, False, False)
+    page.give(page.commands["Presentation: the scene without the panel, or with it"])
+    assert (presentation.on, buttons.visible, page.visitor._tripod.alone) == (True, True, True)
+    assert TASKS[page.session.scenario.task].title in presentation._html.content
+    page.claim(buttons, "Previous")
+    assert shown() == scenes[-1]
+    page.give(page.commands["Next scene"])
+    assert shown() == scenes[0] and SCENES[scenes[0]].title in presentation._html.content
+    page.claim(buttons, "Next")
+    assert shown() == scenes[1]
+    told = []
+    monkeypatch.setattr(page.gui._websock_interface, "queue_message", told.append)
+    page.give(page.commands["Hide the panel, or show it"])
+    assert told == []
+    page.claim(buttons, "End")
+    assert (presentation.on, buttons.visible, page.visitor._tripod.alone) == (False, False, False)
+    page.session.leave_scene()
+    page.give(page.commands["Next scene"])
+    assert shown() == scenes[0]
+    page.session.leave_scene()
 
 
 def test_the_panel_is_folded_and_unfolded_by_a_command(page, monkeypatch):

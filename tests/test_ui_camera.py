@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.scene.camera import (
+    CAPTION,
     FIELD_OF_VIEW,
     HAND,
     HOME,
@@ -52,6 +53,16 @@ def test_a_task_is_seen_beside_the_panel_and_as_large_as_can_be(task, view, size
     assert (at.min(axis=0) > low + room - 1).all() and (at.max(axis=0) < high - room + 1).all()
     empty = (high - low - 2 * room - np.ptp(at, axis=0)) / (high - low)
     assert empty.min() < 0.01
+
+
+@pytest.mark.parametrize("size", [(1600, 900), (390, 844), (844, 390)], ids=str)
+def test_a_presentation_shows_the_task_above_the_caption_in_all_of_the_width(size):
+    task, camera = TASKS["draw_s"](), SimpleNamespace(image_width=size[0], image_height=size[1])
+    at, _ = pixels(shown(task), *camera_for(task, camera, alone=True), size)
+    high = np.array([size[0], size[1] * (1 - CAPTION)])
+    room = MARGIN * high
+    assert (at.min(axis=0) > room - 1).all() and (at.max(axis=0) < high - room + 1).all()
+    assert (np.ptp(at, axis=0) > high - 2 * room - 2).any()
 
 
 @pytest.mark.parametrize("task", TASKS)

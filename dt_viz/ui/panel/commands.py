@@ -12,6 +12,8 @@ from dt_viz.engine.session import Session
 from dt_viz.ui.panel.bindings import Bindings
 
 MAX_DIGIT = 9
+PAGES = {"pageup": "Page Up", "pagedown": "Page Down"}
+"""Names of keys of more than one word."""
 SHIFT: Literal["shift"] = "shift"
 
 
@@ -23,14 +25,14 @@ class Command:
     act: Callable[[Session], None]
     """Does it; it must only submit."""
     key: str = ""
-    """Key on which it is done; empty for none. "space", a digit, or a capital letter."""
+    """Key on which it is done; empty for none. A capital letter, a digit, or a name of viser's, such as "space"."""
     shifted: bool = False
     """Whether Shift is held with the key."""
 
     @property
     def keys(self) -> str:
         """The key as a person reads it."""
-        return f"Shift {self.key}" if self.shifted else self.key.capitalize()
+        return f"Shift {self.key}" if self.shifted else PAGES.get(self.key, self.key.capitalize())
 
 
 def numbered(titles: Sequence[str], choose: Callable[[Session, str], None]) -> list[Command]:

@@ -30,6 +30,7 @@ from dt_viz.ui.panel.disturbances import Disturbances
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
 from dt_viz.ui.panel.plots import JointPlots
+from dt_viz.ui.panel.presentation import Presentation
 from dt_viz.ui.panel.push import PushButton
 from dt_viz.ui.panel.slice import SlicePanel
 from dt_viz.ui.panel.stack import StackPanel
@@ -115,6 +116,8 @@ class Panel:
         self._waits = False
         """Whether another task or scene than the reported one is being computed."""
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
+        self._presentation = Presentation(gui, self._turn, partial(setattr, tripod, "alone"))
+        self._bindings.show(self._title, self._presentation.entitle)
         self._build_task()
         add_avoid_and_imitate(gui, self._bindings)
         self.status = StatusLine(gui, self._bindings)
@@ -138,6 +141,7 @@ class Panel:
             self._build_arm()
         with tabs.add_tab("Picture"):
             self._camera = CameraControls(gui, tripod)
+            on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), self._presentation.begin)
             self._build_export(save_png)
         commands = self._commands(Curtain(gui))
         add_commands(gui, self._bindings, commands)
@@ -199,6 +203,7 @@ class Panel:
 
     def _give_hint(self, text: str) -> None:
         self.hint.content = place_html(text, INK, HINT)
+        self._presentation.caption(text)
 
     def learning(self, fraction: float, message: str) -> None:
         """Show the progress of learning a task."""
@@ -243,6 +248,16 @@ class Panel:
         self.hint = self._gui.add_html("")
         self._give_hint("")
 
+    def _title(self, scenario: Scenario) -> str:
+        return SCENES[scenario.scene].title if scenario.scene in SCENES else self._titles[scenario.task]
+
+    def _turn(self, step: int) -> None:
+        """Go to a scene so many places after the shown one; before the first is the last."""
+        scenario, titles = self._bindings.scenario, tuple(self._scenes)
+        if scenario is not None:
+            shown = titles.index(self._title(scenario)) if scenario.scene in SCENES else min(-step, 0)
+            self._begin(self._load, self._bindings.session, titles[(shown + step) % len(titles)])
+
     def _load(self, session: Session, title: str) -> None:
         if title == _NO_SCENE:
             session.leave_scene()
@@ -256,9 +271,14 @@ class Panel:
             Command("Undo", lambda session: self._travel(session, "Undo"), "Z"),
             Command("Redo", lambda session: self._travel(session, "Redo"), "Z", shifted=True),
             *self._camera.commands,
-            Command("Hide the panel, or show it", lambda _session: curtain.pull(), "H"),
+            Command("Hide the panel, or show it", lambda _session: self._fold(curtain), "H"),
+            *self._presentation.commands,
             *numbered(tuple(self._scenes), partial(self._begin, self._load)),
         ]
+
+    def _fold(self, curtain: Curtain) -> None:
+        if not self._presentation.on:  # its caption would go, too
+            curtain.pull()
 
     def _begin(self, begin: Callable[[Session, str], None], session: Session, title: str) -> None:
         """Begin a task or a scene; if that fails, show why and stay."""

@@ -21,6 +21,8 @@ NARROW = 700
 """Width of a window, pixels, below which the panel lies under the picture, not beside it."""
 UNDER = 0.6
 """Part of a narrow window's height that the panel takes."""
+CAPTION = 0.2
+"""Part of a window's height that the caption of a presentation takes."""
 MARGIN = 0.06
 """Part of the free window that stays empty on each side."""
 MIN_SIZE, MAX_SIZE = 100, 20_000
@@ -48,6 +50,8 @@ def camera_for(
     view: str = HOME,
     panels: Sequence[Slice] = (),
     hand: Array | None = None,
+    *,
+    alone: bool = False,
 ) -> Pose:
     """Return position (3,) and look-at (3,), metres, for a view of a task.
 
@@ -57,6 +61,7 @@ def camera_for(
         view: one of `VIEWS`, `HAND`, or else the task's own: for panels straight onto them.
         panels: rectangles that are to be seen instead of the task.
         hand: (3,) where the hand is, metres; without it the view of the hand is that of the task.
+        alone: whether there is a caption instead of the panel.
     """
     position, look_at = (np.asarray(place) for place in task.camera)
     direction, places = look_at - position, shown(task)
@@ -66,7 +71,7 @@ def camera_for(
         right, up = directions(panels[0], task.camera)
         direction, above = np.cross(up, right), TITLE_ROOM * up
         places = np.concatenate([area.border + offset for area in panels for offset in (np.zeros(3), above)])
-    return framed(places, np.asarray(VIEWS.get(view, direction)), *free_part(window(camera)))
+    return framed(places, np.asarray(VIEWS.get(view, direction)), *free_part(window(camera), alone=alone))
 
 
 def shown(task: Task) -> Array:
@@ -83,8 +88,8 @@ def around(distance: float) -> Array:
     return distance * np.concatenate([np.eye(3), -np.eye(3)])
 
 
-def free_part(size: tuple[int, int]) -> tuple[Array, Array]:
-    """Return what the panel leaves of a window of this width and height, pixels.
+def free_part(size: tuple[int, int], *, alone: bool = False) -> tuple[Array, Array]:
+    """Return what the panel, or the caption of a presentation, leaves of a window of this width and height, pixels.
 
     Returns:
         The tangents (2,) of the angles between the line of sight and its left and right border, and those of its lower
@@ -92,8 +97,8 @@ def free_part(size: tuple[int, int]) -> tuple[Array, Array]:
     """
     width, height = size
     narrow = width < NARROW
-    right = 1.0 if narrow else 1 - 2 * PANEL / width
-    bottom = -1 + 2 * UNDER if narrow else -1.0
+    right = 1.0 if narrow or alone else 1 - 2 * PANEL / width
+    bottom = 2 * (CAPTION if alone else UNDER if narrow else 0.0) - 1
     tangent = np.tan(FIELD_OF_VIEW / 2)
 
     def within(low: float, high: float) -> Array:
@@ -108,16 +113,17 @@ def window(camera: Any) -> tuple[int, int]:  # noqa: ANN401
     return USUAL if size is None or size.min() < MIN_SIZE else (int(size[0]), int(size[1]))
 
 
-def turned(pose: Pose, size: tuple[int, int], angle: float) -> Pose:
+def turned(pose: Pose, size: tuple[int, int], angle: float, *, alone: bool = False) -> Pose:
     """Return a camera's position and look-at, metres, turned around the vertical through the middle of its picture.
 
     Args:
         pose: position (3,) and look-at (3,), metres.
         size: width and height of the window, pixels; the picture is the part of it that the panel leaves.
         angle: rad.
+        alone: whether there is a caption instead of the panel.
     """
     position, look_at = pose
-    across, upright = free_part(size)
+    across, upright = free_part(size, alone=alone)
     ahead, right, up = axes(look_at - position)
     depth = np.linalg.norm(look_at - position)
     middle = position + depth * (ahead + across.mean() * right + upright.mean() * up)

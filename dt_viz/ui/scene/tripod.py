@@ -49,7 +49,7 @@ class Tripod:
         self._window = (0, 0)
         self._shown: tuple[Task, Sequence[Slice], str] | None = None
         """Task, panels and view that the camera was put to show."""
-        self._locked = False
+        self._locked = self._alone = False
         self._turned: float | None = None
         """Time to which the orbit has turned the camera, seconds; None while it does not."""
         reported: Any = self._reported  # viser takes coroutines, too, against its type hints
@@ -86,6 +86,18 @@ class Tripod:
                 self._given = deque([self._chosen], REMEMBERED)
 
     @property
+    def alone(self) -> bool:
+        """Whether there is a caption instead of the panel, and so more room; a change frames the view again."""
+        return self._alone
+
+    @alone.setter
+    def alone(self, alone: bool) -> None:
+        with self._lock:
+            self._alone = alone
+            if self._shown is not None:
+                self._frame()
+
+    @property
     def orbits(self) -> bool:
         """Whether the camera turns slowly around what it shows."""
         return self._turned is not None
@@ -103,14 +115,14 @@ class Tripod:
             seconds = 0.0 if self._turned is None else now - self._turned
             if seconds > 0:  # it does still orbit, and nobody holds the camera
                 self._turned = now
-                self._put(turned(self._chosen or self._given[-1], self._window, TURN * seconds))
+                self._put(turned(self._chosen or self._given[-1], self._window, TURN * seconds, alone=self._alone))
 
     def _frame(self) -> None:
         assert self._shown is not None
         task, panels, view = self._shown
         self._window = window(self._client.camera)
         self._given.clear()
-        self._put(camera_for(task, self._client.camera, view, panels, self._hand()))
+        self._put(camera_for(task, self._client.camera, view, panels, self._hand(), alone=self._alone))
         self._client.camera.fov = FIELD_OF_VIEW
 
     def _put(self, pose: Pose) -> None:

@@ -1,0 +1,112 @@
+"""Pages in a real browser: headless Chromium, what is waited for in it, and where things are seen."""
+
+import time
+from contextlib import suppress
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.ui.scene.camera import window
+from dt_viz.ui.visitor import Visitor
+
+PATIENCE = 240.0
+"""Seconds after which a test gives up; nothing takes that long, even on a machine that has other work."""
+TRIES = 8
+"""Drags or clicks until the page, which may still be on its way to what was asked of it, has taken one."""
+HIDDEN = ("playing", "rollouts", "ghost", "field", "arm", "table", "demonstrations")
+LIGHT = View(handles=True, **dict.fromkeys(HIDDEN, False))
+"""The obstacle only: drawing the lines by software takes a tenth of a second, and the arm most of one."""
+
+UNHURRIED = """
+    const draw = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 200);
+"""
+"""Five pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
+
+
+def wait_until(condition, what):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.05)
+
+
+def until_drawn(visitor):
+    """Until the page has drawn what it was sent, and what it has sent itself has arrived: messages keep their order."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        visitor.client.flush()
+        with suppress(TimeoutError):  # a page that is busy may lose what it is asked
+            visitor.client.get_render(height=16, width=16, timeout=PATIENCE / TRIES)
+            return
+    pytest.fail("the page draws nothing")
+
+
+page_errors: list[str] = []
+"""What pages have complained of in their consoles."""
+OF_VISER = "Unable to preventDefault inside passive event listener"
+"""Said by viser's own page of any drag; nothing is lost."""
+
+
+def close_notices(page):
+    """They cover the scene; the one about software rendering may come late, and go by itself at any moment."""
+    page.locator("button.mantine-Notification-closeButton").evaluate_all("all => all.forEach(button => button.click())")
+
+
+def open_page(browser, server, size):
+    """A new tab, its width and height in pixels, and the visitor that the server made for it.
+
+    Its first scenario is drawn, without the arm.
+    """
+    known = set(server.visitors)
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]}, has_touch=True)
+    page.set_default_timeout(1000 * PATIENCE)
+    page.on("console", lambda message: page_errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: page_errors.append(str(error)))
+    page.add_init_script(UNHURRIED)
+    page.goto(f"http://127.0.0.1:{server.port}")
+    wait_until(lambda: set(server.visitors) - known, "the page of a visitor")
+    (visitor,) = set(server.visitors) - known
+    visitor.session.edit("test", view=LIGHT)
+    assert visitor.session.wait_idle(PATIENCE)
+    page.get_by_text("· stable ·").wait_for()
+    until_drawn(visitor)
+    close_notices(page)
+    return page, visitor
+
+
+def close_page(page, server, visitor):
+    page.close()
+    wait_until(lambda: visitor not in server.visitors, "the visitor to leave")
+
+
+def begin(visitor: Visitor, scenario: Scenario) -> None:
+    """Begin with a scenario, and wait until it is shown."""
+    visitor.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(Scenario)})
+    visitor.session.end_gesture()
+    assert visitor.session.wait_idle(PATIENCE)
+    assert visitor.shown is not None and visitor.shown.scenario.moves_like(scenario)
+
+
+def project(visitor: Visitor, point) -> tuple[float, float]:
+    """CSS pixels of a world point: the camera looks along its z axis, y down, vertical field of view."""
+    camera = visitor.client.camera
+    w, x, y, z = camera.wxyz
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    seen = rotation.T @ (np.asarray(point) - camera.position)
+    width, height = window(camera)
+    focal = height / 2 / np.tan(camera.fov / 2)
+    return width / 2 + focal * seen[0] / seen[2], height / 2 + focal * seen[1] / seen[2]
+
+
+def press(locator):
+    """Click without waiting for two alike pictures of the page, which may be long in coming."""
+    locator.click(force=True)
