@@ -155,6 +155,21 @@ def test_a_covered_start_is_named_and_does_not_keep_the_others_from_being_cleare
     assert SPHERE.signed_distance(built.transform.inverse(passing_points(2))).min() > ACCEPTED_MARGIN * MARGIN
 
 
+def test_a_covered_start_that_leaves_at_once_asks_for_no_way_out():
+    away = np.array(SPHERE.position) + np.linspace(0.95, 4, 40)[:, None] * SPHERE.radius * np.eye(3)[0]
+    built = AVOIDANCE.build(motion(away))
+    assert built.ways == (None,) and built.duration == 0 and len(built.warnings) == 1
+
+
+def test_another_attempt_keeps_the_way_out_and_the_flow_along_it():
+    before = motion(passing_points(1), passing_points(2))
+    first = AVOIDANCE.build(before)
+    moved = replace(before, positions=first.transform.forward(before.positions), earlier=first)
+    again = AVOIDANCE.build(moved)
+    assert first.aside and again.aside is first.aside and again.ways is first.ways
+    assert again.duration >= first.duration
+
+
 def test_the_margin_changes_gradually_where_an_obstacle_comes_over_a_start():
     """It shrinks to nothing there, and grows again."""
     ahead, along = SPHERE.position + 0.2 * np.eye(3)[1], np.linspace(0, 0.5, 40)[:, None] * np.eye(3)[0]
