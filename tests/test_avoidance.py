@@ -140,7 +140,9 @@ def test_what_is_off_or_has_nothing_to_lead_around_is_not_in_the_stack():
 
 
 def test_a_chosen_duration_is_taken_as_it_is():
-    before, chosen = motion(passing_points(1), at_least=0.7), replace(AVOIDANCE, duration=0.123)
+    before, chosen = motion(passing_points(1)), replace(AVOIDANCE, duration=0.123)
+    before = replace(before, earlier=AVOIDANCE.build(before))
+    assert before.at_least > 0.2
     assert chosen.build(before).duration == 0.123
     assert chosen.satisfied(before)  # nobody asked for more
 
@@ -151,6 +153,31 @@ def test_a_covered_start_is_named_and_does_not_keep_the_others_from_being_cleare
     built = AVOIDANCE.build(motion(passing_points(2), covered))
     assert built.warnings == (MotionWarning(Kind.START_COVERED, "start 2 is inside the obstacle", "Avoidance"),)
     assert SPHERE.signed_distance(built.transform.inverse(passing_points(2))).min() > ACCEPTED_MARGIN * MARGIN
+
+
+def test_a_covered_start_that_leaves_at_once_asks_for_no_way_out():
+    away = np.array(SPHERE.position) + np.linspace(0.95, 4, 40)[:, None] * SPHERE.radius * np.eye(3)[0]
+    built = AVOIDANCE.build(motion(away))
+    assert built.ways == (None,) and built.duration == 0 and len(built.warnings) == 1
+
+
+def test_another_attempt_keeps_the_way_out_and_the_flow_along_it():
+    before = motion(passing_points(1), passing_points(2))
+    first = AVOIDANCE.build(before)
+    moved = replace(before, positions=first.transform.forward(before.positions), earlier=first)
+    again = AVOIDANCE.build(moved)
+    assert first.aside and again.aside is first.aside and again.ways is first.ways
+    assert again.duration >= first.duration
+
+
+def test_the_margin_changes_gradually_where_an_obstacle_comes_over_a_start():
+    """It shrinks to nothing there, and grows again."""
+    ahead, along = SPHERE.position + 0.2 * np.eye(3)[1], np.linspace(0, 0.5, 40)[:, None] * np.eye(3)[0]
+    kept = []
+    for depth in (-0.02, -0.004, -0.001, 0.001, 0.004, 0.02):
+        start = np.array(SPHERE.position) + (SPHERE.radius - depth) * np.eye(3)[0]
+        kept.append(AVOIDANCE._kept_margin(motion(ahead + along, start + along)))
+    np.testing.assert_allclose(kept, [0.01, 0.004, 0.001, 0.001, 0.004, 0.01], atol=1e-9)
 
 
 def test_a_covered_goal_is_said():

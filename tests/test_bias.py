@@ -245,7 +245,9 @@ def test_the_closest_point_is_that_of_the_polyline(seed):
 
 
 def test_a_chosen_strength_is_taken_as_it_is():
-    motion, point = straight(0.1, at_least=0.7), BiasPoint((0.0, 0.0, 0.0), 0.3, strength=0.2)
+    motion, point = straight(0.1), BiasPoint((0.0, 0.0, 0.0), 0.3, strength=0.2)
+    motion = replace(motion, earlier=replace(point, strength=None).build(motion))
+    assert motion.at_least > 0.2
     built = point.build(motion)
     assert built.duration == 0.2 and built.goal is motion.goal and not built.hopeless
     assert point.satisfied(motion)  # nobody asked for more

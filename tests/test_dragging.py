@@ -71,6 +71,22 @@ def test_no_motion_jumps_where_a_drag_goes_on(drag, new_engine):
     assert largest_step(drag.dragged(new_engine(), offsets)) < JUMP
 
 
+@pytest.mark.parametrize(
+    ("task", "begin", "end"),
+    [
+        ("draw_s", (0.0975, -0.5, 0.4508), (0.0940, -0.5, 0.4634)),  # the ball comes over a start
+        ("lift_box", (0.2874, -0.3515, 0.3476), (0.2974, -0.3450, 0.3529)),  # starts come near, one after the other
+        ("draw_s", (0.0671, -0.5, 0.4717), (0.0682, -0.5, 0.4617)),  # motions come near on the ball's other side
+    ],
+)
+def test_no_motion_jumps_where_an_obstacle_comes_over_starts(task, begin, end, initial, new_engine):
+    engine, scenario, frames = new_engine(), changed(initial(task), space="task"), []
+    for x, y, z in np.linspace(begin, end, 14).tolist():
+        stages = engine.frames(changed(scenario, obstacles=(Sphere((x, y, z), 0.15),)))
+        frames.append(next(frame for frame in stages if frame.stage is Stage.LIVE))
+    assert largest_step(frames) < JUMP
+
+
 def test_sides_are_kept_at_rest_and_do_not_depend_on_the_steps(drag, new_engine):
     rested = []
     for num in (5, 11):

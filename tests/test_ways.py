@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow
 from dt_viz.metrics import sharpest_turn
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.obstacles.ways import NEARBY, TURNING, Way, remembered
 from dt_viz.transforms.base import MotionBelow
-from dt_viz.transforms.sides import Passes
+from dt_viz.transforms.sides import Passes, held
 
 seeds = st.integers(0, 2**32 - 1)
 X, Y, Z = np.eye(3)
@@ -89,7 +90,8 @@ def test_what_is_dragged_is_remembered(now, is_kept, known):
 
 
 def passes_of(motion, obstacle=None, margin=0.01, **changes):
-    found = Passes.of(motion, ball() if obstacle is None else obstacle, margin, **changes)
+    everywhere = np.ones(len(motion.positions), dtype=bool)
+    found = Passes.of(motion, everywhere, ball() if obstacle is None else obstacle, margin, **changes)
     assert found is not None
     return found
 
@@ -110,7 +112,14 @@ def test_without_a_way_before_it_is_the_nearest_one_across_the_motions():
     way = passes.way(None, gradually=True)
     assert not way.kept
     assert way.direction @ Z > 0.9 and abs(way.direction @ X) < 0.1
-    assert Passes.of(motion_past((RADIUS + 0.011) * Y), ball(), 0.01) is None
+
+
+def test_what_does_not_count_or_is_clear_does_not_pass():
+    near, clear = (motion_past((RADIUS + by) * Y) for by in (0.009, 0.011))
+    everywhere = np.ones(len(near.positions), dtype=bool)
+    assert Passes.of(near, everywhere, ball(), 0.01) is not None
+    assert Passes.of(near, ~everywhere, ball(), 0.01) is None
+    assert Passes.of(clear, everywhere, ball(), 0.01) is None
 
 
 @given(seeds)
@@ -187,6 +196,25 @@ def test_motions_keep_their_side_until_another_costs_much_less_then_turn_togethe
     assert beyond[-1] < 0
     assert max(angle(a, b) for a, b in pairwise(directions)) <= TURNING * 1e-3 / RADIUS + 1e-6
     assert np.abs(np.diff(durations)).max() < 0.2
+
+
+def test_a_turn_that_would_lead_far_around_is_made_at_once():
+    """What has come near on the other side makes the way before a long one."""
+    before = Way(ball(), Y, Y, kept=True, length=0.001)
+    passes = passes_of(motion_past((RADIUS + 0.009) * Y, -(RADIUS + 0.009) * Y), ball(0.001, 0.0, 0.0))
+    way = passes.way(before, gradually=True)
+    assert abs(way.direction @ Z) > 0.99 and way.length < 0.03
+
+
+def test_a_side_is_held_where_what_is_stacked_on_it_moves_the_ends():
+    motion = motion_past(0.01 * Y, end=RADIUS + 0.02)
+    aside = passes_of(motion).flow(Z, 1e-9)
+    outer = AdaptiveFlow(ball().field("free-space", 6.0), 0.1, 1e-9)
+    ends = np.concatenate([motion.starts, motion.goal[None]])
+    moved = outer.forward(ends)
+    assert np.linalg.norm(moved - ends, axis=1).min() > 1e-3
+    assert np.linalg.norm(aside.forward(moved) - moved, axis=1).max() > 1e-3
+    np.testing.assert_allclose(held(aside, outer).forward(moved), moved, atol=1e-9)
 
 
 def test_at_rest_the_way_is_on_its_side_at_once():

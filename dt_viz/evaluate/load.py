@@ -13,6 +13,11 @@ with those that the engine computes here for each pose. The JSON file holds:
     ``p95_ms``, ``megabytes`` received, and ``last_shown``, whether the last picture is of the last pose.
 ``peak_memory_mb``, ``threads``
     of the server; null if its process is unknown, or the system does not report them.
+
+With ``--rest`` nobody drags: the visitors look on while the arm goes its round, and the file holds beside the memory
+
+``core_percent``, ``messages_per_s``
+    processor time of the server for each visitor, in percent of a core; and what each receives.
 """
 
 from __future__ import annotations
@@ -63,6 +68,8 @@ FIRST_PICTURE = 20.0
 """Longest accepted time until a visitor has a picture, seconds."""
 REST = 3.0
 """Time after the drag until the picture is final, seconds."""
+SETTLED = 10.0
+"""Time after the first picture until nothing is refined any more, seconds."""
 PATIENCE = 60.0
 """Longest time to wait for the last pose, seconds."""
 SAME = 1e-4
@@ -175,6 +182,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rounds", type=whole_number(1), default=1, help="that all open the page; in the last they drag (default: 1)"
     )
+    parser.add_argument("--rest", action="store_true", help="drag nothing: measure what a visitor costs who looks on")
     parser.add_argument("--url", type=_url, help="of a server that runs already, such as ws://127.0.0.1:8080")
     parser.add_argument("--out", type=Path, metavar="FILE.json")
 
@@ -183,6 +191,8 @@ def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 1 if a visitor had no picture in time, or was not shown the last pose."""
     tasks, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, ".json")
+    if options.rest:
+        return _run_at_rest(options, out)
     fits = FitStore(default_cache_folder())
     fits.get(task.demonstrations)
     poses = Poses(Engine(tasks, fits, load_jaco()), task)
@@ -224,6 +234,44 @@ def run(options: argparse.Namespace) -> int:
     _print(figures)
     complete = all(first is not None and first <= FIRST_PICTURE for round_ in firsts for first in round_)
     return 0 if complete and all(shown) else 1
+
+
+def _run_at_rest(options: argparse.Namespace, out: Path | None) -> int:
+    """Measure the server while nobody edits anything; 1 if a visitor had no picture in time, or was lost."""
+    with _server(options) as (url, process):
+        if process is None or _processor_seconds(process) is None:
+            raise InputError(
+                "--rest", "a server whose processor time is unknown", "one started by this command, on Linux"
+            )
+        figures = asyncio.run(_look_on(options, url, process))
+        memory = _status(process, "VmHWM")
+    if figures is None:
+        return 1
+    figures["peak_memory_mb"] = None if memory is None else memory / 1024
+    if out is not None:
+        write_json(out, figures)
+    print(
+        f"{options.task}, {options.clients} visitors who look on for {options.seconds:g} s: "
+        f"{figures['core_percent']:.1f} % of a core and {figures['messages_per_s']:.1f} messages a second for each"
+    )
+    return 0
+
+
+async def _look_on(options: argparse.Namespace, url: str, process: int) -> dict[str, float | None] | None:
+    """The figures of visitors who only look on; None if one has no picture in time, or is lost."""
+    async with AsyncExitStack() as stack:
+        clients, began = [ProtocolClient(url) for _ in range(options.clients)], time.perf_counter()
+        if None in await asyncio.gather(*(_first_picture(stack, client, began) for client in clients)):
+            return None
+        await asyncio.sleep(SETTLED)
+        before, spent = sum(client.num_messages for client in clients), _processor_seconds(process)
+        began = time.perf_counter()
+        await asyncio.sleep(options.seconds)
+        each = (time.perf_counter() - began) * options.clients
+        after, finally_spent = sum(client.num_messages for client in clients), _processor_seconds(process)
+        if spent is None or finally_spent is None or any(client.lost for client in clients):
+            return None
+        return {"core_percent": 100 * (finally_spent - spent) / each, "messages_per_s": (after - before) / each}
 
 
 async def _visit(
@@ -293,6 +341,15 @@ def _status(process: int | None, name: str) -> int | None:
         return None
     found = re.search(rf"^{name}:\s*(\d+)", text, re.MULTILINE)
     return None if found is None else int(found[1])
+
+
+def _processor_seconds(process: int) -> float | None:
+    """Processor time that a process has used, seconds; None if it is gone, or the system does not report it."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    except OSError:
+        return None
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _same(expected: Middle, shown: Middle) -> bool:

@@ -142,6 +142,11 @@ class ProtocolClient:
         return next((text for text in texts if STATUS in text), "")
 
     @property
+    def lost(self) -> bool:
+        """Whether the connection has ended."""
+        return self._ended is not None
+
+    @property
     def has_picture(self) -> bool:
         """Whether rollouts and their status are on the page."""
         return self.rollout is not None and bool(self.status)

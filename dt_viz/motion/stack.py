@@ -121,7 +121,7 @@ def build_stack(
     for keeps_goal in (True, False):
         rays, bundle = nominal.rays, nominal.bundle
         ends_below = nominal.ends
-        durations, above = [0.0] * len(layers), (None,) * len(layers)
+        earlier, above = [None] * len(layers), (None,) * len(layers)
         for _ in range(MAX_ATTEMPTS):
             lowest = MotionBelow(
                 nominal.starts,
@@ -133,9 +133,9 @@ def build_stack(
                 num_demonstrated=nominal.num_hosts,
                 gradual=precision is LIVE,
             )
-            built = _build(layers, lowest, durations, above, ways)
+            built = _build(layers, lowest, earlier, above, ways)
             above = _above([made for _, made in built])
-            durations = [made.duration for _, made in built]
+            earlier = [made for _, made in built]
             outer = [made.transform for _, made in built]
             goal = built[-1][1].goal if built else nominal.goal
 
@@ -162,15 +162,15 @@ def build_stack(
 def _build(
     layers: Sequence[tuple[int, Layer]],
     motion: MotionBelow,
-    durations: Sequence[float],
+    earlier: Sequence[Built | None],
     above: Sequence[Diffeomorphism | None],
     ways: Sequence[tuple[Way | None, ...]],
 ) -> list[tuple[MotionBelow, Built]]:
     """Each layer's transform, with the motion that it was made for."""
     built: list[tuple[MotionBelow, Built]] = []
     targets: list[Point] = []
-    for (_, layer), at_least, outer, before in zip(layers, durations, above, ways, strict=True):
-        told = {"name": layer.name, "at_least": at_least, "above": outer, "targets": tuple(targets)}
+    for (_, layer), last, outer, before in zip(layers, earlier, above, ways, strict=True):
+        told = {"name": layer.name, "earlier": last, "above": outer, "targets": tuple(targets)}
         motion = replace(motion, **told, before=before)
         made = layer.transform.build(motion)
         built.append((motion, made))

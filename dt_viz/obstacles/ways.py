@@ -30,6 +30,13 @@ class Way:
     """(3,) unit vector of the motions' way out: the same, or on its way there from another one."""
     kept: bool = False
     """Whether it goes on from a way out where the obstacle was before."""
+    length: float = 0.0
+    """Longest displacement of a motion along `direction`, metres."""
+
+    @property
+    def offset(self) -> Array:
+        """(3,) that motion's displacement, metres."""
+        return self.length * self.direction
 
     def turned_from(self, before: Way, across: Sequence[Array]) -> Way:
         """The way on its way here from that before: farther by an angle for each metre that the obstacle has moved.

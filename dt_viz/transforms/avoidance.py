@@ -10,7 +10,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from dt_viz.errors import check_between
-from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Flow, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
 from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
 from dt_viz.flows.integrators import integrate_adaptive, rk4
 from dt_viz.obstacles.occupancy import Generator
@@ -20,6 +20,7 @@ from dt_viz.obstacles.ways import Way, remembered
 from dt_viz.transforms.base import (
     MOST_DURATION,
     ArmAvoidance,
+    Aside,
     Built,
     Choice,
     FlowIntegration,
@@ -30,7 +31,7 @@ from dt_viz.transforms.base import (
     axes_of,
     start_warnings,
 )
-from dt_viz.transforms.sides import Passes
+from dt_viz.transforms.sides import Passes, held
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
 Space = Literal["task", "cspace"]
@@ -208,6 +209,9 @@ class Avoidance(Transform):
         ways, aside, motion = self._aside(motion)
         spent = sum(flow.duration for flow in aside)
         at_least = max(0.0, motion.at_least - spent)
+        if aside and motion.earlier is not None:
+            last = self.integration.of(AdaptiveFlow(field, at_least, motion.tolerance))
+            motion = replace(motion, positions=Chain([held(first, last) for first in aside]).inverse(motion.positions))
         num_demonstrated = len(motion.demonstrated.starts)
         covered = np.flatnonzero(_blocked(obstacle, motion))
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
@@ -234,31 +238,37 @@ class Avoidance(Transform):
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
         flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
         if aside:
-            flow = Chain([*aside, flow])
+            flow = Chain([*(held(first, flow) for first in aside), flow])
         goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
             end = "end beside it" if inside < BESIDE else f"end {1e3 * inside:.0f} mm deep in it"
             warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
         duration += spent
-        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, {"duration": duration}, ways)
+        chosen = {"duration": duration}
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, ways, aside)
 
-    def _aside(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], list[AdaptiveFlow | Flow], MotionBelow]:
+    def _aside(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], tuple[Aside, ...], MotionBelow]:
         """Return the ways out of the obstacles, the flows that carry all motions to one side of each, and these there.
 
-        A flow time by hand is spent on these first. In a plane no way out turns from one side to the other, so none is
-        remembered there. The paper's generator acts alone.
+        Further attempts take those of the first, with the motion before them: for starts that the flows have moved into
+        the obstacle they would be longer, and move these farther. A flow time by hand is spent on these first. In a
+        plane no way out turns from one side to the other, so none is remembered there. The paper's generator acts
+        alone.
         """
+        if motion.earlier is not None:
+            return motion.earlier.ways, motion.earlier.aside, motion
         ways: list[Way | None] = [None] * len(self.obstacles)
-        aside: list[AdaptiveFlow | Flow] = []
+        aside: list[Aside] = []
         if self.generator == "probability":
-            return tuple(ways), aside, motion
+            return tuple(ways), (), motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
         known = remembered(motion.before if plane is None else (), self.obstacles)
         margin = self._kept_margin(motion.demonstrated)
         left = math.inf if self.duration is None else self.duration
         for k, (obstacle, before) in enumerate(zip(self.obstacles, known, strict=True)):
-            passes = Passes.of(motion, obstacle, margin, self.obstacles[:k], plane)
+            seen = motion.demonstrated
+            passes = Passes.of(seen, self._avoidable(seen), obstacle, margin, self.obstacles[:k], plane)
             if passes is None:
                 continue
             ways[k] = way = passes.way(before, gradually=motion.gradual)
@@ -268,7 +278,7 @@ class Avoidance(Transform):
             if flow.duration > 0:
                 aside.append(flow)
                 motion = replace(motion, positions=flow.inverse(motion.positions))
-        return tuple(ways), aside, motion
+        return tuple(ways), tuple(aside), motion
 
     def satisfied(self, motion: MotionBelow) -> bool:
         """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""
@@ -306,13 +316,14 @@ class Avoidance(Transform):
         return float(distance[self._avoidable(motion) | deeper].min(initial=np.inf))
 
     def _kept_margin(self, motion: MotionBelow) -> float:
-        """Return the clearance to keep, metres: the margin, or less where a free start or goal is nearer."""
-        obstacle = self.avoided
-        ends = motion.starts[~_blocked(obstacle, motion)]
+        """Return the clearance to keep, metres: the margin, or less where a start or goal is nearer to the surface.
+
+        A start may be on either side of it, so that nothing jumps while an obstacle is dragged over it.
+        """
+        ends = motion.starts
         if motion.keeps_goal:
             ends = np.concatenate([ends, self._nearest_free(motion.goal)[None]])
-        room = obstacle.signed_distance(ends).min(initial=self.margin)
-        return max(0.0, float(room))
+        return float(np.abs(self.avoided.signed_distance(ends)).min(initial=self.margin))
 
     def _avoidable(self, motion: MotionBelow) -> Mask:
         """Return which samples (N,) can be kept out of the obstacle.

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import AUTO, Diffeomorphism, Integration
+from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Point
@@ -22,6 +22,8 @@ from dt_viz.warning import Kind, MotionWarning
 
 MOST_DURATION = 100.0
 """Longest flow time that a transform may have."""
+Aside = AdaptiveFlow | Flow
+"""Flow along a way out of an obstacle."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,8 @@ class MotionBelow:
     """Name of the transform, for its warnings."""
     tolerance: float = 2e-9
     """Tolerance of a step of the transform's flow, metres."""
-    at_least: float = 0.0
-    """Lower bound of an automatic flow time: what an earlier attempt needed."""
+    earlier: Built | None = None
+    """The transform as an earlier attempt made it for nearly this motion; None at the first one."""
     above: Diffeomorphism | None = None
     """ψ from the top of the stack to the manifold of the transform, as far as it has been built."""
     top: Array | None = None
@@ -56,6 +58,11 @@ class MotionBelow:
     """Ways out of obstacles that motions took with the transform as it was just before."""
     gradual: bool = False
     """Whether these turn to where they are to be as the obstacles move on; else they are there at once."""
+
+    @property
+    def at_least(self) -> float:
+        """Lower bound of an automatic flow time: what an earlier attempt needed."""
+        return 0.0 if self.earlier is None else self.earlier.duration
 
     @property
     def demonstrated(self) -> MotionBelow:
@@ -93,6 +100,8 @@ class Built:
     """Values that were chosen automatically, by the transform's fields."""
     ways: tuple[Way | None, ...] = field(default=(), compare=False)
     """Ways out of the obstacles that it avoids; None of those that are not in the way."""
+    aside: tuple[Aside, ...] = field(default=(), compare=False)
+    """Flows along these, which come before its own."""
 
 
 @dataclass(frozen=True)

@@ -6,24 +6,24 @@ to one side n before, as far as they need to be clear, by a flow along it,
 
     ẏ = n g exp(−½ ‖A(y − c)‖²) Π_e (1 − exp(−‖y − e‖²/2ρ_e²)),
 
-which is broad along the motions and leaves their free starts and goal e where they are. The side is the one with the
+which is broad along the motions and leaves their starts and goal e where they are. The side is the one with the
 least detour; while an obstacle is dragged, it is kept until another one costs much less.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import AdaptiveFlow
-from dt_viz.flows.fields import Array
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.occupancy import StretchedField
 from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import Way
-from dt_viz.transforms.base import MotionBelow
+from dt_viz.transforms.base import Aside, MotionBelow
 
 NUM_DIRECTIONS, MAX_SAMPLES = 128, 96
 """Number of sides that are compared, and largest number of samples that they are compared by."""
@@ -99,6 +99,15 @@ class Sideways:
         return weight[:, None] * -self.velocity, -self.velocity[:, None] * slope[:, None]
 
 
+def held(aside: Aside, outer: Diffeomorphism) -> Aside:
+    """The flow `aside` to a side, zero not at its ends but at their images under `outer`, which is stacked on it.
+
+    So `outer` alone moves the ends. Where it brought them into the field, that would carry them far into the obstacle.
+    """
+    assert isinstance(aside.field, Sideways)
+    return replace(aside, field=replace(aside.field, ends=outer.forward(aside.field.ends)))
+
+
 @dataclass(frozen=True, eq=False)
 class Passes:
     """Where the motions that have a demonstration come nearer to an obstacle than a margin."""
@@ -111,7 +120,7 @@ class Passes:
     tangents: Array
     """(K, 3) unit vectors along the motions."""
     ends: Array
-    """(E, 3) starts and goal outside the obstacle, metres."""
+    """(E, 3) starts and goal, metres."""
     others: tuple[Obstacle, ...] = ()
     """Obstacles whose sides have been chosen: the way out of this one does not end in them."""
     plane: Array | None = None
@@ -121,14 +130,14 @@ class Passes:
     def of(
         cls,
         motion: MotionBelow,
+        avoidable: Mask,
         obstacle: Obstacle,
         margin: float,
         others: Sequence[Obstacle] = (),
         plane: Array | None = None,
     ) -> Passes | None:
-        """The passes of a motion; None where no sample comes so near."""
-        motion = motion.demonstrated
-        inside = np.flatnonzero(obstacle.signed_distance(motion.positions) < margin)
+        """The passes of a motion, of whose samples only those `avoidable` (N,) count; None where none comes so near."""
+        inside = np.flatnonzero(avoidable & (obstacle.signed_distance(motion.positions) < margin))
         if not len(inside):
             return None
         inside = inside[:: -(-len(inside) // MAX_SAMPLES)]
@@ -138,11 +147,13 @@ class Passes:
         tangents = motion.positions[after] - motion.positions[before]
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
         ends = np.concatenate([motion.starts, motion.goal[None]])
-        ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
     def way(self, before: Way | None, *, gradually: bool) -> Way:
         """The way out on the side with the least detour, or on the side of before while that costs little more.
+
+        Where turning there gradually would move the motions farther than going there at once, it is there at once: what
+        has just come near may make the way long in between.
 
         Args:
             before: the way out of the obstacle where it was just before; None where there was none.
@@ -154,15 +165,20 @@ class Passes:
         share = np.where(alike, np.exp((cost.min() - cost) / (SELECTIVITY * cost.min())), 0)
         best = _unit(share @ directions)
         if before is None:
-            return Way(self.obstacle, best, best)
+            return self._way(best, best, kept=False)
         keeps = best @ before.side < ALIKE and self.costs(before.side[None])[0] < STAYING * cost.min()
         side = before.side if keeps else best
-        way = Way(self.obstacle, side, side, kept=True)
+        way = self._way(side, side)
         if not gradually:
             return way
         over = _unit(np.cross(np.linalg.svd(self.tangents, full_matrices=False)[2][0], before.direction))
         above, below = self.costs(np.stack([over, -over]))
-        return way.turned_from(before, [over if above - below < UPWARDS * over[2] else -over])
+        turned = way.turned_from(before, [over if above - below < UPWARDS * over[2] else -over])
+        ways = way, self._way(side, turned.direction)
+        return min(ways, key=lambda way: float(np.linalg.norm(way.offset - before.offset)))
+
+    def _way(self, side: Array, direction: Array, *, kept: bool = True) -> Way:
+        return Way(self.obstacle, side, direction, kept, float(self._lengths(direction).max()))
 
     def costs(self, directions: Array) -> Array:
         """Longest way (D,), metres, of a sample along unit vectors (D, 3) out of ellipsoids around the obstacles.
