@@ -9,7 +9,7 @@ from dt_viz.ui.scene import palette
 LINES = ("DEMONSTRATION", "ROLLOUT", "ADDED", "GHOST", "WAY", "GOAL", "OBSTACLE", "BIAS", "STREAMLINE", "ARROW_FAST")
 """What must be seen from far."""
 SEEN = 2.7
-"""Smallest contrast with the table and the sky; 3 is asked for of lines that are one pixel wide (WCAG 2.1, 1.4.11)."""
+"""Smallest contrast with table and sky (WCAG 2.1 measures it so)."""
 
 
 def luminance(colour):

@@ -33,7 +33,9 @@ pytestmark = [pytest.mark.browser, needs_chromium]
 BOX = """element => {
     const {left, top, right, bottom} = element.getBoundingClientRect();
     const seen = [Math.max(left, 0), Math.max(top, 0), Math.min(right, innerWidth), Math.min(bottom, innerHeight)];
-    for (let around = element.parentElement; around; around = around.parentElement) {
+    const isFixed = inner => getComputedStyle(inner).position === 'fixed';
+    for (let inner = element; inner.parentElement && !isFixed(inner); inner = inner.parentElement) {
+        const around = inner.parentElement;
         if (getComputedStyle(around).overflow === 'visible') continue;
         const clip = around.getBoundingClientRect();
         seen[0] = Math.max(seen[0], clip.left);
