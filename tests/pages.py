@@ -76,9 +76,8 @@ class CameraClient:
 def panel_of(server: viser.ViserServer, notify: Any = lambda *_: None) -> Panel:
     """A panel without a page."""
     titles = {name: entry.title for name, entry in TASKS.items()}
-    return Panel(
-        server.gui, titles, load_jaco(), lambda *_: None, notify, Tripod(cast(Any, CameraClient()), lambda: None)
-    )
+    tripod = Tripod(cast(Any, CameraClient()), lambda: None)
+    return Panel(server.gui, titles, load_jaco(), lambda *_: None, notify, tripod, lambda _dark: None)
 
 
 class NoFrames:

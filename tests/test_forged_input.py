@@ -294,7 +294,7 @@ def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):
     commands = page.commands
     keys = [(command.hotkey, command.modifier) for command in commands.values() if command.hotkey is not None]
     assert len(set(keys)) == len(keys)
-    letters = "RZFHOLP"
+    letters = "RZFHOLPT"
     special = ("space", "escape", "pagedown", "pageup")
     named = {(key, None) for key in (*letters, *special)} | {("Z", "shift")}
     assert set(keys) == named | {(str(k), None) for k in range(1, 10)}

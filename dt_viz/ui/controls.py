@@ -28,7 +28,7 @@ class Control:
             act: called with each allowed value from the browser. It must only submit.
         """
         self.handle = handle
-        self._value, self._act = handle.value, act
+        self._value, self._act = handle.value, act or (lambda _value: None)
         listen = handle.on_click if _is_button(handle) else handle.on_update
         listen(self._changed)
 
@@ -51,14 +51,24 @@ class Control:
         self._value = self._value if value is None else value
         if claimed != self._value:
             self._put_back()
-        if value is not None and self._act is not None:
-            self._act(value)
+        if value is not None:
+            self.act(value)
+
+    def act(self, value: Any) -> None:  # noqa: ANN401
+        """Do what the control is for, with a value that it has."""
+        self._act(value)
 
     def _put_back(self) -> None:
         # not by viser's setter, which casts to the type of the claim, and calls back on a loop that may have ended
         self.handle._impl.value = self._value
         if not _is_button(self.handle):
             self.handle._queue_update("value", self._value)
+
+
+def switch(checkbox: Control) -> None:
+    """Do as the visitor who presses a checkbox."""
+    checkbox.value = not checkbox.value
+    checkbox.act(checkbox.value)
 
 
 def on_press(button: viser.GuiButtonHandle, act: Callable[[], None]) -> None:

@@ -65,7 +65,8 @@ class Visitor:
         """The last drawn frame."""
         self._view = View()
         """The view that was adopted last."""
-        client.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=palette.BRAND)
+        self._dark = False
+        self._set_theme()
         client.gui.set_panel_label("DT-Viz")
         with client.atomic():
             self.pictures = ScenePictures(
@@ -90,7 +91,7 @@ class Visitor:
         self.playback = Playback(engine.arm, self._pose, self.fail)
         """What moves the arm."""
         self._tripod = Tripod(client, self._hand)
-        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._tripod)
+        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._tripod, self._darken)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(engine.arm.push)
@@ -239,11 +240,39 @@ class Visitor:
                 self.way.show(now, hand, lambda: live.ahead)
                 self.grip.say(live.note)
 
+    def _set_theme(self) -> None:
+        self.client.gui.configure_theme(
+            dark_mode=self._dark, show_logo=False, show_share_button=False, brand_color=palette.BRAND
+        )
+
+    def _darken(self, dark: bool) -> None:
+        """Begin the dark theme, or the light one, on the panel and in the scene."""
+        self._dark = dark
+        self._set_theme()
+        self._dye(dark)
+
+    def _dye(self, dark: bool) -> None:
+        with self.client.atomic():
+            self.pictures.dye(dark)
+            self.way.dye(dark)
+            self.drawing.dye(dark)
+
+    @contextmanager
+    def _light(self) -> Iterator[None]:
+        """Show the scene in light colours for as long as a picture takes, which is on white."""
+        if self._dark:
+            self._dye(False)
+        try:
+            yield
+        finally:
+            if self._dark:
+                self._dye(True)
+
     def _notify(self, text: str, colour: Colour) -> None:
         self.client.add_notification("DT-Viz", text, color=colour, auto_close_seconds=NOTICE_SECONDS)
 
     def _save_png(self, resolution: str, transparent: bool) -> None:
-        with self.pictures.without_handles(), self.grip.without_handles():
+        with self.pictures.without_handles(), self.grip.without_handles(), self._light():
             content = render_png(self.client, RESOLUTIONS[resolution], self._panel.legend, transparent=transparent)
         name = f"dt-viz-{self.session.scenario.task}.png"
         self.client.send_file_download(name, content, save_immediately=True)

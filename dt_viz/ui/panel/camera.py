@@ -1,29 +1,32 @@
-"""Controls of the camera: its views, the orbit, the lock."""
+"""Controls of what the scene is looked at with: the camera's views, the orbit, the lock, and the theme."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import viser
 
-from dt_viz.ui.controls import Control
+from dt_viz.ui.controls import Control, switch
 from dt_viz.ui.panel.commands import Command
 from dt_viz.ui.scene.camera import HAND, HOME, VIEWS
 from dt_viz.ui.scene.tripod import Tripod
 
 ORBIT_HINT = "turns slowly around what is shown; where you move the camera, it goes on from there"
+DARK_HINT = "for a dark room; pictures that are saved stay light"
 LOCK_HINT = "no drag, wheel or key moves the camera; its views, the orbit and another scene do"
 
 
 class CameraControls:
-    """The controls of one visitor's camera, and the same as commands."""
+    """The controls of one visitor's camera and theme, and the same as commands."""
 
-    def __init__(self, gui: viser.GuiApi, tripod: Tripod) -> None:
-        """Build the controls where the panel is being built."""
-        self._tripod = tripod
+    def __init__(self, gui: viser.GuiApi, tripod: Tripod, darken: Callable[[bool], None]) -> None:
+        """Build the controls where the panel is being built; `darken` takes whether the theme is the dark one."""
+        self._tripod, self._darken = tripod, darken
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
         self._orbit = Control(gui.add_checkbox("Orbit", False, hint=ORBIT_HINT), partial(setattr, tripod, "orbits"))
         self._lock = Control(gui.add_checkbox("Lock camera", False, hint=LOCK_HINT), partial(setattr, tripod, "locked"))
+        self._dark = Control(gui.add_checkbox("Dark theme", False, hint=DARK_HINT), darken)
 
     @property
     def commands(self) -> list[Command]:
@@ -32,10 +35,7 @@ class CameraControls:
         return [
             Command("Frame: move the camera back", lambda _: self._tripod.view(), "F"),
             *views,
-            Command("Orbit: turn the camera slowly, or stop", lambda _: self._switch(self._orbit, "orbits"), "O"),
-            Command("Lock the camera, or let it go", lambda _: self._switch(self._lock, "locked"), "L"),
+            Command("Orbit: turn the camera slowly, or stop", lambda _: switch(self._orbit), "O"),
+            Command("Lock the camera, or let it go", lambda _: switch(self._lock), "L"),
+            Command("Theme: dark, or light", lambda _: switch(self._dark), "T"),
         ]
-
-    def _switch(self, control: Control, name: str) -> None:
-        control.value = not control.value
-        setattr(self._tripod, name, control.value)

@@ -94,6 +94,7 @@ class Panel:
         save_png: Callable[[str, bool], None],
         notify: Callable[[str, Colour], None],
         tripod: Tripod,
+        darken: Callable[[bool], None],
     ) -> None:
         """Build the controls; they act once `connect` has given them a session.
 
@@ -104,6 +105,7 @@ class Panel:
             save_png: makes a picture, given the resolution's name and whether it is transparent.
             notify: shows a text in a colour beside the panel, however far that is scrolled.
             tripod: stand of the visitor's camera.
+            darken: begins the dark theme, or the light one.
         """
         self._notify, self._tripod = notify, tripod
         self._gui = gui
@@ -140,7 +142,7 @@ class Panel:
         with tabs.add_tab("Arm"):
             self._build_arm()
         with tabs.add_tab("Picture"):
-            self._camera = CameraControls(gui, tripod)
+            self._camera = CameraControls(gui, tripod, lambda dark: self._chores.later(partial(darken, dark)))
             on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), self._presentation.begin)
             self._build_export(save_png)
         commands = self._commands(Curtain(gui))

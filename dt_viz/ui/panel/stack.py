@@ -177,7 +177,7 @@ def _index(name: str) -> str:
 
 
 def _part(index: str, colour: Colour) -> str:
-    return f"<b style='color:{palette.css(colour)}'>ψ<sub>{index}</sub></b>"
+    return f"<b style='color:{palette.ink(colour)}'>ψ<sub>{index}</sub></b>"
 
 
 def _label(name: str, duration: float | None, what: str = "t") -> str:

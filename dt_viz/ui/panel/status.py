@@ -11,7 +11,7 @@ from dt_viz.engine.session import Pace
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.ui.panel.verdict import Level, Verdict, concerns, shows_arm
-from dt_viz.ui.scene.palette import css
+from dt_viz.ui.scene.palette import ink, paper
 from dt_viz.ui.scene.picture import Colour
 from dt_viz.warning import in_millimetres
 
@@ -64,31 +64,32 @@ def hint(frame: Frame) -> str:
 
 def line_html(verdict: Verdict) -> str:
     """Return the one line of figures, in the colour of its gravity."""
-    ink, paper = BUSY_COLOURS if verdict.busy else COLOURS[verdict.level]
+    text, pale = BUSY_COLOURS if verdict.busy else COLOURS[verdict.level]
     return (
         f"<div role='status' style='margin:0.2em 0.7em 0.3em;padding:0 0.6em;height:{LINE}em;line-height:{LINE}em;"
         f"font-size:0.85em;font-weight:600;white-space:nowrap;overflow:hidden;text-overflow:ellipsis;"
-        f"border-left:3px solid {css(ink)};color:{css(ink)};background:{css(paper)}'>{html.escape(verdict.line)}</div>"
+        f"border-left:3px solid {ink(text)};color:{ink(text)};background:{paper(pale, text)}'>"
+        f"{html.escape(verdict.line)}</div>"
     )
 
 
-def place_html(text: str, ink: Colour, height: float, below: str = "") -> str:
+def place_html(text: str, colour: Colour, height: float, below: str = "") -> str:
     """Return a text in a place of a fixed height, em, with HTML below it; a tooltip has all of a text that is long."""
     said = html.escape(sentence(text))
     clamp = f"display:-webkit-box;-webkit-box-orient:vertical;-webkit-line-clamp:{int(height / LEADING) or 1}"
     return (
         f"<div style='height:{height:.3f}em;overflow:hidden;margin:0 0.9em'>"
-        f"<div title='{html.escape(text)}' style='font-size:0.8em;line-height:1.35;color:{css(ink)};overflow:hidden;"
+        f"<div title='{html.escape(text)}' style='font-size:0.8em;line-height:1.35;color:{ink(colour)};overflow:hidden;"
         f"{clamp}'>{said}</div>{below}</div>"
     )
 
 
 def progress_html(fraction: float) -> str:
     """Return a bar of progress, from 0 to 1."""
-    ink, paper = COLOURS[Level.NOTE]
+    full, pale = COLOURS[Level.NOTE]
     return (
-        f"<div style='height:0.35em;margin-top:0.25em;border-radius:2px;background:{css(paper)}'>"
-        f"<div style='height:100%;width:{100 * fraction:.0f}%;border-radius:2px;background:{css(ink)}'></div></div>"
+        f"<div style='height:0.35em;margin-top:0.25em;border-radius:2px;background:{paper(pale, full)}'>"
+        f"<div style='height:100%;width:{100 * fraction:.0f}%;border-radius:2px;background:{ink(full)}'></div></div>"
     )
 
 
@@ -191,6 +192,6 @@ def alarm(text: str, colour: Colour, background: Colour) -> str:
     """Return a text in a coloured box."""
     return (
         "<div style='font-size:0.8em;margin:0.2em 0.9em 0.5em;padding:0.35em 0.6em;"
-        f"border-left:3px solid {css(colour)};color:{css(colour)};background:{css(background)}'>"
+        f"border-left:3px solid {ink(colour)};color:{ink(colour)};background:{paper(background, colour)}'>"
         f"{html.escape(sentence(text))}</div>"
     )

@@ -72,6 +72,10 @@ class Drawing:
         self._arm = arm
         self._show()
 
+    def dye(self, dark: bool) -> None:
+        """Take the colours of the dark theme, or of the light one."""
+        self.ink.dye(dark)
+
     def pose(self, moment: float, hand: Array, arrived: float) -> None:
         """Let the hand go on; when it sets out again, the board is wiped.
 

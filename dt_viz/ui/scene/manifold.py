@@ -43,7 +43,7 @@ class WarpedGrid(Picture):
     """Image of a grid of base space under ψ⁻¹ of the stack; thinner and paler beside the rollouts of a level."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self.lines = Lines(scene, "/grid", palette.GRID, THICK)
+        self.lines, self._dark = Lines(scene, "/grid", palette.GRID, THICK), False
         super().__init__(self.lines.node)
 
     def draw(self, frame: Frame) -> None:
@@ -51,5 +51,9 @@ class WarpedGrid(Picture):
         if frame.pictures.grid is not None:
             beside = frame.level is not None
             self.lines.show(frame.pictures.grid.lines)
-            self.lines.colour = palette.GRID_BESIDE if beside else palette.GRID
+            self.lines.colour = palette.shade(palette.GRID_BESIDE if beside else palette.GRID, self._dark)
             self.lines.node.thickness = THIN if beside else THICK
+
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self._dark = dark

@@ -63,12 +63,46 @@ BODY_PATH = (0, 92, 66)
 JOINTS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 """Curves of the six joints, base to hand."""
 BRAND = (0, 114, 178)
+ON_DARK = {
+    ADDED: (206, 152, 66),
+    GHOST: (190, 194, 202),
+    WAY: (198, 134, 212),
+    WAY_FADED: (66, 58, 74),
+    OUTLINE: (214, 218, 226),
+    STREAMLINE: (146, 164, 198),
+    ARROW_SLOW: (72, 82, 102),
+    ARROW_FAST: (168, 190, 228),
+    GRID: (76, 152, 206),
+    GRID_BESIDE: (62, 92, 118),
+    INK: (226, 232, 240),
+    TABLE: (38, 40, 46),
+    ZENITH: (16, 19, 26),
+    HORIZON: (58, 61, 71),
+}
+"""Colours of the dark theme, by those of the light one that they replace; all others are for both."""
+
+
+def shade(colour: tuple[int, int, int], dark: bool) -> tuple[int, int, int]:
+    """Return a colour of the light theme as the theme has it."""
+    return ON_DARK.get(colour, colour) if dark else colour
 
 
 def linear(colour: tuple[int, int, int]) -> tuple[int, int, int]:
     """Return the value that shows as this colour on lines and arrows of many colours: linear light."""
     red, green, blue = (round(255 * (c / 255) ** 2.2) for c in colour)
     return red, green, blue
+
+
+def ink(colour: tuple[int, int, int]) -> str:
+    """Return a dark colour of text in CSS, lighter where the panel is dark."""
+    red, green, blue = (round(c + 0.62 * (255 - c)) for c in colour)
+    return f"light-dark({css(colour)}, {css((red, green, blue))})"
+
+
+def paper(colour: tuple[int, int, int], text: tuple[int, int, int]) -> str:
+    """Return a pale background of text in CSS: where the panel is dark it is a dark one of the text's colour."""
+    red, green, blue = (round(0.45 * c) for c in text)
+    return f"light-dark({css(colour)}, {css((red, green, blue))})"
 
 
 def css(colour: tuple[int, int, int]) -> str:

@@ -75,6 +75,9 @@ class Picture(Shown, ABC):
     def draw(self, frame: Frame) -> None:
         """Show the frame."""
 
+    def dye(self, dark: bool) -> None:
+        """Take the colours of the dark theme, or of the light one, from the next drawing on at the latest."""
+
 
 class Lines:
     """Polylines of one look, as one set of line segments."""
@@ -89,7 +92,7 @@ class Lines:
             thickness: metres.
             dash: length of a dash and of the gap after it, metres; 0 draws through.
         """
-        self._dash = dash
+        self._dash, self._light = dash, colour
         self.node = scene.add_line_segments(name, np.zeros((1, 2, 3), np.float32), colour, thickness=thickness)
 
     @property
@@ -100,6 +103,10 @@ class Lines:
     @colour.setter
     def colour(self, colour: Colour) -> None:
         self.node.colors = np.array(colour, np.uint8)
+
+    def dye(self, dark: bool) -> None:
+        """Take the colour of the dark theme, or of the light one."""
+        self.colour = palette.shade(self._light, dark)
 
     def show(self, paths: Sequence[Array]) -> None:
         """Show polylines (T_i, 3), metres."""
@@ -160,6 +167,10 @@ class Arrows:
             head_radius=0.0034 * thickness,
             head_length=0.0085 * thickness,
         )
+
+    def paint(self, little: Colour, much: Colour) -> None:
+        """Give other colours to the shortest and the longest, from the next time that they are shown."""
+        self._little, self._much = np.array(little), np.array(much)
 
     def show(self, points: Array, vectors: Array) -> None:
         """Show vectors (N, 3), of any unit, with their middles at points (N, 3), metres."""

@@ -98,6 +98,10 @@ class Ghost(Picture):
         self._middles.of(frame.rollouts)
         self._lines.show_segments(self._middles.beside(self._lines.segments(undisturbed)))
 
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self._lines.dye(dark)
+
 
 class Rollouts(Picture):
     """The rollouts as tubes: the one that the arm follows thick, the others thin and translucent.
@@ -113,6 +117,7 @@ class Rollouts(Picture):
         self.others = Tubes(scene, "/rollouts/others", palette.ROLLOUT, THIN, ball=2.6 * THIN, opacity=OPACITY)
         self.added = Tubes(scene, "/rollouts/added", palette.ADDED, THIN)
         self.former = Tubes(scene, "/rollouts/former", palette.ROLLOUT, THIN, opacity=OPACITY)
+        self._added = palette.ADDED
         self._drawn: tuple[object, Array] | None = None
         """Task and middles drawn last."""
         self._jumped = -math.inf
@@ -131,10 +136,14 @@ class Rollouts(Picture):
         for tubes, colour in (
             (self.hero, palette.ROLLOUT),
             (self.others, palette.ROLLOUT),
-            (self.added, palette.ADDED),
+            (self.added, self._added),
         ):
             tubes.colour = palette.STALE if frame.blocked else colour
         self._fade_what_jumped(frame.task, middles)
+
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self._added = palette.shade(palette.ADDED, dark)
 
     def _fade_what_jumped(self, task: object, middles: Array) -> None:
         """Begin to let those fade that were drawn far from where they are now, of the same task."""

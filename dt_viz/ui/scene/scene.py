@@ -28,7 +28,7 @@ from dt_viz.ui.scene.picture import Picture
 from dt_viz.ui.scene.rollouts import Demonstrations, Ghost, Middles, Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.slice_layers import ColourSlice, FieldArrows, OccupancySlice, Streamlines
-from dt_viz.ui.scene.stage import Table, set_stage
+from dt_viz.ui.scene.stage import Table, background, set_stage
 from dt_viz.ui.scene.starts import Starts
 
 GOAL, OLD_GOAL = "goal", "demonstrated goal"
@@ -82,6 +82,7 @@ class ScenePictures:
     ) -> None:
         """Build the scene of this robot; the callbacks are those of the pictures."""
         set_stage(scene)
+        self._scene = scene
         self.obstacles = Obstacles(scene, moved, grabbed, clicked)
         self.anchors = Anchors(scene, anchor_moved, anchor_selected)
         self.slice = MovableSlice(scene, slice_moved)
@@ -144,12 +145,25 @@ class ScenePictures:
         self.middles.shown = self._view.rollouts
         if self._grey:
             frame = replace(frame, blocked=(*frame.blocked, COMPUTING))
-        for picture in (*self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())):
+        for picture in self._pictures:
             picture.draw(frame)
         if (bool(frame.blocked), self._grey) != before:
             with self._showing:
                 self._blocked = bool(frame.blocked)
                 self._show()
+
+    def dye(self, dark: bool) -> None:
+        """Take the colours of the dark theme, or of the light one."""
+        self._scene.set_background_image(background(dark), "png")
+        with self._drawing:
+            for picture in self._pictures:
+                picture.dye(dark)
+            if self._frame is not None:
+                self._draw(self._frame)
+
+    @property
+    def _pictures(self) -> tuple[Picture, ...]:
+        return *self._always, *self._by_view.values(), *dict.fromkeys(self._by_colour.values())
 
     def adopt(self, scenario: Scenario) -> None:
         """Show and hide what the scenario's view says, and move the obstacles to where they stand."""

@@ -50,6 +50,10 @@ class FieldArrows(Picture):
         if field is not None:
             self.arrows.show(field.points, field.velocities)
 
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self.arrows.paint(*(palette.shade(colour, dark) for colour in (palette.ARROW_SLOW, palette.ARROW_FAST)))
+
 
 class Streamlines(Picture):
     """Motions from all over the slice as thin lines with an arrow head in the middle of each."""
@@ -69,6 +73,12 @@ class Streamlines(Picture):
             points = np.reshape([line[k] for line, k in zip(lines, middles, strict=True)], (-1, 3))
             ahead = np.reshape([line[k] - line[k - 1] for line, k in zip(lines, middles, strict=True)], (-1, 3))
             self.heads.show(points, ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12))
+
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self.lines.dye(dark)
+        colour = palette.linear(palette.shade(palette.STREAMLINE, dark))
+        self.heads.paint(colour, colour)
 
 
 class _Image:
@@ -180,6 +190,10 @@ class OccupancySlice(Picture):
         self.outline.show_segments(picture.outline)
         colours = np.where(picture.occupied[:, None], palette.OCCUPIED, palette.FREE).astype(np.uint8)
         assign(self.points, picture.points, colours)
+
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self.outline.dye(dark)
 
 
 def _of_probability(probability: Array) -> NDArray[np.uint8]:

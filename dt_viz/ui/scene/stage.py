@@ -18,9 +18,9 @@ BACKGROUND_HEIGHT = 128
 """Number of rows of the background image."""
 
 
-def background() -> NDArray[np.uint8]:
-    """Return the background (H, W, 3), from the top down."""
-    low, high = np.array(palette.HORIZON, float), np.array(palette.ZENITH, float)
+def background(dark: bool = False) -> NDArray[np.uint8]:
+    """Return the background (H, W, 3) of a theme, from the top down."""
+    low, high = (np.array(palette.shade(colour, dark), float) for colour in (palette.HORIZON, palette.ZENITH))
     height = np.clip(np.linspace(1, -6, BACKGROUND_HEIGHT), 0, 1)[:, None] ** 1.5
     rows = np.round(low + height * (high - low)).astype(np.uint8)
     return np.repeat(rows[:, None], 2 * BACKGROUND_HEIGHT, axis=1)
@@ -56,3 +56,7 @@ class Table(Picture):
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`: it never changes."""
+
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self.node.color = palette.shade(palette.TABLE, dark)

@@ -36,8 +36,14 @@ class Way(Shown):
             "/way/trail", np.zeros((1, 2, 3), np.float32), np.zeros(3, np.uint8), thickness=0.005
         )
         self._drawn, self._when = np.empty((0, 3)), -np.inf
+        self._dark = False
         self._came: deque[tuple[float, Array]] = deque()
         """When the hand was where, the newest last."""
+
+    def dye(self, dark: bool) -> None:
+        """Take the colours of the dark theme, or of the light one."""
+        self._dark = dark
+        self.ahead.dye(dark)
 
     def is_due(self, moment: float) -> bool:
         """Whether `show` sends something at a moment, seconds."""
@@ -64,16 +70,16 @@ class Way(Shown):
         times, places = np.array([t for t, _ in self._came]), [*(place for _, place in self._came), hand]
         pieces = np.stack([places[:-1], places[1:]], axis=1) if len(times) else np.zeros((0, 2, 3))
         if len(pieces) or len(self._trail.points):
-            assign(self._trail, pieces, _faded((moment - times) / TRAIL_SECONDS))
+            assign(self._trail, pieces, _faded((moment - times) / TRAIL_SECONDS, self._dark))
 
     def forget(self) -> None:
         """Forget where the hand came: it was put where it is."""
         self._came.clear()
 
 
-def _faded(age: Array) -> NDArray[np.uint8]:
+def _faded(age: Array, dark: bool) -> NDArray[np.uint8]:
     """Colours (K, 2, 3) of pieces of an age (K,) from 0 to 1."""
-    fresh, old = (np.array(colour) for colour in (palette.WAY, palette.WAY_FADED))
+    fresh, old = (np.array(palette.shade(colour, dark)) for colour in (palette.WAY, palette.WAY_FADED))
     colours = fresh + age[:, None] * (old - fresh)
     light = np.round(255 * (colours / 255) ** 2.2).astype(np.uint8)  # see `palette.linear`
     return np.repeat(light[:, None], 2, axis=1)

@@ -1,0 +1,79 @@
+"""The dark theme: what is drawn on it can be seen, and the light one comes back as it was."""
+
+import numpy as np
+import pytest
+from pages import Page
+
+from dt_viz.ui.scene import palette
+
+LINES = ("DEMONSTRATION", "ROLLOUT", "ADDED", "GHOST", "WAY", "GOAL", "OBSTACLE", "BIAS", "STREAMLINE", "ARROW_FAST")
+"""What must be seen from far."""
+SEEN = 2.7
+"""Smallest contrast with table and sky (WCAG 2.1 measures it so)."""
+
+
+def luminance(colour):
+    value = np.array(colour) / 255
+    return float(np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) @ (0.2126, 0.7152, 0.0722))
+
+
+def contrast(one, other):
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("name", [*LINES, "GRID", "INK", "OUTLINE"])
+def test_lines_are_seen_on_the_dark_background(name):
+    colour = palette.shade(getattr(palette, name), dark=True)
+    for ground in (palette.ZENITH, palette.HORIZON, palette.TABLE):
+        assert contrast(colour, palette.shade(ground, dark=True)) >= SEEN
+
+
+@pytest.fixture(scope="module")
+def page(server, robot):
+    page = Page(server, robot)
+    page.busy()
+    yield page
+    page.visitor.close()
+
+
+def colours(page):
+    """Those of all nodes, by name and property."""
+    found = {}
+    for name, node in page.nodes.items():
+        for kind in ("color", "colors"):
+            if hasattr(node, kind):
+                found[name, kind] = np.array(getattr(node, kind)).tolist()
+    return found
+
+
+def choose(page, dark):
+    (switch,) = (handle for handle in page.inputs if handle.label == "Dark theme")
+    page.claim(switch, dark)
+    page.visitor._panel._chores._executor.submit(lambda: None).result(10)
+
+
+def test_the_light_theme_comes_back_as_it_was(page, monkeypatch):
+    themes, before = [], colours(page)
+    monkeypatch.setattr(page.gui, "configure_theme", lambda **theme: themes.append(theme["dark_mode"]))
+    choose(page, True)
+    changed = {name for name, colour in colours(page).items() if colour != before[name]}
+    assert {("/table", "color"), ("/ghost", "colors"), ("/way/ahead", "colors"), ("/ink", "colors")} <= changed
+    choose(page, False)
+    assert colours(page) == before
+    assert themes == [True, False]
+
+
+def test_a_picture_is_saved_in_light_colours_and_the_dark_theme_stays(page, monkeypatch):
+    light, taken = colours(page), []
+    choose(page, True)
+    dark = colours(page)
+
+    def render(*_size, **_how):
+        taken.append(colours(page))
+        return np.zeros((2, 2, 4), np.uint8)
+
+    monkeypatch.setattr(page.client, "get_render", render)
+    page.visitor._save_png("1280 × 720", transparent=False)
+    assert taken[0] == light and colours(page) == dark != light
+    choose(page, False)
