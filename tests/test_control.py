@@ -9,7 +9,7 @@ from scenes import changed
 from dt_viz.arm.arm_system import ArmSystem
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.flows.diffeomorphisms import Identity
-from dt_viz.motion.control import ACCELERATION, Controller, Phase
+from dt_viz.motion.control import ACCELERATION, FORESEEN, Controller, Phase
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 
@@ -183,6 +183,14 @@ class TestSeveralSteps:
                         case 3:
                             controller.follow(scene.solved)
         assert singly < 700 and scene.missed(alone.q) < 1e-3 and alone.phases[-1] is Phase.RESTING
+
+    def test_they_are_foreseen_for_a_while_where_nothing_changes(self, scene, monkeypatch):
+        controller, q, nums = scene.controller(scene.around(scene.middle)), scene.start, []
+        foreseen = controller._foreseen
+        monkeypatch.setattr(controller, "_foreseen", lambda q, dt, num: nums.append(num) or foreseen(q, dt, num))
+        for _ in range(50):
+            q = q + TICK * controller.steps(q, TICK, 5).sum(axis=0)
+        assert nums.count(FORESEEN) > 5 and len(nums) < 25
 
     def test_a_posture_has_to_be_one(self, scene):
         with pytest.raises(ValueError, match="6 finite angles"):

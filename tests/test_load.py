@@ -94,6 +94,21 @@ def test_visitors_drag_in_a_started_server_and_are_shown_the_last_pose(tmp_path,
     assert f"median {figures['median_ms']:.0f} ms" in printed
 
 
+def test_visitors_who_look_on_cost_something(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
+    monkeypatch.setattr(load, "SETTLED", 0.0)
+    out = tmp_path / "rest.json"
+    assert main(["load", "--rest", "--clients", "1", "--seconds", "1", "--out", str(out)]) == 0
+    figures = json.loads(out.read_text())
+    assert 0 < figures["core_percent"] < 400 and figures["messages_per_s"] > 1
+    assert f"{figures['core_percent']:.1f} % of a core" in capsys.readouterr().out
+
+
+def test_the_cost_of_a_server_that_runs_elsewhere_is_unknown(capsys, url):
+    assert main(["load", "--rest", "--url", url]) == 2
+    assert "--rest" in capsys.readouterr().err
+
+
 def test_who_gets_no_picture_fails_the_measurement(monkeypatch, capsys, url):
     monkeypatch.setattr(load, "NUM_POSES", 1)
     monkeypatch.setattr(load, "FIRST_PICTURE", 0.0)

@@ -56,6 +56,10 @@ GAP = 0.05
 LOST, LOOKING = 0.15, 0.3
 """Gap of a joint, rad, from which on the robot begins anew where it is, since the way to where it should be may lead
 through the obstacle; and shortest time between two such beginnings, seconds."""
+FORESEEN = 25
+"""Number of steps that are foreseen at once while nothing changes."""
+EXACT = 1e-9
+"""Deviation of a joint from where it was sent, rad, that is rounding."""
 MOVED = 5e-3
 """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
 CONVERGENCE = 0.5
@@ -184,6 +188,28 @@ class Prepared:
     """None where that has to wait for the state at which it is taken."""
 
 
+@dataclass(eq=False)
+class Foreseen:
+    """Some steps in a row in which nothing is due and nothing binds, while the motion ahead and the sighting last."""
+
+    ahead: Ahead
+    seen: Sighting
+    dt: float
+    """Seconds of a step."""
+    postures: Array
+    """(K, 6) before each step, rad."""
+    velocities: Array
+    """(K, 6) in each, rad/s."""
+    clocks: list[float]
+    """K + 1 times of the course, from before the first step to after the last one, seconds."""
+    rates: list[float]
+    """K + 1 rates at which these pass, in the same order."""
+    rooms: Array | None
+    """(K,) distance from the nearest obstacle at each posture, metres; None where none can be near."""
+    done: int = 0
+    """Number of steps that have been made."""
+
+
 class Controller:
     """A robot's state and what it follows; `step` is for one thread, `follow` and the rest may come from another."""
 
@@ -224,6 +250,8 @@ class Controller:
         self._room = np.inf
         """Distance from the nearest obstacle when it was last looked at, about, metres."""
         self._settled = self._released = False
+        self._known: Foreseen | None = None
+        """The steps that were foreseen last."""
 
     # --- What it follows ---
 
@@ -359,6 +387,7 @@ class Controller:
         if not 0 < dt < np.inf:
             raise ValueError(f"dt: found {dt}; accepted: seconds, more than 0")
         with self._lock:
+            self._known = None
             self._now += dt
             if self._q is None or np.abs(q - self._q).max() > MOVED:
                 self._anchor(q, self._ahead.dodge if self._ahead is not None else NO_DODGE)
@@ -381,7 +410,7 @@ class Controller:
         """
         q = np.asarray(q, float)
         with self._lock:
-            velocities = self._foreseen(q, dt, num)
+            velocities = self._sampled(q, dt, num)
             if velocities is None:
                 velocities = np.empty((num, NUM_JOINTS))
                 for k in range(num):
@@ -485,8 +514,26 @@ class Controller:
         highest, lowest = (np.sqrt(braking * np.maximum(room, 0)) for room in (above, below))
         return -np.minimum(lowest, limits), np.minimum(highest, limits)
 
-    def _foreseen(self, q: Array, dt: float, num: int) -> Array | None:
-        """The velocities (num, 6) of steps in which nothing is due and nothing binds; None where something may be."""
+    def _sampled(self, q: Array, dt: float, num: int) -> Array | None:
+        """The velocities (num, 6) of steps that go on as foreseen, which are made; None where something may be due."""
+        known, at = self._known, self._q
+        goes_on = known is not None and known.ahead is self._ahead and known.seen is self._seen and known.dt == dt
+        as_told = at is not None and np.abs(q - at).max() < EXACT
+        if known is None or not (goes_on and as_told and known.done + num <= len(known.velocities)):
+            self._known = known = (self._foreseen(q, dt, FORESEEN) if goes_on else None) or self._foreseen(q, dt, num)
+            if known is None:
+                return None
+        first = known.done
+        known.done = last = first + num
+        velocities = known.velocities[first:last]
+        self._now, self._clock, self._rate = self._now + num * dt, known.clocks[last], known.rates[last]
+        self._velocity, self._q = velocities[-1], known.postures[last - 1] + dt * velocities[-1]
+        if known.rooms is not None and self._now >= self._safe_until:
+            self._seen_from(float(known.rooms[last - 1]), self._now)
+        return velocities.copy()
+
+    def _foreseen(self, q: Array, dt: float, num: int) -> Foreseen | None:
+        """Steps in which nothing is due and nothing binds; None where something may be."""
         ahead, seen = self._ahead, self._seen
         if ahead is None or self._q is None or not ahead.dodge.cleared or max(seen.speed, self._sighting.speed) > 0:
             return None
@@ -495,10 +542,11 @@ class Controller:
         if np.abs(q - self._q).max() > MOVED or not size < min(LOST, linear):
             return None
         closed = (1 - stiffness * dt) ** np.arange(num)
-        rate, clocks = self._rate, [self._clock]
+        rates, clocks = [self._rate], [self._clock]
         for part in closed.tolist():
-            rate += min(max(1 / (1 + (part * size / GAP) ** 2) - rate, -dt / RAMP), dt / RAMP)
-            clocks.append(min(clocks[-1] + rate * ahead.pace(clocks[-1]) * dt, ahead.course.end))
+            rate = rates[-1]
+            rates.append(rate + min(max(1 / (1 + (part * size / GAP) ** 2) - rate, -dt / RAMP), dt / RAMP))
+            clocks.append(min(clocks[-1] + rates[-1] * ahead.pace(clocks[-1]) * dt, ahead.course.end))
         if not self._settled and clocks[-1] >= ahead.course.end:
             return None
         p, gaps = np.array([ahead.at(clock) for clock in clocks]), closed[:, None] * gap
@@ -508,15 +556,12 @@ class Controller:
         binds = np.abs(velocities - before).max() > self.acceleration * dt
         if binds or (velocities < lowest).any() or (velocities > highest).any():
             return None
-        now = self._now + num * dt
+        rooms, now = None, self._now + num * dt
         if seen.avoidance is not None and now >= self._safe_until and (velocities.any() or np.isinf(self._room)):
-            allowed, room = is_allowed(self._arm, postures, velocities, seen.avoidance, seen.velocities)
+            allowed, rooms = is_allowed(self._arm, postures, velocities, seen.avoidance, seen.velocities)
             if not allowed:
                 return None
-            self._seen_from(room, now)
-        self._now, self._clock, self._rate = now, clocks[-1], rate
-        self._velocity, self._q = velocities[-1], postures[-1] + dt * velocities[-1]
-        return velocities
+        return Foreseen(ahead, seen, dt, postures, velocities, clocks, rates, rooms)
 
     def _seen_from(self, room: float, now: float) -> None:
         """Take note of the distance from the nearest obstacle, metres, and of how long none can be near for sure."""

@@ -63,17 +63,17 @@ def guarded(arm: WholeArm, q: Array, wanted: Array, avoidance: ArmAvoidance, vel
 
 def is_allowed(
     arm: WholeArm, q: Array, wanted: Array, avoidance: ArmAvoidance, velocities: Array
-) -> tuple[bool, float]:
+) -> tuple[bool, Array]:
     """Whether `guarded` leaves several velocities (N, 6) at postures (N, 6) as they are, all at once.
 
     Returns:
-        Whether it does, for sure; and the distance of the arm from the nearest obstacle at the last posture, metres.
+        Whether it does, for sure; and the distance (N,) of the arm from the nearest obstacle at each posture, metres.
     """
     chain = arm.robot.chain(q.T)
-    points, kept, nearest = arm.links.of_chain(chain), _kept(avoidance), np.inf
+    points, kept, nearest = arm.links.of_chain(chain), _kept(avoidance), np.full(len(q), np.inf)
     for part, velocity in zip(avoidance.obstacle.parts, velocities, strict=True):
         distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.links.radius[:, None] + OVERSHOOT
-        nearest = min(nearest, float(distance[:, -1].min()))
+        nearest = np.minimum(nearest, distance.min(axis=0))
         near, posture = np.nonzero(distance - kept <= WINDOW)
         if len(near):
             h = distance[near, posture] - kept

@@ -6,7 +6,7 @@ to one side n before, as far as they need to be clear, by a flow along it,
 
     ẏ = n g exp(−½ ‖A(y − c)‖²) Π_e (1 − exp(−‖y − e‖²/2ρ_e²)),
 
-which is broad along the motions and leaves their starts and goal e where they are. The side is the one with the
+which is broad along the motions and leaves their free starts and goal e where they are. The side is the one with the
 least detour; while an obstacle is dragged, it is kept until another one costs much less.
 """
 
@@ -120,7 +120,7 @@ class Passes:
     tangents: Array
     """(K, 3) unit vectors along the motions."""
     ends: Array
-    """(E, 3) starts and goal, metres."""
+    """(E, 3) starts and goal outside the obstacle, metres."""
     others: tuple[Obstacle, ...] = ()
     """Obstacles whose sides have been chosen: the way out of this one does not end in them."""
     plane: Array | None = None
@@ -147,6 +147,7 @@ class Passes:
         tangents = motion.positions[after] - motion.positions[before]
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
         ends = np.concatenate([motion.starts, motion.goal[None]])
+        ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
     def way(self, before: Way | None, *, gradually: bool) -> Way:

@@ -57,7 +57,12 @@ class Objects:
         for each, handle in self.items:
             if sets_out:
                 handle.position = hand if each.start is None else each.start
-            handle.position = each.moved(np.asarray(handle.position), now)
+            place = np.asarray(handle.position)
+            moved = each.moved(place, now)
+            if (
+                moved is not place
+            ):  # comparing places, as an assignment does, takes longer than most pictures of an object
+                handle.position = moved
         if last is None:
             self._show()
 
