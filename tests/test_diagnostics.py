@@ -62,14 +62,14 @@ def test_a_motion_through_the_obstacle_is_said_whatever_else_is(engine, middle, 
 
 def test_a_missed_goal_is_said_beside_a_covered_start_unless_it_is_covered_itself(engine, task="draw_s"):
     goal = stage(engine, avoiding(task)).goal
-    start = Sphere(as_point(engine.task(task).starts[0]), 0.05)
-    beside = near(goal, engine.task(task).obstacle_position, 2e-5)
-    frame = stage(engine, avoiding(task, (beside, start)))
+    start = Sphere(as_point(engine.task(task).starts[0]), 0.12)
+    beside = near(goal, engine.task(task).obstacle_position, 1e-3)
+    frame = stage(engine, avoiding(task, (beside, start), generator="probability"))
     missed = np.linalg.norm(frame.reached - frame.goal)
     assert missed > MAX_GOAL_MISS
     assert kinds(frame) >= {Kind.START_COVERED, Kind.GOAL_MISSED}
     assert says(frame, f"no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
-    covering = stage(engine, avoiding(task, (replace(beside, position=as_point(goal)), start)))
+    covering = stage(engine, avoiding(task, (replace(beside, position=as_point(goal)), start), generator="probability"))
     assert says(covering, "the goal is inside the obstacle: motions end beside it")
     assert kinds(covering) >= {Kind.START_COVERED, Kind.GOAL_COVERED} and Kind.GOAL_MISSED not in kinds(covering)
 

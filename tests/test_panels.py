@@ -17,6 +17,7 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, plane_of, side_by_side, switched
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
+from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.panels import Panels
 
 BIAS = "Bias 1"
@@ -171,3 +172,14 @@ def test_only_what_a_drag_changes_is_drawn_again(engine, initial, scene):
     assert same == [True, True, False, False, True]  # the bias is built below the avoidance, but for other samples
     panels.draw(frame_of(engine, replace(scenario, view=View(panels=(BASE_PANEL,)))))
     assert [nodes.frame.visible for nodes in panels.panels] == [True, True, False, False, False]
+
+
+def test_panels_take_the_theme_also_those_that_are_drawn_later(engine, initial, scene):
+    panels, scenario = Panels(scene), biased(engine, initial, BASE_PANEL)
+    panels.dye(True)
+    for dark in (True, False):
+        panels.dye(dark)
+        panels.draw(frame_of(engine, scenario))
+        wanted = palette.shade(palette.STREAMLINE, dark)
+        assert {tuple(nodes.streamlines.colour) for nodes in panels.panels} == {wanted}
+        scenario = biased(engine, initial, BASE_PANEL, Panel(BIAS))

@@ -46,6 +46,12 @@ class PanelNodes:
         }
         """What shows each field of a `PanelPicture`."""
         self._drawn: PanelPicture | None = None
+        self._lines = (self._border, grid, self.streamlines, demonstrations, outlines)
+
+    def dye(self, dark: bool) -> None:
+        """Take the colours of the dark theme, or of the light one."""
+        for lines in self._lines:
+            lines.dye(dark)
 
     def draw(self, panel: PanelPicture, camera: tuple[Point, Point]) -> None:
         """Show a panel, read by a camera with this position and look-at, metres."""
@@ -73,6 +79,13 @@ class Panels(Picture):
         super().__init__(scene.add_frame("/panels", show_axes=False))
         self._scene = scene
         self.panels: list[PanelNodes] = []
+        self._dark = False
+
+    def dye(self, dark: bool) -> None:
+        """See `Picture`."""
+        self._dark = dark
+        for nodes in self.panels:
+            nodes.dye(dark)
 
     def draw(self, frame: Frame) -> None:
         """See `Picture`."""
@@ -81,6 +94,7 @@ class Panels(Picture):
             return
         for k in range(len(self.panels), len(panels)):
             self.panels.append(PanelNodes(self._scene, f"/panels/{k}"))
+            self.panels[k].dye(self._dark)
         for k, nodes in enumerate(self.panels):
             nodes.frame.visible = k < len(panels)
             if k < len(panels):
