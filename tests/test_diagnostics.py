@@ -69,7 +69,7 @@ def test_a_missed_goal_is_said_beside_a_covered_start_unless_it_is_covered_itsel
     assert missed > MAX_GOAL_MISS
     assert kinds(frame) >= {Kind.START_COVERED, Kind.GOAL_MISSED}
     assert says(frame, f"no way to the goal: motions end {1e3 * missed:.0f} mm beside it")
-    covering = stage(engine, avoiding(task, (replace(beside, position=as_point(goal)), start), generator="probability"))
+    covering = stage(engine, avoiding(task, (replace(beside, position=as_point(goal)), start)))
     assert says(covering, "the goal is inside the obstacle: motions end beside it")
     assert kinds(covering) >= {Kind.START_COVERED, Kind.GOAL_COVERED} and Kind.GOAL_MISSED not in kinds(covering)
 
