@@ -183,3 +183,10 @@ def test_panels_take_the_theme_also_those_that_are_drawn_later(engine, initial, 
         wanted = palette.shade(palette.STREAMLINE, dark)
         assert {tuple(nodes.streamlines.colour) for nodes in panels.panels} == {wanted}
         scenario = biased(engine, initial, BASE_PANEL, Panel(BIAS))
+
+
+def test_rollouts_on_panels_are_grey_while_there_is_no_motion(engine, initial, scene):
+    panels, frame = Panels(scene), frame_of(engine, biased(engine, initial, BASE_PANEL, Panel(IMITATION)))
+    for blocked, colour in (((), palette.ROLLOUT), (("no way",), palette.STALE), ((), palette.ROLLOUT)):
+        panels.draw(replace(frame, blocked=blocked))
+        assert {tuple(nodes.rollouts.colour) for nodes in panels.panels} == {colour}

@@ -68,7 +68,8 @@ def test_the_obstacle_first_stands_where_hand_and_arm_find_a_way_to_the_goal(nam
     assert all(w.kind is Kind.ARM_TOO_NEAR or w in meshes for w in frame.certificates.warnings)
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
     if space != "task":
-        assert meshes == () and frame.arm_duration > 0.01  # it is in the arm's way, too
+        least = 0.01 if name == "drop_pots" else 0.1  # there the arm only just grazes it
+        assert meshes == () and frame.arm_duration > least  # it is in the arm's way, too
 
 
 @pytest.mark.parametrize("name", TASKS)

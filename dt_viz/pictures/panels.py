@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.obstacles.union import Union
@@ -17,7 +17,7 @@ from dt_viz.scenario.slices import Slice, level_line
 
 MARGIN = 0.18
 """Margin around the base attractor's rays, relative to their extent."""
-ARROW_SPACING = 0.030
+ARROW_SPACING = 0.027
 """Spacing of a generator's arrows, metres."""
 NEGLIGIBLE = 0.03
 """Length of an arrow, relative to the longest, below which it is left out."""
@@ -109,9 +109,14 @@ def generator_panel(title: str, transform: Diffeomorphism, area: Slice) -> Panel
     for flow in transform.parts if isinstance(transform, Chain) else [transform]:
         if isinstance(flow, Flow | AdaptiveFlow):
             vectors -= flow.duration * flow.field(points)
-    size = np.linalg.norm(vectors, axis=1)
-    seen = size > NEGLIGIBLE * size.max(initial=0.0)
+    seen = long_enough(vectors)
     return PanelPicture(title, area, points=points[seen], vectors=vectors[seen])
+
+
+def long_enough(vectors: Array) -> Mask:
+    """Return which arrows (N, 3) are seen beside the longest (N,)."""
+    size = np.linalg.norm(vectors, axis=1)
+    return size > NEGLIGIBLE * size.max(initial=0.0)
 
 
 @dataclass(frozen=True)

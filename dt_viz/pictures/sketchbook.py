@@ -13,15 +13,11 @@ from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.pictures.occupancy import OccupancyPicture
-from dt_viz.pictures.panels import Fit, PanelPicture, base_panel, system_panel
+from dt_viz.pictures.panels import ARROW_SPACING, Fit, PanelPicture, base_panel, long_enough, system_panel
 from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 
-ARROW_SPACING = 0.027
-"""Spacing of the generator's arrows, metres."""
-NEGLIGIBLE = 0.03
-"""Length of an arrow, relative to the largest, below which it is left out."""
 LINE_SPACING = 0.035
 """Spacing of the grid's lines in base space, metres."""
 TRIAL_STEP, COARSE_TRIAL_STEP = 0.004, 0.012
@@ -160,8 +156,7 @@ class Sketchbook:
             assert isinstance(flow, Flow)
             total += flow.duration * flow.field(u)
         displacements = task.scale * (total / len(chosen)) @ task.axes[:, :k].T
-        size = np.linalg.norm(displacements, axis=1)
-        seen = size > NEGLIGIBLE * size.max(initial=0.0)
+        seen = long_enough(displacements)
         return GeneratorPicture(points[seen], displacements[seen], tuple(motions), len(flows))
 
     def grid(self, area: Slice, behaviours: Sequence[Diffeomorphism], *, coarse: bool) -> GridPicture:

@@ -99,3 +99,4 @@ class Panels(Picture):
             nodes.frame.visible = k < len(panels)
             if k < len(panels):
                 nodes.draw(panels[k], frame.task.camera)
+                nodes.rollouts.colour = palette.STALE if frame.blocked else palette.ROLLOUT
