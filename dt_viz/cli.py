@@ -121,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
     parser.add_argument(
-        "--max-sessions", type=_positive, default=8, help="visitors at a time, each with a scene (default: %(default)s)"
+        "--max-sessions", type=_positive, default=8, help="visitors at a time; others wait (default: %(default)s)"
     )
     parser.add_argument(
         "--allow-origin",

@@ -186,17 +186,16 @@ class Page:
 
     def busy(self, **view: Any) -> Scenario:
         """A scenario in which most controls are shown, and most things stand in the scene."""
-        task = TASKS["draw_s"]()
         obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
         avoidance = {"space": "cspace", "duration": 0.5, "integration": Integration("rk4", 8)}
         layers = biases(BiasPoint(MIDDLE, radius=0.1, strength=0.5))
         self.session.edit(
             "test",
+            task="draw_s",
             **changing(self.session.scenario, obstacles=obstacles, layers=layers, **avoidance),
             starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
             view=View(generator=True, click_to_start=True, handles=True, **view),
         )
-        assert task.name == "draw_s"
         return self.session.scenario
 
 

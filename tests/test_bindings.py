@@ -90,12 +90,16 @@ def test_an_edit_leaves_alone_what_a_browser_has_moved_meanwhile(server, sent):
     bound.adopt(SCENARIO)
     slider._impl.value = 0.3  # by a browser, whose edit comes next
     sent.clear()
+
+    def told():  # a page of another test may not be done with its own
+        return [m for m in sent if isinstance(m, messages.GuiUpdateMessage) and m.uuid == slider._impl.uuid]
+
     bound.edited.edit("view", view=View(grid=True))
-    assert slider.value == 0.3 and not sent
+    assert slider.value == 0.3 and not told()
     bound.edited.edit("Warp", warp=0.3)
-    assert slider.value == 0.3 and not sent
+    assert slider.value == 0.3 and not told()
     bound.edited.edit("Warp", warp=0.5)
-    assert slider.value == 0.5 and len(sent) == 1
+    assert slider.value == 0.5 and len(told()) == 1
     slider._impl.value = 0.9  # in vain
     bound.restore()
     assert slider.value == 0.5

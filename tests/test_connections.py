@@ -204,16 +204,24 @@ async def test_there_are_only_so_many_connections(url, server):
 
 
 @asynchronous
-async def test_who_waits_is_told_that_all_places_are_taken(url, server):
+async def test_who_waits_is_told_so_and_has_the_next_place_that_is_free(url, server):
+    def waits(client):
+        return any("places are taken" in str(control) for control in client.controls.values())
+
     async with AsyncExitStack() as stack:
-        for _ in range(NUM_PLACES):
-            await (await stack.enter_async_context(Client(url))).look()
+        seated, waiting = ([Client(url) for _ in range(number)] for number in (NUM_PLACES, 3))
+        for client in seated:
+            await (await stack.enter_async_context(client)).look()
         await come_true(lambda: len(server.visitors) == NUM_PLACES)
-        async with Client(url) as client:
-            await client.look()
-            assert await client.wait_for(
-                lambda: any("places are taken" in str(control) for control in client.controls.values()), PATIENCE
-            )
+        for client in waiting:
+            await (await stack.enter_async_context(client)).look()
+            assert await client.wait_for(lambda c=client: waits(c), PATIENCE)
+        gone, first, last = waiting
+        await gone.__aexit__(None, None, None)
+        await come_true(lambda: len(server._server.get_clients()) == NUM_PLACES + 2)
+        await seated[0].__aexit__(None, None, None)
+        assert await first.wait_for(lambda: first.has_picture, PATIENCE)
+        assert not waits(first) and waits(last) and len(server.visitors) == NUM_PLACES
 
 
 @asynchronous

@@ -219,6 +219,26 @@ def test_what_is_dragged_in_the_scene_moves_and_what_is_far_away_stays(page):
     assert page.session.scenario == after
 
 
+DRAGGED = {
+    "/obstacles/0/surface": lambda scenario: scenario.obstacles[0].position,
+    "/bias/0/ball": lambda scenario: next(filter(None, (layer.transform.anchor for layer in scenario.stack))),
+    "/starts/1": lambda scenario: scenario.starts[1],
+}
+"""Where things stand, by the name of what is dragged in the scene."""
+
+
+@pytest.mark.parametrize("name", DRAGGED)
+@pytest.mark.parametrize("lag", [0, 1, 4])
+def test_what_is_dragged_is_under_the_pointer_however_late_the_browser_sees_it_move(page, name, lag):
+    began = np.array(DRAGGED[name](page.busy()))
+    seen = [began] * (lag + 1)
+    phases = ["start", *["update"] * 4, "end"]
+    for phase, shift in zip(phases, np.linspace(0.0, 1.0, len(phases))[:, None] * (0.05, 0.0, 0.03), strict=True):
+        page.drag(name, tuple(seen[-1 - lag]), tuple(began + shift), phase)
+        seen.append(np.array(DRAGGED[name](page.session.scenario)))
+        np.testing.assert_allclose(seen[-1] - began, shift, atol=1e-9)
+
+
 @pytest.mark.parametrize("phase", ["start", "update", "end", "again", None])
 @pytest.mark.parametrize("place", PLACES, ids=repr)
 def test_what_is_dragged_in_the_scene_goes_nowhere_that_is_no_place(page, place, phase):

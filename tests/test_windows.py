@@ -28,6 +28,11 @@ from dt_viz.ui.server import Server
 
 SIZES = [(1280, 720), (1920, 1080), (390, 844), (844, 390)]
 
+NEAR = 8.0
+"""Accepted distance of what is dragged from the finger, pixels."""
+LATE = 5.0
+"""Time that the events of a drag may take, seconds."""
+
 pytestmark = [pytest.mark.browser, needs_chromium]
 
 BOX = """element => {
@@ -168,20 +173,30 @@ def test_a_touch_drags_the_sphere(visit):
     home, _ = camera_for(TASKS["draw_s"](), camera)
     grabbed = replace(session.scenario, view=replace(LIGHT, handles=False))
     (before,) = grabbed.obstacles
-    x, y, shift = 0.0, 0.0, np.zeros(3)
+    drag = np.array([30.0, -20.0])
+
+    def shift():
+        return np.subtract(session.scenario.obstacles[0].position, before.position)
+
+    def missed():
+        """How far from where it was dragged to the sphere is seen, pixels."""
+        return np.abs(project(visitor, before.position + shift()) - begun - drag).max()
+
     for _ in range(TRIES):  # a page drawn by software may not show the sphere in its place yet
         begin(visitor, grabbed)
         visitor._tripod.view()
         wait_until(lambda: np.abs(camera.position - home).max() < 1e-3, "the camera to be back")
         until_drawn(visitor)
-        x, y = project(visitor, before.position)
-        touch(page, (x, y), (x + 30, y - 20))
-        time.sleep(0.2)  # viser holds the last event back for a moment
-        until_drawn(visitor)
-        shift = np.subtract(session.scenario.obstacles[0].position, before.position)
-        if np.linalg.norm(shift) > 0.02:
+        begun = np.array(project(visitor, before.position))
+        touch(page, begun, begun + drag)
+        deadline = time.monotonic() + LATE
+        while missed() > NEAR and time.monotonic() < deadline:
+            time.sleep(0.1)
+        if missed() < NEAR:
             break
-    assert shift[0] > 0.01 and shift[2] > 0.01 and abs(shift[1]) < 1e-6  # to the right and up, in the drawing plane
-    np.testing.assert_allclose(project(visitor, before.position + shift), (x + 30, y - 20), atol=15)
+    time.sleep(0.3)  # nor does anything of the drag come later that moves it on
+    until_drawn(visitor)
+    x, y, z = shift()
+    assert missed() < NEAR and x > 0.01 and z > 0.01 and abs(y) < 1e-6  # to the right and up, in the drawing plane
     assert np.abs(camera.position - home).max() < 1e-3
     assert session.wait_idle(PATIENCE)

@@ -51,7 +51,7 @@ class Drag:
     """One of `PHASES`."""
     camera: Array
     grabbed: Array
-    """Grabbed point, which moves with the thing."""
+    """Grabbed point, which moves with the thing in the browser: after the start it may lag behind the server."""
     pointer: Array
     """Pointer, on the plane through the grabbed point that faces the camera."""
 

@@ -24,7 +24,7 @@ from dt_viz.ui.visitor import NOTICE_SECONDS, Visitor
 logger = logging.getLogger(__name__)
 
 MAX_WAITING = 8
-"""Number of connections beyond the visitors that are told that all places are taken; any more are refused."""
+"""Number of connections beyond the visitors that wait for a place; any more are refused."""
 
 MAX_SLEEP = 0.5
 """Longest sleep of the main thread, seconds. Only this thread runs signal handlers, and a signal that arrives just
@@ -62,7 +62,7 @@ class Server:
             task: first task of each visitor.
             host: address to listen on.
             port: port to listen on; 0 takes any free one.
-            max_sessions: largest number of visitors; further ones are told to wait.
+            max_sessions: largest number of visitors; further ones wait until one leaves.
             allowed: origins of other pages that may connect; see `Origins`.
 
         Raises:
@@ -77,6 +77,8 @@ class Server:
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
         """Those with a page, and None for those whose page is being built."""
+        self._waiting: dict[int, tuple[viser.ClientHandle, viser.GuiMarkdownHandle | None]] = {}
+        """Those who wait for a place, in the order in which they came, and what their page says meanwhile."""
         self._num_building = 0
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
@@ -96,6 +98,13 @@ class Server:
     def visitors(self) -> tuple[Visitor, ...]:
         """Visitors with a page of their own."""
         return tuple(visitor for visitor in self._visitors.values() if visitor is not None)
+
+    @property
+    def _full(self) -> str:
+        return (
+            f"**All {self._max_sessions} places are taken.** This page opens by itself when a place is free: close "
+            "another tab of this demo, or wait. Whoever runs the server can allow more with `--max-sessions`."
+        )
 
     def wait(self) -> NoReturn:
         """Serve until a signal handler raises an exception."""
@@ -118,17 +127,21 @@ class Server:
         with self._lock:
             if self._closed or client.client_id not in self._server.get_clients():
                 return  # left before its turn came
-            full = len(self._visitors) >= self._max_sessions
-            if not full:
-                self._visitors[client.client_id] = None  # a place is taken before the page is built
-                self._num_building += 1
-        if full:
-            client.gui.add_markdown(
-                f"**All {self._max_sessions} places are taken.** Close another tab of this demo, or reload in a while. "
-                "Whoever runs the server can allow more with `--max-sessions`."
-            )
-            return
+            said = client.gui.add_markdown(self._full) if len(self._visitors) >= self._max_sessions else None
+            self._waiting[client.client_id] = client, said
+        self._admit()
+
+    def _admit(self) -> None:
+        """Build the page of the visitor who has waited longest, if there is a place."""
+        with self._lock:
+            if self._closed or not self._waiting or len(self._visitors) >= self._max_sessions:
+                return
+            client, said = self._waiting.pop(next(iter(self._waiting)))
+            self._visitors[client.client_id] = None  # a place is taken before the page is built
+            self._num_building += 1
         try:
+            if said is not None:
+                said.remove()
             self._build_page(client)
         finally:
             with self._lock:
@@ -153,8 +166,10 @@ class Server:
     def _farewell(self, client: viser.ClientHandle) -> None:
         with self._lock:
             visitor = self._visitors.pop(client.client_id, None)
+            self._waiting.pop(client.client_id, None)
         if visitor is not None:
             visitor.close()
+        self._admit()
 
 
 def _refuse(client: viser.ClientHandle, text: str) -> None:

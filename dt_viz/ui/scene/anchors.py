@@ -15,6 +15,7 @@ import viser.transforms
 from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import anchored, selected
 from dt_viz.transforms.base import Transform, axes_of
 from dt_viz.transforms.registry import KINDS
@@ -47,7 +48,7 @@ class AnchorPicture:
         number: int,
         moved: Moved,
         selected: Callable[[str], None],
-        along: Callable[[Drag], Array],
+        area: Callable[[], Slice | None],
     ) -> None:
         """Hidden until `adopt` gives it a transform.
 
@@ -56,7 +57,7 @@ class AnchorPicture:
             number: number of this picture, from 0.
             moved: called with each new position.
             selected: called when it is clicked or grabbed.
-            along: returns the shift (3,) by an event of a drag, metres.
+            area: returns the slice that it is dragged parallel to.
         """
         self.name = ""
         """Name of the transform."""
@@ -89,7 +90,7 @@ class AnchorPicture:
         def dragged(drag: Drag) -> None:
             if drag.phase == "start":
                 selected(self.name)
-            self.handles.drag(drag, along(drag), put)
+            self.handles.drag(drag, area(), put)
 
         self.handles.on_move(put)
         gestures.on_drag(self.ball, dragged)
@@ -139,7 +140,7 @@ class Anchors(Dragged):
         """Begin with none; see `AnchorPicture`."""
         super().__init__(scene.add_frame("/bias", show_axes=False))
         self._transforms: Mapping[str, Transform] = {}
-        self.items = tuple(AnchorPicture(scene, k, moved, selected, self.along) for k in range(MAX_ANCHORS))
+        self.items = tuple(AnchorPicture(scene, k, moved, selected, self.area) for k in range(MAX_ANCHORS))
 
     @property
     def handles(self) -> Iterable[Handles]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import numpy as np
 import viser
 
 from dt_viz.arm.robot import Robot
@@ -15,7 +14,7 @@ from dt_viz.scenario.slices import Slice
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.handles import in_slice
+from dt_viz.ui.scene.handles import Pull
 
 RADIUS = 0.016
 """Radius of the ball, metres: easy to hit, hardly wider than the fingers."""
@@ -57,18 +56,11 @@ class Grip:
         )
         self.ball.visible, self._said = False, ""
         self._slice: Slice | None = None
-        self._grabbed, self._offset, self._place = np.zeros(3), np.zeros(3), np.zeros(3)
+        pull = Pull()
 
         def dragged(drag: Drag) -> None:
-            if drag.phase == "start":
-                self._grabbed, hand = drag.grabbed, where()
-                self._offset = np.zeros(3) if hand is None else hand - self._grabbed
-                self._place = self._grabbed + self._offset
-            shift = in_slice(self._slice, drag.camera, self._grabbed, drag.pointer)
-            place = gestures.place(self._grabbed + self._offset + shift)
-            if place is not None:
-                self._place = place
-            held(self._place, drag.phase)
+            hand = where()
+            held(pull.place(drag, drag.grabbed if hand is None else hand, self._slice), drag.phase)
 
         gestures.on_drag(self.ball, dragged)
 

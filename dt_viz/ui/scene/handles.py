@@ -32,6 +32,7 @@ class Handles:
         """Begin hidden; `scale` is the size of the handles, metres."""
         self.gizmo, self.scale = gizmo, scale
         self._position, self._wxyz = np.array(gizmo.position), np.array(gizmo.wxyz)
+        self._pull = Pull()
         self._wanted = False
         self._refused = False
         """Whether the current drag has left the permitted space."""
@@ -85,11 +86,9 @@ class Handles:
             self._position, self._wxyz = position, wxyz
             moved(position.copy(), wxyz.copy(), event.phase)
 
-    def drag(self, drag: Drag, shift: Array, moved: Moved) -> None:
-        """Move them by `shift` (3,), metres, for an event of a drag, if that is permitted, and call `moved`."""
-        place = gestures.place(self._position + shift)
-        if place is not None:
-            self.stand(place, self._wxyz)
+    def drag(self, drag: Drag, area: Slice | None, moved: Moved) -> None:
+        """Move them parallel to a slice by an event of a drag of what they move, and call `moved`."""
+        self.stand(self._pull.place(drag, self._position, area), self._wxyz)
         moved(self.position, self._wxyz.copy(), drag.phase)
 
     @property
@@ -103,6 +102,36 @@ class Handles:
 
     def _show(self, shown: bool) -> None:
         self.gizmo.scale, self.gizmo.opacity = (self.scale, 1.0) if shown else (HIDDEN, 0.0)
+
+
+class Pull:
+    """A drag of something parallel to the slice.
+
+    What the pointer has moved since the drag began is added to where the thing stood then. A shift added at each event
+    would be added twice where the next event leaves the browser before the moved thing reaches it.
+    """
+
+    def __init__(self) -> None:
+        self._grabbed: Array | None = None
+        """Point that was grabbed; None while nothing is dragged."""
+        self._stood = self._place = np.zeros(3)
+
+    def place(self, drag: Drag, stands: Array, area: Slice | None) -> Array:
+        """Return the place (3,), metres, that an event drags a thing to; its last one if that is not permitted.
+
+        Args:
+            drag: the event.
+            stands: (3,), where the thing stands, metres; read when a drag begins.
+            area: slice that the thing is dragged parallel to; without one it moves across the line of sight.
+        """
+        if drag.phase == "start" or self._grabbed is None:
+            self._grabbed, self._stood, self._place = drag.grabbed, np.array(stands), np.array(stands)
+        place = gestures.place(self._stood + in_slice(area, drag.camera, self._grabbed, drag.pointer))
+        if place is not None:
+            self._place = place
+        if drag.phase == "end":
+            self._grabbed = None
+        return self._place.copy()
 
 
 class Dragged(Picture):
@@ -129,9 +158,9 @@ class Dragged(Picture):
                 stack.enter_context(handles.hidden())
             yield
 
-    def along(self, drag: Drag) -> Array:
-        """Return the shift (3,) of the grabbed point by an event, metres."""
-        return in_slice(self._slice, drag.camera, drag.grabbed, drag.pointer)
+    def area(self) -> Slice | None:
+        """Return the slice that they are dragged parallel to; None before a picture is drawn."""
+        return self._slice
 
 
 def in_slice(area: Slice | None, camera: Array, grabbed: Array, pointer: Array) -> Array:

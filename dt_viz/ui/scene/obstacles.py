@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Sphere
 from dt_viz.scenario.scenario import MAX_DIAMETER, Scenario
+from dt_viz.scenario.slices import Slice
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene import palette
@@ -45,7 +46,7 @@ class ObstaclePicture:
         moved: Moved,
         grabbed: Callable[[int], None],
         clicked: Callable[[int], None],
-        along: Callable[[Drag], Array],
+        area: Callable[[], Slice | None],
     ) -> None:
         """Draw nothing yet.
 
@@ -55,7 +56,7 @@ class ObstaclePicture:
             moved: called with each new pose.
             grabbed: called with the index when a drag of the obstacle begins.
             clicked: called with the index when it is clicked.
-            along: returns the shift (3,) by an event of a drag, metres.
+            area: returns the slice that it is dragged parallel to.
         """
         self.gizmo = scene.add_transform_controls(f"/obstacles/{index}", line_width=3.0, depth_test=False)
         self.handles = Handles(self.gizmo, HANDLE_SCALE)
@@ -71,7 +72,7 @@ class ObstaclePicture:
         def dragged(drag: Drag) -> None:
             if drag.phase == "start":
                 grabbed(index)
-            self.handles.drag(drag, along(drag), partial(moved, index))
+            self.handles.drag(drag, area(), partial(moved, index))
 
         self.handles.on_move(partial(moved, index))
         gestures.on_drag(self.mesh, dragged)
@@ -135,7 +136,7 @@ class Obstacles(Dragged):
         while len(self.items) < len(scenario.obstacles):
             index = len(self.items)
             told = self._moved, self._grabbed, self._clicked
-            self.items.append(ObstaclePicture(self._scene, index, *told, self.along))
+            self.items.append(ObstaclePicture(self._scene, index, *told, self.area))
         handled = scenario.selected if scenario.view.handles and not scenario.view.move_slice else None
         for index, (item, obstacle) in enumerate(zip(self.items, scenario.obstacles, strict=True)):
             item.adopt(

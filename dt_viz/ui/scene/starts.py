@@ -16,7 +16,7 @@ from dt_viz.scenario.starts import struck
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Clicks, Drag
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.handles import in_slice
+from dt_viz.ui.scene.handles import Pull
 from dt_viz.ui.scene.picture import Picture
 
 RADIUS = 0.010
@@ -56,13 +56,10 @@ class StartBall:
             anchor="bottom-center",
             font_screen_scale=0.6,
         )
-        self._grabbed, self._from = np.zeros(3), np.zeros(3)
+        pull = Pull()
 
         def dragged(drag: Drag) -> None:
-            if drag.phase == "start":
-                self._grabbed, self._from = drag.grabbed, np.array(self.ball.position)
-            place = gestures.place(self._from + in_slice(area(), drag.camera, self._grabbed, drag.pointer))
-            moved(index, np.array(self.ball.position) if place is None else place, drag.phase)
+            moved(index, pull.place(drag, np.array(self.ball.position), area()), drag.phase)
 
         gestures.on_drag(self.ball, dragged)
         gestures.on_click(self.ball, partial(chosen, index))
