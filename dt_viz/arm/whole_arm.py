@@ -42,6 +42,8 @@ from dt_viz.transforms.base import ArmAvoidance
 
 NUM_CONFIGURATIONS = 100
 """Samples of each rollout before refinement."""
+NUM_COARSE = 50
+"""The same for coarse motions."""
 MAX_DURATION = 2.0
 """Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
 SNAPSHOT = 0.1
@@ -69,6 +71,9 @@ NUM_EXTENDED_FOR = 40
 """Number of samples, those that lack most, that this time is chosen for."""
 COARSE_STEP = 0.2
 """Length of a coarse RK4 step, in flow time: off by a tenth of a millimetre at the hand, about."""
+COARSE_SPACING = 0.03
+"""Largest distance, metres at the hand, about, between samples that are integrated in coarse motions; samples between
+them are interpolated, which is off by a tenth of a millimetre, about, too."""
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
@@ -395,7 +400,7 @@ class _Solver:
         self._avoidance = avoidance
         self._generator = generator
         self._spacing = spacing
-        self._coarse = coarse
+        self._coarse = coarse and generator is not None
         self._room = arm.clearance(lifted.pins, avoidance.obstacle) - ROUNDING
 
     def solution(self) -> ArmSolution:
@@ -463,7 +468,8 @@ class _Solver:
 
     def _sampled(self, transform: Diffeomorphism) -> Bundle:
         num_rollouts, num_samples = self._lifted.fractions.shape
-        index, fraction = np.repeat(np.arange(num_rollouts), num_samples), self._lifted.fractions.ravel()
+        first = np.linspace(0, num_samples - 1, NUM_COARSE if self._coarse else num_samples).round().astype(int)
+        index, fraction = np.repeat(np.arange(num_rollouts), len(first)), self._lifted.fractions[:, first].ravel()
         return self._refined(Bundle(index, fraction, self._evaluate(transform, index, fraction)), transform)
 
     def _transform(self, duration: float) -> Diffeomorphism:
@@ -484,7 +490,21 @@ class _Solver:
         return (transform.inverse(q) * LEVERS)[:, None]
 
     def _refined(self, bundle: Bundle, transform: Diffeomorphism) -> Bundle:
-        return refined(bundle, lambda i, u: self._evaluate(transform, i, u), self._spacing)
+        def integrated(index: Indices, fraction: Array) -> Array:
+            return self._evaluate(transform, index, fraction)
+
+        if not self._coarse:
+            return refined(bundle, integrated, self._spacing)
+        bundle = refined(bundle, integrated, COARSE_SPACING)
+        splines = [
+            CubicSpline(u, levels)
+            for u, levels in zip(bundle.split(bundle.fraction), bundle.split(bundle.levels), strict=True)
+        ]
+
+        def interpolated(index: Indices, fraction: Array) -> Array:
+            return np.concatenate([splines[k](fraction[index == k]) for k in np.unique(index)])
+
+        return refined(bundle, interpolated, self._spacing)
 
     def _lack(self, p: Array) -> Array:
         """(N,) metres by which the spheres at configurations (N, 6) miss the clearance that is asked for."""
