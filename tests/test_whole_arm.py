@@ -202,6 +202,30 @@ def test_with_nothing_near_the_arm_moves_undisturbed(case):
     np.testing.assert_allclose(far.p, far.q, rtol=0, atol=1e-13)
 
 
+def off_the_flow(case, obstacle):
+    """How far coarse motions are from where their own transform takes the undisturbed ones, metres at the hand."""
+    coarse = case.arm.avoiding(
+        case.lifted, changed(case.scenario, obstacles=obstacle).arm_avoidance, LIVE.spacing, coarse=True
+    )
+    exact = coarse.transform.inverse(case.arm.limits.inside(coarse.q))
+    hand = case.robot.end_effector
+    return np.linalg.norm(hand(coarse.p) - hand(exact), axis=1).max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_between_the_integrated_ones_are_on_the_flow_too(case, seed):
+    rng = np.random.default_rng(seed)
+    at = as_point(case.middle.position + rng.uniform(-0.04, 0.04, 3))
+    obstacle = Sphere(at, rng.uniform(0.08, 0.2)) if seed else Box(at, rng.uniform(0.06, 0.16, 3))
+    assert off_the_flow(case, obstacle) < 1e-3
+
+
+def test_too_few_integrated_ones_would_be_noticed(case, monkeypatch):
+    monkeypatch.setattr(whole_arm, "NUM_COARSE", 12)
+    monkeypatch.setattr(whole_arm, "COARSE_SPACING", 1.0)
+    assert off_the_flow(case, case.middle) > 1e-3
+
+
 @pytest.mark.parametrize("duration", [None, 0.05])
 def test_the_gradient_of_the_paper_is_there_to_be_compared(case, duration):
     solution = case.avoiding(generator="probability", coarse=True, duration=duration)
