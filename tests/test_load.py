@@ -98,7 +98,7 @@ def test_visitors_who_look_on_cost_something(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
     monkeypatch.setattr(load, "SETTLED", 0.0)
     out = tmp_path / "rest.json"
-    assert main(["load", "--rest", "--clients", "1", "--seconds", "1", "--out", str(out)]) == 0
+    assert main(["load", "--rest", "--clients", "1", "--seconds", "3", "--out", str(out)]) == 0
     figures = json.loads(out.read_text())
     assert 0 < figures["core_percent"] < 400 and figures["messages_per_s"] > 1
     assert f"{figures['core_percent']:.1f} % of a core" in capsys.readouterr().out

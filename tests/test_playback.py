@@ -111,7 +111,7 @@ def test_nothing_moves_before_it_begins():
     playback = Playback(cast(Any, arm), drawn.set, lambda error: pytest.fail(str(error)))
     assert not drawn.wait(0.2) and arm.asked == []
     playback.begin()
-    assert drawn.wait(10)
+    assert drawn.wait(PATIENCE)
     playback.close()
 
 

@@ -390,7 +390,7 @@ def test_a_session_that_closes_ends_what_it_computes_for_a_hand(opened, stage):
     opened.edit("obstacle", obstacles=(at(2.0),))
     assert not opened.session.wait_idle(0.2)  # a newer edit ends nothing that follows a hand
     opened.session.close()
-    opened.session._worker._thread.join(5.0)
+    opened.session._worker._thread.join(PATIENCE)
     assert not opened.session._worker._thread.is_alive()
     assert opened.page.errors == []
 
@@ -479,7 +479,7 @@ def test_a_closed_session_computes_nothing_more(opened):
     opened.session.close()
     asked = len(opened.engine.asked)
     opened.edit("obstacle", obstacles=(at(1.0),))
-    assert opened.session.wait_idle(1.0)
+    assert opened.session.wait_idle(PATIENCE)
     assert len(opened.engine.asked) == asked
 
 
