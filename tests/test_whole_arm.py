@@ -220,6 +220,17 @@ def test_samples_between_the_integrated_ones_are_on_the_flow_too(case, seed):
     assert off_the_flow(case, obstacle) < 1e-3
 
 
+def test_samples_between_the_integrated_ones_keep_the_joint_limits(engine, robot, initial):
+    """A large sphere that presses joints against them: splines of the angles themselves would go beyond."""
+    sphere = Sphere((0.0288, -0.5498, 0.3220), 0.2373)
+    frames = list(engine.frames(changed(initial("lift_box"), space="cspace", obstacles=sphere)))
+    for frame in frames:
+        for path in frame.rollouts:
+            assert np.isfinite(path).all()
+    solution = engine.solved(frames[-1].scenario, LIVE).arm
+    assert (solution.p > robot.lower).all() and (solution.p < robot.upper).all()
+
+
 def test_too_few_integrated_ones_would_be_noticed(case, monkeypatch):
     monkeypatch.setattr(whole_arm, "NUM_COARSE", 12)
     monkeypatch.setattr(whole_arm, "COARSE_SPACING", 1.0)

@@ -496,13 +496,15 @@ class _Solver:
         if not self._coarse:
             return refined(bundle, integrated, self._spacing)
         bundle = refined(bundle, integrated, COARSE_SPACING)
+        limits = self._arm.limits
+        unbounded = limits.forward(bundle.positions / LEVERS)  # where the flow acts: what lies between keeps the limits
         splines = [
-            CubicSpline(u, levels)
-            for u, levels in zip(bundle.split(bundle.fraction), bundle.split(bundle.levels), strict=True)
+            CubicSpline(u, part) for u, part in zip(bundle.split(bundle.fraction), bundle.split(unbounded), strict=True)
         ]
 
         def interpolated(index: Indices, fraction: Array) -> Array:
-            return np.concatenate([splines[k](fraction[index == k]) for k in np.unique(index)])
+            between = np.concatenate([splines[k](fraction[index == k]) for k in np.unique(index)])
+            return (limits.inverse(between) * LEVERS)[:, None]
 
         return refined(bundle, interpolated, self._spacing)
 
