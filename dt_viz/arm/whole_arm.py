@@ -74,6 +74,10 @@ COARSE_STEP = 0.2
 COARSE_SPACING = 0.03
 """Largest distance, metres at the hand, about, between samples that are integrated in coarse motions; samples between
 them are interpolated, which is off by a tenth of a millimetre, about, too."""
+NEAREST = 5e-6
+"""Smallest distance from a joint limit, rad, of the postures interpolated between: rounding may put them on it."""
+BULGE = 0.5
+"""Largest distance of an interpolated posture from the line between its neighbours, relative to their distance."""
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
@@ -497,13 +501,14 @@ class _Solver:
             return refined(bundle, integrated, self._spacing)
         bundle = refined(bundle, integrated, COARSE_SPACING)
         limits = self._arm.limits
-        unbounded = limits.forward(bundle.positions / LEVERS)  # where the flow acts: what lies between keeps the limits
-        splines = [
-            CubicSpline(u, part) for u, part in zip(bundle.split(bundle.fraction), bundle.split(unbounded), strict=True)
+        p = np.clip(bundle.positions / LEVERS, limits.lower + NEAREST, limits.upper - NEAREST)
+        unbounded = limits.forward(p)  # where the flow acts, so that what lies between keeps the limits
+        curves = [
+            _interpolant(u, q) for u, q in zip(bundle.split(bundle.fraction), bundle.split(unbounded), strict=True)
         ]
 
         def interpolated(index: Indices, fraction: Array) -> Array:
-            between = np.concatenate([splines[k](fraction[index == k]) for k in np.unique(index)])
+            between = np.concatenate([curves[k](fraction[index == k]) for k in np.unique(index)])
             return (limits.inverse(between) * LEVERS)[:, None]
 
         return refined(bundle, interpolated, self._spacing)
@@ -566,6 +571,25 @@ class _Solver:
             if not len(state):
                 break
         return float(duration)
+
+
+def _interpolant(fraction: Array, q: Array) -> Callable[[Array], Array]:
+    """A spline through the samples q (T, 6) of a rollout at fractions (T,), not far from the lines between them.
+
+    Where the flow stretches the rollout without limit, fractions are so uneven that a spline alone leaves them.
+    """
+    spline, steps = CubicSpline(fraction, q), np.diff(q, axis=0)
+    most = BULGE * np.linalg.norm(steps, axis=1)
+
+    def at(u: Array) -> Array:
+        before = np.searchsorted(fraction, u, side="right").clip(1, len(steps)) - 1
+        part = (u - fraction[before]) / (fraction[before + 1] - fraction[before])
+        line = q[before] + part[:, None] * steps[before]
+        bulge = spline(u) - line
+        size = np.maximum(np.linalg.norm(bulge, axis=1), np.finfo(float).tiny)
+        return line + np.minimum(1, most[before] / size)[:, None] * bulge
+
+    return at
 
 
 def _crossing(before: Array, after: Array) -> float:
