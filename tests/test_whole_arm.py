@@ -216,7 +216,7 @@ def off_the_flow(case, obstacle):
 def test_samples_between_the_integrated_ones_are_on_the_flow_too(case, seed):
     rng = np.random.default_rng(seed)
     at = as_point(case.middle.position + rng.uniform(-0.04, 0.04, 3))
-    obstacle = Sphere(at, rng.uniform(0.08, 0.2)) if seed else Box(at, rng.uniform(0.06, 0.16, 3))
+    obstacle = Sphere(at, rng.uniform(0.08, 0.2)) if seed else Box(at, as_point(rng.uniform(0.06, 0.16, 3)))
     assert off_the_flow(case, obstacle) < 1e-3
 
 
