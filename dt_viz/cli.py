@@ -45,7 +45,7 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore, default_cache_folder  # noqa: PLC0415
     from dt_viz.obstacles.shapes import unit_sphere_map  # noqa: PLC0415
-    from dt_viz.scenario.tasks import TASKS, lasa_tasks  # noqa: PLC0415
+    from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
     from dt_viz.ui.gate import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
 
@@ -53,7 +53,7 @@ def _serve(options: argparse.Namespace) -> int:
     handler.addFilter(Terse())
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
     try:
-        tasks = {**TASKS, **(lasa_tasks(options.lasa) if options.lasa is not None else {})}
+        tasks = known_tasks(options.lasa)
         if options.task not in tasks:
             print(f"{PROG}: --task: found {options.task!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2

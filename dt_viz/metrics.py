@@ -97,6 +97,145 @@ def discrete_frechet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.sqrt(last[..., 0])
 
 
+def frechet(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-6) -> float:
+    """Return the Fréchet distance of two polylines, also between their points.
+
+    The least, over all ways of moving forward along both from their first to their last points, of the largest
+    distance met (Alt and Godau, 1995). Whether a distance ε suffices is decided exactly, in the free space: on the
+    borders of each cell (a segment of ``a`` × a segment of ``b``) lie intervals where the two are at most ε apart, and
+    those parts of them are passed on that a monotone way can reach. ε is then found by bisection between the discrete
+    distance and that less the longest segment.
+
+    Args:
+        a: shape ``(n, d)``; successive points may coincide.
+        b: shape ``(m, d)``.
+        tolerance: how far the result may be above the distance, in the unit of the points.
+    """
+    a, b = (path[np.concatenate([[True], (np.diff(path, axis=0) != 0).any(axis=1)])] for path in (a, b))
+    if min(len(a), len(b)) == 1:
+        return float(np.linalg.norm(a - b, axis=1).max())
+    longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) for path in (a, b))
+    high = float(discrete_frechet(a, b))
+    low = max(high - longest, *(float(np.linalg.norm(a[end] - b[end])) for end in (0, -1)))
+    left, bottom = _Borders(a, b), _Borders(b, a)
+    while high - low > tolerance:
+        middle = (low + high) / 2
+        if _passes(left.free(middle), bottom.free(middle)):
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+class _Borders:
+    """Borders of the cells of the free space on which a point of one path moves along a segment of the other."""
+
+    def __init__(self, path: np.ndarray, points: np.ndarray) -> None:
+        """Take the path (n, d) whose segments are moved along, no two successive points alike, and points (m, d)."""
+        step = np.diff(path, axis=0)
+        self._length = np.linalg.norm(step, axis=1)[:, None]
+        from_start = points[None] - path[:-1, None]
+        self._nearest = np.einsum("ikd,id->ik", from_start, step) / self._length**2  # (n − 1, m), in segments
+        beside = from_start - self._nearest[..., None] * step[:, None]
+        self._squared = np.square(beside).sum(axis=-1)
+
+    def free(self, distance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the ends (n − 1, m) of the free interval of each border, from 0 to 1; infinity to 0 if empty."""
+        squared = distance**2 - self._squared
+        half = np.sqrt(np.maximum(squared, 0)) / self._length
+        low, high = np.maximum(self._nearest - half, 0.0), np.minimum(self._nearest + half, 1.0)
+        empty = (squared < 0) | (low > high)
+        return np.where(empty, np.inf, low), np.where(empty, 0.0, high)
+
+
+def _passes(left: tuple[np.ndarray, np.ndarray], bottom: tuple[np.ndarray, np.ndarray]) -> bool:
+    """Decide whether a monotone way leads through the free space, from one corner to the other.
+
+    A cell passes on all of a free border that faces one which is not reached at a right angle; otherwise what lies
+    ahead of the first place reached on the border opposite. Cells of an anti-diagonal are computed at once.
+
+    Args:
+        left: free intervals (n − 1, m) on the left borders of the cells (i, j), and on the right ones of the last.
+        bottom: free intervals (m − 1, n) on the lower borders, by j and i.
+    """
+    rows, columns = left[0].shape[0], bottom[0].shape[0]
+    if left[0][0, 0] > 0 or left[1][-1, -1] < 1:
+        return False
+    # on diagonal k, cell i is (i, k − i): the borders behind it have j + 1 and i + 1
+    right_low, right_high = (_skewed(ends[:, 1:], fill) for ends, fill in zip(left, (np.inf, 0.0), strict=True))
+    top_low, top_high = (_skewed(ends.T[1:], fill) for ends, fill in zip(bottom, (np.inf, 0.0), strict=True))
+    # places first reached on the left and lower borders of the cells of a diagonal; along the first ones of all from 0
+    first_left = np.where(np.logical_and.accumulate(_whole(left, 0)), left[0][:, 0], np.inf)
+    first_bottom = np.where(np.logical_and.accumulate(_whole(bottom, 0)), bottom[0][:, 0], np.inf)
+    on_left, on_bottom = np.full(rows, np.inf), np.full(rows, np.inf)
+    on_left[0], on_bottom[0] = first_left[0], first_bottom[0]
+    for k in range(rows + columns - 1):
+        right = np.where(on_bottom < np.inf, right_low[k], np.maximum(right_low[k], on_left))
+        top = np.where(on_left < np.inf, top_low[k], np.maximum(top_low[k], on_bottom))
+        right[right > right_high[k]] = np.inf
+        top[top > top_high[k]] = np.inf
+        if k == rows + columns - 2:
+            return bool(right[-1] < np.inf or top[-1] < np.inf)
+        on_left, on_bottom = right, np.concatenate([[np.inf], top[:-1]])
+        if k + 1 < rows:
+            on_left[k + 1] = first_left[k + 1]
+        if k + 1 < columns:
+            on_bottom[0] = first_bottom[k + 1]
+        if not (on_left.min() < np.inf or on_bottom.min() < np.inf):
+            return False
+    return False
+
+
+def _whole(ends: tuple[np.ndarray, np.ndarray], column: int) -> np.ndarray:
+    """Return which borders (n,) of a column can be reached from the corner: all before are free, this at its start."""
+    low, high = ends[0][:, column], ends[1][:, column]
+    return (low <= 0) & np.concatenate([[True], high[:-1] >= 1])
+
+
+def _skewed(table: np.ndarray, fill: float) -> np.ndarray:
+    """Return a table (n, m) by its anti-diagonals, (n + m − 1, n): row k, column i is the entry (i, k − i)."""
+    n, m = table.shape
+    padded = np.full((n, n + m), fill)
+    padded[:, :m] = table
+    return np.ascontiguousarray(padded.ravel()[: n * (n + m - 1)].reshape(n, n + m - 1).T)
+
+
+def dynamic_time_warping(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the least sum of distances between matched points of two paths.
+
+    Matched are pairs on a way that steps forward along one path, the other, or both, from their first to their last
+    points: D(i, j) = ‖a_i − b_j‖ + min(D(i−1, j), D(i, j−1), D(i−1, j−1)) (Sakoe and Chiba, 1978). The sum grows with
+    the number of points.
+
+    Args:
+        a: shape ``(n, d)``.
+        b: shape ``(m, d)``.
+    """
+    distances = _skewed(np.linalg.norm(a[:, None] - b[None], axis=-1), np.inf)
+    before, last = np.full((2, len(a) + 1), np.inf)  # of the last two anti-diagonals; place i + 1 is row i
+    before[0] = 0.0
+    for distance in distances:
+        least = np.minimum(np.minimum(last[1:], last[:-1]), before[:-1])
+        before, last = last, np.concatenate([[np.inf], distance + least])
+    return float(last[-1])
+
+
+def rms_jerk(times: np.ndarray, points: np.ndarray, interval: float) -> float:
+    """Return the root mean square of the third derivative of a motion, by differences between even times.
+
+    Args:
+        times: shape ``(T,)``, not decreasing.
+        points: shape ``(T, d)``.
+        interval: time between the positions that are compared, in the unit of the times.
+
+    Returns:
+        Length per cubed time; 0 for a motion of less than three intervals.
+    """
+    at = np.arange(times[0], times[-1] + interval / 2, interval)
+    jerk = np.diff(interpolate(at, times, points), 3, axis=0) / interval**3
+    return float(np.sqrt(np.square(jerk).sum(axis=1).mean())) if len(jerk) else 0.0
+
+
 def rms_at_equal_times(
     times: np.ndarray, points: np.ndarray, reference_times: np.ndarray, reference_points: np.ndarray
 ) -> float:

@@ -55,13 +55,13 @@ def close_notices(page):
     page.locator("button.mantine-Notification-closeButton").evaluate_all("all => all.forEach(button => button.click())")
 
 
-def open_page(browser, server, size):
-    """A new tab, its width and height in pixels, and the visitor that the server made for it.
+def open_page(browser, server, size, ratio=1):
+    """A new tab, its width and height in CSS pixels, each of so many of its screen, and the visitor made for it.
 
     Its first scenario is drawn, without the arm.
     """
     known = set(server.visitors)
-    page = browser.new_page(viewport={"width": size[0], "height": size[1]}, has_touch=True)
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]}, has_touch=True, device_scale_factor=ratio)
     page.set_default_timeout(1000 * PATIENCE)
     page.on("console", lambda message: page_errors.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: page_errors.append(str(error)))

@@ -50,7 +50,10 @@ def echoes(request, monkeypatch):
 @pytest.mark.parametrize("name", ["/obstacles/2", "/bias/0", "/slice"])
 def test_a_gizmo_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, sent, echoes, name):
     page.session.edit(
-        "select", view=replace(page.session.scenario.view, selected=2, handles=True, move_slice=name == "/slice")
+        "select",
+        view=replace(
+            page.session.scenario.view, selected=2, handles=True, bias_handles=True, move_slice=name == "/slice"
+        ),
     )
     page.move(name, MIDDLE)
     before = page.session.scenario

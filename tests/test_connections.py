@@ -23,6 +23,7 @@ from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui import gate
 from dt_viz.ui.origins import Origin
+from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.server import MAX_WAITING, Server
 
 PART = 512 * 1024
@@ -487,3 +488,24 @@ def test_a_viser_with_other_messages_is_refused(monkeypatch):
     monkeypatch.delattr("viser._messages.SceneNodeDragMessage")
     with pytest.raises(gate.GateError, match=r"SceneNodeDragMessage.*; accepted: viser 1\.1"):
         gate.Gate(gate.Origins("127.0.0.1"), max_connections=1, max_upload=1, refused=lambda *_: None)
+
+
+@asynchronous
+async def test_a_browser_that_asks_for_the_picture_of_its_window_tells_its_width(server, url):
+    async with Client(url) as client:
+        await open_page(client)
+        (visitor,) = server.visitors
+        html = next(
+            control["content"] for control in client.controls.values() if "<picture" in control.get("content", "")
+        )
+
+        async def ask(path):
+            page = f"http://127.0.0.1:{server.port}{path}"
+            response = await asyncio.to_thread(urllib.request.urlopen, page)
+            return response.status, response.headers["Cache-Control"]
+
+        assert visitor.ruler.html == html
+        assert await ask(f"/window/{Ruler().token}/390") == (204, "no-store")
+        assert visitor._tripod.width is None
+        assert await ask(f"/window/{visitor.ruler.token}/390") == (204, "no-store")
+        assert visitor._tripod.width == 390

@@ -84,8 +84,20 @@ class TestAdmission:
         (reason,) = self.reasons(follower, nominal, around(nominal.goal, 0.15))
         assert reason.kind is Kind.GOAL_COVERED and "the arm there touches it" in reason.text
 
-    def test_what_fits_between_the_fingers_does_not_cover_the_goal(self, follower, nominal):
-        assert self.reasons(follower, nominal, around(nominal.goal, 0.04)) == ()
+    def test_what_fits_between_the_fingers_covers_the_goal_only_where_it_is_there(self, follower, nominal, robot):
+        """The end effector is a point of the arm, too: its way may not begin or end in an obstacle."""
+        ball, pins = around(nominal.goal, 0.02), follower.undisturbed(nominal).pins
+        assert load_collision_model().obstacle_distance(pins[-1:], ball)[0][0] > 0  # the fingers are beside it
+        (reason,) = self.reasons(follower, nominal, ball)
+        assert reason.kind is Kind.GOAL_COVERED
+        across = np.cross(robot.hand_direction(pins[-1]), [0.0, 1.0, 0.0])
+        beside = around(nominal.goal + 0.2 * across / np.linalg.norm(across), 0.02)
+        assert self.reasons(follower, nominal, beside) == ()
+
+    def test_a_start_between_the_fingers_is_left_out(self, follower, nominal):
+        ball = around(nominal.task.starts[2], 0.02)
+        assert load_collision_model().obstacle_distance(follower.undisturbed(nominal).pins[2:3], ball)[0][0] > 0
+        assert 2 in self.admission(follower, nominal, ball).nominal.left_out
 
     @pytest.mark.parametrize(("height", "name"), [(0.05, "base"), (0.2, "link 1")])
     def test_what_touches_the_pedestal_is_said_to(self, follower, nominal, height, name):

@@ -1,6 +1,7 @@
 """Measures of paths against slow, plain definitions, known values and the properties they must have."""
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from hypothesis.extra.numpy import arrays
 from dt_viz.metrics import (
     arc_length,
     discrete_frechet,
+    dynamic_time_warping,
+    frechet,
     maximum_collision_distance,
     resample_by_arc_length,
     rms_at_equal_times,
+    rms_jerk,
     sharpest_turn,
 )
 
@@ -35,6 +39,16 @@ def frechet_by_recursion(a, b):
         return max(distance[i, j], min(reached, default=0.0))
 
     return reach(len(a) - 1, len(b) - 1)
+
+
+def densely(path, spacing):
+    """Points of a path, its own among them, and how far apart they are at most."""
+    pieces = [path[:1]]
+    for a, b in pairwise(path):
+        num = max(1, int(np.ceil(np.linalg.norm(b - a) / spacing)))
+        pieces.append(a + (b - a) * np.linspace(0, 1, num + 1)[1:, None])
+    dense = np.concatenate(pieces)
+    return dense, float(np.linalg.norm(np.diff(dense, axis=0), axis=1).max(initial=0.0))
 
 
 def half_circle(radius=1.0, n=400):
@@ -136,6 +150,80 @@ class TestDiscreteFrechet:
         single = [[float(discrete_frechet(a[i, j], b[j])) for j in range(4)] for i in range(2)]
         np.testing.assert_array_equal(batch, single)
         np.testing.assert_array_equal(discrete_frechet(b[0], a)[1, 3], discrete_frechet(a[1, 3], b[0]))
+
+
+class TestFrechet:
+    @given(paths(2, 1, 6), paths(2, 1, 6))
+    def test_lies_below_the_discrete_distance_of_many_points_by_at_most_their_spacing(self, a, b):
+        dense, spacing = zip(*(densely(path, 0.25) for path in (a, b)), strict=True)
+        discrete = float(discrete_frechet(*dense))
+        assert discrete - max(spacing) - 1e-9 <= frechet(a, b) <= discrete + 1e-5
+
+    @pytest.mark.parametrize(("n", "m"), [(2, 40), (30, 3), (60, 45)])
+    def test_lies_there_on_long_walks_too(self, n, m):
+        rng = np.random.default_rng(n)
+        for _ in range(5):
+            a, b = rng.normal(size=(n, 3)).cumsum(axis=0), rng.normal(size=(m, 3)).cumsum(axis=0)
+            dense, spacing = zip(*(densely(path, 0.05) for path in (a, b)), strict=True)
+            discrete = float(discrete_frechet(*dense))
+            assert discrete - max(spacing) <= frechet(a, b) <= discrete + 1e-5
+
+    def test_needs_no_points_where_the_paths_are_near(self):
+        bent = np.array([[0.0, 0], [0.5, 0.1], [1, 0]])
+        assert frechet(bent, bent[[0, -1]]) == pytest.approx(0.1, abs=1e-5)
+        assert discrete_frechet(bent, bent[[0, -1]]) > 0.5
+
+    def test_waits_where_a_path_goes_back(self):
+        line, back = np.array([[0.0, 0], [4, 0]]), np.array([[0.0, 0], [3, 0], [1, 0], [4, 0]])
+        assert frechet(line, back) == pytest.approx(1.0, abs=1e-5)  # halfway between 1 and 3
+
+    def test_sees_the_direction_of_travel(self):
+        line = np.array([[0.0, 0], [1, 0]])
+        assert frechet(line, line[::-1]) == pytest.approx(1.0, abs=1e-5)
+
+    def test_from_one_place_is_the_largest_distance(self):
+        assert frechet(np.ones((4, 2)), np.array([[1.0, 1], [4, 5], [1, 2]])) == 5
+
+    @given(paths(2, 1), paths(2, 1))
+    def test_is_symmetric_and_sees_no_points_on_segments(self, a, b):
+        halved = np.insert(a, np.arange(1, len(a)), (a[1:] + a[:-1]) / 2, axis=0)
+        assert frechet(halved, b) == pytest.approx(frechet(b, a), abs=3e-6)
+
+    @given(paths(2), arrays(np.float64, 2, elements=COORDINATE))
+    def test_of_a_shifted_path_is_the_shift(self, path, shift):
+        assert frechet(path, path + shift) == pytest.approx(np.linalg.norm(shift), abs=2e-6)
+
+
+class TestDynamicTimeWarping:
+    @given(paths(2, 1, 8), paths(2, 1, 8))
+    def test_equals_the_recursion(self, a, b):
+        distance = np.linalg.norm(a[:, None] - b[None], axis=-1)
+
+        @cache
+        def reach(i, j):
+            before = [(i - 1, j), (i, j - 1), (i - 1, j - 1)]
+            reached = [reach(*cell) for cell in before if min(cell) >= 0]
+            return distance[i, j] + min(reached, default=0.0)
+
+        assert dynamic_time_warping(a, b) == pytest.approx(reach(len(a) - 1, len(b) - 1), abs=1e-9)
+
+    def test_waiting_costs_nothing(self):
+        a = half_circle(1.0, 20)
+        assert dynamic_time_warping(a, np.repeat(a, 3, axis=0)) == 0
+
+
+class TestRmsJerk:
+    def test_of_a_cubic_is_its_third_derivative(self):
+        t = np.linspace(0, 2, 401)
+        assert rms_jerk(t, np.stack([t**3, 0 * t], axis=1), 0.05) == pytest.approx(6.0)
+
+    def test_of_a_parabola_is_zero_and_of_a_corner_is_not(self):
+        t = np.linspace(0, 2, 401)
+        assert rms_jerk(t, (t**2)[:, None], 0.05) == pytest.approx(0, abs=1e-9)
+        assert rms_jerk(t, np.abs(t - 1)[:, None], 0.05) > 10
+
+    def test_of_a_motion_too_short_to_tell_is_zero(self):
+        assert rms_jerk(np.array([0.0, 0.1]), np.eye(2), 0.05) == 0
 
 
 class TestRmsAtEqualTimes:

@@ -1,6 +1,7 @@
 """The tripod: what moves a visitor's camera, and what does not."""
 
 import time
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from pages import CameraClient
 
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.ruler import STEP
 from dt_viz.ui.scene.camera import HOME, camera_for
 from dt_viz.ui.scene.tripod import MOVED, PAUSE, TURN, Tripod
 
@@ -46,6 +48,21 @@ def test_a_view_is_fitted_to_a_window_of_another_size_unless_the_visitor_has_mov
     assert is_at(client, (ELSEWHERE, np.zeros(3)))
     tripod.view(view)
     assert is_at(client, camera_for(TASK, client.camera, view, hand=HAND)) and not is_at(client, narrow, 0.01)
+
+
+def test_a_window_that_is_measured_before_the_camera_has_come_is_fitted_when_it_has(client, tripod):
+    client.camera.image_width, client.camera.image_height = 780, 1688
+    put = client.camera.position, client.camera.look_at
+    client.moves((3.0, 3.0, 3.0))  # where a page's camera is at first
+    tripod.width = 390
+    client.moves(*put)
+    size = tripod.window
+    assert 390 <= size[0] < 390 * STEP and size[1] / size[0] == pytest.approx(844 / 390, rel=0.01)
+    phone = SimpleNamespace(image_width=size[0], image_height=size[1])
+    assert is_at(client, camera_for(TASK, phone))
+    client.camera.image_width, client.camera.image_height = 585, 1266  # drawn coarser, to be as quick
+    client.moves(client.camera.position, client.camera.look_at)
+    assert is_at(client, camera_for(TASK, phone), 1e-2) and not is_at(client, camera_for(TASK, client.camera), 1e-2)
 
 
 def test_another_task_or_a_reset_begins_with_its_own_view(client, tripod):

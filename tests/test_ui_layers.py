@@ -21,13 +21,16 @@ from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
+from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.arm import PEDESTAL, SEEN, ArmPicture
 from dt_viz.ui.scene.arm_layers import NUM_ARMS, Arms, Onion, arms_along, evenly_along
 from dt_viz.ui.scene.legend import OCCUPANCY
 from dt_viz.ui.scene.links import CELL, bodies, light_shells, simplified
+from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.picture import Arrows, Lines
 from dt_viz.ui.scene.rollouts import Middles, Rollouts
 from dt_viz.ui.scene.scene import OF_A_MOTION, OF_A_TASK, ScenePictures
+from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.starts import Starts
 
 ROBOT = load_jaco()
@@ -193,12 +196,23 @@ def test_rollouts_of_another_scenario_are_grey_until_there_are_new_ones(scene):
     np.testing.assert_array_equal(colours(()), fresh)
 
 
-def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(engine, initial, scene):
+def scene_pictures(scene):
+    """Everything in a scene, of which nothing that is dragged tells anyone."""
+
     def ignored(*_what):
         pass
 
-    starts = Starts(scene, ignored, ignored, ignored)
-    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, ignored, starts)
+    dragged = (
+        Obstacles(scene, ignored, ignored, ignored),
+        Anchors(scene, ignored, ignored, ignored),
+        MovableSlice(scene, ignored),
+        Starts(scene, ignored, ignored, ignored),
+    )
+    return ScenePictures(scene, ROBOT, *dragged)
+
+
+def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(engine, initial, scene):
+    pictures = scene_pictures(scene)
     view = View(field=True, streamlines=True, grid=True, onion=True, colour="det")
     good = changed(initial("draw_s"), space="cspace", view=view)
     base = changed(good, obstacles=(Sphere((0.0, 0.0, 0.2)),))
@@ -222,11 +236,7 @@ def test_what_lies_on_the_slice_is_hidden_while_it_belongs_to_another_motion(eng
 def drawn(engine, initial, scene):
     """The pictures of a scenario that was adopted and drawn."""
 
-    def ignored(*_what):
-        pass
-
-    starts = Starts(scene, ignored, ignored, ignored)
-    pictures = ScenePictures(scene, ROBOT, ignored, ignored, ignored, ignored, ignored, ignored, starts)
+    pictures = scene_pictures(scene)
     scenario = replace(
         initial("draw_s"), view=View(field=True, streamlines=True, grid=True, onion=True, panels=(BASE_PANEL,))
     )
@@ -353,7 +363,7 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
 
 def test_every_layer_has_a_checkbox():
     switches = {f.name for f in fields(View) if f.type == "bool"}
-    switches -= {"playing", "replay", "move_slice", "click_to_start", "handles"}
+    switches -= {"playing", "replay", "move_slice", "click_to_start", "handles", "bias_handles"}
     assert set(VIEW_LABELS) == switches | {"panels"}
 
 

@@ -26,7 +26,16 @@ from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
 from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.rollouts import Middles, Rollouts
 from dt_viz.ui.scene.slice import MovableSlice
-from dt_viz.ui.scene.slice_layers import VOLUME, ColourSlice, FieldArrows, Streamlines, painted, scale_of
+from dt_viz.ui.scene.slice_layers import (
+    OPACITY,
+    VOLUME,
+    ColourSlice,
+    FieldArrows,
+    Streamlines,
+    inked,
+    painted,
+    scale_of,
+)
 from dt_viz.ui.scene.tubes import NUM_SIDES
 
 SCENARIO = avoiding("draw_s", (Sphere((0.0, -0.5, 0.4)),))
@@ -68,7 +77,7 @@ def test_one_thing_at_a_time_has_handles_and_none_in_a_picture(scene):
         MovableSlice(scene, lambda *_: None),
         Obstacles(scene, lambda *_: None, lambda _: None, lambda _: None),
     )
-    biases = Anchors(scene, lambda *_: None, lambda _: None)
+    biases = Anchors(scene, lambda *_: None, lambda _: None, lambda _: None)
     picture.draw(frame())
     for moving in (True, False):
         for each in (picture, obstacles, biases):
@@ -107,6 +116,20 @@ def picture_of(values, what="det", clearance=None):
     return ColourPicture(cast(Any, what), TASK.slice, values, room, np.empty((0, 2, 3)))
 
 
+def on_white(pixels):
+    """Colours that pixels (..., 4) have on white, were they as opaque as their colour allows."""
+    return 255 - (255.0 - pixels[..., :3]) * pixels[..., 3:] / (255 * OPACITY)
+
+
+def test_ink_looks_alike_on_white_and_whitens_nothing_behind_it():
+    colours = VOLUME.reshape(-1, 3)
+    ink, opacity = inked(colours)
+    np.testing.assert_allclose(255 - (255.0 - ink) * opacity[:, None], colours, atol=0.6)
+    black = ink * opacity[:, None]
+    assert (black.min(axis=1) < 1).all()  # at least one of red, green and blue stays as it is behind
+    assert opacity.min() < 0.1 and opacity.max() > 0.5
+
+
 def test_colours_say_the_value_at_their_place():
     n, m = 21, 25
     decades = np.linspace(-3, 3, n)
@@ -114,9 +137,9 @@ def test_colours_say_the_value_at_their_place():
     assert (pixels[..., :3] == pixels[:, :1, :3]).all()
     middle = (np.arange(len(pixels)) + 0.5) / len(pixels) * 6 - 3
     expected = VOLUME[np.round((np.clip(middle, -2, 2) + 2) / 4 * (NUM_SHADES - 1)).astype(int)]
-    assert np.abs(pixels[:, 0, :3].astype(int) - expected).max() <= 6
-    np.testing.assert_array_equal(pixels[0, 0, :3], palette.VOLUME[0])
-    np.testing.assert_array_equal(pixels[-1, 0, :3], palette.VOLUME[-1])
+    seen = on_white(pixels[:, 0])
+    assert np.abs(seen - expected).max() <= 7
+    np.testing.assert_allclose(seen[[0, -1]], [palette.VOLUME[0], palette.VOLUME[-1]], atol=1.5)
 
 
 def test_a_fold_jumps_out_and_nothing_is_shown_where_no_motion_comes():
@@ -126,7 +149,7 @@ def test_a_fold_jumps_out_and_nothing_is_shown_where_no_motion_comes():
     np.testing.assert_array_equal(pixels[2, 5], [*palette.FOLDED, 255])
     assert pixels[-2, 5, 3] == 0
     middle = pixels[len(pixels) // 2, 5]
-    assert 0 < middle[3] < 255 and np.ptp(middle[:3].astype(int)) < 4  # det J = 1 has no colour
+    assert on_white(middle).min() > 235 and middle[3] < 0.1 * 255  # det J = 1 has no colour, and veils nothing
     assert (painted(picture_of(np.full((4, 5), np.nan)))[..., 3] == 0).all()
 
 
@@ -139,7 +162,7 @@ def test_the_image_follows_the_slice(scene):
         shown.draw(frame(pictures=Pictures(colour=replace(picture_of(corner), area=area))))
         handle = shown.image.handle
         assert handle is not None
-        rows, columns = np.nonzero((handle.image[..., :3] == palette.VOLUME[-1]).all(axis=-1))
+        rows, columns = np.nonzero((np.abs(on_white(handle.image) - palette.VOLUME[-1]) < 2).all(axis=-1))
         height, width = handle.image.shape[:2]
         across = (columns.mean() + 0.5) / width - 0.5, (rows.mean() + 0.5) / height - 0.5
         w, x, y, z = (float(c) for c in handle.wxyz)

@@ -167,8 +167,8 @@ def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
 # --- Bias points ---
 
 
-def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(scene):
-    picture = Anchors(scene, lambda *_: None, lambda _: None)
+def test_bias_points_stand_where_they_are_and_the_one_that_was_clicked_has_handles(scene):
+    picture = Anchors(scene, lambda *_: None, lambda _: None, lambda _: None)
     picture.adopt(SCENARIO)
     picture.draw(frame())
     first, second, *others = picture.items
@@ -177,8 +177,11 @@ def test_bias_points_stand_where_they_are_and_only_the_selected_one_has_handles(
         np.testing.assert_allclose(item.gizmo.position, cast(Any, point).position)
     assert first.gizmo.active_axes == (True, True, False)  # in the drawing's plane
     assert second.gizmo.active_axes == (True, True, True)
+    assert (first.gizmo.opacity, second.gizmo.opacity) == (0.0, 0.0)
+    assert not first.region.visible
+    picture.adopt(replace(SCENARIO, view=View(bias_handles=True)))
     assert (first.gizmo.opacity, second.gizmo.opacity) == (0.0, 1.0)  # the newest
-    picture.adopt(replace(SCENARIO, view=View(bias="Bias 1")))
+    picture.adopt(replace(SCENARIO, view=View(bias="Bias 1", bias_handles=True)))
     assert (first.gizmo.opacity, second.gizmo.opacity) == (1.0, 0.0)
     with picture.without_handles():
         assert first.gizmo.opacity == 0.0

@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from browsing import (
     close_page,
     open_page,
     page_errors,
+    press,
     project,
     until_drawn,
     wait_until,
@@ -23,6 +25,8 @@ from browsing import (
 from chromium import needs_chromium
 
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.ui.panel.big_type import LARGER
+from dt_viz.ui.ruler import STEP
 from dt_viz.ui.scene.camera import camera_for, window
 from dt_viz.ui.server import Server
 
@@ -200,3 +204,70 @@ def test_a_touch_drags_the_sphere(visit):
     assert missed() < NEAR and x > 0.01 and z > 0.01 and abs(y) < 1e-6  # to the right and up, in the drawing plane
     assert np.abs(camera.position - home).max() < 1e-3
     assert session.wait_idle(PATIENCE)
+
+
+@pytest.mark.parametrize("ratio", [2, 3])
+def test_the_view_fits_the_window_whatever_pixels_the_screen_has(browser, server, ratio):
+    page_errors.clear()
+    page, visitor = open_page(browser, server, SIZES[2], ratio)
+    tripod, camera = visitor._tripod, visitor.client.camera
+    for width, height in (SIZES[2], SIZES[3], SIZES[2]):
+        page.set_viewport_size({"width": width, "height": height})
+        exact = camera_for(TASKS["draw_s"](), SimpleNamespace(image_width=width, image_height=height))
+        near = 0.05 * np.linalg.norm(exact[0] - exact[1])
+        wait_until(lambda: np.abs(camera.position - exact[0]).max() < near, "the camera's place")  # noqa: B023
+        wait_until(lambda: np.abs(np.divide(tripod.window, (width, height)) - 1).max() < STEP - 1, "its size")  # noqa: B023
+        assert camera.image_width > 1.5 * width  # pixels of the screen, of which viser's page takes two at first
+    close_page(page, server, visitor)
+    assert [error for error in page_errors if OF_VISER not in error] == []
+
+
+GROUP = ("Front", "Side", "Top", "Hand", "Home")
+SCREENS = pytest.mark.parametrize("visit", SIZES[:2], indirect=True, ids=str)
+
+
+def open_tab(page, name):
+    press(page.get_by_role("tab", name=name, exact=True))
+
+
+def switch_big(page, factor):
+    """Press the key of the big type, and wait until the type is larger than before by this factor."""
+    measured = "() => parseFloat(getComputedStyle(document.documentElement).fontSize)"
+    before = page.evaluate(measured)
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("b")
+    wait_until(lambda: abs(page.evaluate(measured) / before - factor) < 1e-3, "the type to have its size")
+
+
+@SCREENS
+def test_big_type_is_larger_and_nothing_is_cut_or_overlaps(visit):
+    page, visitor = visit
+    usual, home = boxes(page), visitor.client.camera.position
+    switch_big(page, LARGER)
+    try:
+        big = boxes(page)
+        for name in ("name of Task", "status", "Avoid"):
+            heights = [shown[name]["whole"][3] - shown[name]["whole"][1] for shown in (usual, big)]
+            assert heights[1] > 1.3 * heights[0]
+        assert faults(big) == []
+        assert np.linalg.norm(visitor.client.camera.position - home) > 0.01  # framed beside the wider panel
+        open_tab(page, "Picture")
+        rows = {name: page.get_by_role("button", name=name, exact=True).evaluate(BOX) for name in GROUP}
+        assert len({box["whole"][1] for box in rows.values()}) == 1
+        tabs = {tab.inner_text(): tab.evaluate(BOX) for tab in page.get_by_role("tab").all()}
+        assert len(tabs) >= 5 and faults(tabs) == []
+    finally:
+        open_tab(page, "World")
+        switch_big(page, 1 / LARGER)
+    assert visitor.client.camera.position == pytest.approx(home)
+
+
+@in_all_windows
+def test_the_views_lie_in_one_row(visit):
+    page, _ = visit
+    open_tab(page, "Picture")
+    buttons = {name: page.get_by_role("button", name=name, exact=True).evaluate(BOX) for name in GROUP}
+    open_tab(page, "World")
+    assert len({box["whole"][1] for box in buttons.values()}) == 1
+    lefts = [box["whole"][0] for box in buttons.values()]
+    assert lefts == sorted(set(lefts)) and not any(box["spills"] for box in buttons.values())

@@ -28,6 +28,8 @@ def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.e
         reactive,
         rollouts,
         starts,
+        table1,
+        train,
         velocity,
     )
     from dt_viz.evaluate.options import InputError, with_negative_values  # noqa: PLC0415
@@ -46,6 +48,8 @@ def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.e
         "reactive": reactive,
         "rollouts": rollouts,
         "starts": starts,
+        "table1": table1,
+        "train": train,
         "velocity": velocity,
     }.items():
         summary = (module.__doc__ or "").splitlines()[0]

@@ -45,6 +45,7 @@ from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
+    add_lasa,
     avoiding,
     chosen_task,
     positive_number,
@@ -176,7 +177,7 @@ class Visit:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
     parser.add_argument("--task", default="draw_s", help="that the server begins with (default: %(default)s)")
-    parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
+    add_lasa(parser)
     parser.add_argument("--clients", type=whole_number(1), default=8, help="visitors at once (default: %(default)s)")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), default=60.0, help="to drag (default: 60)")
     parser.add_argument(

@@ -14,7 +14,7 @@ import numpy as np
 from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, lasa_tasks
+from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, known_tasks
 from dt_viz.transforms.avoidance import SPACES, Avoidance
 
 
@@ -28,6 +28,11 @@ class InputError(ValueError):
 def add_task(parser: argparse.ArgumentParser) -> None:
     """Add `--task` and `--lasa`."""
     parser.add_argument("--task", required=True, help=f"{', '.join(TASKS)}, or a file of --lasa without its suffix")
+    add_lasa(parser)
+
+
+def add_lasa(parser: argparse.ArgumentParser) -> None:
+    """Add `--lasa`."""
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
 
 
@@ -63,7 +68,7 @@ def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], T
         InputError: there is none of this name.
         DemonstrationError: the folder or the task's file cannot be used.
     """
-    tasks = {**TASKS, **(lasa_tasks(options.lasa) if options.lasa is not None else {})}
+    tasks = known_tasks(options.lasa)
     if options.task not in tasks:
         hint = "" if options.lasa is not None else "; --lasa DIR adds more"
         raise InputError("--task", repr(options.task), ", ".join(tasks) + hint)

@@ -19,11 +19,11 @@ from typing import Any
 from PIL import Image
 
 from dt_viz.engine.frame import Stage
-from dt_viz.evaluate.options import InputError
+from dt_viz.evaluate.options import InputError, add_lasa
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.motion.control import Phase
-from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.paper_scenes import SCENES, offered
+from dt_viz.scenario.tasks import known_tasks
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 
@@ -46,7 +46,8 @@ HIDE_NOTICES = "() => document.querySelectorAll('button.mantine-Notification-clo
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
     names = (FIRST, *SCENES)
-    parser.add_argument("--only", choices=names, nargs="+", default=names, metavar="NAME", help=", ".join(names))
+    parser.add_argument("--only", choices=names, nargs="+", metavar="NAME", help=", ".join(names))
+    add_lasa(parser)
     parser.add_argument("--size", type=_size, default=(1920, 1080), metavar="W,H", help="pixels (default: 1920,1080)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
@@ -59,14 +60,19 @@ def run(options: argparse.Namespace) -> int:
         raise InputError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
     if CHROMIUM is None:
         raise InputError("Chromium", "not installed", "apt-get install chromium")
+    tasks = known_tasks(options.lasa)
+    scenes = (FIRST, *(scene.name for scene in offered(tasks)))
+    lacking = [name for name in options.only or () if name not in scenes]
+    if lacking:
+        raise InputError("--only", ", ".join(lacking), "scenes whose tasks there are; --lasa DIR adds more")
     options.out.mkdir(parents=True, exist_ok=True)
     width, height = options.size
     complaints: list[str] = []
     with sync_playwright() as playwright:
-        server = Server(TASKS, FitStore(default_cache_folder()), task=FIRST_TASK, port=0)
+        server = Server(tasks, FitStore(default_cache_folder()), task=FIRST_TASK, port=0)
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         try:
-            for name in options.only:
+            for name in options.only or scenes:
                 page = browser.new_page(viewport={"width": width, "height": height})
                 page.on("console", lambda message: _complain(message, complaints))
                 opened = time.monotonic()

@@ -172,6 +172,8 @@ def _title(task: Task, options: argparse.Namespace) -> str:
 def hand_room(robot: Robot, obstacle: Union, places: Array) -> Array:
     """Distance (N,), metres, of the hand from an obstacle, turned to where it is largest, whatever the arm can do.
 
+    The end effector, a point between the fingers, belongs to it.
+
     Args:
         robot: whose hand it is.
         obstacle: what is in the way.
@@ -182,7 +184,7 @@ def hand_room(robot: Robot, obstacle: Union, places: Array) -> Array:
     turns = Rotation.random(NUM_TURNS, np.random.default_rng(0)).as_matrix()
     points = (body.offset[of_hand] - robot.end_effector_offset) @ turns.transpose(0, 2, 1)  # (turns, points, 3)
     distance = obstacle.signed_distance(places[:, None, None] + points) - body.radius[of_hand]
-    return distance.min(axis=2).max(axis=1)
+    return np.minimum(distance.min(axis=2).max(axis=1), obstacle.signed_distance(places))
 
 
 def shortest_shift(robot: Robot, obstacle: Union, q: Array, clearance: float) -> float:

@@ -196,7 +196,12 @@ def _remove_leftovers(folder: Path) -> None:
 
 
 def _content_key(demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> str:
-    digest = hashlib.sha256(f"{FORMAT} {settings!r}".encode())
+    return fingerprint(demonstrations, f"{FORMAT} {settings!r}")
+
+
+def fingerprint(demonstrations: tuple[Demonstration, ...], purpose: str) -> str:
+    """Digest of what is made from demonstrations for a purpose; their names play no part."""
+    digest = hashlib.sha256(purpose.encode())
     for demonstration in demonstrations:
         digest.update(repr(demonstration.positions.shape).encode())
         digest.update(np.ascontiguousarray(demonstration.times, dtype=float).tobytes())

@@ -232,7 +232,7 @@ class Follower:
         usual, asked = self._demonstrated(learned), max(margin - OVERSHOOT, 0.0)
         near = self.whole_arm.clearance(usual.pins, obstacle)
         enough = bool((near >= asked).all())
-        room = near if enough else self._mesh_room(usual.pins, obstacle, near, margin)
+        room = near if enough else self._true_room(usual.pins, obstacle, near, margin)
         if before is None and (enough or (room >= margin).all()):
             yield None, room >= 0
         paths = learned.demonstrated.paths
@@ -255,10 +255,11 @@ class Follower:
                 left &= ~known.alike(int(best))
                 yield stance, free[best]
 
-    def _mesh_room(self, q: Array, obstacle: Union, near: Array, enough: float) -> Array:
-        """Distances (N,), metres, of the arm's meshes at configurations q (N, 6) where `near` is not enough already.
+    def _true_room(self, q: Array, obstacle: Union, near: Array, enough: float) -> Array:
+        """Distances (N,), metres, of the arm at configurations q (N, 6) where `near` is not enough already.
 
-        Where they touch the obstacle it is some negative number.
+        They are those of its meshes and of the end effector, the point between the fingers. Where one of them is in the
+        obstacle it is some negative number.
         """
         room, model = near.copy(), load_collision_model()
         close = np.flatnonzero(near < enough)
@@ -266,6 +267,7 @@ class Follower:
         apart = close[room[close] >= 0]  # or the obstacle is inside a link, which takes longer to tell
         if len(apart):
             room[apart] = np.min([model.obstacle_distance(q[apart], part)[0] for part in obstacle.parts], axis=0)
+        room[close] = np.minimum(room[close], obstacle.signed_distance(self.robot.end_effector(q[close])))
         return room
 
     def _sound(self, learned: Learned, stance: Stance) -> bool:
@@ -320,7 +322,7 @@ class Follower:
         if len(candidates):
             postures = np.stack([self.undisturbed_along(nominal, k).tracked.q[0, 0] for k in candidates])
             near = self.whole_arm.clearance(postures, obstacle)
-            touches[candidates] = self._mesh_room(postures, obstacle, near, 0.0) < 0
+            touches[candidates] = self._true_room(postures, obstacle, near, 0.0) < 0
         if not (far | touches).any():
             return nominal
         numbers = np.array(nominal.numbers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -38,12 +38,16 @@ NUM_LABELS = 4000
 """Number of labelled points of the clover."""
 J_OFFSETS = ((0.30, (0.05, 0.0)), (0.70, (0.0, -0.03)))
 """Places of the two points beside the J: fraction of its length, and offset to the right and up, metres."""
-OTHER_LETTERS = "CGJWZ"
-"""Letters of fig. 5 beside the S."""
+OTHER_LETTERS = tuple(f"draw_{letter}" for letter in "cgjwz")
+"""Tasks of fig. 5 beside the S, of the letters that ship with DT-Viz."""
+OTHER_LASA_LETTERS = ("Angle", "CShape", "GShape", "JShape", "Leaf_1", "NShape", "PShape")
+"""Tasks of fig. 5 beside the S, of the LASA handwriting data."""
 HAND_ONLY = {"arm": False}
 """View of scenes where only the path of the hand gives way: the fingers would be in the obstacle."""
 FIGURE = HAND_ONLY | {"field": False, "streamlines": True, "table": False, "ghost": False, "demonstrations": False}
 """View of panels side by side: flat figures of the motion alone."""
+POSES = {"onion": True, "field": False, "demonstrations": False}
+"""View of the scenes of fig. 8: the arm from its starting pose to where it lets go."""
 FIRST_BIAS = f"{BiasPoint.title} 1"
 """Name of the layer of the first bias point."""
 ABOVE = 0.16
@@ -63,6 +67,11 @@ class PaperScene:
     make: Callable[[Task], Scenario]
     view: Mapping[str, Any] = field(default_factory=dict)
     """Fields of `View` that differ from the defaults."""
+
+    @property
+    def tasks(self) -> frozenset[str]:
+        """Names of all tasks that it shows."""
+        return frozenset((self.task, *(panel.task for panel in self.view.get("panels", ()) if panel.task)))
 
     def scenario(self, task: Task) -> Scenario:
         """Return the scenario for its task."""
@@ -116,6 +125,18 @@ def _cube_before_the_attractor(task: Task) -> Scenario:
 def _alone(task: Task) -> Scenario:
     """Fig. 3 (b), 5 and 8: what was learned, and nothing in its way."""
     return Scenario(task.name, ())
+
+
+def _gallery(name: str, title: str, task: str, others: tuple[str, ...]) -> PaperScene:
+    """Return a scene of what was learned of several drawings, side by side (fig. 5)."""
+    return PaperScene(
+        name,
+        title,
+        "Motions learned from seven drawings of each letter (pale), and where they lead from elsewhere.",
+        task,
+        _alone,
+        view=FIGURE | {"panels": tuple(Panel(task=other) for other in others), "demonstrations": True},
+    )
 
 
 def in_clover(s: Array) -> Mask:
@@ -209,18 +230,8 @@ SCENES: Mapping[str, PaperScene] = {
             _two_points,
             view=FIGURE | {"panels": (Panel(IMITATION), Panel(FIRST_BIAS, generator=True), Panel(FIRST_BIAS))},
         ),
-        PaperScene(
-            "letters",
-            "Fig. 5: letters",
-            "Motions learned from seven drawings of each letter (pale), and where they lead from elsewhere.",
-            "draw_s",
-            _alone,
-            view=FIGURE
-            | {
-                "panels": tuple(Panel(task=f"draw_{letter.lower()}") for letter in OTHER_LETTERS),
-                "demonstrations": True,
-            },
-        ),
+        _gallery("letters", "Fig. 5: letters", "draw_s", OTHER_LETTERS),
+        _gallery("lasa", "Fig. 5: letters of the LASA data", "Sshape", OTHER_LASA_LETTERS),
         PaperScene(
             "cloud",
             "Sec. 4.4: labelled points in the S",
@@ -232,27 +243,38 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "centre_pot",
             "Fig. 8: into the centre pot",
-            "All demonstrations end over the centre pot: let go there, the object falls into it.",
+            "All demonstrations end over the centre pot, into which the object falls. "
+            "Pale arms: from the starting pose on.",
             "drop_pots",
             _alone,
+            view=POSES,
         ),
         PaperScene(
             "left_pot",
             "Fig. 8: into the left pot",
-            "All demonstrations end over the centre pot; one bias point takes the goal along to the left one.",
+            "One bias point takes the goal along from the centre pot to the left one. "
+            "Pale arms: from the starting pose on.",
             "drop_pots",
             _into_pot(0),
+            view=POSES,
         ),
         PaperScene(
             "right_pot",
             "Fig. 8: into the right pot",
-            "All demonstrations end over the centre pot; one bias point takes the goal along to the right one.",
+            "One bias point takes the goal along from the centre pot to the right one. "
+            "Pale arms: from the starting pose on.",
             "drop_pots",
             _into_pot(2),
+            view=POSES,
         ),
     )
 }
-"""Scenes by name, in the order of the figures."""
+"""Scenes by name, in the order of the figures; see `offered`."""
+
+
+def offered(tasks: Container[str]) -> tuple[PaperScene, ...]:
+    """Return the scenes whose tasks are all among these: those of the LASA data only where the user has them."""
+    return tuple(scene for scene in SCENES.values() if all(name in tasks for name in scene.tasks))
 
 
 @lru_cache(maxsize=64)

@@ -80,7 +80,9 @@ class View:
     speed: float = 1.0
     """Speed of the arm's time, relative to real time."""
     bias: str = ""
-    """Name of the bias point that the panel changes and that has the handles."""
+    """Name of the bias point that the panel changes; the newest if empty."""
+    bias_handles: bool = False
+    """Whether that has handles and a ring around its region."""
     tuned: str = ""
     """Name of the transform of the stack whose settings the panel shows; the outermost if empty."""
     level: str = ""

@@ -145,7 +145,7 @@ def added(scenario: Scenario) -> dict[str, Transform]:
 
 
 def selected(scenario: Scenario) -> str | None:
-    """Name of the added transform that has the handles: the chosen one, or else the newest."""
+    """Name of the added transform that the panel changes: the chosen one, or else the newest."""
     names = added(scenario)
     return scenario.view.bias if scenario.view.bias in names else next(reversed(names), None)
 

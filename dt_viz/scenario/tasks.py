@@ -230,6 +230,15 @@ def lasa_tasks(folder: Path) -> dict[str, TaskEntry]:
     }
 
 
+def known_tasks(lasa: Path | None) -> dict[str, TaskEntry]:
+    """Return the tasks that ship with DT-Viz, and those of a folder with the LASA data if there is one.
+
+    Raises:
+        DemonstrationError: as `lasa_tasks`.
+    """
+    return {**TASKS, **(lasa_tasks(lasa) if lasa is not None else {})}
+
+
 def _lasa_task(name: str, path: Path) -> Task:
     demonstrations = load_demonstrations(path)
     if demonstrations[0].dimension != 2:

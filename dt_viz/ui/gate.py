@@ -38,6 +38,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from dt_viz.errors import DataError
+from dt_viz.ui import ruler
 from dt_viz.ui.origins import Origins
 from dt_viz.ui.uploads import MalformedError, Upload
 
@@ -135,7 +136,15 @@ class _Connection(ServerConnection):
 class Gate:
     """Starts viser's server behind its checks."""
 
-    def __init__(self, origins: Origins, *, max_connections: int, max_upload: int, refused: Refused) -> None:
+    def __init__(
+        self,
+        origins: Origins,
+        *,
+        max_connections: int,
+        max_upload: int,
+        refused: Refused,
+        measured: ruler.Measured = lambda _token, _width: None,
+    ) -> None:
         """Prepare the checks.
 
         Args:
@@ -143,12 +152,14 @@ class Gate:
             max_connections: largest number of simultaneous connections.
             max_upload: largest size of a file, bytes.
             refused: called with a visitor and the reason when a file is not accepted.
+            measured: called with what a `Ruler` measures. It must only take note.
 
         Raises:
             GateError: viser's messages differ from the expected ones.
         """
         self.max_upload = max_upload
         self._origins, self._max_connections, self._refused = origins, max_connections, refused
+        self._measured = measured
         self._connections: set[ServerConnection] = set()
         self._server: viser.ViserServer | None = None
         self._protocol = f"viser-v{viser.__version__}"
@@ -210,6 +221,11 @@ class Gate:
                 logger.warning("a connection was refused: there are %d", len(self._connections))
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL)
             self._connections.add(connection)
+        elif (told := ruler.told(request.path)) is not None:
+            self._measured(*told)
+            response = connection.respond(HTTPStatus.NO_CONTENT, "")
+            response.headers["Cache-Control"] = "no-store"  # so that it is asked for each time
+            return response
         return answer(connection, request)
 
     async def _handle(self, handler: Callable[[ServerConnection], Any], connection: ServerConnection) -> None:

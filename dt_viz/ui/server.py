@@ -83,7 +83,11 @@ class Server:
         """Number of pages that are being built, also for visitors who have left meanwhile."""
         self._closed = False
         gate = Gate(
-            Origins(host, allowed), max_connections=max_sessions + MAX_WAITING, max_upload=MAX_BYTES, refused=_refuse
+            Origins(host, allowed),
+            max_connections=max_sessions + MAX_WAITING,
+            max_upload=MAX_BYTES,
+            refused=_refuse,
+            measured=self._measured,
         )
         self._server = gate.open(host, port, "DT-Viz")
         if self._server.get_port() != port:  # another program was faster than the check
@@ -160,8 +164,14 @@ class Server:
         with self._lock:
             if client.client_id in self._visitors:
                 self._visitors[client.client_id] = visitor
+                visitor.measure()
                 return
         visitor.close()  # left while the page was being built
+
+    def _measured(self, token: str, width: float) -> None:
+        for visitor in self.visitors:
+            if visitor.ruler.token == token:
+                visitor.measured(width)
 
     def _farewell(self, client: viser.ClientHandle) -> None:
         with self._lock:

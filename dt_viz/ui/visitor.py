@@ -17,19 +17,23 @@ from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.slices import SlicePose
-from dt_viz.scenario.stack import transform_of, with_avoidance, with_transform
+from dt_viz.scenario.stack import selected, transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.ui.panel.panel import Panel
 from dt_viz.ui.playback import Playback
+from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.arm import ArmPicture
 from dt_viz.ui.scene.arm_layers import Arms
 from dt_viz.ui.scene.drawing import Drawing
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
 from dt_viz.ui.scene.objects import Objects
+from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.picture import Colour
 from dt_viz.ui.scene.scene import ScenePictures
+from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.starts import Starts
 from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.scene.way import Way
@@ -72,12 +76,9 @@ class Visitor:
             self.pictures = ScenePictures(
                 client.scene,
                 robot,
-                self._obstacle_moved,
-                self._obstacle_grabbed,
-                self._obstacle_clicked,
-                self._anchor_moved,
-                self._anchor_selected,
-                self._slice_moved,
+                Obstacles(client.scene, self._obstacle_moved, self._obstacle_grabbed, self._obstacle_clicked),
+                Anchors(client.scene, self._anchor_moved, self._anchor_grabbed, self._anchor_clicked),
+                MovableSlice(client.scene, self._slice_moved),
                 Starts(client.scene, self._start_moved, self._start_chosen, self._start_clicked),
             )
             self.arms = Arms(client.scene, robot)
@@ -95,12 +96,22 @@ class Visitor:
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(engine.arm.push)
+        self.ruler = Ruler()
+        """What the visitor's window is measured with."""
         self.playback.begin()
 
     @property
     def arm(self) -> ArmPicture:
         """The arm in the scene."""
         return self.arms.arm
+
+    def measure(self) -> None:
+        """Have the browser measure its window from now on."""
+        self.client.gui.add_html(self.ruler.html)
+
+    def measured(self, width: float) -> None:
+        """Take the width that the window has at least, CSS pixels."""
+        self._tripod.width = width
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         """See `Display`."""
@@ -201,8 +212,13 @@ class Visitor:
         self.session.edit("add start", starts=with_start(scenario, place), arm_rollout=arm_rollout)
         self.session.end_gesture()
 
-    def _anchor_selected(self, name: str) -> None:
+    def _anchor_grabbed(self, name: str) -> None:
         self.session.edit("select", view=replace(self.session.scenario.view, bias=name))
+
+    def _anchor_clicked(self, name: str) -> None:
+        scenario = self.session.scenario
+        handles = not (scenario.view.bias_handles and name == selected(scenario))
+        self.session.edit("select", view=replace(scenario.view, bias=name, bias_handles=handles))
 
     def _slice_moved(self, position: Array, wxyz: Array, phase: str) -> None:
         with self._dragging(phase) as scenario:

@@ -15,7 +15,7 @@ from dt_viz.engine.session import Pace, Session
 from dt_viz.engine.worker import LatestWorker
 from dt_viz.errors import DataError
 from dt_viz.learning.imitation import ImitationError
-from dt_viz.scenario.paper_scenes import SCENES, PaperScene
+from dt_viz.scenario.paper_scenes import SCENES, PaperScene, offered
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import side_by_side
 from dt_viz.scenario.tasks import Task
@@ -23,6 +23,7 @@ from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
 from dt_viz.ui.panel.about import add_about
 from dt_viz.ui.panel.avoid import add_avoid_and_imitate
+from dt_viz.ui.panel.big_type import BigType
 from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.panel.camera import CameraControls
 from dt_viz.ui.panel.commands import Command, Curtain, add_commands, numbered
@@ -110,7 +111,7 @@ class Panel:
         self._notify, self._tripod = notify, tripod
         self._gui = gui
         self._titles = dict(titles)
-        self._scenes = {scene.title: scene for scene in SCENES.values() if scene.task in self._titles}
+        self._scenes = {scene.title: scene for scene in offered(self._titles)}
         self._bindings = Bindings()
         self._reported: Scenario | None = None
         self._settled = ""
@@ -120,6 +121,7 @@ class Panel:
         self._beginnings = LatestWorker[Callable[[], None]](lambda begin, _: begin(), self._stay, name="beginnings")
         self._presentation = Presentation(gui, self._turn, partial(setattr, tripod, "alone"))
         self._bindings.show(self._title, self._presentation.entitle)
+        big = BigType(gui, tripod)
         self._build_task()
         add_avoid_and_imitate(gui, self._bindings)
         self.status = StatusLine(gui, self._bindings)
@@ -142,7 +144,7 @@ class Panel:
         with tabs.add_tab("Arm"):
             self._build_arm()
         with tabs.add_tab("Picture"):
-            self._camera = CameraControls(gui, tripod, lambda dark: self._chores.later(partial(darken, dark)))
+            self._camera = CameraControls(gui, tripod, lambda dark: self._chores.later(partial(darken, dark)), big.show)
             on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), self._presentation.begin)
             self._build_export(save_png)
         commands = self._commands(Curtain(gui))

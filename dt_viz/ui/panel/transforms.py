@@ -35,6 +35,10 @@ def add_transform_controls(gui: viser.GuiApi, bindings: Bindings, later: Later) 
         which = gui.add_dropdown("Selected", (NONE,), visible=False)
         bindings.properties(which, options=lambda s: tuple(added(s)) or (NONE,), visible=lambda s: len(added(s)) > 1)
         bindings.input(which, lambda s: selected(s) or NONE, lambda s, value: {"view": replace(s.view, bias=value)})
+        hint = "arrows that move it along axes, and a ring around its region; a click on it shows and hides them"
+        handles = gui.add_checkbox("Handles", False, hint=hint, visible=False)
+        bindings.properties(handles, visible=lambda s: bool(added(s)))
+        bindings.input(handles, lambda s: s.view.bias_handles, lambda s, on: {"view": replace(s.view, bias_handles=on)})
         add_settings(gui, bindings, _own_settings, selected)
 
 

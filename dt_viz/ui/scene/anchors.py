@@ -1,6 +1,6 @@
-"""Transforms that have a place, in the scene: each is dragged itself, the selected one also by handles.
+"""Transforms that have a place, in the scene: each is dragged itself, and a click gives one handles as well.
 
-A ring is around the region that it acts in. In a drawing the handles move it in the drawing's plane.
+Then a ring is around the region that it acts in. In a drawing the handles move it in the drawing's plane.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ class AnchorPicture:
         scene: viser.SceneApi,
         number: int,
         moved: Moved,
-        selected: Callable[[str], None],
+        grabbed: Callable[[str], None],
+        clicked: Callable[[str], None],
         area: Callable[[], Slice | None],
     ) -> None:
         """Hidden until `adopt` gives it a transform.
@@ -56,11 +57,13 @@ class AnchorPicture:
             scene: scene of the visitor.
             number: number of this picture, from 0.
             moved: called with each new position.
-            selected: called when it is clicked or grabbed.
+            grabbed: called when a drag of it begins.
+            clicked: called when it is clicked.
             area: returns the slice that it is dragged parallel to.
         """
         self.name = ""
         """Name of the transform."""
+        self._has_region = False
         node = f"/bias/{number}"
         self.gizmo = scene.add_transform_controls(
             node, line_width=3.0, disable_rotations=True, depth_test=False, visible=False
@@ -89,14 +92,14 @@ class AnchorPicture:
 
         def dragged(drag: Drag) -> None:
             if drag.phase == "start":
-                selected(self.name)
+                grabbed(self.name)
             self.handles.drag(drag, area(), put)
 
         self.handles.on_move(put)
         gestures.on_drag(self.ball, dragged)
-        gestures.on_click(self.ball, lambda: selected(self.name))
+        gestures.on_click(self.ball, lambda: clicked(self.name))
 
-    def adopt(self, name: str, transform: Transform, *, on: bool, selected: bool) -> None:
+    def adopt(self, name: str, transform: Transform, *, on: bool, handles: bool) -> None:
         """Move to the transform's place, unless the browser has moved there already."""
         assert transform.anchor is not None
         plane = transform.anchor_plane
@@ -108,7 +111,8 @@ class AnchorPicture:
         self._label.text = f"{name.lower()}: goal" if transform.ends_motions else name.lower()
         self.ball.color = palette.BIAS if on else palette.STALE
         self.region.colors = np.array(palette.REGION if on else palette.STALE, dtype=np.uint8)
-        self.handles.show(selected)
+        self.handles.show(handles)
+        self.region.visible = handles and self._has_region
         self.gizmo.visible = True
 
     def show_region(self, transform: Transform, used: float | None) -> None:
@@ -116,7 +120,8 @@ class AnchorPicture:
         radius = used or transform.region
         if radius is not None:
             self.region.scale = (radius, radius, radius)
-        self.region.visible = radius is not None
+        self._has_region = radius is not None
+        self.region.visible = self.handles.shown and self._has_region
 
     def hide(self) -> None:
         """Hide the marker: there is no such transform."""
@@ -136,11 +141,17 @@ def _rings(*, flat: bool) -> Array:
 class Anchors(Dragged):
     """All transforms of a scenario that have a place."""
 
-    def __init__(self, scene: viser.SceneApi, moved: Moved, selected: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        moved: Moved,
+        grabbed: Callable[[str], None],
+        clicked: Callable[[str], None],
+    ) -> None:
         """Begin with none; see `AnchorPicture`."""
         super().__init__(scene.add_frame("/bias", show_axes=False))
         self._transforms: Mapping[str, Transform] = {}
-        self.items = tuple(AnchorPicture(scene, k, moved, selected, self.area) for k in range(MAX_ANCHORS))
+        self.items = tuple(AnchorPicture(scene, k, moved, grabbed, clicked, self.area) for k in range(MAX_ANCHORS))
 
     @property
     def handles(self) -> Iterable[Handles]:
@@ -159,8 +170,9 @@ class Anchors(Dragged):
         """Show the scenario's transforms where they stand."""
         self._transforms = anchored(scenario)
         on = {layer.name for layer in scenario.stack if layer.on}
-        chosen = None if scenario.view.move_slice else selected(scenario)
+        shown = scenario.view.bias_handles and not scenario.view.move_slice
+        handled = selected(scenario) if shown else None
         for item, (name, transform) in zip(self.items, self._transforms.items(), strict=False):
-            item.adopt(name, transform, on=name in on, selected=name == chosen)
+            item.adopt(name, transform, on=name in on, handles=name == handled)
         for item in self.items[len(self._transforms) :]:
             item.hide()

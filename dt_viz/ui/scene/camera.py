@@ -12,13 +12,14 @@ from dt_viz.scenario.panels import TITLE_ROOM, directions
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui import gestures
+from dt_viz.ui.ruler import STEP
 
 FIELD_OF_VIEW = 0.75
 """Vertical field of view, rad."""
 PANEL = 350
 """Width of the panel and its margins, pixels."""
-NARROW = 700
-"""Width of a window, pixels, below which the panel lies under the picture, not beside it."""
+NARROW = 577
+"""Width of a window, pixels, below which viser puts the panel under the picture, not beside it: from 36 em down."""
 UNDER = 0.6
 """Part of a narrow window's height that the panel takes."""
 CAPTION = 0.2
@@ -52,6 +53,8 @@ def camera_for(
     hand: Array | None = None,
     *,
     alone: bool = False,
+    width: float | None = None,
+    panel: float = PANEL,
 ) -> Pose:
     """Return position (3,) and look-at (3,), metres, for a view of a task.
 
@@ -62,6 +65,8 @@ def camera_for(
         panels: rectangles that are to be seen instead of the task.
         hand: (3,) where the hand is, metres; without it the view of the hand is that of the task.
         alone: whether there is a caption instead of the panel.
+        width: smallest width that the window can have, CSS pixels; None if that is not known.
+        panel: width of the panel and its margins, CSS pixels.
     """
     position, look_at = (np.asarray(place) for place in task.camera)
     direction, places = look_at - position, shown(task)
@@ -71,7 +76,8 @@ def camera_for(
         right, up = directions(panels[0], task.camera)
         direction, above = np.cross(up, right), TITLE_ROOM * up
         places = np.concatenate([area.border + offset for area in panels for offset in (np.zeros(3), above)])
-    return framed(places, np.asarray(VIEWS.get(view, direction)), *free_part(window(camera), alone=alone))
+    free = free_part(window(camera, width), alone=alone, panel=panel)
+    return framed(places, np.asarray(VIEWS.get(view, direction)), *free)
 
 
 def shown(task: Task) -> Array:
@@ -88,8 +94,8 @@ def around(distance: float) -> Array:
     return distance * np.concatenate([np.eye(3), -np.eye(3)])
 
 
-def free_part(size: tuple[int, int], *, alone: bool = False) -> tuple[Array, Array]:
-    """Return what the panel, or the caption of a presentation, leaves of a window of this width and height, pixels.
+def free_part(size: tuple[int, int], *, alone: bool = False, panel: float = PANEL) -> tuple[Array, Array]:
+    """Return what the panel, or the caption of a presentation, leaves of a window of this width and height, CSS pixels.
 
     Returns:
         The tangents (2,) of the angles between the line of sight and its left and right border, and those of its lower
@@ -97,7 +103,7 @@ def free_part(size: tuple[int, int], *, alone: bool = False) -> tuple[Array, Arr
     """
     width, height = size
     narrow = width < NARROW
-    right = 1.0 if narrow or alone else 1 - 2 * PANEL / width
+    right = 1.0 if narrow or alone else 1 - 2 * panel / width
     bottom = 2 * (CAPTION if alone else UNDER if narrow else 0.0) - 1
     tangent = np.tan(FIELD_OF_VIEW / 2)
 
@@ -107,13 +113,24 @@ def free_part(size: tuple[int, int], *, alone: bool = False) -> tuple[Array, Arr
     return within(-1.0, right) * tangent * width / height, within(bottom, 1.0) * tangent
 
 
-def window(camera: Any) -> tuple[int, int]:  # noqa: ANN401
-    """Return width and height of the window of viser's camera, pixels, as the browser told, if it can be."""
+def window(camera: Any, width: float | None = None) -> tuple[int, int]:  # noqa: ANN401
+    """Return width and height of the window of viser's camera, CSS pixels, as the browser told, if it can be.
+
+    The camera's picture has their ratio only: it is as large only while a CSS pixel is a pixel of the picture.
+
+    Args:
+        camera: viser's.
+        width: smallest width that the window can have, as of a `Ruler`; None if that is not known.
+    """
     size = gestures.vector((camera.image_width, camera.image_height), 2, MAX_SIZE)
-    return USUAL if size is None or size.min() < MIN_SIZE else (int(size[0]), int(size[1]))
+    if size is None or size.min() < MIN_SIZE:
+        return USUAL
+    if width is not None and not width <= size[0] < STEP * width:
+        size *= width * STEP**0.5 / size[0]
+    return round(size[0]), round(size[1])
 
 
-def turned(pose: Pose, size: tuple[int, int], angle: float, *, alone: bool = False) -> Pose:
+def turned(pose: Pose, size: tuple[int, int], angle: float, *, alone: bool = False, panel: float = PANEL) -> Pose:
     """Return a camera's position and look-at, metres, turned around the vertical through the middle of its picture.
 
     Args:
@@ -121,9 +138,10 @@ def turned(pose: Pose, size: tuple[int, int], angle: float, *, alone: bool = Fal
         size: width and height of the window, pixels; the picture is the part of it that the panel leaves.
         angle: rad.
         alone: whether there is a caption instead of the panel.
+        panel: width of the panel and its margins, CSS pixels.
     """
     position, look_at = pose
-    across, upright = free_part(size, alone=alone)
+    across, upright = free_part(size, alone=alone, panel=panel)
     ahead, right, up = axes(look_at - position)
     depth = np.linalg.norm(look_at - position)
     middle = position + depth * (ahead + across.mean() * right + upright.mean() * up)

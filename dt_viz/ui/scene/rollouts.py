@@ -29,6 +29,8 @@ BETWEEN = 5
 """Number of points from one ring of a tube to the next that lines are compared with."""
 JUMP, FADING = 0.05, 0.15
 """Distance by which a rollout jumps, metres, where it then fades out where it was, and the time that takes, seconds."""
+SPARSE = 3
+"""Stride of the rings with which it is drawn there: the faces are sent, too, which other frames of a drag keep."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,7 @@ class Rollouts(Picture):
             return
         jumped = np.linalg.norm(before[1] - middles, axis=2).max(axis=1, initial=0) > JUMP
         if jumped.any():
-            self.former.show(before[1][jumped])
+            self.former.show(before[1][jumped, ::SPARSE])
             self._jumped = time.monotonic()
 
     def fade(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -17,12 +17,10 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.anchors import BALL_RADIUS, Anchors
-from dt_viz.ui.scene.anchors import Moved as AnchorMoved
 from dt_viz.ui.scene.arm_layers import Onion
-from dt_viz.ui.scene.handles import Moved as SliceMoved
 from dt_viz.ui.scene.levels import LevelRollouts
 from dt_viz.ui.scene.manifold import Generator, WarpedGrid
-from dt_viz.ui.scene.obstacles import Moved, Obstacles
+from dt_viz.ui.scene.obstacles import Obstacles
 from dt_viz.ui.scene.panels import Panels
 from dt_viz.ui.scene.picture import Picture
 from dt_viz.ui.scene.rollouts import Demonstrations, Ghost, Middles, Rollouts
@@ -72,21 +70,15 @@ class ScenePictures:
         self,
         scene: viser.SceneApi,
         robot: Robot,
-        moved: Moved,
-        grabbed: Callable[[int], None],
-        clicked: Callable[[int], None],
-        anchor_moved: AnchorMoved,
-        anchor_selected: Callable[[str], None],
-        slice_moved: SliceMoved,
+        obstacles: Obstacles,
+        anchors: Anchors,
+        area: MovableSlice,
         starts: Starts,
     ) -> None:
-        """Build the scene of this robot; the callbacks are those of the pictures."""
+        """Build the rest of the scene of this robot, beside what its visitor drags."""
         set_stage(scene)
         self._scene = scene
-        self.obstacles = Obstacles(scene, moved, grabbed, clicked)
-        self.anchors = Anchors(scene, anchor_moved, anchor_selected)
-        self.slice = MovableSlice(scene, slice_moved)
-        self.starts = starts
+        self.obstacles, self.anchors, self.slice, self.starts = obstacles, anchors, area, starts
         self._always: tuple[Picture, ...] = (
             self.obstacles,
             self.anchors,

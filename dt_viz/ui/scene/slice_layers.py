@@ -23,7 +23,7 @@ HEAD_LENGTH = 0.012
 PIXEL = 0.004
 """Size of a pixel of the colours, metres."""
 OPACITY, MOST_OPAQUE = 0.5, 0.85
-"""Opacity of det J and the Lyapunov value, and of occupancy where it is certain."""
+"""Opacity of the ink of det J and the Lyapunov value, and of occupancy where it is certain."""
 POINT_SIZE = 0.0016
 """Size of a cloud's points, metres."""
 DET_DECADES = 2
@@ -152,12 +152,22 @@ def painted(picture: ColourPicture) -> NDArray[np.uint8]:
     at = np.meshgrid(*axes, indexing="ij")
     shown = np.log10(np.maximum(values, 10.0 ** (-2 * DET_DECADES))) if picture.what == "det" else CM2 * values
     pixels = np.empty((*shape, 4), np.uint8)
-    pixels[..., :3] = scale_of(picture).colours(map_coordinates(shown, at, order=1))
+    pixels[..., :3], ink = inked(scale_of(picture).colours(map_coordinates(shown, at, order=1)))
     room = map_coordinates(np.minimum(picture.clearance, 1.0), at, order=1)
-    pixels[..., 3] = np.round(255 * OPACITY * np.clip(room / PIXEL + 0.5, 0, 1))
+    pixels[..., 3] = np.round(255 * OPACITY * ink * np.clip(room / PIXEL + 0.5, 0, 1))
     if picture.what == "det":
         pixels[map_coordinates(values, at, order=0) <= 0] = (*palette.FOLDED, 255)
     return pixels
+
+
+def inked(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Array]:
+    """Return colours (..., 3) as ink and its opacity (...): alike on white, and what is behind is not whitened.
+
+    White is left out: c = (1 − a) white + a ink with the smallest opacity a that is possible.
+    """
+    opacity = 1 - colours.min(axis=-1) / 255
+    ink = 255 - (255 - colours) / np.maximum(opacity, 1 / 255)[..., None]
+    return np.round(ink).astype(np.uint8), opacity
 
 
 def _rounded_up(value: float) -> float:

@@ -15,7 +15,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui import gestures
-from dt_viz.ui.scene.camera import FIELD_OF_VIEW, HOME, Pose, camera_for, turned, window
+from dt_viz.ui.scene.camera import FIELD_OF_VIEW, HOME, PANEL, Pose, camera_for, turned, window
 
 MOVED = 1e-3
 """Distance of the camera from where it was put, metres, from which on the visitor has moved it."""
@@ -43,10 +43,13 @@ class Tripod:
         self._client, self._hand = client, hand
         self._lock = threading.RLock()  # tasks, ticks and reports come from threads of their own
         self._given: deque[Pose] = deque(maxlen=REMEMBERED)
-        """Poses that the camera was given since it last jumped, the newest last."""
+        """Poses that the camera was given since it took another view, the newest last."""
         self._chosen: Pose | None = None
         """Pose that the visitor has moved the camera to; None if it stands where it was put."""
-        self._window = (0, 0)
+        self._fitted = (0, 0)
+        """Width and height of the window that the view was framed for, CSS pixels."""
+        self._width: float | None = None
+        self._panel: float = PANEL
         self._shown: tuple[Task, Sequence[Slice], str] | None = None
         """Task, panels and view that the camera was put to show."""
         self._locked = self._alone = False
@@ -64,6 +67,7 @@ class Tripod:
         """Move the camera to where the task, or the panels beside its scene, are seen best."""
         with self._lock:
             self._shown = task, panels, HOME
+            self._given.clear()
             self._frame()
 
     def view(self, name: str = HOME) -> None:
@@ -71,6 +75,7 @@ class Tripod:
         with self._lock:
             if self._shown is not None:
                 self._shown = (*self._shown[:2], name)
+                self._given.clear()
                 self._frame()
 
     @property
@@ -98,6 +103,34 @@ class Tripod:
                 self._frame()
 
     @property
+    def width(self) -> float | None:
+        """Smallest width that the window can have, CSS pixels; None before it is known. A change may fit the view."""
+        return self._width
+
+    @width.setter
+    def width(self, width: float) -> None:
+        with self._lock:
+            self._width = width
+            self._fit()
+
+    @property
+    def panel(self) -> float:
+        """Width of the panel and its margins, CSS pixels; a change frames the view again."""
+        return self._panel
+
+    @panel.setter
+    def panel(self, panel: float) -> None:
+        with self._lock:
+            self._panel = panel
+            if self._shown is not None:
+                self._frame()
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """Width and height of the window, CSS pixels."""
+        return window(self._client.camera, self._width)
+
+    @property
     def orbits(self) -> bool:
         """Whether the camera turns slowly around what it shows."""
         return self._turned is not None
@@ -115,15 +148,21 @@ class Tripod:
             seconds = 0.0 if self._turned is None else now - self._turned
             if seconds > 0:  # it does still orbit, and nobody holds the camera
                 self._turned = now
-                self._put(turned(self._chosen or self._given[-1], self._window, TURN * seconds, alone=self._alone))
+                pose = self._chosen or self._given[-1]
+                self._put(turned(pose, self.window, TURN * seconds, alone=self._alone, panel=self._panel))
 
     def _frame(self) -> None:
         assert self._shown is not None
         task, panels, view = self._shown
-        self._window = window(self._client.camera)
-        self._given.clear()
-        self._put(camera_for(task, self._client.camera, view, panels, self._hand(), alone=self._alone))
-        self._client.camera.fov = FIELD_OF_VIEW
+        self._fitted, camera = self.window, self._client.camera
+        how = {"alone": self._alone, "width": self._width, "panel": self._panel}
+        self._put(camera_for(task, camera, view, panels, self._hand(), **how))
+        camera.fov = FIELD_OF_VIEW
+
+    def _fit(self) -> None:
+        """Frame the view anew if the window has another size, unless the visitor has moved the camera."""
+        if self._shown is not None and self._chosen is None and self.window != self._fitted:
+            self._frame()
 
     def _put(self, pose: Pose) -> None:
         self._given.append(pose)
@@ -149,7 +188,4 @@ class Tripod:
                     self._turned = time.monotonic() + PAUSE
             elif self._chosen is not None and np.abs(reported - self._given[-1]).max() <= MOVED:
                 self._chosen = None
-            if window(camera) != self._window:
-                self._window = window(camera)
-                if self._chosen is None:
-                    self._frame()
+            self._fit()

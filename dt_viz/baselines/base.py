@@ -1,0 +1,98 @@
+"""What a method of the comparison is: it is fitted to a task, and then plans motions around obstacles.
+
+A new method is one file with a subclass of `Method`, and one line in `dt_viz.baselines.registry.METHODS`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import ClassVar, Protocol
+
+from dt_viz.arm.robot import Robot
+from dt_viz.flows.fields import Array
+from dt_viz.motion.nominal import Learned
+from dt_viz.obstacles.union import Union
+from dt_viz.scenario.tasks import Task
+
+INSTALL = 'pip install "dt-viz[baselines]"'
+"""Command that installs what some methods need beside DT-Viz itself."""
+
+
+class NotFittedError(Exception):
+    """A method cannot be fitted to a task; the text says why, for the user."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a method is fitted to."""
+
+    learned: Learned
+    """The task, and our imitation of it."""
+    robot: Robot
+    postures: tuple[Array, ...]
+    """Of the arm along each demonstration, (T_i, 6), rad; the first row is where a motion from that start begins."""
+
+    @property
+    def task(self) -> Task:
+        """The demonstrations and their place in the world."""
+        return self.learned.task
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Motions around obstacles, one from each start; that of a start without a way has one sample, at the start."""
+
+    paths: tuple[Array, ...]
+    """(N_i, 3) places of the end effector, metres."""
+    times: tuple[Array, ...]
+    """(N_i,) seconds from the start."""
+    joints: tuple[Array, ...] | None = None
+    """(N_i, 6) of the arm, rad, where the method plans them; otherwise the arm tracks the paths."""
+    warnings: tuple[str, ...] = ()
+    """What the motions fail at, for the user."""
+
+
+class Planner(Protocol):
+    """A method that has been fitted to a task. Any thread may call it."""
+
+    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+        """Plan motions from the starts (R, 3), metres, around obstacles (an empty union: none).
+
+        Methods that plan joints start at the posture of the nearest demonstrated start, moved to the start by inverse
+        kinematics. What `interrupted` raises, which is called often, ends it.
+        """
+        ...
+
+
+class Method(ABC):
+    """A way to learn motions from demonstrations, or to plan them."""
+
+    name: ClassVar[str]
+    """Short name in files and commands."""
+    title: ClassVar[str]
+    promise: ClassVar[str]
+    """Sentence that says what it guarantees and what it does not."""
+    stable: ClassVar[bool]
+    """Whether its motions reach the goal for certain."""
+    whole_arm: ClassVar[bool]
+    """Whether the whole arm avoids, not the end effector alone."""
+    live: ClassVar[bool]
+    """Whether it follows a drag; others plan when the obstacle rests."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Modules beyond DT-Viz's own that it cannot plan without."""
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Modules it needs that are not installed; see `INSTALL`."""
+        return tuple(module for module in self.needs if find_spec(module) is None)
+
+    @abstractmethod
+    def fit(self, problem: Problem) -> Planner:
+        """Fit the method to a task, or load what was fitted to it.
+
+        Raises:
+            NotFittedError: the demonstrations do not allow it, or what was fitted is of another task or version.
+        """

@@ -1,0 +1,304 @@
+"""EFlow: natural gradient descent seen through affine coupling layers (Rana et al., Euclideanizing Flows, L4DC 2020).
+
+ẏ = −σ(y)·J(y)⁻¹·∇‖ψ(y) − ψ(y_e)‖ with a learned speed σ > 0. In the latent space the motions are straight rays, so a
+rollout is one pass of ψ⁻¹ along a ray, and its times are the integral of 1/σ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.weights import FOLDER, load_weights
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.rollouts import evenly_sampled, refined
+from dt_viz.motion.stack import LIVE
+from dt_viz.obstacles.union import Union
+from dt_viz.properties import cached_property
+from dt_viz.scenario.tasks import Task
+
+VERSION = 1
+"""Version of the weights, raised with every change to what they mean."""
+NUM_BLOCKS, NUM_FEATURES = 10, 200
+"""Number of coupling layers, and of random Fourier features of each of a layer's two functions."""
+LENGTH_SCALE = 0.45
+"""Length scale of the features, in the unit of the normalised demonstrations: their extent along each axis is 1."""
+NUM_HIDDEN = 100
+"""Width of the two hidden layers of the speed."""
+SLOPE = 0.01
+"""Slope of their leaky rectifiers below zero."""
+BLOCK = 100
+"""Number of points whose cosines are computed together: few enough to stay in the processor's cache."""
+NUM_SAMPLES = 50
+"""Number of samples of a rollout before refinement."""
+NUM_KEPT = 4
+"""Number of sets of starts whose rollouts are kept."""
+AT_GOAL = 1e-9
+"""Distance from the latent goal within which the velocity is zero, in the normalised unit."""
+
+
+EVEN, ODD = slice(0, None, 2), slice(1, None, 2)
+"""Coordinates of even and of odd number, counted from 0."""
+MASKS = tuple((ODD, EVEN) if k % 2 == 0 else (EVEN, ODD) for k in range(NUM_BLOCKS))
+"""Coordinates that each layer reads, and those that it moves."""
+
+
+def num_of(coordinates: slice, dim: int) -> int:
+    """Number of these coordinates among `dim`."""
+    return len(range(dim)[coordinates])
+
+
+@dataclass(frozen=True, eq=False)
+class Coupling(Diffeomorphism):
+    """Affine coupling layer y_b = x_b·exp(s(x_a)) + t(x_a), y_a = x_a; s and t are sums of cosines cos(Wᵀx_a + φ)."""
+
+    given: slice
+    """Coordinates a that s and t read."""
+    moved: slice
+    """All other coordinates, b."""
+    frequencies: Array
+    """W over φ (|a| + 1, 2F), of s before those of t; its precision is that of the cosines."""
+    amplitudes: Array
+    """(2F, 2|b|) of the cosines in s and in t; zero where a feature of the one would meet the other."""
+    slopes: Array
+    """(2F, 2|b|·|a|) of their sines in the derivatives of s and of t."""
+
+    @classmethod
+    def of(cls, given: slice, moved: slice, W: Array, phases: Array, weights: Array) -> Coupling:
+        """Make a layer of its features.
+
+        Args:
+            given: coordinates that it reads.
+            moved: coordinates that it moves.
+            W: (2, F, |a|) frequencies of s and of t.
+            phases: (2, F).
+            weights: (2, F, |b|) of the features.
+        """
+        num = W.shape[1]
+        amplitudes = np.zeros((2, num, 2, weights.shape[2]), W.dtype)
+        amplitudes[0, :, 0], amplitudes[1, :, 1] = weights
+        flat, frequencies = amplitudes.reshape(2 * num, -1), W.reshape(2 * num, -1)
+        slopes = (-flat[:, :, None] * frequencies[:, None, :]).reshape(2 * num, -1)
+        return cls(given, moved, np.vstack([frequencies.T, phases.reshape(-1)]), flat, slopes)
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return len(self.frequencies) - 1 + self.amplitudes.shape[1] // 2
+
+    def scaled(self, fraction: float) -> Coupling:
+        """The layer with s and t in proportion; not a group, as that of a flow is."""
+        return replace(self, amplitudes=fraction * self.amplitudes, slopes=fraction * self.slopes)
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        a, b, num = self.given, self.moved, self.amplitudes.shape[1] // 2
+        values, slopes = self._functions(s[:, a], with_slopes=U is not None)
+        stretch, shift = values[:, :num], values[:, num:]
+        factor = np.exp(-stretch if inverse else stretch)
+        x = s.copy()
+        x[:, b] = (s[:, b] - shift) * factor if inverse else s[:, b] * factor + shift
+        if U is None:
+            return x, None
+        V, derivatives = U.copy(), slopes @ U[:, a]
+        Ds, Dt = derivatives[:, :num], derivatives[:, num:]
+        if inverse:
+            V[:, b] = factor[..., None] * (U[:, b] - Dt) - x[:, b, None] * Ds
+        else:
+            V[:, b] = factor[..., None] * (U[:, b] + s[:, b, None] * Ds) + Dt
+        return x, V
+
+    def _functions(self, x: Array, *, with_slopes: bool) -> tuple[Array, Array]:
+        """Compute s and t (N, 2|b|) and, if asked for, their derivatives (N, 2|b|, |a|), at `x` (N, |a|)."""
+        extended = np.ones((len(x), len(self.frequencies)), self.frequencies.dtype)
+        extended[:, :-1] = x
+        values = np.empty((len(x), self.amplitudes.shape[1]))
+        slopes = np.empty((len(x) if with_slopes else 0, self.slopes.shape[1]))
+        for k in range(0, len(x), BLOCK):
+            phase = extended[k : k + BLOCK] @ self.frequencies
+            if with_slopes:
+                slopes[k : k + BLOCK] = np.sin(phase) @ self.slopes
+            values[k : k + BLOCK] = np.cos(phase, out=phase) @ self.amplitudes
+        return values, slopes.reshape(len(slopes), values.shape[1], len(self.frequencies) - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Normalisation(Diffeomorphism):
+    """The affine map y ↦ scale·y + shift, coordinate by coordinate."""
+
+    scale: Array
+    shift: Array
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the space."""
+        return len(self.scale)
+
+    def scaled(self, fraction: float) -> Normalisation:
+        """Itself: it is a change of units, no behaviour."""
+        return self
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        scale = 1 / self.scale if inverse else self.scale
+        image = (s - self.shift) * scale if inverse else s * scale + self.shift
+        return image, None if U is None else U * scale[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Speed:
+    """σ(y) = exp of a network with two hidden layers and leaky rectifiers, of the normalised coordinates."""
+
+    layers: Sequence[tuple[Array, Array]]
+    """Weights (out, in) and biases (out,) of each layer."""
+
+    def __call__(self, x: Array) -> Array:
+        """σ (N,), in normalised units a second, at normalised points `x` (N, k)."""
+        for W, c in self.layers[:-1]:
+            x = x @ W.T + c
+            x = np.maximum(x, SLOPE * x)
+        W, c = self.layers[-1]
+        return np.exp(x @ W.T + c)[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class EFlowSystem:
+    """A learned EFlow in the world; stable by construction: ‖ψ(y) − ψ(y_e)‖ falls at the rate σ along every motion."""
+
+    transform: Diffeomorphism
+    """ψ from the world to the latent space, in the world's frame."""
+    normalised: Callable[[Array], Array]
+    """Takes world points (N, 3) to the normalised coordinates of the demonstrations (N, k)."""
+    speed: Speed
+    scale: float
+    """World metres for one latent unit."""
+    goal: Array
+    """y_e (3,), metres."""
+    latent_goal: Array
+    """ψ(y_e) (3,)."""
+
+    @classmethod
+    def of(cls, task: Task, arrays: Mapping[str, Array], precision: Any = np.float32) -> EFlowSystem:  # noqa: ANN401 - a numpy type
+        """Make the system that weights describe.
+
+        Args:
+            task: the task that they were trained for.
+            arrays: as `dt_viz.baselines.eflow_training.train` returns them.
+            precision: numpy type that the cosines are computed in; single costs less than a micrometre.
+
+        Raises:
+            NotFittedError: an array is missing, or of another shape.
+        """
+        dim = task.demonstrations[0].dimension
+        num_moved = (dim + 1) // 2
+        shapes = {
+            "frequencies": (NUM_BLOCKS, 2, NUM_FEATURES, num_moved),
+            "phases": (NUM_BLOCKS, 2, NUM_FEATURES),
+            "weights": (NUM_BLOCKS, 2, NUM_FEATURES, num_moved),
+            "normalisation": (2, dim),
+            "goal": (dim,),
+            "speed_0": (NUM_HIDDEN, dim + 1),
+            "speed_1": (NUM_HIDDEN, NUM_HIDDEN + 1),
+            "speed_2": (1, NUM_HIDDEN + 1),
+        }
+        for name, shape in shapes.items():
+            found = arrays[name].shape if name in arrays else "nothing"
+            if found != shape:
+                raise NotFittedError(f"eflow: array {name!r}: found {found}; accepted: {shape}")
+        couplings = [
+            Coupling.of(a, b, W[..., : num_of(a, dim)], phases, w[..., : num_of(b, dim)])
+            for (a, b), W, phases, w in zip(
+                MASKS,
+                *(arrays[name].astype(precision) for name in ("frequencies", "phases", "weights")),
+                strict=True,
+            )
+        ]
+        normalisation = Normalisation(*arrays["normalisation"])
+        transform = Placed(Chain([*couplings[::-1], normalisation]), task.origin, task.axes, task.scale)
+        layers = [(arrays[f"speed_{k}"][:, :-1], arrays[f"speed_{k}"][:, -1]) for k in range(3)]
+        goal = task.to_world(arrays["goal"])
+        normalised = lambda y: normalisation.forward(transform.to_frame(y)[:, :dim])  # noqa: E731
+        return cls(transform, normalised, Speed(layers), task.scale, goal, transform.forward(goal))
+
+    def velocity(self, y: Array) -> Array:
+        """ẏ (N, 3), m/s, at `y` (N, 3), metres."""
+        z, J = self.transform.jacobian(y)
+        offset = (z - self.latent_goal) / self.scale
+        r = np.linalg.norm(offset, axis=1, keepdims=True)
+        descent = -np.divide(offset, r, out=np.zeros_like(offset), where=r > AT_GOAL)
+        rate = self.scale * self.speed(self.normalised(y))
+        return rate[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
+
+    def lyapunov(self, y: Array) -> Array:
+        """‖ψ(y) − ψ(y_e)‖ (N,), in the normalised unit."""
+        return np.linalg.norm(self.transform.forward(y) - self.latent_goal, axis=-1) / self.scale
+
+    def rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Motions to the goal, exact but for their times, whose integral is a sum of trapezia.
+
+        Those asked for lately are kept: while an obstacle is dragged the starts stay. Nobody may change them.
+
+        Args:
+            starts: (R, 3), metres.
+            spacing: largest distance between neighbouring samples, metres.
+
+        Returns:
+            For each start a path (T, 3), metres, and its times (T,), seconds.
+        """
+        return self._kept_rollouts(starts.tobytes(), spacing)
+
+    @cached_property
+    def _kept_rollouts(self) -> Callable[[bytes, float], tuple[tuple[Array, ...], tuple[Array, ...]]]:
+        return lru_cache(NUM_KEPT)(
+            lambda content, spacing: self._rollouts(np.frombuffer(content).reshape(-1, 3), spacing)
+        )
+
+    def _rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        rays = self.transform.forward(starts) - self.latent_goal
+
+        def evaluate(index: Indices, fraction: Array) -> Array:
+            return self.transform.inverse(self.latent_goal + (1 - fraction)[:, None] * rays[index])[:, None]
+
+        bundle = refined(evenly_sampled(evaluate, len(starts), NUM_SAMPLES), evaluate, spacing)
+        slowness = bundle.split(1 / self.speed(self.normalised(bundle.positions)))
+        lengths = np.linalg.norm(rays, axis=1) / self.scale
+        steps = (
+            length * np.diff(fraction) * (slow[1:] + slow[:-1]) / 2
+            for length, fraction, slow in zip(lengths, bundle.split(bundle.fraction), slowness, strict=True)
+        )
+        return bundle.paths, tuple(np.append(0.0, np.cumsum(step)) for step in steps)
+
+
+@dataclass(frozen=True, eq=False)
+class _Planner:
+    system: EFlowSystem
+    spacing: float
+
+    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+        """Plan without regard to the obstacle; see `Planner`."""
+        return Plan(*self.system.rollouts(starts, self.spacing))
+
+
+class EFlow(Method):
+    """EFlow: imitation alone."""
+
+    name, title = "eflow", "EFlow"
+    promise = "Stable: every motion reaches the goal, by construction. It does not avoid."
+    stable, whole_arm, live = True, False, True
+
+    def __init__(self, spacing: float = LIVE.spacing, folder: Path = FOLDER) -> None:
+        """Choose the largest distance between samples of a path, metres, and the folder of the weights."""
+        self.spacing, self.folder = spacing, folder
+
+    def fit(self, problem: Problem) -> Planner:
+        """Load the task's weights; see `Method`."""
+        return _Planner(self.system(problem.task), self.spacing)
+
+    def system(self, task: Task) -> EFlowSystem:
+        """Load the task's weights. Raises NotFittedError as `Method.fit`."""
+        return EFlowSystem.of(task, load_weights("eflow", VERSION, task, self.folder))

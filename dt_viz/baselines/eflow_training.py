@@ -1,0 +1,140 @@
+"""Training of EFlow: velocities regressed on positions, as its authors' code does it; the file of EFlow with torch.
+
+An epoch is one step on all points, as theirs is with random Fourier features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch  # pyright: ignore[reportMissingImports] - an extra
+from scipy.signal import savgol_filter
+
+from dt_viz.baselines.base import NotFittedError, Problem
+from dt_viz.baselines.eflow import LENGTH_SCALE, MASKS, NUM_BLOCKS, NUM_FEATURES, NUM_HIDDEN, SLOPE, num_of
+from dt_viz.flows.fields import Array
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.preparation import ImitationError, prepare
+from dt_viz.metrics import interpolate
+
+RATE, DECAY, LARGEST_GRADIENT = 1e-4, 1e-10, 0.1
+"""Learning rate and weight decay of Adam, and the norm at which the gradient is clipped."""
+NUM_POINTS = 150
+"""Number of points of a demonstration, evenly in time."""
+WINDOW = 25 / 150
+"""Part of them that is smoothed over, by cubic polynomials (Savitzky and Golay)."""
+REPORT_EVERY = 25
+"""Number of epochs between two reports."""
+
+Tensors = dict[str, "torch.Tensor"]
+
+
+def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed: int = 0) -> dict[str, Array]:
+    """Train EFlow on the demonstrations of a task.
+
+    Args:
+        problem: the task.
+        num_epochs: number of steps, each on all points.
+        report: takes a line of progress.
+        seed: of the features and of the speed's first weights.
+
+    Returns:
+        Arrays for `dt_viz.baselines.eflow.EFlowSystem.of`: of the epoch with the least loss.
+
+    Raises:
+        NotFittedError: nothing can be learned from the demonstrations.
+    """
+    x, v, normalisation, goal = samples(problem.task.demonstrations)
+    rng = np.random.default_rng(seed)
+    fixed, learned = initial(x.shape[1], rng)
+    points, velocities = (torch.tensor(array, dtype=torch.float32) for array in (x, v))
+    centre = torch.tensor(goal * normalisation[0] + normalisation[1], dtype=torch.float32)
+    optimiser = torch.optim.Adam(learned.values(), lr=RATE, weight_decay=DECAY)
+    best, least = learned, np.inf
+    for epoch in range(num_epochs):
+        loss = torch.nn.functional.smooth_l1_loss(velocity(points, centre, fixed, learned), velocities)
+        if loss.item() < least:
+            best, least = {name: tensor.detach().clone() for name, tensor in learned.items()}, loss.item()
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(learned.values(), LARGEST_GRADIENT)
+        optimiser.step()
+        if (epoch + 1) % REPORT_EVERY == 0:
+            report(f"epoch {epoch + 1} of {num_epochs}, loss {loss.item():.3g}")
+    arrays = {name: tensor.detach().numpy().astype(float) for name, tensor in {**fixed, **best}.items()}
+    return {**arrays, "normalisation": normalisation, "goal": goal}
+
+
+def samples(demonstrations: tuple[Demonstration, ...]) -> tuple[Array, Array, Array, Array]:
+    """Points and velocities to learn from.
+
+    Returns:
+        Normalised points (N, k) and their velocities (N, k), 1/s; scale and shift (2, k) of the normalisation, which
+        maps the demonstrations' box to [−1/2, 1/2]; their common goal (k,), in their own unit.
+
+    Raises:
+        NotFittedError: they have no common goal, or do not move.
+    """
+    try:
+        motions = prepare(demonstrations)
+    except ImitationError as error:
+        raise NotFittedError(str(error)) from error
+    window = 2 * int(WINDOW * NUM_POINTS / 2) + 1
+    paths, steps = [], []
+    for times, positions in zip(motions.times, motions.positions, strict=True):
+        even = np.linspace(times[0], times[-1], NUM_POINTS)
+        path = np.asarray(savgol_filter(interpolate(even, times, positions), window, 3, axis=0))
+        paths.append(path + motions.goal - path[-1])
+        steps.append(even[1])
+    every = np.concatenate(paths)
+    lowest, extent = every.min(axis=0), np.ptp(every, axis=0)
+    scale = 1 / np.maximum(extent, 1e-6 * extent.max())
+    rates = [np.diff(path, axis=0, append=path[-1:]) * scale / h for path, h in zip(paths, steps, strict=True)]
+    shift = -lowest * scale - 0.5
+    return every * scale + shift, np.concatenate(rates), np.stack([scale, shift]), motions.goal
+
+
+def initial(dim: int, rng: np.random.Generator) -> tuple[Tensors, Tensors]:
+    """Fixed features, and what is learned: coupling layers that are the identity, a random speed."""
+    num_moved = (dim + 1) // 2
+    tensor = lambda array: torch.tensor(array, dtype=torch.float32)  # noqa: E731
+    fixed = {
+        "frequencies": tensor(rng.normal(size=(NUM_BLOCKS, 2, NUM_FEATURES, num_moved)) / LENGTH_SCALE),
+        "phases": tensor(rng.uniform(0, 2 * np.pi, size=(NUM_BLOCKS, 2, NUM_FEATURES))),
+    }
+    learned = {"weights": torch.zeros(NUM_BLOCKS, 2, NUM_FEATURES, num_moved)}
+    for k, (num_in, num_out) in enumerate([(dim, NUM_HIDDEN), (NUM_HIDDEN, NUM_HIDDEN), (NUM_HIDDEN, 1)]):
+        bound = num_in**-0.5
+        learned[f"speed_{k}"] = tensor(rng.uniform(-bound, bound, size=(num_out, num_in + 1)))
+    return fixed, {name: value.requires_grad_() for name, value in learned.items()}
+
+
+def velocity(x: torch.Tensor, goal: torch.Tensor, fixed: Tensors, learned: Tensors) -> torch.Tensor:
+    """σ·J⁻¹·f (N, k) at the normalised points `x` (N, k), as `dt_viz.baselines.eflow.EFlowSystem.velocity`.
+
+    J⁻¹ is applied layer by layer, from the last to the first: that of a coupling layer is triangular.
+    """
+    dim, z, passed = x.shape[1], torch.cat([x, goal[None]]), []
+    for k, (a, b) in enumerate(MASKS):
+        W, w = fixed["frequencies"][k, ..., : num_of(a, dim)], learned["weights"][k, ..., : num_of(b, dim)]
+        phase = torch.einsum("na,kfa->knf", z[:, a], W) + fixed["phases"][k][:, None]
+        stretch, shift = torch.cos(phase) @ w
+        passed.append((a, b, W, w, phase[:, :-1], stretch[:-1], z[:-1][:, b]))
+        z = _put(z, b, z[:, b] * stretch.exp() + shift)
+    U = -torch.nn.functional.normalize(z[:-1] - z[-1])
+    for a, b, W, w, phase, stretch, before in reversed(passed):
+        Ds, Dt = -(torch.sin(phase) * torch.einsum("na,kfa->knf", U[:, a], W)) @ w
+        U = _put(U, b, (U[:, b] - Dt) * torch.exp(-stretch) - before * Ds)
+    for k in range(3):
+        layer = learned[f"speed_{k}"]
+        x = x @ layer[:, :-1].T + layer[:, -1]
+        x = torch.nn.functional.leaky_relu(x, SLOPE) if k < 2 else x
+    return x.exp() * U
+
+
+def _put(x: torch.Tensor, columns: slice, values: torch.Tensor) -> torch.Tensor:
+    """`x` with other columns."""
+    x = x.clone()
+    x[:, columns] = values
+    return x

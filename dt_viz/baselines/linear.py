@@ -1,0 +1,38 @@
+"""Straight lines in configuration space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.baselines.postures import Query, planned
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.union import Union
+
+
+@dataclass(frozen=True, eq=False)
+class _Planner:
+    problem: Problem
+
+    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+        """Plan without regard to the obstacle; see `Planner`."""
+        queries = []
+        for start in starts:
+            interrupted()
+            queries.append(Query.of(self.problem, start))
+        return planned(self.problem, queries, [np.stack([query.start, query.goal]) for query in queries])
+
+
+class Linear(Method):
+    """The straight line from the start's posture to the demonstrated goal posture, in the demonstrated duration."""
+
+    name, title = "linear", "Linear"
+    promise = "A path to the goal, straight in the joints. It neither imitates nor avoids."
+    stable, whole_arm, live = True, False, True
+
+    def fit(self, problem: Problem) -> Planner:
+        """Take the task's postures; see `Method`."""
+        return _Planner(problem)

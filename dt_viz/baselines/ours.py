@@ -1,0 +1,118 @@
+"""Ours: the learned motion, and the same with the whole arm led around obstacles (sec. 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.flows.fields import Array
+from dt_viz.interruption import interruptible
+from dt_viz.motion.following import Follower
+from dt_viz.motion.nominal import Learned, Nominal
+from dt_viz.motion.solve import solve
+from dt_viz.motion.stack import FINE, Precision
+from dt_viz.obstacles.shapes import as_point
+from dt_viz.obstacles.union import Union
+from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.transforms.avoidance import Avoidance
+
+
+@dataclass(frozen=True, eq=False)
+class _AlonePlanner:
+    learned: Learned
+
+    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+        """Plan without regard to the obstacle; see `Planner`."""
+        nominal, numbers = from_starts(self.learned, starts)
+        bundle = nominal.bundle
+        times = bundle.split(nominal.rays.times(bundle.index, bundle.fraction))
+        return Plan(tuple(nominal.paths[k] for k in numbers), tuple(times[k] for k in numbers))
+
+
+class OursAlone(Method):
+    """Our imitation alone."""
+
+    name, title = "ours-no-avoidance", "Ours, no avoidance"
+    promise = "Stable: every motion reaches the goal, by construction. It does not avoid."
+    stable, whole_arm, live = True, False, True
+
+    def fit(self, problem: Problem) -> Planner:
+        """Take what is learned already; see `Method`."""
+        return _AlonePlanner(problem.learned)
+
+
+@dataclass(frozen=True, eq=False)
+class _WholeArmPlanner:
+    learned: Learned
+    follower: Follower
+    precision: Precision
+
+    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+        """Plan motions of the whole arm; those that it finds no way for stay at their start. See `Planner`.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the task's motions start.
+        """
+        nominal, numbers = from_starts(self.learned, starts)
+        with interruptible(interrupted):
+            moving = self._moving(nominal, obstacle)
+        motions = [moving[k] if k in moving else self._resting(nominal, k) for k in numbers]
+        end_effector = self.follower.robot.end_effector
+        return Plan(
+            tuple(end_effector(q) for q, _ in motions), tuple(t for _, t in motions), tuple(q for q, _ in motions)
+        )
+
+    def _resting(self, nominal: Nominal, number: int) -> tuple[Array, Array]:
+        """The posture (1, 6), rad, at the start of a rollout, at time 0 (1,)."""
+        return self.follower.undisturbed_along(nominal, number).tracked.q[0, :1], np.zeros(1)
+
+    def _moving(self, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
+        """Joints (N, 6), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their number."""
+        avoidance = Avoidance(obstacle.parts, space="cspace")
+        assert avoidance.arm_avoidance is not None
+        admission = self.follower.admission(nominal, avoidance.arm_avoidance)
+        if admission.blocked:
+            return {}
+        scenario = Scenario(nominal.task.name, (Layer(avoidance, name=avoidance.title),))
+        solved = solve(scenario, admission.nominal, self.precision, self.follower)
+        arm = solved.arm
+        if solved.blocked or arm is None:
+            return {}
+        due, limits = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits
+        rows = [arm.index == rollout for rollout in range(len(solved.nominal.strands))]
+        return {
+            number: (arm.p[row], within_velocity_limits(due[row], arm.p[row], limits))
+            for number, row in zip(solved.nominal.numbers, rows, strict=True)
+        }
+
+
+class Ours(Method):
+    """Our imitation, the whole arm led around the obstacles in configuration space."""
+
+    name, title = "ours", "Ours"
+    promise = "Stable, and the whole arm keeps clear; where it finds no way it says so."
+    stable, whole_arm, live = True, True, False
+
+    def __init__(self, precision: Precision = FINE) -> None:
+        """Choose how exactly the motion is worked out."""
+        self.precision = precision
+
+    def fit(self, problem: Problem) -> Planner:
+        """Take what is learned already; see `Method`."""
+        return _WholeArmPlanner(problem.learned, Follower(problem.robot), self.precision)
+
+
+def from_starts(learned: Learned, starts: Array) -> tuple[Nominal, list[int]]:
+    """The undisturbed motion from starts (R, 3), metres, and the number of each start's rollout in it.
+
+    The task's starts are always part of it: the whole arm's avoidance is made for their motions.
+    """
+    known = {as_point(start): number for number, start in enumerate(learned.task.starts)}
+    points = [as_point(start) for start in starts]
+    added = list(dict.fromkeys(point for point in points if point not in known))
+    numbers = {**known, **{point: len(learned.task.starts) + k for k, point in enumerate(added)}}
+    return learned.nominal([learned.strand(point) for point in added]), [numbers[point] for point in points]

@@ -1,0 +1,115 @@
+"""Where methods that plan joints begin and end, how long they take, and what their way is free of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.arm.body_points import BodyPoints, load_body_points
+from dt_viz.arm.collision import CollisionModel, load_collision_model
+from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.arm.robot import Robot
+from dt_viz.arm.tracking import IK_TOLERANCE, inverse_kinematics
+from dt_viz.baselines.base import Plan, Problem
+from dt_viz.flows.fields import Array
+from dt_viz.metrics import arc_length, interpolate
+from dt_viz.obstacles.union import Union
+
+NUM_SAMPLES = 200
+"""Number of even samples of a motion; its corners come on top."""
+SPACING = 0.01
+"""Largest distance, metres, that a point of the arm moves between two postures that are tried for a quick answer."""
+NUM_TRIED = 3
+"""Number of postures, those with the deepest spheres, whose meshes are tried before the whole line's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """One motion that is asked for."""
+
+    start: Array
+    """(6,) posture, rad."""
+    goal: Array
+    """(6,) posture at the end of the demonstration with the nearest start, rad."""
+    duration: float
+    """Duration of that demonstration, seconds."""
+
+    @classmethod
+    def of(cls, problem: Problem, start: Array) -> Query:
+        """Find the postures for a start (3,), metres.
+
+        Raises:
+            UnreachableError: the arm cannot reach the start.
+        """
+        nearest = int(np.linalg.norm(problem.task.starts - start, axis=1).argmin())
+        along, times = problem.postures[nearest], problem.task.demonstrations[nearest].times
+        posture = along[0]
+        if np.linalg.norm(problem.robot.end_effector(posture) - start) > IK_TOLERANCE:
+            posture = inverse_kinematics(problem.robot, start, posture)
+        return cls(posture, along[-1], float(times[-1] - times[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What the arm may hit: an obstacle, the table and itself, by its meshes."""
+
+    robot: Robot
+    obstacle: Union
+    body: BodyPoints
+    model: CollisionModel
+
+    @classmethod
+    def of(cls, robot: Robot, obstacle: Union) -> Surroundings:
+        """The surroundings of an arm with an obstacle."""
+        return cls(robot, obstacle, load_body_points().on_moving_links, load_collision_model())
+
+    def is_free(self, start: Array, end: Array) -> bool:
+        """Decide whether the arm is free on the straight line between two postures (6,), rad, at every point of it."""
+        turn = np.abs(end - start)
+        num = 1 + int(np.ceil((self.model.reach * turn).sum(axis=1).max() / SPACING))
+        line = start + np.linspace(0, 1, num + 1)[:, None] * (end - start)
+        # spheres around the links answer most questions
+        points = self.body.positions(self.robot, line)
+        if self.obstacle.parts and not self._clears(line, points):
+            return False
+        height = points[..., 2] - self.body.radius
+        if height.min() <= SPACING / 2 and self.model.nearest_to_table(line[[0, -1]]).distance <= 0:
+            return False
+        itself = self.model.nearest_to_itself(line[[0, -1]])
+        return itself is None or itself.distance > 0
+
+    def _clears(self, line: Array, points: Array) -> bool:
+        """Decide whether the arm clears the obstacle, from samples (N, 6), rad, and the spheres' centres (N, P, 3)."""
+        if (self.obstacle.signed_distance(self.robot.end_effector(line)) < 0).any():
+            return False
+        room = (self.obstacle.signed_distance(points) - self.body.radius).min(axis=1)
+        if room.min() > SPACING / 2:
+            return True
+        deepest = line[np.argsort(room)[:NUM_TRIED]]
+        if any((self.model.obstacle_distance(deepest, part)[0] <= 0).any() for part in self.obstacle.parts):
+            return False
+        return self.model.nearest_to_obstacle(line[[0, -1]], self.obstacle).distance > 0
+
+
+def planned(problem: Problem, queries: Sequence[Query], ways: Sequence[Array], warnings: tuple[str, ...] = ()) -> Plan:
+    """Make motions of corners in joint space: straight between them, even in joint space but for the velocity limits.
+
+    Args:
+        problem: what the method was fitted to.
+        queries: what was asked for.
+        ways: corners (K_i, 6), rad, for each of them.
+        warnings: what the motions fail at.
+    """
+    paths, times, joints = [], [], []
+    for query, way in zip(queries, ways, strict=True):
+        length = arc_length(way)
+        kept = np.concatenate([[True], np.diff(length) > 0])
+        at = np.union1d(np.linspace(0, length[-1], NUM_SAMPLES), length[kept])
+        q = interpolate(at, length[kept], way[kept])
+        even = query.duration * at / length[-1] if length[-1] else at
+        joints.append(q)
+        times.append(within_velocity_limits(even, q, problem.robot.velocity_limits))
+        paths.append(problem.robot.end_effector(q))
+    return Plan(tuple(paths), tuple(times), tuple(joints), warnings)

@@ -1,0 +1,85 @@
+"""Weights of trained methods: files that say which method, version and demonstrations they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.baselines.base import NotFittedError
+from dt_viz.errors import DataError, FormatError, parsing
+from dt_viz.files.checks import read_bytes
+from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
+from dt_viz.flows.fields import Array
+from dt_viz.learning.store import fingerprint
+from dt_viz.scenario.tasks import Task
+from dt_viz.shipped import ASSETS
+
+FOLDER = ASSETS / "baselines"
+"""Folder of the weights that ship with DT-Viz."""
+MAX_FILE, MAX_BYTES = 10**6, 10**7
+"""Largest number of bytes of a file, and of its arrays when unpacked."""
+MADE_BY = "python -m dt_viz.evaluate train"
+"""Command that makes the weights."""
+
+
+class WeightsError(DataError):
+    """A file of weights that cannot be read."""
+
+
+def save_weights(path: Path, method: str, version: int, task: Task, arrays: Mapping[str, Array]) -> None:
+    """Write the weights of a method for a task; arrays of floats are stored in single precision.
+
+    Args:
+        path: the file; `weights_file` names the one that `load_weights` reads.
+        method: name of the method.
+        version: of its format, raised with every change to what the arrays mean.
+        task: whose demonstrations it was trained on.
+        arrays: what was learned, finite numbers; no name begins with an underscore.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    values = {name: np.asarray(array) for name, array in arrays.items()}
+    single = {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in values.items()}
+    stamp = {"_method": method, "_version": version, "_demonstrations": _demonstrations(task)}
+    write_whole(path, npz_bytes({**{name: np.array(value) for name, value in stamp.items()}, **single}))
+
+
+def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -> dict[str, Array]:
+    """Read the weights of a method for a task, floats in double precision.
+
+    Raises:
+        NotFittedError: there are none, the file is damaged, or it is of another method, version or task.
+    """
+    path = weights_file(folder, method, task)
+    accepted = f"weights as {MADE_BY!r} writes them"
+    if not path.is_file():
+        text = f"{method} has not been trained for {task.title!r}; {MADE_BY} --method {method} --task {task.name}"
+        raise NotFittedError(text)
+    try:
+        with parsing(WeightsError, path, "file", accepted):
+            archive = NpzFile(read_bytes(path, MAX_FILE), max_bytes=MAX_BYTES)
+            arrays = {name: archive.read(name) for name in archive.names}
+            asked = {"_method": method, "_version": version, "_demonstrations": _demonstrations(task)}
+            for field, wanted in asked.items():
+                found = arrays.pop(field).item()
+                if found != wanted:
+                    raise FormatError(field[1:], repr(found)[:80], repr(wanted))
+            for name, array in arrays.items():
+                if array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+                    raise FormatError(f"array {name!r}", "text, or numbers that are not finite", "finite numbers")
+    except WeightsError as error:
+        raise NotFittedError(str(error)) from error
+    return {name: array.astype(float) if array.dtype.kind == "f" else array for name, array in arrays.items()}
+
+
+def weights_file(folder: Path, method: str, task: Task) -> Path:
+    """The file of a method's weights for a task."""
+    return folder / f"{method}_{task.name}.npz"
+
+
+def _demonstrations(task: Task) -> str:
+    """Digest of the task's demonstrations."""
+    return fingerprint(task.demonstrations, "weights")

@@ -1,0 +1,392 @@
+"""Compare all methods, around a sphere at seeded places of the paper's three tasks (Table 1 and figure 6).
+
+    python -m dt_viz.evaluate table1 --out DIR
+
+Places: a sphere of 15 cm is centred up to 5 cm from the mean demonstration, between a fifth and four fifths of its
+length. Those places are kept where the hand of every undisturbed motion enters it, and where the arm's meshes are free
+in its usual posture at every start and goal of the demonstrations: each method has a problem that can be solved.
+
+``DIR/table1.json`` holds ``{method: {task: {column: {"mean", "worst", "paper"}}}}`` in metres and seconds, over all
+places and rollouts; ``paper`` is null where the paper's figure is not known here. ``DIR/METHOD_TASK.npz`` holds what
+the cells are made from: ``obstacle_k`` (4,), centre and diameter of the sphere at place k; ``x_k_i``, ``t_k_i`` and
+``q_k_i``, the path (N, 3), its times (N,) and the arm's postures (M, 6) along it, of the rollout from start i;
+``demo_i`` (T, 3), its demonstration, and ``demo_t_i``; one array (K, R) for each column, of motions from the starts;
+``perturbed_k`` (P, 3) and ``ends_k`` (P, 3), perturbed starts and where their motions end. Columns:
+
+``frechet``, ``dtw``
+    Fréchet distance of the hand's path to the demonstration, between points, too (Alt and Godau); and mean distance of
+    points matched by dynamic time warping, between `NUM_WARPED` points each, evenly by arc length.
+``arm_depth``, ``hand_depth``, ``clearance``
+    maximum collision distance of the arm's meshes and of the end effector, and the meshes' smallest distance.
+``goal_error``, ``turn``, ``jerk``
+    distance of the end from the demonstrations' goal; sharpest turn over `TURN_ARC`, degrees; root mean square of
+    the third derivative at 20 Hz, m/s³.
+``reached``
+    share of motions from perturbed starts that end within `REACHED` of the goal; worst is that of a place.
+``seconds``
+    processor time to plan all motions of a place, without tracking them.
+
+Hand paths are tracked by the arm, in its usual posture, for what is measured of the meshes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.arm.robot import load_jaco
+from dt_viz.arm.tracking import UnreachableError, track
+from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.engine.engine import Engine
+from dt_viz.evaluate.avoidance import TURN_ARC
+from dt_viz.evaluate.figure6 import MATPLOTLIB, draw
+from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json, write_npz
+from dt_viz.flows.fields import Array
+from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.metrics import (
+    dynamic_time_warping,
+    frechet,
+    maximum_collision_distance,
+    resample_by_arc_length,
+    rms_jerk,
+    sharpest_turn,
+)
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.union import Union
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import TASKS, Task
+
+PAPER_TASKS = ("push_box", "lift_box", "draw_s")
+DIAMETER = 0.15
+"""Diameter of the sphere, metres."""
+ALONG, WITHIN = (0.2, 0.8), 0.05
+"""Part of the mean demonstration that spheres are drawn along, and largest distance from it, metres."""
+MAX_DRAWN = 2000
+"""Largest number of spheres drawn for a task."""
+PERTURBED_BY = 0.05
+"""Largest distance of a perturbed start from a demonstrated one, metres."""
+REACHED = 0.01
+"""Distance from the goal at which a motion counts as having reached it, metres."""
+NUM_WARPED = 200
+"""Number of points of each path that are matched by dynamic time warping."""
+INTERVAL = 0.05
+"""Interval of the jerk's differences, seconds: the paper's 20 Hz."""
+FREE = 1e-3
+"""Maximum collision distance up to which a method counts as free of collisions, metres."""
+ALIKE = 2.0
+"""Ratio of mean Fréchet distances up to which two methods count as comparable."""
+SMALLEST = ("clearance", "reached")
+"""Columns whose worst value is the smallest."""
+UNITS = {"turn": (1.0, "°"), "reached": (100.0, "%"), "seconds": (1.0, "s"), "jerk": (1.0, "m/s³")}
+"""Factor and unit of each column in the printed table; all others are lengths, printed in millimetres."""
+PAPER: Mapping[tuple[str, str, str], float] = {
+    ("ours", "push_box", "frechet"): 0.124,
+    ("ours", "lift_box", "frechet"): 0.127,
+    ("ours", "draw_s", "frechet"): 0.067,
+}
+"""Figures of the paper's Table 1 that are known here, by method, task and column, metres."""
+INCONSISTENT = """The paper's table does not agree with itself in two places, and is no measure there:
+- maximum collision distances above the sphere's radius: no point is deeper in a sphere than that;
+- Fréchet distances of Draw S that are larger than a letter of the LASA data set."""
+FAILED = 1
+"""Exit status if something that a method needs is not installed, or a method was not trained."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Measurements of one motion; see the columns of the file."""
+
+    frechet: float
+    dtw: float
+    arm_depth: float
+    hand_depth: float
+    clearance: float
+    goal_error: float
+    turn: float
+    jerk: float
+
+
+COLUMNS = (*(value.name for value in fields(Measured)), "reached", "seconds")
+
+
+@dataclass(frozen=True)
+class Place:
+    """A sphere, and starts beside the demonstrated ones."""
+
+    sphere: Sphere
+    perturbed: Array
+    """(P, 3), metres."""
+
+    @property
+    def obstacle(self) -> Union:
+        """The sphere as an obstacle."""
+        return Union((self.sphere,))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the subcommand's arguments."""
+    parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=list(METHODS), help="(default: all)")
+    parser.add_argument("--tasks", nargs="+", choices=PAPER_TASKS, default=list(PAPER_TASKS), help="(default: all)")
+    parser.add_argument("--count", type=whole_number(1), default=10, help="places (default: %(default)s)")
+    parser.add_argument("--perturbed", type=whole_number(0), default=200, help="starts (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number(0), default=0, help="of the places (default: %(default)s)")
+    parser.add_argument("--no-figures", action="store_true", help="leave figure 6 out")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the table and its arrays")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand; 1 if a method needs what is not there."""
+    folder, methods = ready_folder(options.out), [METHODS[name] for name in options.methods]
+    missing = {method.title: method.missing for method in methods if method.missing}
+    if not options.no_figures and MATPLOTLIB.missing:
+        missing["figure 6"] = MATPLOTLIB.missing
+    for title, modules in missing.items():
+        print(f"{title} needs {', '.join(modules)}: {INSTALL}; or leave it out", file=sys.stderr)
+    if missing:
+        return FAILED
+    engine = Engine(TASKS, FitStore(default_cache_folder()), load_jaco())
+    table: dict[str, dict[str, Any]] = {method.name: {} for method in methods}
+    for name in options.tasks:
+        problem = problem_of(engine.nominal(Scenario(name)).learned, engine.follower)
+        places = drawn(problem, options.count, options.perturbed, options.seed)
+        curves = {}
+        for method in methods:
+            try:
+                planner = method.fit(problem)
+            except NotFittedError as error:
+                print(f"{method.title}, {problem.task.title}: {error}", file=sys.stderr)
+                return FAILED
+            arrays = measured(planner, problem, places)
+            write_npz(folder / f"{method.name}_{name}.npz", **arrays)
+            table[method.name][name] = cells(method.name, name, arrays)
+            curves[method.title] = arrays
+            print(f"{method.title}, {problem.task.title}: {arrays['seconds'].sum():.0f} s of planning", flush=True)
+            write_json(folder / "table1.json", table)
+        _print(problem.task, methods, table)
+        if not options.no_figures:
+            draw(folder / f"figure6_{name}", problem.task.title, curves)
+    print_orderings(table)
+    print(f"\n{INCONSISTENT}")
+    return 0
+
+
+def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[Place]:
+    """Draw the places of a task, as the module says, and perturbed starts, divided among the places.
+
+    Raises:
+        InputError: the places are not found.
+    """
+    task, model = problem.task, load_collision_model()
+    rng, mean, undisturbed = np.random.default_rng(seed), task.mean_path, problem.learned.demonstrated.paths
+    at_ends = np.concatenate([path[[0, -1]] for path in problem.postures])
+    places: list[Place] = []
+    for _ in range(MAX_DRAWN):
+        if len(places) == count:
+            return places
+        centre = mean[round(rng.uniform(*ALONG) * (len(mean) - 1))] + _in_ball(rng, WITHIN)
+        sphere = Sphere(as_point(centre), DIAMETER)
+        if any(sphere.signed_distance(path).min() >= 0 for path in undisturbed):
+            continue
+        if model.obstacle_distance(at_ends, sphere)[0].min() <= 0:
+            continue
+        share = (len(places) + 1) * num_perturbed // count - len(places) * num_perturbed // count
+        beside = np.random.default_rng([seed, len(places)])  # places do not depend on how many starts there are
+        places.append(Place(sphere, _perturbed(problem, sphere, share, beside)))
+    found = f"{len(places)} of {task.title!r} among {MAX_DRAWN} spheres"
+    raise InputError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
+
+
+def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Generator) -> Array:
+    """Starts (num, 3), metres, beside the demonstrated ones: reached by the arm, which is free there."""
+    starts, model, robot = problem.task.starts, load_collision_model(), problem.robot
+    found: list[Array] = []
+    for _ in range(MAX_DRAWN):
+        if len(found) == num:
+            break
+        nearest = int(rng.integers(len(starts)))
+        start = starts[nearest] + _in_ball(rng, PERTURBED_BY)
+        posture = track(robot, start[None], problem.postures[nearest][0])
+        if posture.error[0] < FREE and model.obstacle_distance(posture.q, sphere)[0].min() > 0:
+            found.append(start)
+    return np.array(found).reshape(-1, 3)
+
+
+def _in_ball(rng: np.random.Generator, radius: float) -> Array:
+    direction = rng.normal(size=3)
+    return radius * rng.uniform() ** (1 / 3) * direction / np.linalg.norm(direction)
+
+
+def measured(planner: Planner, problem: Problem, places: Sequence[Place]) -> dict[str, Array]:
+    """Plan and measure the motions of a method at all places.
+
+    Returns:
+        The arrays of the method's file.
+    """
+    task, goal = problem.task, problem.learned.goal
+    arrays: dict[str, Array] = {f"demo_{i}": path for i, path in enumerate(task.paths)}
+    arrays |= {f"demo_t_{i}": d.times for i, d in enumerate(task.demonstrations)}
+    table: dict[str, list[Any]] = {column: [] for column in COLUMNS}
+    for k, place in enumerate(places):
+        began = time.thread_time()
+        plan = planner.plan(place.obstacle, task.starts)
+        seconds = time.thread_time() - began
+        rows = []
+        for i, (x, t, q) in enumerate(zip(plan.paths, plan.times, joints_along(problem, plan), strict=True)):
+            arrays |= {f"x_{k}_{i}": x, f"t_{k}_{i}": t, f"q_{k}_{i}": q}
+            rows.append(measure(x, t, q, task.paths[i], goal, place.obstacle))
+        for value in fields(Measured):
+            table[value.name].append([getattr(row, value.name) for row in rows])
+        ends = _ends(planner, place)
+        arrays |= {f"obstacle_{k}": np.array([*place.sphere.position, place.sphere.diameter])}
+        arrays |= {f"perturbed_{k}": place.perturbed, f"ends_{k}": ends}
+        table["reached"].append(np.mean(np.linalg.norm(ends - goal, axis=1) <= REACHED) if len(ends) else np.nan)
+        table["seconds"].append(seconds)
+    return {**arrays, "goal": goal, **{column: np.array(values) for column, values in table.items()}}
+
+
+def measure(x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obstacle: Union) -> Measured:
+    """Measure one motion.
+
+    Args:
+        x: (N, 3) path of the end effector, metres.
+        t: (N,) its times, seconds.
+        q: (M, 6) postures of the arm along it, rad.
+        demonstration: (T, 3), metres.
+        goal: (3,), metres.
+        obstacle: what was to be avoided.
+    """
+    nearest = load_collision_model().nearest_to_obstacle(q, obstacle)
+    path = x if len(x) > 1 else np.repeat(x, 2, axis=0)
+    warped = (resample_by_arc_length(p, NUM_WARPED) for p in (path, demonstration))
+    return Measured(
+        frechet=frechet(path, demonstration, 1e-5),
+        dtw=dynamic_time_warping(*warped) / NUM_WARPED,
+        arm_depth=max(0.0, -nearest.distance),
+        hand_depth=maximum_collision_distance(path, obstacle.signed_distance) + 0.0,  # never -0
+        clearance=nearest.distance,
+        goal_error=float(np.linalg.norm(x[-1] - goal)),
+        turn=sharpest_turn(x, TURN_ARC),
+        jerk=rms_jerk(t, x, INTERVAL),
+    )
+
+
+def joints_along(problem: Problem, plan: Plan) -> tuple[Array, ...]:
+    """The arm's postures (N_i, 6), rad, along a plan: its own, or those that track its paths, as the demonstrations."""
+    if plan.joints is not None:
+        return plan.joints
+    return tuple(
+        track(problem.robot, path, along[0]).q for path, along in zip(plan.paths, problem.postures, strict=True)
+    )
+
+
+def _ends(planner: Planner, place: Place) -> Array:
+    """Where motions from the perturbed starts of a place end, (P, 3), metres."""
+    if not len(place.perturbed):
+        return place.perturbed
+    try:
+        return np.stack([path[-1] for path in planner.plan(place.obstacle, place.perturbed).paths])
+    except UnreachableError:
+        return np.full_like(place.perturbed, np.inf)
+
+
+def cells(method: str, task: str, arrays: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
+    """The cells of a method's file, by column; None is unknown."""
+    found: dict[str, dict[str, float | None]] = {}
+    for column in COLUMNS:
+        values = arrays[column]
+        known = bool(np.isfinite(values).all())
+        worst = values.min() if column in SMALLEST else values.max()
+        found[column] = {
+            "mean": float(values.mean()) if known else None,
+            "worst": float(worst) if known else None,
+            "paper": PAPER.get((method, task, column)),
+        }
+    return found
+
+
+def print_orderings(table: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print for each ordering that the paper argues from whether it holds, and by which figures."""
+    for task in dict.fromkeys(task for of_method in table.values() for task in of_method):
+        print(f"\n{TASKS[task].title}")
+        for text, holds, figures in orderings({name: row[task] for name, row in table.items() if task in row}):
+            print(f"  {'holds' if holds else 'does NOT hold'}: {text} ({figures})")
+
+
+def orderings(row: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[tuple[str, bool, str]]:
+    """Decide the orderings of one task, those whose methods were measured.
+
+    Args:
+        row: cells of the task, by method and column.
+
+    Returns:
+        What is said, whether it holds, and the figures in words.
+    """
+
+    def mean(method: str, column: str = "frechet") -> float:
+        return row[method][column]["mean"]
+
+    def deepest(method: str) -> float:
+        return row[method]["arm_depth"]["worst"]
+
+    def mm(value: float) -> str:
+        return f"{1e3 * value:.0f} mm"
+
+    def collides(method: str) -> tuple[str, bool, str]:
+        return f"{METHODS[method].title} collides", deepest(method) > FREE, f"M.C.D. at most {mm(deepest(method))}"
+
+    said: list[tuple[str, bool, str]] = []
+    if {"ours-no-avoidance", "eflow"} <= row.keys():
+        pair = mean("ours-no-avoidance"), mean("eflow")
+        text = "pure imitation of ours and EFlow comparable"
+        said.append((text, max(pair) <= ALIKE * min(pair), f"F.D. {mm(pair[0])} and {mm(pair[1])}"))
+    if "ours" in row:
+        said.append(("ours is free of collisions at all places", deepest("ours") <= FREE, mm(deepest("ours"))))
+        for column, who in (("arm_depth", "whole arm"), ("hand_depth", "hand alone")):
+            free = {name: mean(name) for name in row if row[name][column]["worst"] <= FREE}
+            least = min(free, key=free.__getitem__, default="none")
+            text = f"ours has the smallest Fréchet distance of the methods with M.C.D. 0 of the {who}"
+            figures = ", ".join(f"{name} {mm(value)}" for name, value in free.items())
+            said.append((text, least == "ours", f"least is {least}; {figures}"))
+        paper = row["ours"]["frechet"]["paper"]
+        if paper is not None:
+            said.append((f"ours is below the paper's {mm(paper)}", mean("ours") < paper, f"F.D. {mm(mean('ours'))}"))
+    if {"ours", "eflow-repulsive"} <= row.keys():
+        turns = mean("eflow-repulsive", "turn"), mean("ours", "turn")
+        distances = mean("eflow-repulsive"), mean("ours")
+        figures = f"F.D. {mm(distances[0])} to {mm(distances[1])}, turn {turns[0]:.0f}° to {turns[1]:.0f}°"
+        larger = distances[0] > distances[1] and turns[0] > turns[1]
+        said.append(("EFlow (repulsive) departs farther and turns sharper than ours", larger, figures))
+    said += [collides(name) for name in ("mpnet", "linear") if name in row]
+    if "mpnet-rrt" in row:
+        said.append(("MPNet-RRT does not collide", deepest("mpnet-rrt") <= FREE, mm(deepest("mpnet-rrt"))))
+        if "ours" in row:
+            pair = mean("mpnet-rrt"), mean("ours")
+            said.append(
+                ("MPNet-RRT departs farther than ours", pair[0] > pair[1], f"F.D. {mm(pair[0])}, {mm(pair[1])}")
+            )
+    return said
+
+
+def _print(task: Task, methods: Sequence[Method], table: Mapping[str, Mapping[str, Any]]) -> None:
+    print(f"\n{task.title}: mean (worst) [paper]; lengths in mm")
+    rows = []
+    for method in methods:
+        cells_ = table[method.name][task.name]
+        rows.append((method.title, *(_cell(column, cells_[column]) for column in COLUMNS)))
+    print_table(("", *(f"{column} {UNITS[column][1]}" if column in UNITS else column for column in COLUMNS)), rows)
+
+
+def _cell(column: str, cell: Mapping[str, float | None]) -> str:
+    factor, _ = UNITS.get(column, (1e3, ""))
+    digits = 3 if column == "seconds" else 0
+    mean, worst, paper = ("–" if (v := cell[k]) is None else f"{factor * v:.{digits}f}" for k in cell)
+    return f"{mean} ({worst})" + (f" [{paper}]" if cell["paper"] is not None else "")

@@ -1,0 +1,101 @@
+"""EFlow (repulsive): nothing beyond the range, away from the obstacle within, EFlow itself before and after."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_baselines_eflow import weights
+
+from dt_viz.baselines import repulsive
+from dt_viz.baselines.eflow import EFlowSystem
+from dt_viz.baselines.repulsive import RANGE, STRONGEST, repulsion
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Union
+from dt_viz.scenario.tasks import TASKS
+
+SPHERE = Union((Sphere((0.1, -0.5, 0.3), 0.15),))
+
+
+def at_distances(distances):
+    """Points (N, 3) at these distances from the sphere, in the direction x."""
+    return np.array(SPHERE.parts[0].position) + np.outer(0.075 + np.array(distances), [1.0, 0.0, 0.0])
+
+
+def test_it_is_zero_outside_its_range_and_continuous_there():
+    y = at_distances([RANGE + 1e-9, 2 * RANGE, 1.0])
+    distance, velocity = repulsion(SPHERE, y)
+    assert np.allclose(distance, [RANGE, 2 * RANGE, 1.0])
+    assert not velocity.any()
+    assert 0 < np.linalg.norm(repulsion(SPHERE, at_distances([RANGE - 1e-6]))[1]) < 1e-4
+
+
+def test_it_leads_away_and_grows_towards_the_obstacle_up_to_a_bound():
+    distances = np.array([0.9, 0.7, 0.5, 0.3]) * RANGE
+    _, velocity = repulsion(SPHERE, at_distances(distances))
+    assert (np.diff(velocity[:, 0]) > 0).all()
+    assert np.abs(velocity[:, 1:]).max() < 1e-12
+    _, inside = repulsion(SPHERE, at_distances([-0.01, -0.05]))
+    assert np.allclose(inside, [[STRONGEST, 0, 0]] * 2)
+
+
+def test_it_is_the_gradient_of_the_potential():
+    y = at_distances([0.5 * RANGE])
+    potential = lambda y: 0.5 * repulsive.GAIN * (1 / SPHERE.signed_distance(y) - 1 / RANGE) ** 2  # noqa: E731
+    h = 1e-7
+    slope = [(potential(y + e) - potential(y - e)).item() / (2 * h) for e in h * np.eye(3)]
+    assert np.allclose(repulsion(SPHERE, y)[1][0], -np.array(slope), rtol=1e-4, atol=1e-9)
+
+
+@pytest.fixture
+def task():
+    return TASKS["push_box"]()
+
+
+@pytest.fixture
+def planner(task):
+    arrays = weights(task, amplitude=0.003)
+    arrays["speed_2"][:, -1] -= 1.5  # as slow as a demonstration
+    system = EFlowSystem.of(task, arrays)
+    return repulsive._Planner(system, 0.05, 0.012)
+
+
+def test_motions_that_stay_out_of_range_are_those_of_eflow(task, planner):
+    far = Union((Sphere((0.0, 0.0, 3.0), 0.15),))
+    paths, times = planner.system.rollouts(task.starts, 0.012)
+    plan = planner.plan(far, task.starts)
+    assert all(np.array_equal(a, b) for a, b in zip((*plan.paths, *plan.times), (*paths, *times), strict=True))
+
+
+def passing(planner, task):
+    """An obstacle beside the first motion."""
+    (path,), _ = planner.system.rollouts(task.starts[:1], 0.012)
+    return Union((Sphere(tuple(path[len(path) // 2] + [0.0, 0.03, 0.03]), 0.06),))
+
+
+def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(task, planner):
+    obstacle = passing(planner, task)
+    plan = planner.plan(obstacle, task.starts[:1])
+    path, times = plan.paths[0], plan.times[0]
+    assert (np.diff(times) > 0).all()
+    stepped = np.flatnonzero(np.isclose(np.diff(times), 0.05, rtol=0, atol=1e-12))
+    assert len(stepped) > 10
+    v = planner.system.velocity(path[stepped]) + repulsion(obstacle, path[stepped])[1]
+    assert np.allclose(path[stepped + 1], path[stepped] + 0.05 * v, atol=1e-6)
+    assert not np.allclose(path[stepped + 1], path[stepped] + 0.05 * planner.system.velocity(path[stepped]), atol=1e-4)
+    assert np.linalg.norm(path[-1] - planner.system.goal) < 1e-6
+
+
+def test_finer_steps_converge(task, planner):
+    obstacle = passing(planner, task)
+    paths = [
+        replace(planner, interval=h).plan(obstacle, task.starts[:1]).paths[0] for h in (0.05, 0.005, 0.0025, 0.00125)
+    ]
+    off = [np.linalg.norm(a[:, None] - paths[-1], axis=2).min(axis=1).max() for a in paths[:3]]
+    assert off[0] > off[1] > off[2] > 0
+
+
+def test_before_an_obstacle_on_the_goal_a_motion_stops(task, planner):
+    x, y, z = planner.system.goal
+    plan = planner.plan(Union((Sphere((x, y, z), 0.1),)), task.starts[:2])
+    assert all(0.02 < np.linalg.norm(path[-1] - planner.system.goal) < 0.2 for path in plan.paths)
+    assert max(t[-1] for t in plan.times) < repulsive.LONGEST + 60

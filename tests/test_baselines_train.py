@@ -1,0 +1,97 @@
+"""The command that trains: weights that the method reads, and a clear end where something is missing."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from test_baselines_eflow import weights
+
+from dt_viz.baselines import registry
+from dt_viz.baselines.base import INSTALL, NotFittedError
+from dt_viz.baselines.eflow import VERSION, EFlow
+from dt_viz.baselines.weights import load_weights
+from dt_viz.evaluate import train
+from dt_viz.evaluate.__main__ import main
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.scenario.tasks import TASKS
+
+COMMAND = ["train", "--method", "eflow", "--task", "draw_s", "--epochs", "3"]
+
+
+@pytest.fixture(autouse=True)
+def _cached(cache, monkeypatch, engine):
+    engine.task("draw_s")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+
+def trained_by(monkeypatch, training):
+    """Have another training in the place of the one that needs torch."""
+    monkeypatch.setattr(train, "import_module", lambda name: SimpleNamespace(train=training))
+
+
+def test_weights_are_written_for_the_method_to_read_and_the_table_says_how_near_it_comes(monkeypatch, tmp_path, capsys):
+    def training(problem, num_epochs, report, seed):
+        report(f"{num_epochs} epochs, seed {seed}")
+        return weights(problem.task)
+
+    trained_by(monkeypatch, training)
+    assert main([*COMMAND, "--seed", "4", "--out", str(tmp_path)]) == 0
+    assert load_weights("eflow", VERSION, TASKS["draw_s"](), tmp_path)["phases"].shape == (10, 2, 200)
+    printed = capsys.readouterr().out
+    assert "eflow, draw_s: 3 epochs, seed 4" in printed
+    assert "Fréchet mean" in printed.splitlines()[-1]
+    assert EFlow(folder=tmp_path).system(TASKS["draw_s"]()).goal.shape == (3,)
+
+
+def test_without_what_it_needs_it_says_how_to_install_it(monkeypatch, tmp_path, capsys):
+    def training(*_):
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+    trained_by(monkeypatch, training)
+    assert main([*COMMAND, "--out", str(tmp_path)]) == 1
+    assert f"torch, which is not installed: {INSTALL}" in capsys.readouterr().err
+
+
+def test_what_cannot_be_fitted_is_said_and_the_exit_status_is_1(monkeypatch, tmp_path, capsys):
+    def training(*_):
+        raise NotFittedError("the demonstrations have no common goal")
+
+    trained_by(monkeypatch, training)
+    assert main([*COMMAND, "--out", str(tmp_path)]) == 1
+    assert "eflow, draw_s: the demonstrations have no common goal" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_task_that_does_not_exist_is_refused_by_name(tmp_path, capsys):
+    assert main(["train", "--task", "none", "--out", str(tmp_path)]) == 2
+    assert "--task: found 'none'; accepted: draw_s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("trained", registry.TRAINED.values(), ids=registry.TRAINED.keys())
+def test_a_method_that_is_trained_refuses_a_folder_without_its_weights(trained, tmp_path, engine):
+    from dt_viz.scenario.scenario import Scenario
+
+    problem = registry.problem_of(engine.nominal(Scenario("draw_s")).learned, engine.follower)
+    with pytest.raises(NotFittedError, match="has not been trained"):
+        trained.from_folder(tmp_path).fit(problem)
+
+
+@pytest.mark.parametrize("num", [1, 7])
+def test_training_lowers_the_loss_also_with_a_single_demonstration(num):
+    pytest.importorskip("torch")
+    from dt_viz.baselines.eflow_training import train as train_eflow
+
+    losses, task = [], SimpleNamespace(demonstrations=TASKS["draw_j"]().demonstrations[:num])
+    problem: Any = SimpleNamespace(task=task)
+    arrays = train_eflow(problem, 50, lambda line: losses.append(float(line.rsplit(" ", 1)[1])))
+    assert losses[-1] < losses[0]
+    assert (arrays["weights"] != 0).any()
+
+
+def test_demonstrations_without_a_common_goal_are_refused():
+    pytest.importorskip("torch")
+    from dt_viz.baselines.eflow_training import samples
+
+    first, second = TASKS["draw_j"]().demonstrations[:2]
+    with pytest.raises(NotFittedError, match="common goal"):
+        samples((first, Demonstration(second.times, second.positions + 5.0, "moved")))
