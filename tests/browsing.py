@@ -20,10 +20,13 @@ LIGHT = View(handles=True, **dict.fromkeys(HIDDEN, False))
 """The obstacle only: drawing the lines by software takes a tenth of a second, and the arm most of one."""
 
 UNHURRIED = """
-    const draw = window.requestAnimationFrame.bind(window);
-    window.requestAnimationFrame = callback => setTimeout(() => draw(callback), 200);
+    window.requestAnimationFrame = callback => setTimeout(() => callback(performance.now()), 200);
+    window.cancelAnimationFrame = clearTimeout;
 """
-"""Five pictures a second are enough: a page is drawn all the time, and by software that takes a whole core."""
+"""Five pictures a second are enough: a page is drawn all the time, and by software that takes a whole core.
+
+Timers also run where the browser gives no frames for a while, as after a change of the window's size.
+"""
 
 
 def wait_until(condition, what):

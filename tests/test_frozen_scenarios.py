@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from frozen_scenarios import DESCRIPTIONS, FOLDER, rollouts_of
 
-NUMBERS = [3, 9, 12, 17, 18, 20, 27, 39]
+NUMBERS = [3, 9, 12, 17, 18, 27, 39, 57]
 """Scenarios of the hand, of the whole arm, with bias points, added starts and a warp."""
 TOLERANCE = 1e-5
-"""Metres, radians and seconds: fits differ by rounding from machine to machine. On one machine it is rounding alone,
-see `frozen_scenarios`."""
+"""Metres and radians: fits differ by rounding from machine to machine. On one machine it is rounding alone, see
+`frozen_scenarios`."""
+TIME_TOLERANCE = 5e-3
+"""Seconds: motions begin at rest, where the time until the second sample hardly depends on its place."""
 NUM_KEPT = 15
 """Samples kept of each path."""
 
@@ -25,7 +27,8 @@ def test_a_scenario_gives_the_rollouts_that_it_gave(new_engine, number):
         names = {name.split("/")[1] for name in before.files if name.startswith(f"{number}/")}
         assert names == set(found)
         for name, path in found.items():
-            np.testing.assert_allclose(kept(path), before[f"{number}/{name}"], rtol=0, atol=TOLERANCE, err_msg=name)
+            tolerance = TIME_TOLERANCE if name.startswith("times") else TOLERANCE
+            np.testing.assert_allclose(kept(path), before[f"{number}/{name}"], rtol=0, atol=tolerance, err_msg=name)
 
 
 def test_descriptions_cover_what_a_stack_can_be():
