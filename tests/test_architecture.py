@@ -29,7 +29,7 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "pictures": BELOW_SCENARIO | {"arm", "scenario"},
     "saving": BELOW_SCENARIO | {"scenario"},
     "library": BELOW_ENGINE - {"pictures", "files"} | {"saving"},
-    "engine": BELOW_ENGINE,
+    "engine": BELOW_ENGINE | {"baselines"},
     "baselines": BELOW_ENGINE - {"pictures"},
     "ui": BELOW_ENGINE | {"engine", "baselines"},
     "evaluate": BELOW_ENGINE | {"engine", "baselines", "ui"},

@@ -11,6 +11,7 @@ from dt_viz.arm.tracking import UnreachableError
 from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.postures import NUM_SAMPLES, Query, Surroundings, planned
 from dt_viz.baselines.registry import problem_of
+from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Scenario
@@ -53,8 +54,8 @@ def test_an_obstacle_changes_nothing_and_what_interrupts_it_ends_it(problem):
     def interrupted():
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        planner.plan(ball, starts, interrupted)
+    with pytest.raises(KeyboardInterrupt), interruptible(interrupted):
+        planner.plan(ball, starts)
 
 
 def test_corners_are_kept_and_joints_stay_within_their_velocity_limits(problem):

@@ -28,6 +28,7 @@ from dt_viz.baselines.mpnet import (
 from dt_viz.baselines.mpnet_rrt import MPNetRRT
 from dt_viz.baselines.postures import Surroundings
 from dt_viz.baselines.registry import problem_of
+from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Scenario
@@ -65,7 +66,7 @@ def search(free):
 
     line = SimpleNamespace(robot=SimpleNamespace(clip=np.asarray), is_free=lambda start, end: free(start[0], end[0]))
     model = MPNetModel.of(weights())
-    return Search(model, np.zeros(ENCODER[-1]), cast("Surroundings", line), np.random.default_rng(0), lambda: None)
+    return Search(model, np.zeros(ENCODER[-1]), cast("Surroundings", line), np.random.default_rng(0))
 
 
 def at(*values):
@@ -200,8 +201,9 @@ class TestPlanning:
             if len(calls) == 10:
                 raise KeyboardInterrupt
 
-        with pytest.raises(KeyboardInterrupt):
-            MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1], interrupted)
+        planner = MPNet().fit(problem)
+        with pytest.raises(KeyboardInterrupt), interruptible(interrupted):
+            planner.plan(in_the_way, problem.task.starts[:1])
         assert len(calls) == 10
 
     def test_a_task_that_it_was_not_trained_for_is_refused_with_the_command(self, problem, tmp_path):
@@ -233,15 +235,17 @@ class TestRRT:
     @needs_ompl
     def test_an_exception_within_ompl_ends_it(self, problem, in_the_way):
         alone, calls = [], []
-        MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1], lambda: alone.append(0))
+        with interruptible(lambda: alone.append(0)):
+            MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1])
 
         def interrupted():
             calls.append(0)
             if len(calls) == len(alone) + 20:
                 raise KeyboardInterrupt
 
-        with pytest.raises(KeyboardInterrupt):
-            MPNetRRT().fit(problem).plan(in_the_way, problem.task.starts[:1], interrupted)
+        planner = MPNetRRT().fit(problem)
+        with pytest.raises(KeyboardInterrupt), interruptible(interrupted):
+            planner.plan(in_the_way, problem.task.starts[:1])
         assert len(calls) == len(alone) + 20
 
     def test_without_ompl_it_says_what_is_missing(self, monkeypatch):

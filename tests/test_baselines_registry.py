@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dt_viz.baselines.registry import METHODS, TRAINED, problem_of
+from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Scenario
@@ -58,5 +59,5 @@ def test_what_interrupts_a_plan_ends_it(problem, in_the_way):
     def interrupted():
         raise TimeoutError
 
-    with pytest.raises(TimeoutError):
-        METHODS["ours"].fit(problem).plan(in_the_way, problem.task.starts, interrupted)
+    with pytest.raises(TimeoutError), interruptible(interrupted):
+        METHODS["ours"].fit(problem).plan(in_the_way, problem.task.starts)

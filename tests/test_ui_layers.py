@@ -238,7 +238,8 @@ def drawn(engine, initial, scene):
 
     pictures = scene_pictures(scene)
     scenario = replace(
-        initial("draw_s"), view=View(field=True, streamlines=True, grid=True, onion=True, panels=(BASE_PANEL,))
+        initial("draw_s"),
+        view=View(field=True, streamlines=True, grid=True, onion=True, panels=(BASE_PANEL,), compared=("linear",)),
     )
     pictures.adopt(scenario)
     pictures.draw(next(engine.frames(scenario)))

@@ -6,7 +6,6 @@ A new method is one file with a subclass of `Method`, and one line in `dt_viz.ba
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import ClassVar, Protocol
@@ -58,11 +57,11 @@ class Plan:
 class Planner(Protocol):
     """A method that has been fitted to a task. Any thread may call it."""
 
-    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+    def plan(self, obstacle: Union, starts: Array) -> Plan:
         """Plan motions from the starts (R, 3), metres, around obstacles (an empty union: none).
 
         Methods that plan joints start at the posture of the nearest demonstrated start, moved to the start by inverse
-        kinematics. What `interrupted` raises, which is called often, ends it.
+        kinematics. It can be interrupted; see `dt_viz.interruption`.
         """
         ...
 

@@ -279,7 +279,7 @@ class _Planner:
     system: EFlowSystem
     spacing: float
 
-    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+    def plan(self, obstacle: Union, starts: Array) -> Plan:
         """Plan without regard to the obstacle; see `Planner`."""
         return Plan(*self.system.rollouts(starts, self.spacing))
 

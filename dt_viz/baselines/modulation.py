@@ -10,7 +10,6 @@ the quick side of ψ.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +20,7 @@ from dt_viz.baselines.surface import distance_and_normal
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.interruption import checkpoint
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
@@ -109,13 +109,13 @@ class _Planner:
         """Our imitation."""
         return self.learned.system
 
-    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+    def plan(self, obstacle: Union, starts: Array) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         state = self._state(obstacle, self.system.transform.forward(starts))
         states, times = [state], [np.zeros(len(starts))]
         moving, h = self._moving(state), FIRST / np.maximum(state.speed, SLOWEST)
         while moving.any() and len(states) < NUM_STEPS:
-            interrupted()
+            checkpoint()
             bend = np.zeros_like(state.z)
             if len(states) > 1:  # the method of Adams and Bashforth, of order 2, with steps of their own
                 last = times[-1] - times[-2]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from dt_viz.arm.retiming import within_velocity_limits
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.flows.fields import Array
-from dt_viz.interruption import interruptible
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned, Nominal
 from dt_viz.motion.solve import solve
@@ -25,7 +23,7 @@ from dt_viz.transforms.avoidance import Avoidance
 class _AlonePlanner:
     learned: Learned
 
-    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+    def plan(self, obstacle: Union, starts: Array) -> Plan:
         """Plan without regard to the obstacle; see `Planner`."""
         nominal, numbers = from_starts(self.learned, starts)
         bundle = nominal.bundle
@@ -51,15 +49,14 @@ class _WholeArmPlanner:
     follower: Follower
     precision: Precision
 
-    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+    def plan(self, obstacle: Union, starts: Array) -> Plan:
         """Plan motions of the whole arm; those that it finds no way for stay at their start. See `Planner`.
 
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
         nominal, numbers = from_starts(self.learned, starts)
-        with interruptible(interrupted):
-            moving = self._moving(nominal, obstacle)
+        moving = self._moving(nominal, obstacle)
         motions = [moving[k] if k in moving else self._resting(nominal, k) for k in numbers]
         end_effector = self.follower.robot.end_effector
         return Plan(

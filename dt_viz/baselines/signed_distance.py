@@ -7,7 +7,6 @@ effector.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,6 @@ from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.ours import from_starts
 from dt_viz.baselines.surface import distance_and_normal
 from dt_viz.flows.fields import Array, InPlane, VectorField
-from dt_viz.interruption import interruptible
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.stack import LIVE, Precision, build_stack
 from dt_viz.obstacles.union import Union
@@ -69,13 +67,12 @@ class _Planner:
     learned: Learned
     precision: Precision
 
-    def plan(self, obstacle: Union, starts: Array, interrupted: Callable[[], None] = lambda: None) -> Plan:
+    def plan(self, obstacle: Union, starts: Array) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         nominal, numbers = from_starts(self.learned, starts)
         avoidance = SignedDistanceAvoidance(obstacle.parts)
         layers = [(0, Layer(avoidance, name=avoidance.title))] if avoidance.acts else []
-        with interruptible(interrupted):
-            solution = build_stack(nominal, layers, self.precision)
+        solution = build_stack(nominal, layers, self.precision)
         bundle = solution.bundle
         times = bundle.split(solution.rays.times(bundle.index, bundle.fraction))
         return Plan(tuple(bundle.paths[k] for k in numbers), tuple(times[k] for k in numbers))

@@ -11,6 +11,7 @@ from dt_viz.arm.robot import Robot
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine import compose
 from dt_viz.engine.certify import certify, with_meshes
+from dt_viz.engine.comparison import Comparison
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.live_arm import LiveArm
 from dt_viz.engine.turns import Turns
@@ -90,6 +91,8 @@ class Engine:
         self.follower = Follower(robot, self.memo)
         self.arm = LiveArm(self.follower)
         """The arm in the loop."""
+        self.comparison = Comparison(self.follower, self.memo)
+        """Other methods beside ours."""
         self._shown: dict[str, _Shown] = {}
 
     def task(self, name: str) -> Task:
@@ -232,12 +235,13 @@ class Engine:
         with _in_turn():
             frame, live = self._with_arm(scenario, LIVE), self.solved(scenario, LIVE)
             frame = replace(frame, stage=Stage.LIVE, pictures=self._pictures(scenario, live, coarse=True))
+            frame = self._compared(frame)
             self._shown[scenario.task] = _Shown(frame, live, live)
         yield frame
         with _in_turn(checkpoint):
             frame, fine = self._with_arm(scenario, FINE), self.solved(scenario, FINE)
             frame = replace(frame, stage=Stage.FINE, pictures=self._pictures(scenario, fine, coarse=False))
-            frame = replace(frame, blocked=fine.blocked)
+            frame = self._compared(replace(frame, blocked=fine.blocked))
             if scenario.view.health_plots and frame.chosen is not None:
                 frame = replace(frame, profiles=compose.profiles(frame, fine, frame.chosen, self.follower))
             self._shown[scenario.task] = _Shown(frame, fine, live)
@@ -245,7 +249,22 @@ class Engine:
         certificates = self.memo(
             "certificates", scenario.plain, lambda: self._certified(frame, fine, checkpoint), newest=1
         )
-        yield replace(frame, stage=Stage.CERTIFIED, certificates=certificates)
+        frame = replace(frame, stage=Stage.CERTIFIED, certificates=certificates)
+        yield frame
+        yield from self._compared_at_rest(frame, fine, checkpoint)
+
+    def _compared(self, frame: Frame) -> Frame:
+        """The frame with other methods beside ours, as far as they are known."""
+        learned = self.nominal(frame.scenario).learned
+        return replace(frame, comparison=self.comparison.of(frame, learned))
+
+    def _compared_at_rest(self, frame: Frame, solved: Solved | None, checkpoint: Checkpoint) -> Iterator[Frame]:
+        """The last frame again and again, each with more of what is known of other methods."""
+        for step in self.comparison.steps(frame, self.nominal(frame.scenario).learned, solved):
+            with _in_turn(checkpoint):
+                step()
+                frame = self._compared(frame)
+            yield frame
 
     def _rollouts(self, scenario: Scenario, precision: Precision) -> Frame:
         """The frame of stage ROLLOUTS."""
@@ -327,7 +346,9 @@ class Engine:
         for stage in Stage:
             if changed and stage in (Stage.LIVE, Stage.FINE):
                 good = replace(good, pictures=self._pictures(seen, solved, coarse=stage is Stage.LIVE))
-            yield replace(good, scenario=scenario, stage=stage, blocked=blocked, certificates=certificates)
+            good = replace(good, scenario=scenario, stage=stage, blocked=blocked, certificates=certificates)
+            yield self._compared(good) if stage >= Stage.LIVE else replace(good, comparison=())
+        yield from self._compared_at_rest(good, None, checkpoint)
 
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:

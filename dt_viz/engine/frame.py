@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
+from dt_viz.baselines.base import Method
 from dt_viz.flows.fields import Array
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import ArmMotion
@@ -27,7 +28,41 @@ class Stage(IntEnum):
     FINE = 2
     """All of it refined, for a scenario that rests."""
     CERTIFIED = 3
-    """Also the certificates."""
+    """Also the certificates. Where methods are compared, more frames of this stage follow, each of which tells more of
+    them."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a method around the obstacles of a scenario."""
+
+    frechet: float
+    """Mean over the starts of the discrete Fréchet distance to the demonstration, metres."""
+    hand_depth: float
+    """Maximum collision distance of the end effector, metres; 0 when it is clear."""
+    goal_error: float
+    """Largest distance of a motion's end from the goal, metres."""
+    arm_depth: float | None = None
+    """Maximum collision distance of the arm's meshes, metres; None where it is not known yet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A method's motions around the obstacles of a scenario, from the starts of the demonstrations."""
+
+    method: Method
+    paths: tuple[Array, ...]
+    """(N_i, 3) of the end effector, metres; none where there are no motions."""
+    scores: Scores | None
+    curves: Array | None
+    """(`dt_viz.motion.profiles.NUM_SAMPLES`, 2) of one motion, at even distances along it, metres: distance to the
+    demonstration, and depth in the obstacle."""
+    rollout: int
+    """Number of that motion: the one that the arm follows where that begins at a demonstrated start."""
+    note: str = ""
+    """What the motions fail at, or why there are none."""
+    arm: ArmMotion | None = None
+    """The arm along that motion, where the view shows it."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +108,8 @@ class Frame:
     """Pictures of ψ and on the slice, as far as the view shows them; empty before stage LIVE."""
     profiles: Profiles | None = None
     """Along the rollout that the arm follows; None before stage FINE, and where the view does not show them."""
+    comparison: tuple[Compared, ...] = ()
+    """Ours and the methods beside it, as far as the view shows any; none before stage LIVE."""
     seconds: float = 0.0
     """Time from the start of the rebuild until this frame."""
 

@@ -48,6 +48,16 @@ FIGURE = HAND_ONLY | {"field": False, "streamlines": True, "table": False, "ghos
 """View of panels side by side: flat figures of the motion alone."""
 POSES = {"onion": True, "field": False, "demonstrations": False}
 """View of the scenes of fig. 8: the arm from its starting pose to where it lets go."""
+FIG_6_PLACES: Mapping[str, Point] = {
+    "push_box": (0.0156, -0.5003, 0.1605),
+    "lift_box": (0.0246, -0.4889, 0.1217),
+    "draw_s": (0.0688, -0.4549, 0.3857),
+}
+"""Places of the sphere of fig. 6, for each task: the first at which `evaluate table1` measures, metres."""
+FIG_6_DIAMETER = 0.15
+"""Its diameter, metres."""
+FIG_6 = {"compared": ("eflow-repulsive", "linear", "modulation"), "field": False, "ghost": False}
+"""View of its scenes: the methods that follow a drag, one of each kind."""
 FIRST_BIAS = f"{BiasPoint.title} 1"
 """Name of the layer of the first bias point."""
 ABOVE = 0.16
@@ -171,6 +181,17 @@ def release(pot: Pot) -> Point:
     return x, y, z + ABOVE
 
 
+def _beside_others(task: Task) -> Scenario:
+    """Fig. 6."""
+    return _avoiding(task, Avoidance(Sphere(FIG_6_PLACES[task.name], FIG_6_DIAMETER), space="cspace"))
+
+
+def _comparison(name: str, title: str, task: str) -> PaperScene:
+    """Return a scene of ours beside other methods (fig. 6)."""
+    line = "Ours (orange) and others around the same sphere; their scores and curves are in “Compare”. Drag the sphere."
+    return PaperScene(name, f"Fig. 6: {title}", line, task, _beside_others, view=FIG_6)
+
+
 def _into_pot(index: int) -> Callable[[Task], Scenario]:
     """Fig. 8."""
 
@@ -240,6 +261,9 @@ SCENES: Mapping[str, PaperScene] = {
             _cloud_in_the_letter,
             view=HAND_ONLY | {"colour": "occupancy", "field": False, "demonstrations": False},
         ),
+        _comparison("others_push", "push, beside other methods", "push_box"),
+        _comparison("others_lift", "lift, beside other methods", "lift_box"),
+        _comparison("others_s", "the S, beside other methods", "draw_s"),
         PaperScene(
             "centre_pot",
             "Fig. 8: into the centre pot",

@@ -58,6 +58,10 @@ class View:
     """Joint angles and speeds over time, with their limits."""
     health_plots: bool = False
     """Lyapunov value, distance to the demonstration and clearance along the rollout that the arm follows."""
+    compared: tuple[str, ...] = ()
+    """Names of methods whose motions are shown beside ours."""
+    their_arm: str = ""
+    """Name of the one of them whose arm is shown, too; none if empty."""
     table: bool = True
     selected: int = 0
     """Number of the obstacle that the panel changes; if there are fewer, it is the last one."""
@@ -202,4 +206,6 @@ class Scenario:
         same_colour = after.colour in {"none", before.colour}
         same_place = (after.slice, after.level) == (before.slice, before.level)
         same_panels = after.panels in ((), before.panels)
-        return self.moves_like(other) and shows_no_more and same_layer and same_colour and same_place and same_panels
+        same_methods = after.compared == () or (after.compared, after.their_arm) == (before.compared, before.their_arm)
+        same_pictures = shows_no_more and same_layer and same_colour and same_place and same_panels and same_methods
+        return self.moves_like(other) and same_pictures

@@ -39,6 +39,10 @@ class Replay:
         """Let some time pass."""
         self._clock += seconds
 
+    def restart(self) -> None:
+        """Begin the loop anew."""
+        self._clock = 0.0
+
     @property
     def arrived(self) -> float:
         """Time since the goal was reached, seconds; 0 before."""

@@ -26,6 +26,7 @@ from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.arm import ArmPicture
 from dt_viz.ui.scene.arm_layers import Arms
+from dt_viz.ui.scene.comparison import TheirArm
 from dt_viz.ui.scene.drawing import Drawing
 from dt_viz.ui.scene.export import RESOLUTIONS, render_png
 from dt_viz.ui.scene.grip import Grip
@@ -82,6 +83,7 @@ class Visitor:
                 Starts(client.scene, self._start_moved, self._start_chosen, self._start_clicked),
             )
             self.arms = Arms(client.scene, robot)
+            self.their_arm = TheirArm(client.scene, robot)
             self.objects = Objects(client.scene)
             self.drawing = Drawing(client.scene, self.arm.frames[-1].name, robot.end_effector_offset)
             self.way = Way(client.scene, self.pictures.middles)
@@ -121,6 +123,8 @@ class Visitor:
             self._tripod.look(frame.task, beside)
         with self.client.atomic():
             self.pictures.draw(frame)
+            self.their_arm.draw(frame)
+            self.their_arm.show(bool(self._view.their_arm))
             self.objects.stand(frame.task)
             self.drawing.stand(frame.task)
             if frame.blocked or frame.stage is not Stage.ROLLOUTS:  # until then the arm stays where it was
@@ -139,6 +143,7 @@ class Visitor:
             self._view = view = scenario.view
             self.arm.stale = view.replay and (self.arm.stale or self.pictures.stale)
             self.arms.show(view)
+            self.their_arm.show(bool(view.their_arm))
             self.objects.show(arm=view.arm)
             self.drawing.show(arm=view.arm)
             self.way.visible = view.arm and not view.replay
@@ -244,11 +249,13 @@ class Visitor:
         posed = q.tobytes(), view.ghost_arm or view.body_points
         moves = posed != self._posed
         # a block wakes the connection, also if nothing is sent
-        with self.client.atomic() if moves or self.way.is_due(now) else nullcontext():
+        drawn = moves or bool(view.their_arm) or self.way.is_due(now)
+        with self.client.atomic() if drawn else nullcontext():
             if moves:
                 self._posed = posed
                 without = self.playback.without if posed[1] else None
                 self.arms.pose(q, q if without is None else without)
+            self.their_arm.pose(q, view.speed if view.playing else 0.0, arrived=self.playback.arrived > 0)
             self.objects.pose(hand, self.playback.arrived)
             self.drawing.pose(now, hand, self.playback.arrived)
             self.pictures.rollouts.fade()

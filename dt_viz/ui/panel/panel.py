@@ -27,6 +27,7 @@ from dt_viz.ui.panel.big_type import BigType
 from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.panel.camera import CameraControls
 from dt_viz.ui.panel.commands import Command, Curtain, add_commands, numbered
+from dt_viz.ui.panel.compare import ComparePanel
 from dt_viz.ui.panel.disturbances import Disturbances
 from dt_viz.ui.panel.health_plots import HealthPlots
 from dt_viz.ui.panel.obstacles import ObstaclePanel
@@ -80,6 +81,8 @@ VIEW_HINTS: Mapping[str, str] = {
 }
 FOLLOWS_HINT = "number of the rollout that the arm follows: first those of the demonstrations, then added ones"
 _NO_SCENE = "–"
+NARROW_TABS = "<style>[data-dock-tab] { padding: 0 0.45em !important }</style>"
+"""Style with which all tabs lie in one row."""
 MAX_FLOWS = 3
 """Number of flows that ψ is composed of until a picture of the generator brings its own."""
 
@@ -126,6 +129,7 @@ class Panel:
         add_avoid_and_imitate(gui, self._bindings)
         self.status = StatusLine(gui, self._bindings)
         self._bindings.on(gui.add_button_group("History", ("Undo", "Redo", "Reset")), self._travel)
+        gui.add_html(NARROW_TABS)
         tabs = gui.add_tab_group()
         self._chores = Chores(self.fail)
         later = self._chores.later
@@ -143,6 +147,8 @@ class Panel:
             self._build_view()
         with tabs.add_tab("Arm"):
             self._build_arm()
+        with tabs.add_tab("Compare"):
+            self._compare = ComparePanel(gui, self._bindings)
         with tabs.add_tab("Picture"):
             self._camera = CameraControls(gui, tripod, lambda dark: self._chores.later(partial(darken, dark)), big.show)
             on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), self._presentation.begin)
@@ -188,6 +194,7 @@ class Panel:
         self._bindings.report(frame)
         self.joints.follow(frame.arm)
         self.health.draw(frame.profiles)
+        self._compare.draw(frame.comparison)
         self.status.report(frame, pace)
 
     def _wait(self) -> None:

@@ -12,7 +12,7 @@ from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.flows.fields import Array
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.links import bodies, light_shells
-from dt_viz.ui.scene.picture import Shown
+from dt_viz.ui.scene.picture import Colour, Shown
 
 PEDESTAL = 2
 """Number of bodies that no motion moves away: the base, and link 1, which only spins."""
@@ -99,11 +99,14 @@ class ArmPicture:
 
 
 class GhostArm(Shown):
-    """The translucent arm without avoidance; links that coincide with the arm's are hidden."""
+    """A translucent arm, such as that without avoidance; links that coincide with the arm's are hidden."""
 
-    def __init__(self, scene: viser.SceneApi, robot: Robot) -> None:
+    def __init__(
+        self, scene: viser.SceneApi, robot: Robot, name: str = "/ghost_arm", colour: Colour = palette.GHOST
+    ) -> None:
+        """Make the arm, hidden, under a name in the scene tree."""
         self._robot = robot
-        self._tree = ArmFrames(scene, robot, "/ghost_arm")
+        self._tree = ArmFrames(scene, robot, name)
         super().__init__(self._tree.frames[0])
         self.visible = False
         shells = light_shells(robot.joint_names)[PEDESTAL:]
@@ -113,7 +116,7 @@ class GhostArm(Shown):
                 f"{frame.name}/shell",
                 shell.vertices,
                 shell.faces,
-                color=palette.GHOST,
+                color=colour,
                 opacity=GHOST_OPACITY,
                 cast_shadow=False,
                 receive_shadow=False,

@@ -62,6 +62,18 @@ BODY_POINT_MOVED = (0, 158, 115)
 BODY_PATH = (0, 92, 66)
 JOINTS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (0, 114, 178), (213, 94, 0), (204, 121, 167))
 """Curves of the six joints, base to hand."""
+COMPARED = (
+    (120, 94, 200),
+    (51, 34, 136),
+    (17, 119, 51),
+    (110, 170, 60),
+    (136, 34, 85),
+    (204, 102, 119),
+    (140, 130, 40),
+    (0, 140, 150),
+    (60, 110, 190),
+)
+"""Motions of methods beside ours, in the order of the tables: after the muted set of Tol."""
 BRAND = (0, 114, 178)
 ON_DARK = {
     ADDED: (206, 152, 66),
@@ -75,6 +87,11 @@ ON_DARK = {
     GRID: (76, 152, 206),
     GRID_BESIDE: (62, 92, 118),
     INK: (226, 232, 240),
+    COMPARED[0]: (168, 148, 236),
+    COMPARED[1]: (136, 128, 230),
+    COMPARED[2]: (72, 186, 112),
+    COMPARED[4]: (214, 96, 152),
+    COMPARED[6]: (200, 190, 92),
     TABLE: (38, 40, 46),
     ZENITH: (16, 19, 26),
     HORIZON: (58, 61, 71),

@@ -18,6 +18,7 @@ from dt_viz.scenario.stack import anchored
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.anchors import BALL_RADIUS, Anchors
 from dt_viz.ui.scene.arm_layers import Onion
+from dt_viz.ui.scene.comparison import ComparedMotions
 from dt_viz.ui.scene.levels import LevelRollouts
 from dt_viz.ui.scene.manifold import Generator, WarpedGrid
 from dt_viz.ui.scene.obstacles import Obstacles
@@ -33,7 +34,7 @@ GOAL, OLD_GOAL = "goal", "demonstrated goal"
 """Labels of the demonstrations' end: where motions end there, and where they end elsewhere."""
 OF_A_MOTION = {"field", "streamlines", "grid", "onion"}
 """Fields of `View` whose pictures are hidden while there is no motion: unlike the rollouts they cannot turn grey."""
-OF_A_TASK = {"demonstrations", "ghost", "panels"}
+OF_A_TASK = {"demonstrations", "ghost", "panels", "compared"}
 """Fields of `View` whose pictures are hidden while another task or scene is being computed."""
 COMPUTING = "computing"
 
@@ -101,6 +102,7 @@ class ScenePictures:
             "grid": WarpedGrid(scene),
             "panels": Panels(scene),
             "onion": Onion(scene, robot),
+            "compared": ComparedMotions(scene),
         }
         self._view, self._blocked = View(), False
         self._showing = threading.Lock()  # views change on another thread than the one that draws

@@ -1,0 +1,171 @@
+"""Comparison of other methods with ours, around the obstacle under the hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from html import escape
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from dt_viz.baselines.base import INSTALL, Method
+from dt_viz.engine.comparison import OTHERS, OURS
+from dt_viz.engine.frame import Compared
+from dt_viz.motion.profiles import NUM_SAMPLES
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.ui.panel.bindings import Bindings
+from dt_viz.ui.panel.plots import LOOK, SMALL, columns
+from dt_viz.ui.scene import palette
+from dt_viz.ui.scene.comparison import COLOURS
+from dt_viz.ui.scene.palette import css
+
+NONE = "–"
+SHORT = {
+    "ours-no-avoidance": "No avoidance",
+    "eflow-repulsive": "EFlow, field",
+    "eflow-repulsive-fine": "… at 200 Hz",
+    "signed-distance": "Distance",
+}
+"""Names of methods that fit beside a box, where the title does not."""
+HEIGHT = 130
+"""Height of a plot, pixels."""
+DEEP = 0.001
+"""Maximum collision distance from which on it is marked, metres."""
+_MILLIMETRES = 1e3
+COLUMNS = (
+    ("to demo", "mean discrete Fréchet distance to the demonstrations"),
+    ("hand in", "maximum collision distance of the end effector"),
+    ("arm in", "maximum collision distance of the arm’s meshes, once all of it rests"),
+    ("off goal", "largest distance of a motion’s end from the goal"),
+)
+"""Heads of the table, each with what it means; all are in millimetres."""
+TITLES = ("Distance to the demonstration [mm]", "Depth of the hand in the obstacle [mm]")
+
+
+class ComparePanel:
+    """Controls of the comparison, its table, and figure 6 of the paper for one motion."""
+
+    def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
+        """Build the controls in the tab that is open."""
+        self._gui, self._drawn = gui, ()
+        for method in OTHERS:
+            label = SHORT.get(method.name, method.title)
+            box = gui.add_checkbox(label, False, disabled=bool(method.missing), hint=hint(method))
+            bindings.input(box, partial(_is_compared, method.name), partial(_compare, method.name))
+        self.table = gui.add_html("", visible=False)
+        titles = {method.title: method.name for method in OTHERS if not method.missing}
+        by_name = {name: title for title, name in titles.items()}
+        bindings.input(
+            gui.add_dropdown(
+                "Their arm", (NONE, *titles), hint="a second arm, which follows the motion of this method"
+            ),
+            lambda s: by_name.get(s.view.their_arm, NONE),
+            lambda s, title: _with_their_arm(s, titles.get(title, "")),
+        )
+        self.folder = gui.add_folder("Along the path (fig. 6)", visible=False)
+        with self.folder:
+            self.plots = tuple(self._plot(title) for title in TITLES)
+        bindings.properties(self.folder, visible=lambda s: bool(s.view.compared))
+        bindings.properties(self.table, visible=lambda s: bool(s.view.compared))
+
+    def _plot(self, title: str) -> viser.GuiUplotHandle:
+        self._gui.add_html(_small(title))
+        return self._gui.add_uplot((np.zeros(2),) * 2, tuple(_series(())), **{**LOOK, "height": HEIGHT})
+
+    def draw(self, comparison: Sequence[Compared]) -> None:
+        """Show how methods fare; nothing leaves what is there."""
+        if not comparison:
+            return
+        self.table.content = table_html(comparison)
+        plotted = [compared for compared in comparison if compared.curves is not None]
+        names = tuple(compared.method.name for compared in plotted)
+        curves = [_MILLIMETRES * compared.curves for compared in plotted if compared.curves is not None]
+        along = np.linspace(0, 1, NUM_SAMPLES)
+        for k, plot in enumerate(self.plots):
+            if names != self._drawn:
+                plot.series = tuple(_series(names))
+            plot.data = columns(along, *(curve[:, k] for curve in curves)) if curves else (np.zeros(2),) * 2
+        self._drawn = names
+
+
+def hint(method: Method) -> str:
+    """Return what a method promises, when it plans, and what it lacks."""
+    if method.missing:
+        return f"{method.title} needs {', '.join(method.missing)}: {INSTALL}"
+    stable = "Stable" if method.stable else "Not stable"
+    reach = "whole arm" if method.whole_arm else "end effector only"
+    when = "follows a drag" if method.live else "plans when the obstacle rests"
+    return f"{method.title}. {method.promise} {stable}, {reach}; {when}."
+
+
+def table_html(comparison: Sequence[Compared]) -> str:
+    """Return a table of how the methods fare, each with its promise or what keeps it from moving."""
+    head = "".join(f"<th title='{escape(why)}' style='{_CELL};opacity:0.65'>{name}</th>" for name, why in COLUMNS)
+    rows = "".join(_row(compared) for compared in comparison)
+    table = f"<table style='border-collapse:collapse;width:100%'><tr><th></th>{head}</tr>{rows}</table>"
+    return f"<div style='{SMALL}'>{table}</div>"
+
+
+_CELL = "font-weight:600;text-align:right;padding:0 0 0 0.4em;white-space:nowrap"
+
+
+def _row(compared: Compared) -> str:
+    scores, method = compared.scores, compared.method
+    name = (
+        f"<td style='padding-top:0.35em'><span style='display:inline-block;width:0.8em;height:0.8em;"
+        f"border-radius:0.2em;margin-right:0.4em;vertical-align:-0.08em;background:{css(_colour(method.name))}'></span>"
+        f"{escape(method.title)}</td>"
+    )
+    values = (None,) * 4
+    if scores is not None:
+        values = (scores.frechet, scores.hand_depth, scores.arm_depth, scores.goal_error)
+    cells = "".join(_cell(value, bad=k in (1, 2) and (value or 0) > DEEP) for k, value in enumerate(values))
+    said = compared.note or method.promise
+    below = f"<td colspan=5 style='opacity:0.65;padding-left:1.2em;white-space:normal'>{escape(said)}</td>"
+    return f"<tr>{name}{cells}</tr><tr>{below}</tr>"
+
+
+def _cell(metres: float | None, *, bad: bool) -> str:
+    text = NONE if metres is None else f"{_MILLIMETRES * metres:.0f}"
+    colour = f";color:{palette.ink(palette.FOLDED)}" if bad else ""
+    return f"<td style='{_CELL}{colour}'>{text}</td>"
+
+
+def _colour(name: str) -> tuple[int, int, int]:
+    return COLOURS.get(name, palette.ROLLOUT)
+
+
+def _series(names: Sequence[str]) -> list[uplot.Series]:
+    curves = [
+        uplot.Series(label=name, stroke=css(_colour(name)), width=2, points={"show": False})
+        for name in (names or (OURS.name,))
+    ]
+    return [uplot.Series(label="path"), *curves]
+
+
+def _is_compared(name: str, scenario: Scenario) -> bool:
+    return name in scenario.view.compared
+
+
+def _compare(name: str, scenario: Scenario, shown: bool) -> dict[str, Any]:
+    others = [known for known in scenario.view.compared if known != name]
+    their_arm = scenario.view.their_arm if shown or scenario.view.their_arm != name else ""
+    return {"view": replace(scenario.view, compared=_ordered([*others, *([name] * shown)]), their_arm=their_arm)}
+
+
+def _with_their_arm(scenario: Scenario, name: str) -> dict[str, Any]:
+    """The view with the arm of this method, which is compared then, too; of none if empty."""
+    compared = _ordered([*scenario.view.compared, name]) if name else scenario.view.compared
+    return {"view": replace(scenario.view, compared=compared, their_arm=name)}
+
+
+def _ordered(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(method.name for method in OTHERS if method.name in names)
+
+
+def _small(text: str) -> str:
+    return f"<div style='{SMALL}'>{text}</div>"
