@@ -188,7 +188,7 @@ def _beside_others(task: Task) -> Scenario:
 
 def _comparison(name: str, title: str, task: str) -> PaperScene:
     """Return a scene of ours beside other methods (fig. 6)."""
-    line = "Ours (orange) and others around the same sphere; their scores and curves are in “Compare”. Drag the sphere."
+    line = "Ours is orange. Scores and curves of all are in “Compare”; drag the sphere."
     return PaperScene(name, f"Fig. 6: {title}", line, task, _beside_others, view=FIG_6)
 
 
