@@ -3,6 +3,7 @@
 import argparse
 import json
 from contextlib import redirect_stdout
+from dataclasses import replace
 from io import StringIO
 
 import numpy as np
@@ -17,20 +18,22 @@ from dt_viz.evaluate import drag, latency, rollouts
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.held_out import follow
 from dt_viz.evaluate.latency import Recorder
+from dt_viz.evaluate.off_course import off_course
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.places import hand_room, shortest_shift
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
 from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
+from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
-from dt_viz.learning.imitation import ImitationSettings, fit, grown_grid
+from dt_viz.learning.imitation import fit, grown_grid
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, distance_from_path, resample_by_arc_length, rms_at_equal_times
 from dt_viz.motion.control import ACCELERATION
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.tasks import lasa_tasks
+from dt_viz.scenario.tasks import TASKS, lasa_tasks
 from dt_viz.ui.scene.tubes import NUM_RINGS, NUM_SIDES
 
 NUM_DEMONSTRATIONS = 2
@@ -187,18 +190,56 @@ def test_held_out_demonstrations_are_followed_by_what_the_others_teach(left_out)
     assert [float(cell) for cell in row[1:]] == pytest.approx(wanted, abs=0.006)
 
 
+def test_held_out_motions_are_compared_at_equal_times(left_out):
+    out, printed = left_out
+    (figures,) = json.loads((out / "figures.json").read_text())["held_out"]
+    with np.load(out / "Hook-held-out.npz") as arrays:
+        for way in ("learned", "mean", "nearest"):
+            apart = []
+            for i in range(NUM_DEMONSTRATIONS):
+                times, positions = hook(i)
+                assert arrays[f"{way}_times_{i}"][0] == 0 and (np.diff(arrays[f"{way}_times_{i}"]) >= 0).all()
+                moments, path = arrays[f"{way}_times_{i}"], arrays[f"{way}_{i}"]
+                apart.append(rms_at_equal_times(moments, path, times - times[0], positions))
+            assert figures[f"{way}_rms_mm"] == pytest.approx(np.mean(apart), rel=1e-5)
+    assert "RMS at equal times" in printed and "off the demonstrations" in printed
+
+
+def test_what_is_off_course_is_told_of_a_motion_that_is_spoilt():
+    demonstrations = TASKS["draw_s"]().demonstrations
+    good = off_course("S", demonstrations, fit_augmented(demonstrations))
+    assert max(good.shape_error) < 0.05 and max(good.speed) < 1.5 and good.drawn > 0.6
+    hurried = [replace(d, times=d.times / 3) for d in demonstrations]
+    assert min(off_course("S", demonstrations, fit_augmented(hurried)).speed) > 2
+    bent = [replace(d, positions=d.positions * [1, 0.5]) for d in demonstrations]
+    assert min(off_course("S", demonstrations, fit_augmented(bent)).shape_error) > 0.05
+    plain = off_course("S", demonstrations, fit(demonstrations))
+    assert plain.shape_error[1] > good.shape_error[1] and plain.drawn < good.drawn
+
+
+def test_augmented_imitation_is_measured_as_plain_is(lasa, tmp_path, capsys):
+    files, out = [str(lasa / "Hook.mat")], tmp_path / "out"
+    assert main(["imitation", *files, "--state", "augmented", "--leave-one-out", "--crossings", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    figures = json.loads((out / "figures.json").read_text())
+    assert figures["state"] == "augmented"
+    (shape,) = figures["shapes"]
+    assert shape["min_det_jacobian"] == pytest.approx(1.0) and shape["round_trip_of_extent"] < 1e-12
+    assert set(figures["off_course"][0]) == {"name", "shape_error", "speed", "drawn"}
+    cases = printed[printed.index("what crosses") :].splitlines()
+    assert len(cases) > 12 and (out / "crossings.png").stat().st_size > 10_000
+
+
 def test_what_is_held_out_is_not_learned_from():
     recorded = [hook(i) for i in range(4)]
     demonstrations = [Demonstration(times, path / 1000, str(i)) for i, (times, path) in enumerate(recorded)]
     learned_from = []
 
-    def fit_nothing(others, settings):
+    def learn(others):
         learned_from.append([d.name for d in others])
-        return fit(others, settings)
+        return fit(others)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dt_viz.evaluate.held_out.fit", fit_nothing)
-        followed = follow(demonstrations, ImitationSettings(), folds=2)
+    followed = follow(demonstrations, learn, folds=2)
     assert learned_from == [["1", "3"], ["0", "2"]]
     nearest = resample_by_arc_length(demonstrations[1].positions, 400)  # the nearest start of 1 and 3
     np.testing.assert_allclose(

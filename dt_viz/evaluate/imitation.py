@@ -14,7 +14,9 @@ For each file the folder gets an npz, all lengths in the file's own unit (LASA: 
 
 With ``--leave-one-out`` each demonstration is also followed by the motion learned from the others, and by two ways that
 need no learning (see `dt_viz.evaluate.held_out`): SHAPE-held-out.npz holds ``learned_i``, ``mean_i`` and ``nearest_i``
-(T, d) for each demonstration i.
+(T, d) for each demonstration i, and ``learned_times_i`` … (T,); and the motion is followed from starts far away and
+after pushes (see `dt_viz.evaluate.off_course`). ``--crossings`` adds synthetic demonstrations that cross, come back or
+wind (see `dt_viz.evaluate.crossings`).
 
 ``figures.json`` holds what the table shows, and ``shapes.png`` all shapes: the paper's fig. 5.
 """
@@ -26,22 +28,39 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dt_viz.evaluate.held_out import WAYS, HeldOut, follow, frechet, rollouts_from, summed_up
+from dt_viz.evaluate.crossings import crossings
+from dt_viz.evaluate.held_out import (
+    WAYS,
+    HeldOut,
+    Learn,
+    Learned,
+    follow,
+    frechet,
+    path_from,
+    rollouts_from,
+    summed_up,
+)
+from dt_viz.evaluate.off_course import AWAY, OffCourse, off_course
 from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json, write_npz
 from dt_viz.evaluate.picture import Panel, draw_panels
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
+from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
-from dt_viz.learning.imitation import OBJECTIVES, Imitation, ImitationError, ImitationSettings, fit, grown_grid
+from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, fit, grown_grid
 from dt_viz.metrics import rms_at_equal_times
 
 GRID = {2: 101, 3: 25}
 """Number of points on each side of the certificates' grid, by dimension."""
+NUM_PHASES = 7
+"""Number of phases at which the certificates of augmented motions are computed."""
+STATES = ("plain", "augmented")
 
 
 @dataclass(frozen=True)
@@ -75,9 +94,11 @@ class Figures:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
-    parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
+    parser.add_argument("files", type=Path, nargs="*", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and picture")
     parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
+    parser.add_argument("--state", choices=STATES, default=STATES[0], help="default: %(default)s")
+    parser.add_argument("--crossings", action="store_true", help="also what crosses itself, comes back or winds")
     parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
     parser.add_argument(
         "--folds", type=whole_number(2), metavar="N", help="hold out in so many folds (default: one for each)"
@@ -86,7 +107,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 2 if one of the shapes could not be fitted."""
-    settings = ImitationSettings(options.objective)
+    if not (options.files or options.crossings):
+        raise InputError("SHAPE", "no file", "files, or --crossings")
+    if options.state == "augmented" and options.objective != OBJECTIVES[0]:
+        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
+    learn = partial(fit, settings=ImitationSettings(options.objective)) if options.state == "plain" else fit_augmented
     if options.folds and not options.leave_one_out:
         raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
     sources = _sources(options.files)
@@ -96,14 +121,16 @@ def run(options: argparse.Namespace) -> int:
     folder = ready_folder(options.out)
     results: list[Figures] = []
     held_out: list[HeldOut] = []
+    beside: list[OffCourse] = []
     panels: list[Panel] = []
     for source in sources:
         began = time.perf_counter()
         try:
-            imitation = fit(source.demonstrations, settings)
+            imitation = learn(source.demonstrations)
             seconds = time.perf_counter() - began
             if options.leave_one_out:
-                held_out.append(_held_out(source, settings, options.folds, folder))
+                held_out.append(_held_out(source, learn, options.folds, folder))
+                beside.append(off_course(source.path.stem, source.demonstrations, imitation))
         except ImitationError as error:
             print(f"{source.path}: {error}", file=sys.stderr)
             continue
@@ -119,17 +146,26 @@ def run(options: argparse.Namespace) -> int:
         shapes = [asdict(figures) for figures in results]
         if held_out:
             _report_held_out(results, held_out)
-        held = [asdict(figures) for figures in held_out]
-        write_json(folder / "figures.json", {"objective": options.objective, "shapes": shapes, "held_out": held})
+            _report_off_course(beside)
+        written = {"held_out": [asdict(row) for row in held_out], "off_course": [asdict(row) for row in beside]}
+        chosen = {"state": options.state, "objective": options.objective}
+        write_json(folder / "figures.json", {**chosen, "shapes": shapes, **written})
         draw_panels(folder / "shapes.png", panels)
+    if options.crossings:
+        _report_crossings(options.state, learn, folder)
     return 0 if len(results) == len(sources) else 2
 
 
-def measured(imitation: Imitation, source: Source, fit_seconds: float) -> dict[str, Any]:
+def measured(imitation: Learned, source: Source, fit_seconds: float) -> dict[str, Any]:
     """Compute the arrays of the file's npz; see the module's docstring."""
-    transform = imitation.transform
     rollouts, times = rollouts_from(imitation, np.stack([d.positions[0] for d in source.demonstrations]))
-    grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]), GRID[transform.dim])
+    grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]), GRID[len(imitation.goal)])
+    if isinstance(imitation, AugmentedImitation):
+        transform = imitation.system(imitation.starts[0]).transform
+        phases = np.repeat(np.linspace(0, imitation.top, NUM_PHASES), len(grid))
+        grid = np.column_stack([np.tile(grid, (NUM_PHASES, 1)), phases])
+    else:
+        transform = imitation.transform
     arrays: dict[str, Any] = {
         "fit_seconds": fit_seconds,
         "min_det_jacobian": min_det_jacobian(transform.jacobian, grid),
@@ -166,18 +202,19 @@ def compared(arrays: dict[str, Any], source: Source) -> Figures:
     )
 
 
-def _held_out(source: Source, settings: ImitationSettings, folds: int | None, folder: Path) -> HeldOut:
+def _held_out(source: Source, learn: Learn, folds: int | None, folder: Path) -> HeldOut:
     """Follow each demonstration without having learned from it, and write the paths to the folder."""
     num = len(source.demonstrations)
     folds = min(folds or num, num)
     arrays = {
-        f"{way}_{i}": path / source.unit
-        for i, followed in enumerate(follow(source.demonstrations, settings, folds))
-        for way, path in followed.items()
+        f"{name}_{i}": values if name.endswith("_times") else values / source.unit
+        for i, followed in enumerate(follow(source.demonstrations, learn, folds))
+        for name, values in followed.items()
     }
     write_npz(folder / f"{source.path.stem}-held-out.npz", **arrays)
     demonstrations = [d.positions / source.unit for d in source.demonstrations]
-    return summed_up(source.path.stem, folds, arrays, demonstrations, 1e3 * source.unit)
+    times = [d.times for d in source.demonstrations]
+    return summed_up(source.path.stem, folds, arrays, demonstrations, times, 1e3 * source.unit)
 
 
 def _sources(paths: Sequence[Path]) -> list[Source]:
@@ -230,12 +267,59 @@ def _report(results: Sequence[Figures]) -> None:
 
 
 def _report_held_out(results: Sequence[Figures], held_out: Sequence[HeldOut]) -> None:
-    in_sample = [r.frechet_mean_mm for r in results]
-    columns = [in_sample, *([getattr(h, f"{way}_mm") for h in held_out] for way in WAYS)]
-    print("\nheld out: each demonstration against what was learned from others; Fréchet mean, mm")
+    for title, attribute, in_sample in (
+        ("Fréchet mean", "mm", [r.frechet_mean_mm for r in results]),
+        ("RMS at equal times", "rms_mm", [r.rms_mm for r in results]),
+    ):
+        columns = [in_sample, *([getattr(h, f"{way}_{attribute}") for h in held_out] for way in WAYS)]
+        print(f"\nheld out: each demonstration against what was learned from others; {title}, mm")
+        rows = [
+            (h.name, str(h.folds), *(f"{value:.2f}" for value in values))
+            for h, *values in zip(held_out, *columns, strict=True)
+        ]
+        means = ("mean", "", *(f"{np.mean(column):.2f}" for column in columns))
+        print_table(("shape", "folds", "in-sample", "held out", "mean of others", "nearest start"), [*rows, means])
+        better = sum(learned < min(others) for _, learned, *others in zip(*columns, strict=True))
+        print(f"nearer than both without learning: {better} of {len(rows)}")
+
+
+def _report_off_course(beside: Sequence[OffCourse]) -> None:
+    print("\noff the demonstrations; shape error relative to the extent, speed to the fastest demonstrated")
+    heads = [f"{what} at {100 * away:.0f} %" for what in ("shape error", "speed") for away in AWAY]
     rows = [
-        (h.name, str(h.folds), *(f"{value:.2f}" for value in values))
-        for h, *values in zip(held_out, *columns, strict=True)
+        (b.name, *(f"{v:.3f}" for v in b.shape_error), *(f"{v:.2f}" for v in b.speed), f"{b.drawn:.2f}") for b in beside
     ]
-    means = ("mean", "", *(f"{np.mean(column):.2f}" for column in columns))
-    print_table(("shape", "folds", "in-sample", "held out", "mean of others", "nearest start"), [*rows, means])
+    columns = np.array([[*b.shape_error, *b.speed, b.drawn] for b in beside])
+    mean = ("mean", *(f"{value:.3f}" for value in columns.mean(axis=0)))
+    print_table(("shape", *heads, "drawn after a push"), [*rows, mean])
+
+
+def _report_crossings(state: str, learn: Learn, folder: Path) -> None:
+    """Follow what crosses, comes back or winds, and print and draw it."""
+    rows, panels = [], []
+    for name, case in crossings().items():
+        demonstrations = case.demonstrations
+        extent = float(np.ptp(np.concatenate([d.positions for d in demonstrations]), axis=0).max())
+        try:
+            if case.labels and learn is fit_augmented:
+                labelled = fit_augmented(demonstrations, case.labels)
+                starts = zip(demonstrations, case.labels, strict=True)
+                begun = [
+                    (labelled.system(d.positions[0], label), labelled.state(d.positions[0])) for d, label in starts
+                ]
+                paths = [
+                    path_from(*motion, d.positions.shape[1]) for motion, d in zip(begun, demonstrations, strict=True)
+                ]
+            else:
+                paths = list(
+                    rollouts_from(learn(demonstrations), np.stack([d.positions[0] for d in demonstrations]))[0]
+                )
+        except ImitationError as error:
+            rows.append((name, f"{1e3 * extent:.0f}", "–", "–", str(error)))
+            continue
+        worst = float(frechet(paths, [d.positions for d in demonstrations]).max())
+        rows.append((name, f"{1e3 * extent:.0f}", f"{1e3 * worst:.1f}", f"{100 * worst / extent:.1f}", ""))
+        panels.append(Panel(name, [d.positions for d in demonstrations], paths))
+    print(f"\nwhat crosses, comes back or winds, by the {state} state; worst of each case, in-sample")
+    print_table(("case", "extent mm", "Fréchet mm", "% of the extent", ""), rows)
+    draw_panels(folder / "crossings.png", panels)

@@ -57,6 +57,14 @@ class Attractor:
         shrink = np.divide(r, r0, out=np.zeros_like(r), where=r0 > 0)
         return self.goal + shrink[..., None] * offset[..., None, :]
 
+    def at_fraction(self, z0: Array, fraction: Array) -> Array:
+        """Points (*B, T, d) of motions from `z0` (*B, d) where a `fraction` (*B, T) of their way is left."""
+        return self.goal + fraction[..., None] * (z0 - self.goal)[..., None, :]
+
+    def times_at_fraction(self, z0: Array, fraction: Array) -> Array:
+        """Times (*B, T), seconds, at which a `fraction` (*B, T) of their way is left to motions from `z0` (*B, d)."""
+        return self.times_at(z0, fraction * np.linalg.norm(z0 - self.goal, axis=-1, keepdims=True))
+
     def times_at(self, z0: Array, distances: Array) -> Array:
         """Times (*B, T), seconds, at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of it.
 

@@ -29,6 +29,8 @@ class ImitationError(ValueError):
 class Motions:
     """Prepared motions, the input of a fit."""
 
+    numbers: tuple[int, ...]
+    """Numbers of the demonstrations that they are, from 0; others are left out."""
     names: tuple[str, ...]
     times: tuple[Array, ...]
     """(T_i,) times of each motion, seconds, increasing from 0."""
@@ -62,19 +64,19 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     except FormatError as error:
         raise ImitationError(str(error)) from error
     warnings: list[str] = []
-    usable = []
-    for demonstration, (times, positions) in zip(demonstrations, samples, strict=True):
+    usable: dict[int, Demonstration] = {}
+    for number, (demonstration, (times, positions)) in enumerate(zip(demonstrations, samples, strict=True)):
         if arc_length(positions)[-1] > 0:
-            usable.append(Demonstration(times, positions, demonstration.name))
+            usable[number] = Demonstration(times, positions, demonstration.name)
         else:
             warnings.append(f"'{demonstration.name}' never moves; it is left out")
     if not usable:
         raise ImitationError("no demonstration moves; at least one must lead to the goal")
-    spread = _spread(usable)
+    spread = _spread(list(usable.values()))
     usable, goal = _with_common_goal(usable, spread, warnings)
 
-    names, times, positions = [], [], []
-    for demonstration in usable:
+    numbers, names, times, positions = [], [], [], []
+    for number, demonstration in usable.items():
         t, path = demonstration.times, _end_moved(demonstration.positions, goal)
         away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
         if len(away) == 0:
@@ -88,12 +90,13 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
             )
             t, path = t[first:] - t[first], path[first:]
         _warn_about(demonstration.name, t, path, spread, warnings)
+        numbers.append(number)
         names.append(demonstration.name)
         times.append(t)
         positions.append(path)
     if not positions:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
-    return Motions(tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
+    return Motions(tuple(numbers), tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
 
 
 def _spread(demonstrations: Sequence[Demonstration]) -> float:
@@ -102,25 +105,26 @@ def _spread(demonstrations: Sequence[Demonstration]) -> float:
 
 
 def _with_common_goal(
-    demonstrations: list[Demonstration], spread: float, warnings: list[str]
-) -> tuple[list[Demonstration], Array]:
+    demonstrations: dict[int, Demonstration], spread: float, warnings: list[str]
+) -> tuple[dict[int, Demonstration], Array]:
     """Return the demonstrations that end where most of them do, and that goal."""
-    ends = np.array([demonstration.positions[-1] for demonstration in demonstrations])
+    found = list(demonstrations.values())
+    ends = np.array([demonstration.positions[-1] for demonstration in found])
     near = np.linalg.norm(ends - np.median(ends, axis=0), axis=1) <= MAX_MOVED_END * spread
     if 2 * near.sum() <= len(ends):
-        farthest = demonstrations[int(np.argmax(np.linalg.norm(ends - np.median(ends, axis=0), axis=1)))]
+        farthest = found[int(np.argmax(np.linalg.norm(ends - np.median(ends, axis=0), axis=1)))]
         raise ImitationError(
             f"the demonstrations have no common goal: most end more than {MAX_MOVED_END * spread:.2g} from where the "
             f"others do, '{farthest.name}' the farthest"
         )
     goal = ends[near].mean(axis=0)
-    for demonstration, end, kept in zip(demonstrations, ends, near, strict=True):
+    for demonstration, end, kept in zip(found, ends, near, strict=True):
         off = float(np.linalg.norm(end - goal))
         if not kept:
             warnings.append(f"'{demonstration.name}' ends {off:.2g} from the others' goal; it is left out")
         elif off > SAME_GOAL * spread:
             warnings.append(f"'{demonstration.name}' ends {off:.2g} from the common goal; its end is moved there")
-    return [demonstration for demonstration, kept in zip(demonstrations, near, strict=True) if kept], goal
+    return {number: d for (number, d), kept in zip(demonstrations.items(), near, strict=True) if kept}, goal
 
 
 def _end_moved(path: Array, goal: Array) -> Array:

@@ -41,7 +41,7 @@ def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) 
     Returns:
         At least `num_stages` + 2 arrays (R, n, d). In each, every motion ends at the goal.
     """
-    groups = _groups(motions)
+    groups = groups_of(motions)
     members = [groups == group for group in range(groups.max() + 1)]
     unbendings = [_Unbending(motions[member], keep_arrival=len(members) > 1) for member in members]
 
@@ -61,7 +61,7 @@ def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) 
     return [rays, *shapes]
 
 
-def _groups(motions: Array) -> NDArray[np.integer[Any]]:
+def groups_of(motions: Array) -> NDArray[np.integer[Any]]:
     """Number the groups of the motions, (R,), from 0."""
     if len(motions) == 1:
         return np.zeros(1, dtype=int)

@@ -1,0 +1,295 @@
+"""Imitation in an augmented state (y, s): a motion is predicted for its start, and followed by its phase s.
+
+Plain imitation is one field in R^d, in which no two motions cross and none comes back to a place. Here the state is
+the place y, the phase s, from s_max at the start to 0 at the goal, and, constant along a motion, its condition a: where
+it started, and a label if there is one. The motion c(s; a) predicted for a is
+
+    c(u s_max; a) = mean(u) + u (start − mean(1)) + GP(a)(u),
+
+the mean demonstration, an offset that fades, and a Gaussian process over the starts. The shear along it (see
+`dt_viz.flows.phased`) is ψ_a; the base system runs s down on a clock that is predicted for a, too.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.flows.phased import PhaseCurve, PhasedAttractor, Shear
+from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.preparation import ImitationError, prepare
+from dt_viz.learning.timing import ARRIVED, TimedAttractor
+from dt_viz.learning.unbending import groups_of
+from dt_viz.metrics import arc_length, interpolate
+
+NUM_POINTS, NUM_KNOTS = 150, 30
+"""Number of points of a demonstration, evenly by arc length, and number of knots of a predicted motion."""
+TOP = 0.5
+"""s_max relative to the extent of the demonstrations."""
+SMALLEST_SPREAD = 0.04
+"""Smallest spread of the starts, relative to the extent: starts nearer to each other teach nothing of what they do."""
+WIDTH, NOISE = 2.0, 0.6
+"""Width of the kernel over the starts, in their spreads, and variance of what it does not explain, relative to it."""
+LABEL_SPREAD, LABEL_NOISE = 3.0, 0.02
+"""Distance of labels that differ by 1, in spreads of the starts, and the variance that replaces `NOISE` with labels."""
+TIME_NOISE, TIME_WIDTH, JITTER = 1.0, 0.1, 0.02
+"""Variance of the clocks that the starts do not explain, width of the kernel that it has instead of being noise, so
+that a demonstration's own start has its own timing, in spreads, and the part of it that remains noise."""
+NUM_PACES, NUM_TIMED = 80, 120
+"""Number of knots of a clock, and number of samples of a demonstration that it is learned from."""
+CAUGHT_WITHIN, LEAST_PHASE, NUM_CAUGHT = 0.15, 0.05, 61
+"""Largest change of the phase of a motion that is pushed, and the least phase that it gets, relative to s_max, and
+number of phases that are compared."""
+SLOWEST = 2e-3
+"""Smallest speed of the phase, relative to the mean: it never stands still."""
+
+
+@dataclass(frozen=True, eq=False)
+class OverStarts:
+    """A Gaussian process over conditions: the mean of what it was given, and how it changes with the condition."""
+
+    mean: Array
+    """(k,) mean of the conditions."""
+    spread: float
+    """RMS distance of the conditions from their mean, or a larger one."""
+    known: Array
+    """(R, k) conditions, less their mean, in spreads."""
+    coefficients: Array
+    """(R, …)."""
+    noise: float
+    narrow: float | None
+    """Width of the kernel of the noise, in spreads; None for noise of each condition by itself."""
+
+    @classmethod
+    def of(
+        cls, conditions: Array, values: Array, *, spread: float, noise: float, narrow: float | None = None
+    ) -> OverStarts:
+        """Learn `values` (R, …) of `conditions` (R, k)."""
+        mean = conditions.mean(axis=0)
+        known = (conditions - mean) / spread
+        own = JITTER if narrow else 1.0
+        made = cls(mean, spread, known, np.empty(0), noise, narrow)
+        kernel = made._kernel(known) + own * noise * np.eye(len(known))
+        flat = np.linalg.solve(kernel, values.reshape(len(known), -1))
+        return cls(mean, spread, known, flat.reshape(values.shape), noise, narrow)
+
+    def at(self, condition: Array) -> Array:
+        """The value at a condition (k,)."""
+        return np.tensordot(self._kernel((condition - self.mean)[None] / self.spread)[0], self.coefficients, 1)
+
+    def _kernel(self, at: Array) -> Array:
+        squared = ((at[:, None] - self.known) ** 2).sum(axis=-1)
+        kernel = np.exp(-squared / (2 * WIDTH**2))
+        return kernel + self.noise * np.exp(-squared / (2 * self.narrow**2)) if self.narrow else kernel
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """What demonstrations of one shape teach: the motion and the clock of any start."""
+
+    conditions: Array
+    """(R, k) of the demonstrations."""
+    mean: Array
+    """(K, d) mean demonstration at the knots, from the start, metres."""
+    shapes: OverStarts
+    """(K, d) offsets from the mean and its fading shift."""
+    profile: Array
+    """(P,) mean part of the length that lies behind at even times."""
+    duration: float
+    """Mean logarithm of the duration of motions a metre long, seconds."""
+    timing: OverStarts
+    """(1 + P,) offsets from that logarithm, and from the profile."""
+
+
+@dataclass(frozen=True, eq=False)
+class AugmentedImitation:
+    """A learned motion in the augmented state, for any start."""
+
+    starts: Array
+    """(R, d) of the demonstrations, metres."""
+    goal: Array
+    """(d,) common end of the demonstrations, metres."""
+    labels: Array | None
+    """(R,) of the demonstrations; None without labels."""
+    top: float
+    """s_max, metres."""
+    power: float
+    """p of the base system."""
+    patterns: tuple[Pattern, ...]
+    clock: TimedAttractor
+    """Clock of the phase, without the pace that is predicted for a start."""
+    fit_seconds: float
+    warnings: tuple[str, ...] = ()
+    _label_unit: float = field(default=1.0, repr=False)
+    """Distance of labels that differ by 1, metres."""
+
+    def state(self, start: Array) -> Array:
+        """The state (d + 1,) in which a motion from a start (d,), metres, begins."""
+        return np.append(start, self.top)
+
+    def system(self, start: Array, label: float | None = None) -> DiffeomorphicSystem:
+        """The system in R^(d+1) of motions from a start.
+
+        Args:
+            start: (d,), metres.
+            label: of the motion; None takes that of the nearest demonstrated start.
+
+        Raises:
+            ImitationError: no demonstration has such a label.
+        """
+        condition = self.condition(start, label)
+        nearest = [np.linalg.norm(condition - pattern.conditions, axis=1).min() for pattern in self.patterns]
+        pattern = self.patterns[int(np.argmin(nearest))]
+        phases = np.linspace(1.0, 0.0, len(pattern.mean))
+        points = pattern.mean + phases[:, None] * (start - pattern.mean[0]) + pattern.shapes.at(condition)
+        points[0], points[-1] = start, self.goal
+        return DiffeomorphicSystem(
+            Shear(PhaseCurve.through(self.top * phases[::-1], points[::-1])),
+            PhasedAttractor(
+                goal=np.zeros(len(start) + 1),
+                speed=self.clock.speed,
+                smoothing=self.clock.smoothing,
+                clock=self._timed(pattern, condition, float(arc_length(points)[-1])),
+                power=self.power,
+            ),
+        )
+
+    def caught(self, state: Array, start: Array, label: float | None = None) -> Array:
+        """The state (d + 1,) from which a pushed motion goes on, so that what it has not drawn yet is drawn.
+
+        Its phase is the one, not far from its own, at which the motion from its start is nearest; see `system` for the
+        start and the label.
+        """
+        transform = self.system(start, label).transform
+        assert isinstance(transform, Shear)
+        reach = CAUGHT_WITHIN * self.top
+        low, high = np.clip((state[-1] - reach, state[-1] + reach), LEAST_PHASE * self.top, self.top)
+        phases = np.linspace(min(low, state[-1]), max(high, state[-1]), NUM_CAUGHT)
+        away = np.linalg.norm(transform.curve.at(phases) - state[:-1], axis=1)
+        return np.append(state[:-1], phases[away.argmin()])
+
+    def condition(self, start: Array, label: float | None = None) -> Array:
+        """Condition (k,) of a motion; see `system`."""
+        if self.labels is None:
+            if label is not None:
+                raise ImitationError(f"label: found {label:g}; the demonstrations have none")
+            return start
+        if label is None:
+            label = float(self.labels[np.linalg.norm(self.starts - start, axis=1).argmin()])
+        elif label not in self.labels:
+            known = ", ".join(f"{value:g}" for value in np.unique(self.labels))
+            raise ImitationError(f"label: found {label:g}; accepted: {known}")
+        return np.append(start, self._label_unit * label)
+
+    def _timed(self, pattern: Pattern, condition: Array, length: float) -> TimedAttractor:
+        """The clock of a motion of a length, metres."""
+        duration, *profile = pattern.timing.at(condition)
+        behind = np.maximum.accumulate(np.clip(pattern.profile + np.array(profile), 0.0, 1.0))
+        behind[0], behind[-1] = 0.0, 1.0
+        even = np.linspace(0.0, 1.0, len(behind))
+        behind = (1 - SLOWEST) * behind + SLOWEST * even
+        # as the clock of a phase that falls evenly advances, time passes at these paces
+        plain = self.clock
+        left = plain.smoothing * asinh_exp(plain.knots * plain.speed / plain.smoothing) / self.top
+        total = np.exp(pattern.duration + duration) * np.sqrt(length)
+        elapsed = total * np.interp(1 - (left - ARRIVED) / (1 - ARRIVED), behind, even)
+        paces = np.maximum(-np.gradient(elapsed, plain.knots), SLOWEST)
+        paces *= total / ((paces[1:] + paces[:-1]) / 2 * np.diff(plain.knots)).sum()
+        return replace(plain, paces=paces[None])
+
+
+def fit_augmented(
+    demonstrations: Sequence[Demonstration], labels: Sequence[float] | None = None, *, power: float = 3.0
+) -> AugmentedImitation:
+    """Learn motions in the augmented state.
+
+    Args:
+        demonstrations: at least one, all ending at (about) the same place.
+        labels: a number for each demonstration, where they differ although they begin at one place; usually from −1
+            to 1.
+        power: p of the base system.
+
+    Raises:
+        ImitationError: nothing can be learned from these demonstrations, or there are not as many labels.
+    """
+    began = time.perf_counter()
+    if labels is not None and len(labels) != len(demonstrations):
+        raise ImitationError(
+            f"labels: found {len(labels)}; accepted: {len(demonstrations)}, one for each demonstration"
+        )
+    motions = prepare(demonstrations)
+    starts = np.stack([path[0] for path in motions.positions])
+    extent = float(np.ptp(np.concatenate(motions.positions), axis=0).max())
+    spread = max(float(np.sqrt(((starts - starts.mean(axis=0)) ** 2).sum(axis=1).mean())), SMALLEST_SPREAD * extent)
+    unit, top, kept = LABEL_SPREAD * spread, TOP * extent, None
+    conditions, points = starts, motions.resampled(NUM_POINTS)
+    if labels is None:
+        group = groups_of((points - points.mean(axis=(0, 1))) / motions.spread)
+    else:
+        kept = np.array([labels[number] for number in motions.numbers], dtype=float)
+        conditions, group = np.column_stack([starts, unit * kept]), np.zeros(len(starts), dtype=int)
+    durations = np.array([t[-1] for t in motions.times])
+    clock = _plain_clock(top, float(durations.mean()))
+    profiles = np.stack([_profile(*motion) for motion in zip(motions.times, motions.positions, strict=True)])
+    knots = np.linspace(0, NUM_POINTS - 1, NUM_KNOTS)
+    at_knots = np.stack([interpolate(knots, np.arange(NUM_POINTS, dtype=float), path) for path in points])
+    lengths = np.array([arc_length(path)[-1] for path in at_knots])
+    noise = NOISE if labels is None else LABEL_NOISE
+    patterns = []
+    for number in range(int(group.max()) + 1):
+        of = group == number
+        patterns.append(
+            _pattern(
+                conditions[of], at_knots[of], np.log(durations[of] / np.sqrt(lengths[of])), profiles[of], spread, noise
+            )
+        )
+    seconds = time.perf_counter() - began
+    return AugmentedImitation(
+        starts, motions.goal, kept, top, power, tuple(patterns), clock, seconds, motions.warnings, unit
+    )
+
+
+def _pattern(
+    conditions: Array, points: Array, durations: Array, profiles: Array, spread: float, noise: float
+) -> Pattern:
+    fading = np.linspace(1.0, 0.0, points.shape[1])[:, None]
+    mean = points.mean(axis=0)
+    rest = points - mean - fading * (points[:, :1] - mean[0])
+    timing = np.column_stack([durations - durations.mean(), profiles - profiles.mean(axis=0)])
+    return Pattern(
+        conditions,
+        mean,
+        OverStarts.of(conditions, rest, spread=spread, noise=noise),
+        profiles.mean(axis=0),
+        float(durations.mean()),
+        OverStarts.of(conditions, timing, spread=spread, noise=TIME_NOISE, narrow=TIME_WIDTH),
+    )
+
+
+def _plain_clock(top: float, duration: float) -> TimedAttractor:
+    """The clock on which every pace is 1, for phases up to `top`."""
+    plain = Attractor(np.zeros(1), speed=top / duration, smoothing=0.1 * top)
+    nearest, farthest = (
+        plain.smoothing / plain.speed * float(log_sinh(np.array(part * top / plain.smoothing)))
+        for part in (ARRIVED, 1.0)
+    )
+    knots = np.linspace(nearest, farthest, NUM_PACES)
+    return TimedAttractor(
+        plain.goal,
+        plain.speed,
+        plain.smoothing,
+        directions=np.ones((1, 1)),
+        knots=knots,
+        paces=np.ones((1, NUM_PACES)),
+    )
+
+
+def _profile(times: Array, path: Array) -> Array:
+    """The part of a motion's length that lies behind at even times, (P,)."""
+    length = arc_length(path)
+    return np.interp(np.linspace(0, times[-1], NUM_TIMED), times, length / length[-1])

@@ -1,0 +1,197 @@
+"""Imitation in the augmented state: demonstrations that cross, come back and wind, other starts, labels, bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.evaluate.crossings import crossings
+from dt_viz.learning.augmented import fit_augmented
+from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.imitation import fit
+from dt_viz.learning.preparation import ImitationError
+from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
+from dt_viz.scenario.tasks import TASKS
+
+CASES = crossings()
+NUM = 150
+
+
+def path_from(imitation, start, label=None, num=400):
+    """Places of the motion from a start, evenly in the phase."""
+    system, state = imitation.system(start, label), imitation.state(start)
+    z = system.base.at_fraction(system.transform.forward(state), np.linspace(1, 0, num))
+    return system.transform.inverse(z)[:, :-1]
+
+
+def frechet(a, b):
+    return float(discrete_frechet(resample_by_arc_length(a, NUM), resample_by_arc_length(b, NUM)))
+
+
+def extent(demonstrations):
+    return float(np.ptp(np.concatenate([d.positions for d in demonstrations]), axis=0).max())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_crosses_comes_back_or_winds_is_followed(name):
+    case = CASES[name]
+    imitation = fit_augmented(case.demonstrations, case.labels)
+    labels = case.labels or [None] * len(case.demonstrations)
+    off = [
+        frechet(path_from(imitation, d.positions[0], label), d.positions)
+        for d, label in zip(case.demonstrations, labels, strict=True)
+    ]
+    assert max(off) <= (0.03 if case.labels else 0.04) * extent(case.demonstrations)
+
+
+def test_plain_imitation_misses_an_eight():
+    demonstrations = CASES["wide eight"].demonstrations
+    plain = fit(demonstrations)
+    times = np.linspace(0, 8, 400)
+    off = [frechet(plain.system.rollout(d.positions[0], times), d.positions) for d in demonstrations]
+    assert max(off) > 0.1 * extent(demonstrations)
+
+
+@pytest.mark.parametrize("task", ["draw_s", "draw_w", "push_box"])
+def test_motions_begin_and_end_exactly_and_take_their_time(task):
+    demonstrations = TASKS[task]().demonstrations
+    imitation = fit_augmented(demonstrations)
+    for d in demonstrations:
+        start = d.positions[0]
+        path = path_from(imitation, start)
+        np.testing.assert_allclose(path[0], start, atol=1e-12)
+        np.testing.assert_allclose(path[-1], imitation.goal, atol=1e-12)
+        system = imitation.system(start)
+        times = np.linspace(0, d.times[-1] - d.times[0], 400)
+        rollout = system.rollout(imitation.state(start), times)[:, :-1]
+        assert rms_at_equal_times(times, rollout, d.times - d.times[0], d.positions) < 0.05 * extent(demonstrations)
+        assert np.linalg.norm(rollout[-1] - imitation.goal) < 0.01 * extent(demonstrations)
+
+
+def test_left_out_demonstrations_are_predicted_better_than_by_their_mean():
+    off, trivial = [], []
+    for task in ("draw_s", "draw_j", "draw_g"):
+        demonstrations = TASKS[task]().demonstrations
+        for k, held in enumerate(demonstrations):
+            others = [d for i, d in enumerate(demonstrations) if i != k]
+            start = held.positions[0]
+            off.append(frechet(path_from(fit_augmented(others), start), held.positions))
+            mean = np.mean([resample_by_arc_length(d.positions, NUM) for d in others], axis=0)
+            shifted = mean + np.linspace(1, 0, NUM)[:, None] * (start - mean[0])
+            trivial.append(frechet(shifted, held.positions))
+    assert np.mean(off) < np.mean(trivial)
+
+
+@pytest.mark.parametrize("away", [0.25, 0.5, 1.5])
+def test_from_far_away_the_figure_is_drawn_shifted_and_not_in_a_hurry(away):
+    demonstrations = TASKS["draw_s"]().demonstrations
+    imitation, size = fit_augmented(demonstrations), extent(demonstrations)
+    mean = np.mean([resample_by_arc_length(d.positions, NUM) for d in demonstrations], axis=0)
+    fastest = max(np.linalg.norm(np.gradient(d.positions, d.times, axis=0), axis=1).max() for d in demonstrations)
+    direction = np.array([1.0, 0, 0, 1.0, -1.0, 0, 0, -1.0]).reshape(4, 2)
+    axes = np.linalg.svd(mean - mean.mean(axis=0))[2][:2]
+    for across in direction:
+        start = mean[0] + away * size * across @ axes
+        shifted = mean + np.linspace(1, 0, NUM)[:, None] * (start - mean[0])
+        assert frechet(path_from(imitation, start), shifted) < 0.06 * size
+        times = np.linspace(0, 12, 1200)
+        path = imitation.system(start).rollout(imitation.state(start), times)[:, :-1]
+        assert np.linalg.norm(np.gradient(path, times, axis=0), axis=1).max() < (1.3 + 2 * max(away - 0.5, 0)) * fastest
+
+
+def test_a_push_is_forgotten_and_the_rest_of_the_figure_is_drawn():
+    demonstrations = CASES["wide eight"].demonstrations
+    imitation, start = fit_augmented(demonstrations), demonstrations[0].positions[0]
+    system, size = imitation.system(start), extent(demonstrations)
+    z = system.base.at_fraction(system.transform.forward(imitation.state(start)), np.array([0.6]))
+    state = system.transform.inverse(z)[0] + [0.2 * size, 0, 0]
+    z0 = system.transform.forward(state)
+    pushed = system.transform.inverse(system.base.at_fraction(z0, np.linspace(1, 0, 300)))[:, :-1]
+    rest = system.transform.inverse(system.base.at_fraction(z[0], np.linspace(1, 0, 300)))[:, :-1]
+    drawn = np.linalg.norm(rest[:, None] - pushed, axis=2).min(axis=1) < 0.05 * size
+    assert drawn.mean() > 0.6
+    np.testing.assert_allclose(pushed[-1], imitation.goal, atol=1e-9)
+
+
+def test_a_small_change_of_the_start_changes_the_motion_little():
+    demonstrations = TASKS["draw_w"]().demonstrations
+    imitation = fit_augmented(demonstrations)
+    for d in demonstrations:
+        start = d.positions[0]
+        moved = path_from(imitation, start + 1e-5) - path_from(imitation, start)
+        assert np.linalg.norm(moved, axis=1).max() < 3 * 1e-5 * np.sqrt(len(start))
+
+
+# --- Bad input ---
+
+
+def test_one_demonstration_is_followed_exactly():
+    (d, *_) = TASKS["draw_s"]().demonstrations
+    imitation = fit_augmented([d])
+    assert frechet(path_from(imitation, d.positions[0]), d.positions) < 0.01 * extent([d])
+    assert np.isfinite(path_from(imitation, d.positions[0] + 0.1)).all()
+
+
+def test_demonstrations_that_contradict_in_time_give_a_time_between():
+    (d, *_) = TASKS["draw_s"]().demonstrations
+    beside = replace(d, positions=d.positions + np.linspace(1, 0, len(d.positions))[:, None] * [0.01, 0.01])
+    quick, slow = (
+        replace(d, times=np.linspace(0, 1, len(d.times))),
+        replace(beside, times=np.linspace(0, 30, len(d.times))),
+    )
+    imitation = fit_augmented([quick, slow])
+    arrival = [
+        float(imitation.system(x).base.times_at_fraction(imitation.state(x), np.array([1e-3]))[0])
+        for x in (d.positions[0], (d.positions[0] + beside.positions[0]) / 2)
+    ]
+    assert 0.9 < arrival[0] < arrival[1] < 30
+
+
+def test_identical_starts_do_no_harm():
+    demonstrations = TASKS["draw_s"]().demonstrations
+    start = demonstrations[0].positions[0]
+    alike = [
+        replace(d, positions=d.positions + np.linspace(1, 0, len(d.positions))[:, None] * (start - d.positions[0]))
+        for d in demonstrations
+    ]
+    imitation, size = fit_augmented(alike), extent(alike)
+    assert max(frechet(path_from(imitation, start), d.positions) for d in alike) < 0.15 * size
+    elsewhere = path_from(imitation, start + 0.1 * size)
+    assert np.linalg.norm(elsewhere - path_from(imitation, start), axis=1).max() < 0.3 * size
+
+
+def test_a_start_on_the_goal_draws_the_whole_figure():
+    demonstrations = TASKS["draw_s"]().demonstrations
+    imitation = fit_augmented(demonstrations)
+    path = path_from(imitation, imitation.goal)
+    np.testing.assert_allclose(path[[0, -1]], np.stack([imitation.goal] * 2), atol=1e-12)
+    assert np.ptp(path, axis=0).max() > 0.3 * extent(demonstrations)
+
+
+def test_labels_are_checked():
+    case = CASES["left and right from one start"]
+    with pytest.raises(ImitationError, match="found 3; accepted: 2, one for each"):
+        fit_augmented(case.demonstrations, (1, 2, 3))
+    imitation = fit_augmented(case.demonstrations, case.labels)
+    start = case.demonstrations[0].positions[0]
+    with pytest.raises(ImitationError, match=r"label: found 7; accepted: -1, 1"):
+        imitation.system(start, 7)
+    plain = fit_augmented(case.demonstrations[:1])
+    with pytest.raises(ImitationError, match="the demonstrations have none"):
+        plain.system(start, 1.0)
+    one, other = (path_from(imitation, start, label) for label in (1.0, -1.0))
+    assert one[:, 1].max() > 0.09 and other[:, 1].min() < -0.09
+
+
+def test_labels_stay_with_their_demonstrations_where_one_is_left_out():
+    case = CASES["left and right from one start"]
+    assert case.labels is not None
+    resting = Demonstration(np.linspace(0, 1, 10), np.tile(case.demonstrations[0].positions[-1], (10, 1)), "rests")
+    imitation = fit_augmented([resting, *case.demonstrations], (5.0, *case.labels))
+    assert imitation.labels is not None and imitation.labels.tolist() == list(case.labels)
+    assert any("rests" in warning for warning in imitation.warnings)
+
+
+def test_nothing_to_learn_is_said():
+    with pytest.raises(ImitationError):
+        fit_augmented([])
