@@ -33,7 +33,7 @@ def bump(dim, seed=1):
     """A flow of R^dim that moves space by a few centimetres."""
     rng = np.random.default_rng(seed)
     grid = GaussianGrid(tuple(np.linspace(-0.2, 0.2, 4) for _ in range(dim)), 0.5 / 0.1**2)
-    return Flow(GridRBF(grid, 0.04 * rng.normal(size=(grid.num_points, dim))), 1.0, 32)
+    return Flow(GridRBF(grid, 0.04 * rng.normal(size=(grid.num_points, dim))), 1.0, 16)
 
 
 def states(dim, num, seed=2):
@@ -114,10 +114,10 @@ def test_exact_rollouts_are_what_stepping_converges_to(dim, stacked):
     transform = Chain([Shear(curve(dim)), *lifted([bump(dim)])]) if stacked else Shear(curve(dim))
     system = DiffeomorphicSystem(transform, attractor(dim))
     start = states(dim, 4) + np.array([*[0.0] * dim, 0.02])
-    times = np.linspace(0, 3, 13)
+    times = np.linspace(0, 1.5, 6)
     exact = system.rollout(start, times)
-    errors = [np.abs(system.stepped_rollout(start, times, n) - exact).max() for n in (5, 40)]
-    assert errors[1] < 5e-6 and errors[1] < errors[0] / 20  # the clock's paces have kinks
+    errors = [np.abs(system.stepped_rollout(start, times, n) - exact).max() for n in (5, 30)]
+    assert errors[1] < 2e-5 and errors[1] < errors[0] / 20  # the clock's paces have kinks
     values = system.lyapunov(exact)
     assert (np.diff(values, axis=1) < 0).all()
     np.testing.assert_allclose(

@@ -80,6 +80,8 @@ class Method(ABC):
     """Whether the whole arm avoids, not the end effector alone."""
     live: ClassVar[bool]
     """Whether it follows a drag; others plan when the obstacle rests."""
+    avoids: ClassVar[bool] = True
+    """Whether its motions depend on the obstacle."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Modules beyond DT-Viz's own that it cannot plan without."""
 

@@ -290,6 +290,7 @@ class EFlow(Method):
     name, title = "eflow", "EFlow"
     promise = "Stable: every motion reaches the goal, by construction. It does not avoid."
     stable, whole_arm, live = True, False, True
+    avoids = False
 
     def __init__(self, spacing: float = LIVE.spacing, folder: Path = FOLDER) -> None:
         """Choose the largest distance between samples of a path, metres, and the folder of the weights."""

@@ -32,6 +32,7 @@ class Linear(Method):
     name, title = "linear", "Linear"
     promise = "A path to the goal, straight in the joints. It neither imitates nor avoids."
     stable, whole_arm, live = True, False, True
+    avoids = False
 
     def fit(self, problem: Problem) -> Planner:
         """Take the task's postures; see `Method`."""

@@ -37,6 +37,7 @@ class OursAlone(Method):
     name, title = "ours-no-avoidance", "Ours, no avoidance"
     promise = "Stable: every motion reaches the goal, by construction. It does not avoid."
     stable, whole_arm, live = True, False, True
+    avoids = False
 
     def fit(self, problem: Problem) -> Planner:
         """Take what is learned already; see `Method`."""

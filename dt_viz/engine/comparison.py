@@ -31,6 +31,8 @@ OTHERS = tuple(method for method in METHODS.values() if method is not OURS)
 """Methods that a page can show beside ours."""
 NEWEST = 32
 """Number of plans that are kept."""
+TOLERANCE = 1e-4
+"""By how much a maximum collision distance may be too small, metres."""
 WAITS, NO_WAY = "planned when the obstacle rests", "finds no way"
 
 
@@ -119,9 +121,19 @@ class Comparison:
         return self._memo(
             "their plan",
             (method.name, learned, obstacle),
-            lambda: self._plan(method, learned, obstacle),
+            lambda: self._scored(method, learned, obstacle),
             newest=NEWEST,
         )
+
+    def _scored(self, method: Method, learned: Learned, obstacle: Union) -> _Planned:
+        """The motions of a method, scored; those that do not avoid are planned once for all obstacles."""
+        seen = obstacle if method.avoids else Union()
+        planned = self._memo(
+            "their motions", (method.name, learned, seen), lambda: self._plan(method, learned, seen), newest=NEWEST
+        )
+        if planned.scores is None or method.avoids:
+            return planned
+        return replace(planned, scores=replace(planned.scores, hand_depth=hand_depth(planned.paths, obstacle)))
 
     def _plan(self, method: Method, learned: Learned, obstacle: Union) -> _Planned:
         planner = self._memo("planner", (method.name, learned), lambda: self._fitted(method, learned), newest=NEWEST)
@@ -214,12 +226,18 @@ def scored(paths: tuple[Array, ...], task: Task, goal: Array, obstacle: Union) -
     """
     even = np.stack([resample_by_arc_length(path, NUM_SAMPLES) for path in paths])
     demonstrated = np.stack([resample_by_arc_length(path, NUM_SAMPLES) for path in task.paths])
-    inside = [maximum_collision_distance(path, obstacle.signed_distance, 1e-4) for path in paths]
     return Scores(
         float(discrete_frechet(even, demonstrated).mean()),
-        max(0.0, *inside) if obstacle.parts else 0.0,
+        hand_depth(paths, obstacle),
         float(max(np.linalg.norm(path[-1] - goal) for path in paths)),
     )
+
+
+def hand_depth(paths: tuple[Array, ...], obstacle: Union) -> float:
+    """Maximum collision distance of the end effector on paths (N_i, 3), metres; 0 when all are clear."""
+    if not obstacle.parts:
+        return 0.0
+    return max(maximum_collision_distance(path, obstacle.signed_distance, TOLERANCE) for path in paths) + 0.0
 
 
 def curves(path: Array, demonstration: Array, obstacle: Union) -> Array:
