@@ -116,6 +116,16 @@ def draw_z(num_demonstrations: int = 7, seed: int = 71) -> tuple[Demonstration, 
     return _draw(_letter_z(), "draw Z", num_demonstrations, seed)
 
 
+def draw_8(num_demonstrations: int = 7, seed: int = 88) -> tuple[Demonstration, ...]:
+    """Draw the figure 8 on a plane, from its top down across itself, round, and up again to the left of where it began.
+
+    Returns:
+        Demonstrations in metres, 2-D, origin in the middle of the figure (about 0.26 wide and 0.40 high),
+        u to the right and v up.
+    """
+    return _draw(_figure_8(), "draw 8", num_demonstrations, seed)
+
+
 def drop_pots(num_demonstrations: int = 8, seed: int = 98) -> tuple[Demonstration, ...]:
     """Carry an object forward over the centre one of three pots in a row, and stop above it.
 
@@ -191,6 +201,12 @@ def _letter_z() -> np.ndarray:
     bar = u * [0.15, 0.0] + (1 - u**2) * [0.0, 0.012]
     up = np.array([0.0, 0.18])
     return _rounded(np.concatenate([bar + up, bar * [1.0, -1.0] - up]), 0.016)
+
+
+def _figure_8() -> np.ndarray:
+    """Return the path of an 8: a Lissajous figure that is open at its top, shape ``(DENSE, 2)``."""
+    turn = np.linspace(0.10, 2 * np.pi - 0.40, DENSE)
+    return np.stack([0.13 * np.sin(2 * turn), 0.20 * np.cos(turn)], axis=1)
 
 
 def _arc(start: float, end: float) -> np.ndarray:
@@ -304,5 +320,5 @@ def _smooth_step(x: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    for make in (draw_s, lift_box, push_box, draw_j, drop_pots, draw_c, draw_g, draw_w, draw_z):
+    for make in (draw_s, lift_box, push_box, draw_j, drop_pots, draw_c, draw_g, draw_w, draw_z, draw_8):
         save_demonstrations(FOLDER / f"{make.__name__}.npz", make())

@@ -21,11 +21,13 @@ from dt_viz.arm.robot import Robot
 from dt_viz.arm.robot import load_jaco as load_robot
 from dt_viz.arm.tracking import inverse_kinematics, track
 from dt_viz.flows.fields import Array
+from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
 from dt_viz.flows.systems import CONTROLLER_TOLERANCE, DiffeomorphicSystem
+from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.choice import State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
-from dt_viz.learning.imitation import fit as fit_imitation
 from dt_viz.motion import control
 from dt_viz.motion.certificates import Certificates, Shown, certified
 from dt_viz.motion.diagnostics import motion_warnings
@@ -73,7 +75,7 @@ class Motion:
     def __init__(self, learned: Learned, layers: tuple[Layer, ...] = ()) -> None:
         """Wrap what was learned; see `fit`."""
         self._learned, self._layers = learned, layers
-        self.dimension = learned.imitation.base.dim
+        self.dimension = len(learned.imitation.goal)
         """d: 2 of drawings, 3 of motions in space."""
 
     @property
@@ -100,32 +102,71 @@ class Motion:
             scenario = replace(scenario, stack=(*scenario.stack, Layer(flat, name=name)))
         return Motion(self._learned, scenario.stack)
 
-    def rollouts(self, starts: ArrayLike | None = None, *, spacing: float = 0.005) -> tuple[Path, ...]:
+    def rollouts(
+        self, starts: ArrayLike | None = None, *, spacing: float = 0.005, label: float | None = None
+    ) -> tuple[Path, ...]:
         """Exact paths to the goal, sampled more closely where the stack stretches them.
 
         Args:
             starts: (R, d) where they begin, metres; None is where the demonstrations do.
             spacing: largest distance between neighbouring samples, metres.
+            label: of the motions from `starts`; None takes that of the nearest demonstrated start.
+
+        Raises:
+            FormatError: no demonstration has such a label.
         """
         solution = self._solution
         system = solution.system
         if starts is None:
             rays = solution.rays
         else:
-            rays = Rays(system.transform.forward(self._in_space(np.atleast_2d(np.asarray(starts, float)))), system.base)
-        evaluate = lambda index, fraction: system.transform.inverse(rays.at(index, fraction))[:, None]  # noqa: E731
+            states = self._states(np.atleast_2d(np.asarray(starts, float)), label)
+            rays = Rays(system.transform.forward(states), system.base)
+        evaluate = lambda index, fraction: system.transform.inverse(rays.at(index, fraction))[:, None, :3]  # noqa: E731
         bundle = refined(evenly_sampled(evaluate, len(rays.z0), NUM_SAMPLES), evaluate, spacing)
         times = bundle.split(rays.times(bundle.index, bundle.fraction))
         return tuple(Path(path[:, : self.dimension], t) for path, t in zip(bundle.paths, times, strict=True))
 
-    def velocity(self, y: ArrayLike) -> Array:
+    def velocity(
+        self, y: ArrayLike, phase: float = 1.0, start: ArrayLike | None = None, label: float | None = None
+    ) -> Array:
         """ẏ (*B, d), m/s, at the places `y` (*B, d), metres: what a controller follows.
 
-        It is exact to about a thousandth of its speed, and quickest for a single place.
+        It is exact to about a thousandth of its speed, and quickest for a single place. In the augmented state there is
+        one such field for each phase and each start, which a controller remembers; see `phase_rate`.
+
+        Args:
+            y: places, metres.
+            phase: part of the motion that is left, from 1 at its start to 0 at the goal.
+            start: (d,) where it began, metres; None is where the first demonstration does.
+            label: of the motion; None takes that of the nearest demonstrated start.
+
+        Raises:
+            FormatError: no demonstration has such a label.
         """
         points = np.asarray(y, float)
-        velocity = self._controlled.velocity(self._in_space(points.reshape(-1, self.dimension)))
+        system = frozen(self._controlled, self._rest(phase, start, label))
+        velocity = system.velocity(self._in_space(points.reshape(-1, self.dimension)))
         return velocity[:, : self.dimension].reshape(points.shape)
+
+    def phase_rate(self, phase: float, start: ArrayLike | None = None, label: float | None = None) -> float:
+        """How fast the phase falls at a phase, 1/s; 0 in the plain state, which has none. See `velocity`."""
+        base, rest = self._solution.rays.base, self._rest(phase, start, label)
+        if not len(rest):
+            return 0.0
+        state = np.concatenate([np.zeros(NUM_COORDINATES), rest])
+        return float(-phase * base.velocity(state)[NUM_COORDINATES] / max(rest[0], 1e-12))
+
+    @property
+    def state(self) -> str:
+        """The state that it was learned in, plain or augmented."""
+        return "augmented" if self._augmented else "plain"
+
+    @property
+    def reason(self) -> str:
+        """Why it was learned in the augmented state, if nobody asked for it."""
+        imitation = self._learned.imitation
+        return imitation.reason if isinstance(imitation, AugmentedImitation) else ""
 
     def certificates(self) -> Certificates:
         """Checks of the paths from the demonstrations' starts, and warnings."""
@@ -150,7 +191,10 @@ class Motion:
             OSError: the file cannot be written.
         """
         learned = self._learned
-        save_motion(path, SavedMotion(learned.task.demonstrations, self._layers), learned.imitation)
+        imitation = learned.imitation
+        augmented = isinstance(imitation, AugmentedImitation)
+        labels = imitation.labels if isinstance(imitation, AugmentedImitation) else None
+        save_motion(path, SavedMotion(learned.task.demonstrations, self._layers, augmented, labels), imitation)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Motion:
@@ -174,6 +218,21 @@ class Motion:
     @cached_property
     def _controlled(self) -> DiffeomorphicSystem:
         return self._solution.system.at_tolerance(CONTROLLER_TOLERANCE)
+
+    @property
+    def _augmented(self) -> bool:
+        return isinstance(self._learned.imitation, AugmentedImitation)
+
+    def _states(self, places: Array, label: float | None) -> Array:
+        """The states (R, k) in which motions from places (R, d) begin."""
+        return self._solution.rays.base.states(self._in_space(places), label)
+
+    def _rest(self, phase: float, start: ArrayLike | None, label: float | None) -> Array:
+        """What the state of a motion from a start (d,) consists of besides the place, at a phase."""
+        began = self._learned.task.starts[0, : self.dimension] if start is None else np.asarray(start, float)
+        rest = self._states(began[None], label)[0, NUM_COORDINATES:]
+        rest[:1] *= phase
+        return rest
 
     def _in_space(self, points: Array) -> Array:
         """Points (N, 3) of points (N, d)."""
@@ -297,18 +356,28 @@ def load_jaco() -> Arm:
     return Arm(load_robot())
 
 
-def fit(demonstrations: Sequence[Demonstration], objective: Objective = "trajectory") -> Motion:
+def fit(
+    demonstrations: Sequence[Demonstration],
+    objective: Objective = "trajectory",
+    state: State = "auto",
+    labels: Sequence[float] | None = None,
+) -> Motion:
     """Learn a stable motion from demonstrations, all ending at (about) the same place.
 
     Args:
         demonstrations: of one motion, with 2 or 3 coordinates; see `load_demonstrations`.
-        objective: what is fitted: the motions, or their velocities as in eq. (3).
+        objective: what is fitted in the plain state: the motions, or their velocities as in eq. (3).
+        state: "plain" is the paper's: one vector field of places, which needs no memory. "augmented" remembers its
+            phase and where it began: it crosses itself, comes back, winds, and draws the figure from other starts,
+            too. "auto" is plain unless demonstrations conflict or are missed by more than 5 % of their extent.
+        labels: a number for each demonstration, usually from −1 to 1, where they differ although they begin at one
+            place; makes the state augmented.
 
     Raises:
-        ImitationError: no stable motion can be learned from them.
+        ImitationError: no stable motion can be learned from them, or there is no such state.
     """
     given = tuple(demonstrations)
-    imitation = fit_imitation(given, ImitationSettings(objective))
+    imitation = learn(given, ImitationSettings(objective), state, labels)
     return Motion(Learned.of(_task(given), imitation, imitates=True))
 
 

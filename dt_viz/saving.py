@@ -3,7 +3,7 @@
 `motion` (text)
     JSON: the version, the demonstrations and the layers, as `dt_viz.files.values` writes them.
 `imitation.…`
-    What was learned, as `Imitation.to_arrays` gives it.
+    What was learned in the plain state, as `Imitation.to_arrays` gives it.
 others
     The arrays that the text names, such as the vertices of meshes.
 """
@@ -21,8 +21,11 @@ from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
 from dt_viz.files.values import Codec
+from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
+from dt_viz.learning.choice import AnyImitation
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
+from dt_viz.learning.preparation import ImitationError
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
 from dt_viz.scenario.scenario import Layer
 from dt_viz.transforms import registry
@@ -48,9 +51,14 @@ class SavedMotion:
     demonstrations: tuple[Demonstration, ...]
     layers: tuple[Layer, ...]
     """The transforms on the imitation, from the inside out."""
+    augmented: bool = False
+    """Whether it was learned in the augmented state: then it is learned again from the demonstrations when it is
+    read, which takes milliseconds."""
+    labels: tuple[float, ...] | None = None
+    """Labels of the demonstrations, of the augmented state."""
 
 
-def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: Imitation) -> None:
+def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: AnyImitation) -> None:
     """Write a motion to a file, whatever its suffix; an existing one is replaced only by a whole one.
 
     Raises:
@@ -61,13 +69,14 @@ def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: Im
     with parsing(MotionError, path, "motion", "what Motion.load can read"):
         plain = {"version": FORMAT, **_codec().encode(motion, SavedMotion, "motion", arrays)}
         text = {TEXT: np.array(json.dumps(plain, default=lambda number: number.item()))}  # numpy's
-    learned = {LEARNED + name: array for name, array in imitation.to_arrays().items()}
+    plain = imitation.to_arrays() if isinstance(imitation, Imitation) else {}
+    learned = {LEARNED + name: array for name, array in plain.items()}
     content = npz_bytes(text | learned | arrays)
     read_motion(content, path)  # what could not be read is refused now
     write_whole(path, content)
 
 
-def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, Imitation]:
+def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, AnyImitation]:
     """Read a motion from a file.
 
     Raises:
@@ -80,7 +89,7 @@ def load_motion(path: str | os.PathLike[str]) -> tuple[SavedMotion, Imitation]:
     return read_motion(content, path)
 
 
-def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, Imitation]:
+def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImitation]:
     """Read a motion from the bytes of a file; `source` is its name, for messages.
 
     Raises:
@@ -99,16 +108,24 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, Imitat
         arrays = {name: _checked(archive.read(name), name) for name in archive.names if name != TEXT}
         motion: SavedMotion = _codec().decode(plain, SavedMotion, "motion", arrays)
         learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}
-        imitation = Imitation.from_arrays(learned)
         demonstrations = check_demonstrations(motion.demonstrations, source)
-        if imitation.base.dim != demonstrations[0].dimension:
-            found = f"{imitation.base.dim}, and demonstrations in {demonstrations[0].dimension}"
+        imitation = _again(motion) if motion.augmented else Imitation.from_arrays(learned)
+        if len(imitation.goal) != demonstrations[0].dimension:
+            found = f"{len(imitation.goal)}, and demonstrations in {demonstrations[0].dimension}"
             raise FormatError("dimension of the imitation", found, "the same dimension")
         for layer in motion.layers:
             for obstacle in layer.transform.avoided.parts:
                 check_between("distance of an obstacle", float(np.linalg.norm(obstacle.position)), 0.0, MAX_COORDINATE)
                 check_between("length of its quaternion", float(np.linalg.norm(obstacle.wxyz)), 1e-3, 1e3)
     return SavedMotion(demonstrations, motion.layers), imitation
+
+
+def _again(motion: SavedMotion) -> AugmentedImitation:
+    """Learn a motion again. Raises FormatError where that fails."""
+    try:
+        return fit_augmented(motion.demonstrations, motion.labels)
+    except ImitationError as error:
+        raise FormatError("demonstrations", str(error), "some that a motion is learned from") from error
 
 
 def _codec() -> Codec:

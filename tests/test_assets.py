@@ -11,7 +11,7 @@ from dt_viz.metrics import arc_length, resample_by_arc_length, sharpest_turn
 from dt_viz.scenario.tasks import POTS
 
 ASSETS = Path(__file__).parents[1] / "assets"
-TASKS = ["draw_s", "lift_box", "push_box", "draw_j", "drop_pots", "draw_c", "draw_g", "draw_w", "draw_z"]
+TASKS = ["draw_s", "lift_box", "push_box", "draw_j", "drop_pots", "draw_c", "draw_g", "draw_w", "draw_z", "draw_8"]
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_the_script_makes_the_files_that_ship(script, task):
 @pytest.mark.parametrize(
     ("task", "number", "dimension"),
     [
-        *((f"draw_{letter}", 7, 2) for letter in "sjcgwz"),
+        *((f"draw_{letter}", 7, 2) for letter in "sjcgwz8"),
         ("lift_box", 8, 3),
         ("push_box", 7, 3),
         ("drop_pots", 8, 3),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dt_viz.errors import FormatError
 from dt_viz.evaluate.crossings import crossings
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
@@ -19,9 +20,9 @@ NUM = 150
 
 def path_from(imitation, start, label=None, num=400):
     """Places of the motion from a start, evenly in the phase."""
-    system, state = imitation.system(start, label), imitation.state(start)
+    system, state = imitation.system, imitation.states(start, label)
     z = system.base.at_fraction(system.transform.forward(state), np.linspace(1, 0, num))
-    return system.transform.inverse(z)[:, :-1]
+    return system.transform.inverse(z)[:, : len(start)]
 
 
 def frechet(a, b):
@@ -61,9 +62,8 @@ def test_motions_begin_and_end_exactly_and_take_their_time(task):
         path = path_from(imitation, start)
         np.testing.assert_allclose(path[0], start, atol=1e-12)
         np.testing.assert_allclose(path[-1], imitation.goal, atol=1e-12)
-        system = imitation.system(start)
         times = np.linspace(0, d.times[-1] - d.times[0], 400)
-        rollout = system.rollout(imitation.state(start), times)[:, :-1]
+        rollout = imitation.system.rollout(imitation.states(start), times)[:, : imitation.dim]
         assert rms_at_equal_times(times, rollout, d.times - d.times[0], d.positions) < 0.05 * extent(demonstrations)
         assert np.linalg.norm(rollout[-1] - imitation.goal) < 0.01 * extent(demonstrations)
 
@@ -95,19 +95,19 @@ def test_from_far_away_the_figure_is_drawn_shifted_and_not_in_a_hurry(away):
         shifted = mean + np.linspace(1, 0, NUM)[:, None] * (start - mean[0])
         assert frechet(path_from(imitation, start), shifted) < 0.06 * size
         times = np.linspace(0, 12, 1200)
-        path = imitation.system(start).rollout(imitation.state(start), times)[:, :-1]
+        path = imitation.system.rollout(imitation.states(start), times)[:, : imitation.dim]
         assert np.linalg.norm(np.gradient(path, times, axis=0), axis=1).max() < (1.3 + 2 * max(away - 0.5, 0)) * fastest
 
 
 def test_a_push_is_forgotten_and_the_rest_of_the_figure_is_drawn():
     demonstrations = CASES["wide eight"].demonstrations
     imitation, start = fit_augmented(demonstrations), demonstrations[0].positions[0]
-    system, size = imitation.system(start), extent(demonstrations)
-    z = system.base.at_fraction(system.transform.forward(imitation.state(start)), np.array([0.6]))
-    state = system.transform.inverse(z)[0] + [0.2 * size, 0, 0]
+    system, size = imitation.system, extent(demonstrations)
+    z = system.base.at_fraction(system.transform.forward(imitation.states(start)), np.array([0.6]))
+    state = system.transform.inverse(z)[0] + [0.2 * size, 0, 0, 0, 0]
     z0 = system.transform.forward(state)
-    pushed = system.transform.inverse(system.base.at_fraction(z0, np.linspace(1, 0, 300)))[:, :-1]
-    rest = system.transform.inverse(system.base.at_fraction(z[0], np.linspace(1, 0, 300)))[:, :-1]
+    pushed = system.transform.inverse(system.base.at_fraction(z0, np.linspace(1, 0, 300)))[:, :2]
+    rest = system.transform.inverse(system.base.at_fraction(z[0], np.linspace(1, 0, 300)))[:, :2]
     drawn = np.linalg.norm(rest[:, None] - pushed, axis=2).min(axis=1) < 0.05 * size
     assert drawn.mean() > 0.6
     np.testing.assert_allclose(pushed[-1], imitation.goal, atol=1e-9)
@@ -141,7 +141,7 @@ def test_demonstrations_that_contradict_in_time_give_a_time_between():
     )
     imitation = fit_augmented([quick, slow])
     arrival = [
-        float(imitation.system(x).base.times_at_fraction(imitation.state(x), np.array([1e-3]))[0])
+        float(imitation.system.base.times_at(imitation.states(x), np.array([1e-3 * imitation.top]))[0])
         for x in (d.positions[0], (d.positions[0] + beside.positions[0]) / 2)
     ]
     assert 0.9 < arrival[0] < arrival[1] < 30
@@ -174,11 +174,11 @@ def test_labels_are_checked():
         fit_augmented(case.demonstrations, (1, 2, 3))
     imitation = fit_augmented(case.demonstrations, case.labels)
     start = case.demonstrations[0].positions[0]
-    with pytest.raises(ImitationError, match=r"label: found 7; accepted: -1, 1"):
-        imitation.system(start, 7)
+    with pytest.raises(FormatError, match=r"label: found 7; accepted: -1, 1"):
+        imitation.states(start, 7)
     plain = fit_augmented(case.demonstrations[:1])
-    with pytest.raises(ImitationError, match="the demonstrations have none"):
-        plain.system(start, 1.0)
+    with pytest.raises(FormatError, match="the demonstrations have none"):
+        plain.states(start, 1.0)
     one, other = (path_from(imitation, start, label) for label in (1.0, -1.0))
     assert one[:, 1].max() > 0.09 and other[:, 1].min() < -0.09
 
@@ -188,7 +188,10 @@ def test_labels_stay_with_their_demonstrations_where_one_is_left_out():
     assert case.labels is not None
     resting = Demonstration(np.linspace(0, 1, 10), np.tile(case.demonstrations[0].positions[-1], (10, 1)), "rests")
     imitation = fit_augmented([resting, *case.demonstrations], (5.0, *case.labels))
-    assert imitation.labels is not None and imitation.labels.tolist() == list(case.labels)
+    starts = np.stack([d.positions[0] for d in (resting, *case.demonstrations)])
+    labels = imitation.demonstrated(starts)[1:, -1]
+    assert labels[0] > 0 > labels[1]
+    np.testing.assert_array_equal(labels, [imitation.states(starts[1], label)[-1] for label in case.labels])
     assert any("rests" in warning for warning in imitation.warnings)
 
 

@@ -186,9 +186,13 @@ def test_the_ground_keeps_what_it_has_of_the_demonstrations(engine, initial):
     more = nominal.learned.nominal([nominal.learned.strand((0.1, -0.5, 0.3))])
     assert nominal.learned.nominal(()) is nominal
     np.testing.assert_array_equal(more.starts[:-1], nominal.starts)
-    np.testing.assert_allclose(more.images(more.ends)[[0, -1]], nominal.images(nominal.ends)[[0, -1]], atol=1e-9)
+    alike, other = more.rays_between(more.ends), nominal.rays_between(nominal.ends)
+    np.testing.assert_allclose(alike.z0[0], other.z0[0], atol=1e-9)
+    np.testing.assert_allclose(alike.base.goal, other.base.goal, atol=1e-9)
     moved = more.ends + 0.01
-    np.testing.assert_allclose(more.system.transform.inverse(more.images(moved)), moved, atol=1e-8)
+    elsewhere = more.rays_between(moved)
+    np.testing.assert_allclose(more.system.transform.inverse(elsewhere.z0), moved[:-1], atol=1e-8)
+    np.testing.assert_allclose(more.system.transform.inverse(elsewhere.base.goal), moved[-1], atol=1e-8)
     assert more.only([0, 7]).rollout(7) == 1 and more.only([0, 7]).rollout(3) is None
     assert build_stack(more, initial("lift_box").active, LIVE).rays.z0.shape == (9, 3)
 

@@ -112,8 +112,10 @@ def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choos
     assert not note.visible
     controls.set("Settings of", IMITATION)
     assert note.visible and "3 flows of 4 Euler steps" in note.content and "nothing to choose" in note.content
-    assert "One flow of 12 Euler steps" in learned_html((12,))
-    assert "straight" in learned_html(())
+    assert "One flow of 12 Euler steps" in learned_html(frame(learned_steps=(12,)))
+    assert "straight" in learned_html(None)
+    remembering = learned_html(frame(learned_steps=(), remembers=True, reason="they cross"))
+    assert "Chosen because they cross" in remembering and "remembers its phase" in remembering
 
 
 # --- The warp ---

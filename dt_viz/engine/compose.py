@@ -12,7 +12,9 @@ from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array
+from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Bundle
+from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.diagnostics import anchor_warnings, motion_warnings, target_warnings
 from dt_viz.motion.following import ArmMotion, Follower, arm_samples, far_starts, unreachable
@@ -37,6 +39,9 @@ from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import IMITATION, levels
 from dt_viz.scenario.starts import followed
 from dt_viz.warning import MotionWarning
+
+PLAIN_TITLE, AUGMENTED_TITLE = "plain: one field for all", "augmented: remembers its phase"
+"""What is written over the two states, where they are side by side."""
 
 
 def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Frame:
@@ -70,6 +75,8 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         num_added=nominal.num_added,
         blocked=(),
         certificates=Certificates(clearance, found=warnings),
+        remembers=isinstance(nominal.imitation, AugmentedImitation),
+        reason=nominal.imitation.reason if isinstance(nominal.imitation, AugmentedImitation) else "",
         learned_steps=_learned_steps(nominal),
         durations=tuple(applied.made.duration if applied else None for applied in made),
         chosen_values=tuple(applied.made.chosen if applied else {} for applied in made),
@@ -131,22 +138,27 @@ def profiles(frame: Frame, solved: Solved, chosen: int, follower: Follower) -> P
     nominal = solved.nominal
     obstacle, arm, task = frame.scenario.obstacle, solved.arm, nominal.task
     path, undisturbed = frame.rollouts[chosen], nominal.paths[chosen]
-    number, system = nominal.numbers[chosen], solved.stack.system
+    number, stack = nominal.numbers[chosen], solved.stack
+    potential = nominal.system.lyapunov(nominal.states_of(chosen))
     of_mean = number >= nominal.num_demonstrated
     demonstration = task.mean_path if of_mean else task.paths[number]
     if arm is None:
+        rows = stack.bundle.index == chosen
+        samples = stack.bundle.index[rows], stack.bundle.fraction[rows]
         return Profiles(
-            hand_profile(path, demonstration, system, obstacle),
-            hand_profile(undisturbed, demonstration, nominal.system, obstacle),
+            hand_profile(path, demonstration, stack.system.lyapunov(stack.states(*samples, path)), obstacle),
+            hand_profile(undisturbed, demonstration, potential, obstacle),
             of_mean=of_mean,
         )
-    p, fraction = arm.p[arm.index == chosen], nominal.strands[chosen].fraction
+    rows, fraction = arm.index == chosen, nominal.strands[chosen].fraction
+    p = arm.p[rows]
     below = follower.robot.end_effector(arm.transform.forward(p))
     q = follower.undisturbed_along(nominal, chosen).at(np.zeros(len(fraction), int), fraction)
     clearance = follower.whole_arm.clearance
+    values = stack.system.lyapunov(stack.states(arm.index[rows], arm.fraction[rows], below))
     return Profiles(
-        body_profile(path, demonstration, system.lyapunov(below), clearance(p, obstacle)),
-        body_profile(undisturbed, demonstration, nominal.system.lyapunov(undisturbed), clearance(q, obstacle)),
+        body_profile(path, demonstration, values, clearance(p, obstacle)),
+        body_profile(undisturbed, demonstration, potential, clearance(q, obstacle)),
         of_body=True,
         of_mean=of_mean,
     )
@@ -155,7 +167,7 @@ def profiles(frame: Frame, solved: Solved, chosen: int, follower: Follower) -> P
 def pictures(
     scenario: Scenario,
     solved: Solved,
-    books: Mapping[str, Sketchbook],
+    books: Mapping[Panel, Sketchbook],
     *,
     arrows: bool,
     coarse: bool,
@@ -165,7 +177,8 @@ def pictures(
     Args:
         scenario: whose view it is.
         solved: the motion.
-        books: make the pictures of ψ: for its own task as far as the motion is warped, and for those on its panels.
+        books: make the pictures of ψ, by what a panel would show: for its own task as far as the motion is warped, and
+            for those on its panels.
         arrows: whether the hand's velocities are among them.
         coarse: whether they are to follow a drag.
     """
@@ -173,8 +186,8 @@ def pictures(
     area = nominal.task.slice.posed(view.slice)
     level = level_of(scenario, stack)
     built = stack.built[:level]
-    system = stack.system if level is None else cut_off(nominal, stack, level)
-    clearance, book = _avoided(built).signed_distance, books[scenario.task]
+    system = frozen(stack.system if level is None else cut_off(nominal, stack, level), rest(scenario, solved))
+    clearance, book = _avoided(built).signed_distance, books[Panel(task=scenario.task)]
     field, colour = arrows_and_colour(system, area, clearance, view.colour, arrows=arrows, coarse=coarse)
     return Pictures(
         field=field,
@@ -187,15 +200,25 @@ def pictures(
     )
 
 
+def rest(scenario: Scenario, solved: Solved) -> Array:
+    """Phase and condition at which augmented motions are shown on the slice; empty for plain ones.
+
+    The condition is that of the rollout which the arm follows.
+    """
+    held = solved.below.rest(_chosen(scenario, solved.below) or 0)
+    held[:1] *= scenario.view.phase
+    return held
+
+
 def field(scenario: Scenario, solved: Solved) -> FieldPicture:
     """The hand's velocities on the view's slice, of the whole stack below the arm's avoidance."""
     area = solved.below.task.slice.posed(scenario.view.slice)
     clearance = _avoided(solved.stack.built).signed_distance
-    return Samples(solved.stack.system, area, clearance, ARROW_SPACING, jacobian=False).field
+    return Samples(solved.stack.at_phase(rest(scenario, solved)), area, clearance, ARROW_SPACING, jacobian=False).field
 
 
 def _panels(
-    scenario: Scenario, solved: Solved, books: Mapping[str, Sketchbook], *, coarse: bool
+    scenario: Scenario, solved: Solved, books: Mapping[Panel, Sketchbook], *, coarse: bool
 ) -> tuple[PanelPicture, ...]:
     """The panels of a view, side by side, and the frame of the scene's own slice."""
     task, names = solved.below.task, levels(scenario)[: 1 + len(solved.stack.built)]
@@ -208,7 +231,9 @@ def _panels(
         replace(picture, offset=area.centre - picture.area.centre + by)
         for picture, by in zip(shown, places, strict=True)
     ]
-    if any(panel.task for panel in scenario.view.panels):
+    if any(panel.plain for panel in scenario.view.panels):
+        title = AUGMENTED_TITLE
+    elif any(panel.task for panel in scenario.view.panels):
         title = task.title
     else:
         title = _title(names[-1]) if scenario.imitation or len(names) > 1 else BASE_TITLE
@@ -219,16 +244,16 @@ def _panel(
     panel: Panel,
     scenario: Scenario,
     solved: Solved,
-    books: Mapping[str, Sketchbook],
+    books: Mapping[Panel, Sketchbook],
     area: Slice,
     *,
     coarse: bool,
 ) -> PanelPicture | None:
     """A panel where the slice is; None for that of a level which is off."""
-    book, stack = books[panel.task or scenario.task], solved.stack
+    book, stack = books[panel.shown or Panel(task=scenario.task)], solved.stack
     names = levels(scenario)[: 1 + len(stack.built)]
     if panel.task:
-        return book.imitation(book.task.slice, book.task.title)
+        return book.imitation(book.task.slice, PLAIN_TITLE if panel.plain else book.task.title)
     if panel == BASE_PANEL:
         return book.base(area, grid=scenario.view.grid)
     if panel.level not in names:
@@ -240,7 +265,7 @@ def _panel(
         return generator_panel(title, stack.built[level - 1].made.transform, area)
     return system_panel(
         _title(panel.level),
-        cut_off(solved.below, stack, level),
+        frozen(cut_off(solved.below, stack, level), rest(scenario, solved)),
         stack.bundle.split(stack.bundle.levels[:, level]),
         area,
         _avoided(stack.built[:level]),

@@ -16,6 +16,8 @@ from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.live_arm import LiveArm
 from dt_viz.engine.turns import Turns
 from dt_viz.flows.fields import Array
+from dt_viz.flows.phased import frozen
+from dt_viz.flows.rollouts import Rays
 from dt_viz.interruption import Checkpoint, interruptible
 from dt_viz.learning.imitation import ImitationSettings, Progress
 from dt_viz.learning.store import FitStore
@@ -27,6 +29,7 @@ from dt_viz.motion.solve import Solved, kept_stance, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.pictures.arm_field import LiftedField
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
+from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task, TaskEntry
 from dt_viz.transforms.base import Transform
@@ -120,22 +123,22 @@ class Engine:
         self.nominal(scenario, progress)
         for panel in scenario.view.panels:
             if panel.task:
-                self._imitated(panel.task, progress)
+                self._imitated(panel, progress)
         began = time.perf_counter()
         for frame in self._stages(scenario, checkpoint):
             yield replace(frame, seconds=time.perf_counter() - began)
 
     def nominal(self, scenario: Scenario, progress: Progress | None = None) -> Nominal:
         """The undisturbed motion of a scenario, from all of its starts; see `frames`."""
-        key = (scenario.task, scenario.imitation, scenario.objective)
+        key = (scenario.task, scenario.imitation, scenario.objective, scenario.state)
         learned = self.memo("learned", key, lambda: self._learned(scenario, progress))
         strand = learned.strand  # a start that is dragged leaves nothing behind
         added = [self.memo("strand", (learned, s), lambda s=s: strand(s), newest=NEWEST) for s in scenario.starts]
         return self.memo("nominal", (learned, scenario.starts), lambda: learned.nominal(added), newest=4)
 
-    def _imitated(self, task: str, progress: Progress | None = None) -> Nominal:
-        """The undisturbed motion of another task."""
-        return self.nominal(Scenario(task), progress)
+    def _imitated(self, panel: Panel, progress: Progress | None = None) -> Nominal:
+        """The undisturbed motion that a panel shows."""
+        return self.nominal(Scenario(panel.task, state="plain" if panel.plain else "auto"), progress)
 
     def solved(self, scenario: Scenario, precision: Precision) -> Solved:
         """The motion of a scenario that is not blocked, at a precision; what it raises see `frames`.
@@ -203,7 +206,8 @@ class Engine:
 
     def _learned(self, scenario: Scenario, progress: Progress | None) -> Learned:
         task = self.task(scenario.task)
-        imitation = self._fits.get(task.demonstrations, ImitationSettings(scenario.objective), progress)
+        state = scenario.state if scenario.imitation else "plain"  # without it there is nothing to remember
+        imitation = self._fits.learned(task.demonstrations, ImitationSettings(scenario.objective), state, progress)
         return Learned.of(task, imitation, imitates=scenario.imitation)
 
     def _admission(self, scenario: Scenario) -> Admission:
@@ -255,12 +259,15 @@ class Engine:
 
     def _compared(self, frame: Frame) -> Frame:
         """The frame with other methods beside ours, as far as they are known."""
-        learned = self.nominal(frame.scenario).learned
-        return replace(frame, comparison=self.comparison.of(frame, learned))
+        return replace(frame, comparison=self.comparison.of(frame, self._plain(frame.scenario)))
+
+    def _plain(self, scenario: Scenario) -> Learned:
+        """What is learned for a scenario in the plain state, which other methods are compared with."""
+        return self.nominal(replace(scenario, state="plain")).learned
 
     def _compared_at_rest(self, frame: Frame, solved: Solved | None, checkpoint: Checkpoint) -> Iterator[Frame]:
         """The last frame again and again, each with more of what is known of other methods."""
-        for step in self.comparison.steps(frame, self.nominal(frame.scenario).learned, solved):
+        for step in self.comparison.steps(frame, self._plain(frame.scenario), solved):
             with _in_turn(checkpoint):
                 step()
                 frame = self._compared(frame)
@@ -299,11 +306,9 @@ class Engine:
         return shown.frame.arm.q if same_learned and shown.frame.scenario.arm_rollout == scenario.arm_rollout else None
 
     def _pictures(self, scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
-        others = {panel.task: self._imitated(panel.task).learned for panel in scenario.view.panels if panel.task}
-        books = {
-            name: self.memo("sketchbook", learned, lambda learned=learned: _sketchbook(learned), newest=NUM_BOOKS)
-            for name, learned in {**others, scenario.task: solved.below.learned}.items()
-        }
+        others = {panel.shown: self._imitated(panel).learned for panel in scenario.view.panels if panel.shown}
+        books = {panel: self._book(learned, learned.demonstrated.rest(0)) for panel, learned in others.items()}
+        books[Panel(task=scenario.task)] = self._book(solved.below.learned, compose.rest(scenario, solved))
         arm, view = solved.arm, scenario.view
         carried = view.field and arm is not None and not view.level
         pictures = compose.pictures(scenario, solved, books, arrows=view.field and not carried, coarse=coarse)
@@ -312,11 +317,16 @@ class Engine:
         layers, robot = tuple(layer for _, layer in scenario.active), self.follower.robot
         lifted = self.memo(
             "lifted field",
-            (solved.below, layers, view.slice),
+            (solved.below, layers, view.slice, compose.rest(scenario, solved).tobytes()),
             lambda: LiftedField.of(compose.field(scenario, solved), robot, self.follower.reference(solved.nominal)),
             newest=2,
         )
         return replace(pictures, field=lifted.around(arm.transform, robot, scenario.obstacle))
+
+    def _book(self, learned: Learned, rest: Array) -> Sketchbook:
+        """The maker of pictures of ψ, at one phase and for one condition."""
+        key = (learned, rest.tobytes())
+        return self.memo("sketchbook", key, lambda: _sketchbook(learned, rest), newest=NUM_BOOKS)
 
     def _certified(self, frame: Frame, fine: Solved, checkpoint: Checkpoint) -> Certificates:
         with _in_turn(checkpoint):
@@ -360,7 +370,7 @@ def _avoids(transform: Transform) -> bool:
     return transform.arm_avoidance is not None or bool(transform.avoided.parts)
 
 
-def _sketchbook(learned: Learned) -> Sketchbook:
-    """The maker of pictures of ψ."""
-    shown = learned.demonstrated
-    return Sketchbook(learned.task, in_frame(learned.system.transform), learned.system, shown.rays, shown.paths)
+def _sketchbook(learned: Learned, rest: Array) -> Sketchbook:
+    shown, system = learned.demonstrated, frozen(learned.system, rest)
+    rays = Rays(system.transform.forward(shown.starts), system.base)
+    return Sketchbook(learned.task, in_frame(learned.system.transform), system, rays, shown.paths)

@@ -92,6 +92,10 @@ class Frame:
     chosen: int | None = 0
     """Index of the rollout that the arm follows: the first one where it cannot begin the one that is asked for;
     None where that begins at an added start."""
+    remembers: bool = False
+    """Whether the imitation is augmented: it remembers its phase and where it began."""
+    reason: str = ""
+    """Why it is, if nobody asked for it."""
     learned_steps: tuple[int, ...] = ()
     """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
     durations: tuple[float | None, ...] = ()

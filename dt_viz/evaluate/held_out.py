@@ -109,9 +109,7 @@ def _shifted(start: Array, path: Array, progress: Array, duration: float) -> tup
 
 def begun(imitation: Learned, start: Array) -> tuple[DiffeomorphicSystem, Array]:
     """The system of a motion from a start (d,), metres, and the state in which it begins there."""
-    if isinstance(imitation, AugmentedImitation):
-        return imitation.system(start), imitation.state(start)
-    return imitation.system, start
+    return imitation.system, imitation.system.base.states(start)
 
 
 def path_from(system: DiffeomorphicSystem, state: Array, dim: int, num: int = NUM_COMPARED) -> Array:
@@ -135,7 +133,8 @@ def rollouts_from(imitation: Learned, starts: Array) -> tuple[Array, Array]:
 def arrival_times(system: DiffeomorphicSystem, z0: Array) -> Array:
     """Return the times (R,), s, at which motions from `z0` (R, d) in base space are within `AT_GOAL` of the goal."""
     # near the goal ψ⁻¹ stretches by at most the norm of its Jacobian there
-    stretch = np.linalg.norm(system.transform.inverse_jacobian(system.base.goal)[1], 2)
+    ends = system.base.at_fraction(z0, np.zeros(1))[:, 0]
+    stretch = np.linalg.norm(system.transform.inverse_jacobian(ends)[1], 2, axis=(1, 2)).max()
     return system.base.arrival_time(z0, float(AT_GOAL / max(stretch, 1.0)))
 
 

@@ -161,11 +161,11 @@ def measured(imitation: Learned, source: Source, fit_seconds: float) -> dict[str
     rollouts, times = rollouts_from(imitation, np.stack([d.positions[0] for d in source.demonstrations]))
     grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]), GRID[len(imitation.goal)])
     if isinstance(imitation, AugmentedImitation):
-        transform = imitation.system(imitation.starts[0]).transform
-        phases = np.repeat(np.linspace(0, imitation.top, NUM_PHASES), len(grid))
-        grid = np.column_stack([np.tile(grid, (NUM_PHASES, 1)), phases])
-    else:
-        transform = imitation.transform
+        states = np.tile(imitation.states(imitation.starts[0]), (NUM_PHASES * len(grid), 1))
+        states[:, : imitation.dim] = np.tile(grid, (NUM_PHASES, 1))
+        states[:, imitation.dim] = np.repeat(np.linspace(0, imitation.top, NUM_PHASES), len(grid))
+        grid = states
+    transform = imitation.system.transform
     arrays: dict[str, Any] = {
         "fit_seconds": fit_seconds,
         "min_det_jacobian": min_det_jacobian(transform.jacobian, grid),
@@ -304,12 +304,8 @@ def _report_crossings(state: str, learn: Learn, folder: Path) -> None:
             if case.labels and learn is fit_augmented:
                 labelled = fit_augmented(demonstrations, case.labels)
                 starts = zip(demonstrations, case.labels, strict=True)
-                begun = [
-                    (labelled.system(d.positions[0], label), labelled.state(d.positions[0])) for d, label in starts
-                ]
-                paths = [
-                    path_from(*motion, d.positions.shape[1]) for motion, d in zip(begun, demonstrations, strict=True)
-                ]
+                begun = [labelled.states(d.positions[0], label) for d, label in starts]
+                paths = [path_from(labelled.system, state, labelled.dim) for state in begun]
             else:
                 paths = list(
                     rollouts_from(learn(demonstrations), np.stack([d.positions[0] for d in demonstrations]))[0]

@@ -82,7 +82,7 @@ def _drawn(imitation: Learned, start: Array, extent: float, across: Array) -> fl
             pushed = here.copy()
             pushed[:dim] += PUSH * extent * direction @ across
             if isinstance(imitation, AugmentedImitation):
-                pushed = imitation.caught(pushed, start)
+                pushed[dim] = imitation.caught(pushed)
             after = path_from(system, pushed, dim)
             near = np.linalg.norm(rest[:, None] - after, axis=2).min(axis=1) < DRAWN * extent
             shares.append(near.mean())

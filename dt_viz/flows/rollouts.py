@@ -26,7 +26,10 @@ MAX_SAMPLES = 60_000
 
 @dataclass(frozen=True)
 class Rays:
-    """The base system's motions: straight rays z = z_e + (1 − u)(z₀ − z_e), u from 0 at the start to 1 at the goal."""
+    """The base system's motions, u from 0 at the start to 1 at the goal.
+
+    Those of a plain attractor are straight rays, z = z_e + (1 − u)(z₀ − z_e).
+    """
 
     z0: Array
     """(R, d) starts in base space."""
@@ -34,7 +37,7 @@ class Rays:
 
     def at(self, index: Indices, fraction: Array) -> Array:
         """Points (N, d) of the rays `index` (N,) at the fractions `fraction` (N,)."""
-        return self.base.goal + (1 - fraction)[:, None] * (self.z0[index] - self.base.goal)
+        return self.base.at_fraction(self.z0[index], (1 - fraction)[:, None])[:, 0]
 
     def times(self, index: Indices, fraction: Array) -> Array:
         """Times (N,), seconds, at which the motions are at the points that `at` gives; `index` must not decrease.
@@ -42,7 +45,7 @@ class Rays:
         The goal counts as reached at the distance `ARRIVED`, or at a smaller one where other samples are nearer: no two
         samples share a time.
         """
-        radius = np.linalg.norm(self.z0 - self.base.goal, axis=1)
+        radius = self.base.left(self.z0)
         left = (1 - fraction) * radius[index]
         least = np.full(len(radius), ARRIVED)
         np.minimum.at(least, index[left > 0], ARRIVING * left[left > 0])

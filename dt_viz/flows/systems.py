@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
 
@@ -34,9 +35,42 @@ class Attractor:
         """Dimension d of the space."""
         return len(self.goal)
 
+    def states(self, places: Array, label: float | None = None) -> Array:
+        """The states (*B, d) in which motions from places (*B, d) begin: the places themselves.
+
+        Raises:
+            FormatError: no demonstration has such a label.
+        """
+        if label is not None:
+            raise FormatError("label", f"{label:g}", "none, in the plain state")
+        return places
+
+    def demonstrated(self, starts: Array) -> Array:
+        """The states (R, d) in which the motions of the demonstrations begin, from their starts (R, d)."""
+        return starts
+
+    def caught(self, state: Array, below: Array) -> Array:
+        """The state (d,) from which a motion goes on that was pushed to a `state` (d,): that one.
+
+        A system with a phase chooses it again by the place `below` (3,) to which the stack on it takes the place.
+        """
+        del below
+        return state
+
+    def distance(self, z: Array) -> Array:
+        """Distance from the goal, (*B,), metres, which falls along every motion."""
+        return np.linalg.norm(z - self.goal, axis=-1)
+
     def potential(self, z: Array) -> Array:
         """Φ(z), (*B,): zero at the goal, growing away from it, falling along every motion."""
-        ratio = np.linalg.norm(z - self.goal, axis=-1) / self.smoothing
+        return self._potential(self.distance(z))
+
+    def potential_at(self, distance: float) -> float:
+        """Φ at a distance from the goal, metres."""
+        return float(self._potential(np.array(distance)))
+
+    def _potential(self, distance: Array) -> Array:
+        ratio = distance / self.smoothing
         log_cosh = ratio + np.log1p(np.exp(-2 * ratio)) - np.log(2)
         return self.speed * self.smoothing * log_cosh
 
@@ -61,14 +95,14 @@ class Attractor:
         """Points (*B, T, d) of motions from `z0` (*B, d) where a `fraction` (*B, T) of their way is left."""
         return self.goal + fraction[..., None] * (z0 - self.goal)[..., None, :]
 
-    def times_at_fraction(self, z0: Array, fraction: Array) -> Array:
-        """Times (*B, T), seconds, at which a `fraction` (*B, T) of their way is left to motions from `z0` (*B, d)."""
-        return self.times_at(z0, fraction * np.linalg.norm(z0 - self.goal, axis=-1, keepdims=True))
+    def left(self, z: Array) -> Array:
+        """What is left of the way of motions from `z` (*B, d), (*B,), metres: falls in proportion to the fraction."""
+        return self.distance(z)
 
     def times_at(self, z0: Array, distances: Array) -> Array:
-        """Times (*B, T), seconds, at which motions from `z0` (*B, d) come within `distances` (*B, T), metres, of it.
+        """Times (*B, T), seconds, at which `distances` (*B, T), metres, are `left` to motions from `z0` (*B, d).
 
-        Zero where the start is already within the distance.
+        Zero where no more is left at the start.
         """
         r0 = np.linalg.norm(z0 - self.goal, axis=-1, keepdims=True)
         farther = np.maximum(r0, distances)

@@ -7,17 +7,20 @@ it started, and a label if there is one. The motion c(s; a) predicted for a is
     c(u s_max; a) = mean(u) + u (start − mean(1)) + GP(a)(u),
 
 the mean demonstration, an offset that fades, and a Gaussian process over the starts. The shear along it (see
-`dt_viz.flows.phased`) is ψ_a; the base system runs s down on a clock that is predicted for a, too.
+`dt_viz.flows.phased`) is ψ; the base system runs s down on a clock that is predicted for a, too.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 
+from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.flows.phased import PhaseCurve, PhasedAttractor, Shear
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
@@ -26,6 +29,7 @@ from dt_viz.learning.preparation import ImitationError, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
 from dt_viz.learning.unbending import groups_of
 from dt_viz.metrics import arc_length, interpolate
+from dt_viz.properties import cached_property
 
 NUM_POINTS, NUM_KNOTS = 150, 30
 """Number of points of a demonstration, evenly by arc length, and number of knots of a predicted motion."""
@@ -47,6 +51,9 @@ CAUGHT_WITHIN, LEAST_PHASE, NUM_CAUGHT = 0.15, 0.05, 61
 number of phases that are compared."""
 SLOWEST = 2e-3
 """Smallest speed of the phase, relative to the mean: it never stands still."""
+NUM_KEPT = 64
+"""Number of conditions whose curves and clocks are kept."""
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +89,25 @@ class OverStarts:
         """The value at a condition (k,)."""
         return np.tensordot(self._kernel((condition - self.mean)[None] / self.spread)[0], self.coefficients, 1)
 
+    def slope_at(self, condition: Array) -> Array:
+        """The derivative (…, k) of the value with respect to the condition (k,); of values without a narrow kernel."""
+        offset = (condition - self.mean) / self.spread - self.known
+        weights = -self._kernel((condition - self.mean)[None] / self.spread)[0][:, None] * offset
+        return np.moveaxis(np.tensordot(weights, self.coefficients, (0, 0)), 0, -1) / (WIDTH**2 * self.spread)
+
+    def placed(self, origin: Array, axes: Array, scale: float, vectors: Array) -> OverStarts:
+        """The same over conditions in a space of more dimensions, values multiplied by `vectors` (d, D) from the right.
+
+        See `AugmentedImitation.placed` for the other arguments.
+        """
+        return replace(
+            self,
+            mean=_placed_conditions(self.mean[None], origin, axes, scale)[0],
+            spread=scale * self.spread,
+            known=_placed_conditions(self.known, np.zeros(len(origin)), axes, 1.0),
+            coefficients=self.coefficients @ vectors,
+        )
+
     def _kernel(self, at: Array) -> Array:
         squared = ((at[:, None] - self.known) ** 2).sum(axis=-1)
         kernel = np.exp(-squared / (2 * WIDTH**2))
@@ -105,86 +131,172 @@ class Pattern:
     timing: OverStarts
     """(1 + P,) offsets from that logarithm, and from the profile."""
 
+    def placed(self, origin: Array, axes: Array, scale: float) -> Pattern:
+        """See `AugmentedImitation.placed`."""
+        return replace(
+            self,
+            conditions=_placed_conditions(self.conditions, origin, axes, scale),
+            mean=origin + scale * self.mean @ axes.T,
+            shapes=self.shapes.placed(origin, axes, scale, scale * axes.T),
+            duration=self.duration - np.log(scale) / 2,
+            timing=self.timing.placed(origin, axes, scale, np.eye(len(self.profile) + 1)),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class AugmentedImitation:
-    """A learned motion in the augmented state, for any start."""
+    """A learned motion in the augmented state, for any start: what `dt_viz.flows.phased.Predictions` are."""
 
     starts: Array
     """(R, d) of the demonstrations, metres."""
     goal: Array
     """(d,) common end of the demonstrations, metres."""
-    labels: Array | None
-    """(R,) of the demonstrations; None without labels."""
+    labels: tuple[float, ...] | None
+    """One for each demonstration that was given; None without labels."""
     top: float
     """s_max, metres."""
     power: float
     """p of the base system."""
     patterns: tuple[Pattern, ...]
-    clock: TimedAttractor
+    plain_clock: TimedAttractor
     """Clock of the phase, without the pace that is predicted for a start."""
     fit_seconds: float
     warnings: tuple[str, ...] = ()
+    reason: str = ""
+    """Why it was learned in this state, where that was not asked for; see `dt_viz.learning.choice`."""
+    _of_starts: Array | None = field(default=None, repr=False)
+    """(R,) labels of the starts."""
     _label_unit: float = field(default=1.0, repr=False)
     """Distance of labels that differ by 1, metres."""
 
-    def state(self, start: Array) -> Array:
-        """The state (d + 1,) in which a motion from a start (d,), metres, begins."""
-        return np.append(start, self.top)
+    @property
+    def dim(self) -> int:
+        """Dimension d of the places."""
+        return len(self.goal)
 
-    def system(self, start: Array, label: float | None = None) -> DiffeomorphicSystem:
-        """The system in R^(d+1) of motions from a start.
+    @property
+    def num_conditions(self) -> int:
+        """Number of coordinates of a condition: those of the start, and the label if there is one."""
+        return self.dim + (self._of_starts is not None)
+
+    @cached_property
+    def system(self) -> DiffeomorphicSystem:
+        """The learned dynamical system, of states (y, s, a)."""
+        base = PhasedAttractor(
+            goal=np.zeros(self.dim + 1 + self.num_conditions),
+            speed=self.plain_clock.speed,
+            smoothing=self.plain_clock.smoothing,
+            predictions=self,
+            power=self.power,
+        )
+        return DiffeomorphicSystem(Shear(self), base)
+
+    def states(self, places: Array, label: float | None = None) -> Array:
+        """The states (*B, d + 1 + c) in which motions from places (*B, d), metres, begin.
 
         Args:
-            start: (d,), metres.
-            label: of the motion; None takes that of the nearest demonstrated start.
+            places: metres.
+            label: of the motions; None takes that of the demonstrated start which is nearest to each.
 
         Raises:
-            ImitationError: no demonstration has such a label.
+            FormatError: no demonstration has such a label.
         """
-        condition = self.condition(start, label)
-        nearest = [np.linalg.norm(condition - pattern.conditions, axis=1).min() for pattern in self.patterns]
-        pattern = self.patterns[int(np.argmin(nearest))]
-        phases = np.linspace(1.0, 0.0, len(pattern.mean))
-        points = pattern.mean + phases[:, None] * (start - pattern.mean[0]) + pattern.shapes.at(condition)
-        points[0], points[-1] = start, self.goal
-        return DiffeomorphicSystem(
-            Shear(PhaseCurve.through(self.top * phases[::-1], points[::-1])),
-            PhasedAttractor(
-                goal=np.zeros(len(start) + 1),
-                speed=self.clock.speed,
-                smoothing=self.clock.smoothing,
-                clock=self._timed(pattern, condition, float(arc_length(points)[-1])),
-                power=self.power,
+        top = np.full((*places.shape[:-1], 1), self.top)
+        parts = [places, top, places]
+        known = () if self._of_starts is None else np.unique(self._of_starts)
+        if label is not None and label not in known:
+            accepted = ", ".join(f"{value:g}" for value in known) or "none: the demonstrations have none"
+            raise FormatError("label", f"{label:g}", accepted)
+        if self._of_starts is not None:
+            nearest = np.linalg.norm(places[..., None, :] - self.starts, axis=-1).argmin(axis=-1)
+            labels = self._of_starts[nearest][..., None] if label is None else np.full_like(top, label)
+            parts.append(self._label_unit * labels)
+        return np.concatenate(parts, axis=-1)
+
+    def demonstrated(self, starts: Array) -> Array:
+        """The states (R, d + 1 + c) in which the motions of all demonstrations begin, from their starts (R, d)."""
+        if self.labels is None:
+            return self.states(starts)
+        known = set() if self._of_starts is None else set(self._of_starts)
+        labels = [label if label in known else None for label in self.labels]
+        return np.stack([self.states(start, label) for start, label in zip(starts, labels, strict=True)])
+
+    def caught(self, state: Array) -> float:
+        """The phase, metres, at which a motion goes on that was pushed to a `state` (d + 1 + c,).
+
+        It is the one, not far from that of the state, at which the predicted motion is nearest: so what it has not
+        drawn yet is drawn.
+        """
+        place, phase, condition = state[: self.dim], state[self.dim], state[self.dim + 1 :]
+        reach = CAUGHT_WITHIN * self.top
+        first, last = np.clip((phase - reach, phase + reach), LEAST_PHASE * self.top, self.top)
+        phases = np.linspace(first, last, NUM_CAUGHT)
+        away = np.linalg.norm(self.curve(condition).at(phases) - place, axis=1)
+        return float(phases[away.argmin()])
+
+    def curve(self, condition: Array) -> PhaseCurve:
+        """The motion (d,), metres, that is predicted for a condition (c,), over the phase."""
+        return self._curves(condition.tobytes())
+
+    def sensitivity(self, condition: Array) -> PhaseCurve:
+        """Its derivative (d, c) with respect to the condition."""
+        pattern = self._pattern(condition)
+        slopes = pattern.shapes.slope_at(condition)
+        slopes[..., : self.dim] += self._phases(pattern)[:, None, None] * np.eye(self.dim)
+        return PhaseCurve.through(self.top * self._phases(pattern)[::-1], slopes[::-1])
+
+    def clock(self, condition: Array) -> TimedAttractor:
+        """The clock of the phase that is predicted for a condition (c,)."""
+        return self._clocks(condition.tobytes())
+
+    def placed(self, origin: Array, axes: Array, scale: float) -> AugmentedImitation:
+        """The same motions in a space of more dimensions: a place y becomes origin + scale·axes·y.
+
+        Args:
+            origin: (D,), metres.
+            axes: (D, d) orthonormal columns.
+            scale: metres for one unit of y.
+        """
+        return replace(
+            self,
+            starts=origin + scale * self.starts @ axes.T,
+            goal=origin + scale * axes @ self.goal,
+            top=scale * self.top,
+            patterns=tuple(pattern.placed(origin, axes, scale) for pattern in self.patterns),
+            plain_clock=replace(
+                self.plain_clock, speed=scale * self.plain_clock.speed, smoothing=scale * self.plain_clock.smoothing
             ),
+            _label_unit=scale * self._label_unit,
         )
 
-    def caught(self, state: Array, start: Array, label: float | None = None) -> Array:
-        """The state (d + 1,) from which a pushed motion goes on, so that what it has not drawn yet is drawn.
+    @cached_property
+    def _curves(self) -> Callable[[bytes], PhaseCurve]:
+        return _kept(self._curve)
 
-        Its phase is the one, not far from its own, at which the motion from its start is nearest; see `system` for the
-        start and the label.
-        """
-        transform = self.system(start, label).transform
-        assert isinstance(transform, Shear)
-        reach = CAUGHT_WITHIN * self.top
-        low, high = np.clip((state[-1] - reach, state[-1] + reach), LEAST_PHASE * self.top, self.top)
-        phases = np.linspace(min(low, state[-1]), max(high, state[-1]), NUM_CAUGHT)
-        away = np.linalg.norm(transform.curve.at(phases) - state[:-1], axis=1)
-        return np.append(state[:-1], phases[away.argmin()])
+    @cached_property
+    def _clocks(self) -> Callable[[bytes], TimedAttractor]:
+        return _kept(self._clock)
 
-    def condition(self, start: Array, label: float | None = None) -> Array:
-        """Condition (k,) of a motion; see `system`."""
-        if self.labels is None:
-            if label is not None:
-                raise ImitationError(f"label: found {label:g}; the demonstrations have none")
-            return start
-        if label is None:
-            label = float(self.labels[np.linalg.norm(self.starts - start, axis=1).argmin()])
-        elif label not in self.labels:
-            known = ", ".join(f"{value:g}" for value in np.unique(self.labels))
-            raise ImitationError(f"label: found {label:g}; accepted: {known}")
-        return np.append(start, self._label_unit * label)
+    def _pattern(self, condition: Array) -> Pattern:
+        """That of the demonstration with the nearest condition."""
+        nearest = [np.linalg.norm(condition - pattern.conditions, axis=1).min() for pattern in self.patterns]
+        return self.patterns[int(np.argmin(nearest))]
+
+    def _phases(self, pattern: Pattern) -> Array:
+        return np.linspace(1.0, 0.0, len(pattern.mean))
+
+    def _points(self, condition: Array) -> Array:
+        """The predicted motion at the knots, from its start, (K, d)."""
+        pattern = self._pattern(condition)
+        offset = condition[: self.dim] - pattern.mean[0]
+        return pattern.mean + self._phases(pattern)[:, None] * offset + pattern.shapes.at(condition)
+
+    def _curve(self, condition: Array) -> PhaseCurve:
+        points = self._points(condition)
+        return PhaseCurve.through(self.top * np.linspace(0.0, 1.0, len(points)), points[::-1])
+
+    def _clock(self, condition: Array) -> TimedAttractor:
+        return self._timed(self._pattern(condition), condition, float(arc_length(self._points(condition))[-1]))
 
     def _timed(self, pattern: Pattern, condition: Array, length: float) -> TimedAttractor:
         """The clock of a motion of a length, metres."""
@@ -194,7 +306,7 @@ class AugmentedImitation:
         even = np.linspace(0.0, 1.0, len(behind))
         behind = (1 - SLOWEST) * behind + SLOWEST * even
         # as the clock of a phase that falls evenly advances, time passes at these paces
-        plain = self.clock
+        plain = self.plain_clock
         left = plain.smoothing * asinh_exp(plain.knots * plain.speed / plain.smoothing) / self.top
         total = np.exp(pattern.duration + duration) * np.sqrt(length)
         elapsed = total * np.interp(1 - (left - ARRIVED) / (1 - ARRIVED), behind, even)
@@ -250,7 +362,17 @@ def fit_augmented(
         )
     seconds = time.perf_counter() - began
     return AugmentedImitation(
-        starts, motions.goal, kept, top, power, tuple(patterns), clock, seconds, motions.warnings, unit
+        starts,
+        motions.goal,
+        None if labels is None else tuple(float(label) for label in labels),
+        top,
+        power,
+        tuple(patterns),
+        clock,
+        seconds,
+        motions.warnings,
+        _of_starts=kept,
+        _label_unit=unit,
     )
 
 
@@ -293,3 +415,14 @@ def _profile(times: Array, path: Array) -> Array:
     """The part of a motion's length that lies behind at even times, (P,)."""
     length = arc_length(path)
     return np.interp(np.linspace(0, times[-1], NUM_TIMED), times, length / length[-1])
+
+
+def _placed_conditions(conditions: Array, origin: Array, axes: Array, scale: float) -> Array:
+    """Conditions (R, c) whose first coordinates are a place, in a space of more dimensions; see `placed`."""
+    dim = axes.shape[1]
+    return np.column_stack([origin + scale * conditions[:, :dim] @ axes.T, scale * conditions[:, dim:]])
+
+
+def _kept(compute: Callable[[Array], _T]) -> Callable[[bytes], _T]:
+    """A function of a condition's bytes whose latest results are kept."""
+    return lru_cache(NUM_KEPT)(lambda content: compute(np.frombuffer(content)))

@@ -204,7 +204,12 @@ def fit(
         fit_seconds=time.perf_counter() - began,
         min_det_jacobian=min_det_jacobian(transform.jacobian, box),
         round_trip_error=round_trip_error(transform, box),
-        warnings=(*motions.warnings, *warnings, *_strayed(motions, DiffeomorphicSystem(transform, base))),
+        warnings=(
+            *motions.warnings,
+            *motions.crossing,
+            *warnings,
+            *_strayed(motions, DiffeomorphicSystem(transform, base)),
+        ),
     )
     if not (result.min_det_jacobian > 0 and result.round_trip_error < 1e-9 * motions.spread):
         raise ImitationError(

@@ -42,6 +42,8 @@ class Motions:
     """RMS distance of all points from their mean."""
     warnings: tuple[str, ...]
     """Descriptions of the changes to the demonstrations."""
+    crossing: tuple[str, ...] = ()
+    """Descriptions of what the plain state cannot follow."""
 
     @cached_property
     def length(self) -> float:
@@ -75,7 +77,7 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     spread = _spread(list(usable.values()))
     usable, goal = _with_common_goal(usable, spread, warnings)
 
-    numbers, names, times, positions = [], [], [], []
+    numbers, names, times, positions, crossing = [], [], [], [], []
     for number, demonstration in usable.items():
         t, path = demonstration.times, _end_moved(demonstration.positions, goal)
         away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
@@ -90,13 +92,20 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
             )
             t, path = t[first:] - t[first], path[first:]
         _warn_about(demonstration.name, t, path, spread, warnings)
+        if path.shape[1] == 2 and _crosses_itself(resample_by_arc_length(path, 120)):
+            crossing.append(
+                f"'{demonstration.name}' crosses itself, which no motion of a first-order system can; the crossing is "
+                "smoothed"
+            )
         numbers.append(number)
         names.append(demonstration.name)
         times.append(t)
         positions.append(path)
     if not positions:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
-    return Motions(tuple(numbers), tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
+    return Motions(
+        tuple(numbers), tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings), tuple(crossing)
+    )
 
 
 def _spread(demonstrations: Sequence[Demonstration]) -> float:
@@ -141,10 +150,6 @@ def _warn_about(name: str, t: Array, path: Array, spread: float, warnings: list[
     standing = float((steps[1:-1] < STANDING_STEP * spread).mean())
     if standing > LONG_STAND:
         warnings.append(f"'{name}' stands still for {standing * t[-1]:.2g} s; the learned motion only slows down there")
-    if path.shape[1] == 2 and _crosses_itself(resample_by_arc_length(path, 120)):
-        warnings.append(
-            f"'{name}' crosses itself, which no motion of a first-order system can; the crossing is smoothed"
-        )
 
 
 def _crosses_itself(path: Array) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
+from dt_viz.learning.choice import AnyImitation, State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
 
@@ -118,13 +119,27 @@ class FitStore:
         if folder is not None:
             _remove_leftovers(folder)
 
+    def learned(
+        self,
+        demonstrations: tuple[Demonstration, ...],
+        settings: ImitationSettings | None = None,
+        state: State = "auto",
+        progress: Progress | None = None,
+    ) -> AnyImitation:
+        """Return what is learned from these demonstrations in a state; see `dt_viz.learning.choice.learn` and `get`.
+
+        What is learned in the augmented state is not stored: it takes milliseconds.
+        """
+        plain = lambda: self.get(demonstrations, settings, progress)  # noqa: E731
+        return learn(demonstrations, settings, state, plain=plain)
+
     def get(
         self,
         demonstrations: tuple[Demonstration, ...],
         settings: ImitationSettings | None = None,
         progress: Progress | None = None,
     ) -> Imitation:
-        """Return the imitation of these demonstrations, fitted if it is new.
+        """Return the plain imitation of these demonstrations, fitted if it is new.
 
         Args:
             demonstrations: motions to imitate.

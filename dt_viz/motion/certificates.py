@@ -104,7 +104,8 @@ def certified(
         shown: the motions.
         tolerance: distance of ψ of a sample from its base motion, metres, before it is said.
     """
-    transform, y, base_motion = stack.transform, shown.positions, stack.rays.at(shown.index, shown.fraction)
+    transform, base_motion = stack.transform, stack.rays.at(shown.index, shown.fraction)
+    y = np.concatenate([shown.positions, base_motion[:, 3:]], axis=1)
     by_hand = any(applied.made.integration.by_hand for applied in stack.built)
     keep = _evenly(np.arange(len(y)), NUM_CHECKED)
     z = transform.forward(y)
@@ -112,12 +113,13 @@ def certified(
     off = transform.inverse(base_motion) - y if by_hand else z - base_motion
     det = _determinant(transform, y[keep], base_motion[keep] if by_hand else None)
     known = _with_map(known, det, _longest(transform.inverse(z[keep]) - y[keep]))
-    falls = _falls(np.linalg.norm(z - stack.rays.base.goal, axis=1), shown)
+    falls = _falls(stack.rays.base.distance(z), shown)
+    base_ends = np.concatenate([stack.rays.z0, stack.rays.base.goal[None]])
     rises = () if falls else (MotionWarning(Kind.NOT_FALLING, "the Lyapunov value does not fall all the way"),)
     return replace(known, lyapunov_falls=falls).warning(
         *rises,
         *_beside(_longest(off), tolerance),
-        *_of_ends(np.concatenate([stack.rays.z0, stack.rays.base.goal[None]]) - transform.forward(ends), shown),
+        *_of_ends(base_ends - transform.forward(np.concatenate([ends, base_ends[:, 3:]], axis=1)), shown),
         *_of_times(stack, shown, base_motion),
     )
 

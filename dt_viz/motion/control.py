@@ -126,7 +126,7 @@ class Course:
     q: Array
     """(K, 6) rad."""
     z: Array
-    """(K, 3) base coordinates; the hand's place where nothing is learned."""
+    """(K, k) base coordinates; the hand's place where nothing is learned."""
 
     @property
     def end(self) -> float:
@@ -242,6 +242,9 @@ class Controller:
         """The obstacles that the dodge is made for, and where they were seen last."""
         self._section = Section(self.robot, follower.reference(solved.nominal))
         self._aim, self._home, self._then = Aim.GOAL, 0, Aim.GOAL
+        self._rest: Array | None = None
+        """What else the state was, besides the place, when it last went to the goal: phase and condition of an
+        augmented one; None where it begins anew."""
         self._ahead: Ahead | None = None
         self._q: Array | None = None
         self._velocity = np.zeros(NUM_JOINTS)
@@ -310,7 +313,7 @@ class Controller:
     def _goes_on(self, solved: Solved, section: Section) -> bool:
         """Whether the undisturbed motion is the same with another stack."""
         before, after = self._solved.stack, solved.stack
-        parts, others = (Chain([stack.transform]).parts for stack in (before, after))
+        parts, others = (stack.parts for stack in (before, after))
         same = len(parts) == len(others) and all(a is b for a, b in zip(parts, others, strict=True))
         same = same and before.rays.base is after.rays.base
         return same and np.array_equal(self._section.reference, section.reference)
@@ -319,8 +322,12 @@ class Controller:
     def system(self) -> ArmSystem:
         """The system of eq. (4) whose motion it is."""
         with self._lock:
-            transform = self._ahead.dodge.transform if self._ahead is not None else Identity(NUM_JOINTS)
-            return ArmSystem(self._solved.stack.system, self._section, transform)
+            stack, transform = self._solved.stack, Identity(NUM_JOINTS)
+            rest = stack.rays.z0[0, 3:]
+            if self._ahead is not None:
+                transform = self._ahead.dodge.transform
+                rest = self._image()[3:] if self._aim is Aim.GOAL else rest
+            return ArmSystem(stack.at_phase(rest), self._section, transform)
 
     # --- What happens to it ---
 
@@ -339,6 +346,7 @@ class Controller:
         with self._lock:
             self._home = start
             self._set_out(Aim.HOME)
+            self._rest = None
 
     def hold(self, place: ArrayLike) -> None:
         """Take the hand to a place (3,), metres, and stay there until `release`, giving way to obstacles."""
@@ -453,7 +461,7 @@ class Controller:
             q = ahead.course.at(self._clock)
             if self._aim is not Aim.GOAL or not solved.stack.built:
                 return q
-            x = solved.below.system.transform.inverse(self._image()[None])
+            x = solved.below.learned.places(self._image()[None])
             return track(self.robot, x, q, reference=self._section.reference).q[0]
 
     @property
@@ -574,6 +582,7 @@ class Controller:
         """Begin at a posture (6,) that nobody foresaw, as the image of another under a dodge."""
         shadow = known.transform.forward(self._arm.limits.inside(q))
         resting = self._aim is Aim.HAND
+        self._remember()
         course = _resting(shadow, self.robot.end_effector(shadow)) if resting else self._course(shadow)
         self._clock, self._settled = 0.0, False
         self._take(course, known)
@@ -583,6 +592,7 @@ class Controller:
 
     def _set_out(self, aim: Aim) -> None:
         with self._lock:
+            self._remember()
             self._aim, self._settled, self._released = aim, False, False
             if self._ahead is not None:
                 course = self._course(self._ahead.course.at(self._clock))
@@ -590,6 +600,7 @@ class Controller:
                 self._take(course)
 
     def _held(self, course: Course, *, released: bool = False) -> None:
+        self._remember()
         if self._aim is not Aim.HAND:
             self._then = self._aim
         self._aim, self._settled, self._released = Aim.HAND, False, released
@@ -597,9 +608,14 @@ class Controller:
         self._take(course)
 
     def _image(self) -> Array:
-        """The base coordinates (3,) at which the motion is."""
+        """The base coordinates (k,) at which the motion is."""
         course = self._begun.course
         return np.array([np.interp(self._clock, course.times, z) for z in course.z.T])
+
+    def _remember(self) -> None:
+        """Take note of phase and condition before the motion to the goal is left."""
+        if self._aim is Aim.GOAL and self._ahead is not None:
+            self._rest = self._image()[3:]
 
     def _take(self, course: Course, known: Dodge | None = None) -> None:
         """Follow a course from the clock on, around what is in the way."""
@@ -624,19 +640,27 @@ class Controller:
     def _course(self, q: Array, z: Array | None = None, near: Course | None = None) -> Course:
         """The undisturbed motion from a posture (6,) to where it is to go; see `_towards`."""
         stack, nominal = self._solved.stack, self._solved.nominal
+        outer: list[Diffeomorphism] = [applied.made.transform for applied in stack.built]
+        stacked = Chain(outer) if outer else Identity(3)
+        hand = self.robot.end_effector(q)
         if self._aim is Aim.HOME:
-            outer: list[Diffeomorphism] = [applied.made.transform for applied in stack.built]
-            transform = Chain(outer) if outer else Identity(3)
-            start = transform.forward(nominal.starts[self._home % len(nominal.starts)])
+            start = stacked.forward(nominal.starts[self._home % len(nominal.starts)])
             base = Attractor(start, HOMING_SPEED * stack.rays.base.speed, stack.rays.base.smoothing)
-            system = DiffeomorphicSystem(transform, base)
-        else:
-            system = stack.system
-        return _towards(system, self._section, q, z, near)
+            return _towards(DiffeomorphicSystem(stacked, base), self._section, q, hand, z, near)
+        base = stack.rays.base
+        state = base.states(hand)
+        if self._rest is not None and len(self._rest) == len(state) - 3:
+            state = base.caught(np.concatenate([hand, self._rest]), stacked.forward(hand))
+        return _towards(stack.system, self._section, q, state, z, near)
 
 
 def _towards(
-    system: DiffeomorphicSystem, section: Section, q: Array, z: Array | None = None, near: Course | None = None
+    system: DiffeomorphicSystem,
+    section: Section,
+    q: Array,
+    state: Array,
+    z: Array | None = None,
+    near: Course | None = None,
 ) -> Course:
     """The motion of a system that a robot follows on a section, onto which it converges.
 
@@ -644,20 +668,23 @@ def _towards(
         system: of the end effector.
         section: the postures on which it is followed.
         q: (6,) where the robot is, rad.
-        z: (3,) base coordinates to begin from; None are those of the hand.
+        state: (k,) in which the hand is.
+        z: (k,) base coordinates to begin from; None are those of the state.
         near: a motion of another system on that section, whose postures are looked for first.
     """
     robot, base = section.robot, system.base
     lower = robot.lower
-    z0 = system.transform.forward(robot.end_effector(q)) if z is None else z
-    if np.linalg.norm(z0 - base.goal) < ARRIVED:
-        times, fractions, path = np.zeros(1), np.ones(1), system.transform.inverse(base.goal[None])
+    z0 = system.transform.forward(state) if z is None else z
+    rays = Rays(z0[None], base)
+    if base.distance(z0) < ARRIVED:
+        times, fractions = np.zeros(1), np.ones(1)
+        path = system.transform.inverse(rays.at(np.zeros(1, int), fractions))[:, :3]
     else:
-        rays = Rays(z0[None], base)
-        bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], 1, NUM_SAMPLES)
+        bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None, :3], 1, NUM_SAMPLES)
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
     # from the end, which is near the reference, backwards: the beginning may be far from the section's branch
-    left = (1 - fractions) * np.linalg.norm(z0 - base.goal)
+    along = rays.at(np.zeros(len(fractions), int), fractions)
+    left = np.linalg.norm(along - along[-1], axis=1)
     initial = None if z is None or near is None else near.where_left(left[::-1], section)
     joints = track(robot, path[::-1], section.reference, initial, reference=section.reference).q[::-1]
     turns = np.where(np.isinf(lower), np.round((q - joints[0]) / (2 * np.pi)), 0.0)
@@ -665,9 +692,9 @@ def _towards(
     converged = CONVERGENCE * np.log(max(float(np.abs(offset).max()) / CONVERGED, 1.0))
     longer = times[-1] + np.arange(SETTLING, max(converged - times[-1], SETTLING) + SETTLING / 2, SETTLING)
     times = np.concatenate([times, longer])
-    joints, fractions = (np.concatenate([part, np.repeat(part[-1:], len(longer), 0)]) for part in (joints, fractions))
+    joints, along = (np.concatenate([part, np.repeat(part[-1:], len(longer), 0)]) for part in (joints, along))
     joints = joints + 2 * np.pi * turns + offset * np.exp(-times / CONVERGENCE)[:, None]
-    return Course(times, joints, base.goal + (1 - fractions)[:, None] * (z0 - base.goal))
+    return Course(times, joints, along)
 
 
 def _resting(q: Array, hand: Array) -> Course:

@@ -11,7 +11,7 @@ from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.imitation import Imitation
+from dt_viz.learning.choice import AnyImitation
 from dt_viz.obstacles.shapes import Point
 from dt_viz.properties import cached_property
 from dt_viz.scenario.tasks import Task
@@ -32,9 +32,9 @@ class Strand:
     start: Array
     """(3,), metres."""
     image: Array
-    """ψ(start), (3,)."""
+    """ψ of the state in which it begins, (k,)."""
     jacobian: Array
-    """(3, 3) derivative of ψ at the start."""
+    """(k, 3) derivative of ψ with respect to the place, there."""
     fraction: Array
     """(n,) where on its base ray the samples are."""
     positions: Array
@@ -46,13 +46,14 @@ class Learned:
     """The learned motion of a task, wherever its rollouts start."""
 
     task: Task
-    imitation: Imitation
+    imitation: AnyImitation
     system: DiffeomorphicSystem
+    """The system of its states: places (3,) in the plain state; see `dt_viz.flows.phased` for the augmented one."""
     goal: Array
     """(3,), metres."""
 
     @classmethod
-    def of(cls, task: Task, imitation: Imitation, *, imitates: bool) -> Learned:
+    def of(cls, task: Task, imitation: AnyImitation, *, imitates: bool) -> Learned:
         """The motion of a task; straight to the goal unless it `imitates`."""
         goal, system = task.to_world(imitation.goal), task.system(imitation)
         if not imitates:
@@ -62,34 +63,41 @@ class Learned:
     @cached_property
     def demonstrated(self) -> Nominal:
         """The rollouts from the task's starts."""
-        return Nominal(self, self._strands(self.task.starts, NUM_SAMPLES))
+        return Nominal(self, self._strands(self.system.base.demonstrated(self.task.starts), NUM_SAMPLES))
 
     def warped(self, fraction: float) -> Learned:
         """The same with the imitation's flows run for a fraction of their durations."""
-        transform = self.system.transform.scaled(fraction)
-        base = replace(self.system.base, goal=transform.forward(self.goal))
+        transform, base = self.system.transform.scaled(fraction), self.system.base
+        base = replace(base, goal=transform.forward(self.system.transform.inverse(base.goal)))
         return replace(self, system=DiffeomorphicSystem(transform, base))
 
     @cached_property
     def at_goal(self) -> tuple[Array, Array]:
-        """ψ (1, 3) and its derivative (1, 3, 3) at the goal."""
-        return self.system.transform.jacobian(self.goal[None])
+        """ψ (1, k) and its derivative (1, k, 3) with respect to the place, at the goal."""
+        return self.images(self.system.transform.inverse(self.system.base.goal[None]))
+
+    def images(self, states: Array) -> tuple[Array, Array]:
+        """ψ (N, k) of states (N, k), and its derivatives (N, k, 3) with respect to the places."""
+        along = np.broadcast_to(np.eye(states.shape[1])[:, :3], (*states.shape, 3))
+        return self.system.transform.forward_tangents(states, along)
+
+    def places(self, base_states: Array) -> Array:
+        """Places (N, 3), metres, of base states (N, k): the first coordinates of ψ⁻¹."""
+        return self.system.transform.inverse(base_states)[:, :3]
 
     def strand(self, start: Point) -> Strand:
         """The rollout from an added start, metres."""
-        return self._strands(np.array([start]), NUM_ADDED_SAMPLES)[0]
+        return self._strands(self.system.base.states(np.array([start])), NUM_ADDED_SAMPLES)[0]
 
     def nominal(self, added: Sequence[Strand]) -> Nominal:
         """The rollouts from the task's starts and from added ones."""
         return Nominal(self, (*self.demonstrated.strands, *added)) if added else self.demonstrated
 
-    def _strands(self, starts: Array, num_samples: int) -> tuple[Strand, ...]:
-        images, jacobians = self.system.transform.jacobian(starts)
+    def _strands(self, states: Array, num_samples: int) -> tuple[Strand, ...]:
+        images, jacobians = self.images(states)
         rays = Rays(images, self.system.base)
-        bundle = evenly_sampled(
-            lambda i, u: self.system.transform.inverse(rays.at(i, u))[:, None], len(starts), num_samples
-        )
-        parts = starts, images, jacobians, bundle.split(bundle.fraction), bundle.paths
+        bundle = evenly_sampled(lambda i, u: self.places(rays.at(i, u))[:, None], len(states), num_samples)
+        parts = states[:, :3], images, jacobians, bundle.split(bundle.fraction), bundle.paths
         return tuple(Strand(*part) for part in zip(*parts, strict=True))
 
 
@@ -113,7 +121,7 @@ class Nominal:
         return self.learned.task
 
     @property
-    def imitation(self) -> Imitation:
+    def imitation(self) -> AnyImitation:
         """The imitation of the demonstrations."""
         return self.learned.imitation
 
@@ -162,10 +170,10 @@ class Nominal:
     def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""
         learned = self.learned.warped(fraction)
-        images, jacobians = learned.system.transform.jacobian(self.starts)
+        images, jacobians = learned.images(self.states)
         bundle = self.bundle
         samples = Rays(images, learned.system.base).at(bundle.index, bundle.fraction)
-        paths = bundle.split(learned.system.transform.inverse(samples))
+        paths = bundle.split(learned.places(samples))
         strands = (
             replace(strand, image=image, jacobian=jacobian, positions=path)
             for strand, image, jacobian, path in zip(self.strands, images, jacobians, paths, strict=True)
@@ -176,6 +184,21 @@ class Nominal:
     def starts(self) -> Array:
         """(R, 3), metres."""
         return np.stack([strand.start for strand in self.strands])
+
+    @property
+    def states(self) -> Array:
+        """(R, k) states in which the rollouts begin."""
+        return np.concatenate([self.starts, self.rays.z0[:, 3:]], axis=1)
+
+    def rest(self, rollout: int) -> Array:
+        """(k − 3,) what the state in which a rollout begins consists of besides the place."""
+        return self.rays.z0[rollout, 3:].copy()
+
+    def states_of(self, rollout: int) -> Array:
+        """(n, k) states of the samples of a rollout."""
+        strand = self.strands[rollout]
+        samples = self.rays.at(np.full(len(strand.fraction), rollout), strand.fraction)
+        return np.concatenate([strand.positions, samples[:, 3:]], axis=1)
 
     @cached_property
     def rays(self) -> Rays:
@@ -199,15 +222,20 @@ class Nominal:
         """(R + 1, 3) starts and goal, metres."""
         return np.concatenate([self.starts, [self.goal]])
 
-    def images(self, ends: Array) -> Array:
-        """ψ of points (R + 1, 3) not far from `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
+    def rays_between(self, ends: Array) -> Rays:
+        """Rays of motions that begin and end elsewhere, not far away: `ends` (R + 1, 3), metres; see `ends`."""
+        *z0, z_e = self._images(ends)
+        return Rays(np.stack(z0), replace(self.system.base, goal=z_e))
+
+    def _images(self, ends: Array) -> Array:
+        """ψ of the states at `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
         at_goal, J_at_goal = self.learned.at_goal
         images = np.concatenate([self.rays.z0, at_goal])
         J = np.concatenate([[strand.jacobian for strand in self.strands], J_at_goal])
         error = ends - self.ends
         for _ in range(MAX_CHORDS):
             images = images + (J @ error[..., None])[..., 0]
-            error = ends - self.system.transform.inverse(images)
+            error = ends - self.learned.places(images)
             if np.abs(error).max() <= IMAGE_TOLERANCE:
                 return images
-        return self.system.transform.forward(ends)
+        return self.system.transform.forward(np.concatenate([ends, images[:, 3:]], axis=1))

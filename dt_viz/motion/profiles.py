@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array
-from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.metrics import (
     arc_length,
     discrete_frechet,
@@ -54,17 +53,17 @@ class Profiles:
         return np.linspace(0, 1, len(self.shown.lyapunov))
 
 
-def hand_profile(path: Array, demonstration: Array, system: DiffeomorphicSystem, obstacle: Union) -> Profile:
+def hand_profile(path: Array, demonstration: Array, potential: Array, obstacle: Union) -> Profile:
     """Profile of a motion of the end effector.
 
     Args:
-        path: (T, 3) its samples, on a motion of the system, metres.
+        path: (T, 3) its samples, metres.
         demonstration: (M, 3), metres.
-        system: whose motion it is.
+        potential: (T,) Lyapunov value at the samples.
         obstacle: that it is to keep clear of.
     """
     depth = maximum_collision_distance(path, obstacle.signed_distance)
-    return _profile(path, demonstration, system.lyapunov(path), obstacle.signed_distance(path), depth)
+    return _profile(path, demonstration, potential, obstacle.signed_distance(path), depth)
 
 
 def body_profile(path: Array, demonstration: Array, potential: Array, clearance: Array) -> Profile:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.phased import OnPlaces, frozen, on_places
 from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.motion.nominal import Nominal
@@ -69,8 +70,18 @@ class Solution:
 
     @property
     def system(self) -> DiffeomorphicSystem:
-        """The dynamical system whose motions these are."""
+        """The dynamical system whose motions these are, of its states."""
         return DiffeomorphicSystem(self.transform, self.rays.base)
+
+    @property
+    def parts(self) -> tuple[Diffeomorphism, ...]:
+        """What ψ is a chain of: the same objects wherever they stay the same."""
+        parts = Chain([self.transform]).parts
+        return tuple(part.transform if isinstance(part, OnPlaces) else part for part in parts)
+
+    def at_phase(self, rest: Array) -> DiffeomorphicSystem:
+        """The system of places (3,), for the other coordinates (k − 3,) of the state; see `frozen`."""
+        return frozen(self.system, rest)
 
     @property
     def warnings(self) -> tuple[MotionWarning, ...]:
@@ -83,13 +94,22 @@ class Solution:
 
     def positions_at(self, index: Indices, fraction: Array) -> Array:
         """End effector (N, 3), metres, of the rollouts `index` (N,) at the fractions `fraction` (N,) of their rays."""
-        return self.transform.inverse(self.rays.at(index, fraction))
+        return self.transform.inverse(self.rays.at(index, fraction))[:, :3]
+
+    def states(self, index: Indices, fraction: Array, positions: Array) -> Array:
+        """States (N, k) at positions (N, 3) of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
+        return np.concatenate([positions, self.rays.at(index, fraction)[:, 3:]], axis=1)
 
 
 def cut_off(nominal: Nominal, solution: Solution, level: int) -> DiffeomorphicSystem:
     """The system on the manifold of a level, counted as in `Bundle.levels`: without what is stacked on it."""
     stacked = [applied.made.transform for applied in solution.built[:level]]
-    return DiffeomorphicSystem(Chain([nominal.system.transform, *stacked]), solution.rays.base)
+    return DiffeomorphicSystem(chained(nominal, stacked), solution.rays.base)
+
+
+def chained(nominal: Nominal, outer: Sequence[Diffeomorphism]) -> Chain:
+    """ψ of states: of the undisturbed motion, and of transforms of places (3,) on it, from the inside out."""
+    return Chain([nominal.system.transform, *on_places(outer, nominal.system.transform.dim - 3)])
 
 
 def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
@@ -117,7 +137,7 @@ def build_stack(
     """
     known = [before and before.at(place) for place, _ in layers]
     ways = [applied.made.ways if applied else () for applied in known]
-    solution = None
+    solution, places = None, nominal.learned.places
     for keeps_goal in (True, False):
         rays, bundle = nominal.rays, nominal.bundle
         ends_below = nominal.ends
@@ -142,14 +162,11 @@ def build_stack(
             ends = np.concatenate([nominal.starts, [goal]])
             below = Chain(outer).forward(ends) if outer else ends
             if np.abs(below - ends_below).max() > precision.ends:
-                *z0, z_e = nominal.images(below)
-                rays, ends_below = Rays(np.stack(z0), replace(nominal.system.base, goal=z_e)), below
-                positions = nominal.system.transform.inverse(rays.at(bundle.index, bundle.fraction))
-                bundle = replace(bundle, levels=positions[:, None])
+                rays, ends_below = nominal.rays_between(below), below
+                bundle = replace(bundle, levels=places(rays.at(bundle.index, bundle.fraction))[:, None])
             bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
-            transforms = [nominal.system.transform, *outer]
-            bundle = refined(bundle, lambda i, u, r=rays, s=transforms: climb(r.at(i, u), s)[:, 1:], precision.spacing)
-            solution = Solution(Chain(transforms), rays, bundle, _applied(layers, built, above, bundle))
+            bundle = refined(bundle, lambda i, u, r=rays, s=outer: climb(places(r.at(i, u)), s), precision.spacing)
+            solution = Solution(chained(nominal, outer), rays, bundle, _applied(layers, built, above, bundle))
             if not any(applied.may_improve for applied in solution.built):
                 return solution
         assert solution is not None

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from dt_viz.flows.diffeomorphisms import Chain
-from dt_viz.flows.rollouts import Rays, refined
+from dt_viz.flows.rollouts import refined
 from dt_viz.motion.nominal import Nominal
-from dt_viz.motion.stack import Precision, Solution, climb
+from dt_viz.motion.stack import Precision, Solution, chained, climb
 
 
 def warped_stack(nominal: Nominal, full: Solution, fraction: float, precision: Precision) -> Solution:
@@ -34,14 +34,10 @@ def warped_stack(nominal: Nominal, full: Solution, fraction: float, precision: P
     moved = built[-1].made.goal - nominal.goal if built else np.zeros_like(nominal.goal)
     ends = np.concatenate([nominal.starts, [nominal.goal + fraction * moved]])
     below = Chain(outer).forward(ends) if outer else ends
-    rays, bundle = nominal.rays, nominal.bundle
+    rays, bundle, places = nominal.rays, nominal.bundle, nominal.learned.places
     if np.abs(below - nominal.ends).max() > precision.ends:
-        *z0, z_e = nominal.system.transform.forward(below)
-        rays = Rays(np.stack(z0), replace(rays.base, goal=z_e))
-        bundle = replace(
-            bundle, levels=nominal.system.transform.inverse(rays.at(bundle.index, bundle.fraction))[:, None]
-        )
+        rays = nominal.rays_between(below)
+        bundle = replace(bundle, levels=places(rays.at(bundle.index, bundle.fraction))[:, None])
     bundle = replace(bundle, levels=climb(bundle.levels[:, 0], outer))
-    stack = [nominal.system.transform, *outer]
-    bundle = refined(bundle, lambda i, u: climb(rays.at(i, u), stack)[:, 1:], precision.spacing)
-    return Solution(Chain(stack), rays, bundle, built)
+    bundle = refined(bundle, lambda i, u: climb(places(rays.at(i, u)), outer), precision.spacing)
+    return Solution(chained(nominal, outer), rays, bundle, built)

@@ -143,7 +143,7 @@ def lyapunov_value(samples: Samples) -> ColourPicture:
     radius, levels = LEVEL_SPACING, []
     # no lines where a cell of the lattice would have more than one
     sparse = np.where(_steps(values) < base.speed * LEVEL_SPACING, values, np.nan)
-    while (level := _potential(samples.system, radius)) < np.nanmax(values, initial=0.0):
+    while (level := base.potential_at(radius)) < np.nanmax(values, initial=0.0):
         levels.append(level_line(samples.grid, sparse - level))
         radius += LEVEL_SPACING
     lines = np.concatenate([np.empty((0, 2, 3)), *levels])
@@ -240,8 +240,3 @@ def _steps(values: Array) -> Array:
         ahead, behind = (np.insert(step, place, 0.0, axis=axis) for place in (step.shape[axis], 0))
         steps = np.maximum(steps, np.maximum(ahead, behind))
     return steps
-
-
-def _potential(system: DiffeomorphicSystem, radius: float) -> float:
-    """Return the base attractor's potential at a distance from its goal."""
-    return float(system.base.potential(system.base.goal + radius * np.eye(system.base.dim)[0]))

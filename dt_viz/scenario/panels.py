@@ -27,7 +27,14 @@ class Panel:
     generator: bool = False
     """Whether it shows the vector field that leads to this level from the one below it."""
     task: str = ""
-    """Name of another task, of which it shows the imitation."""
+    """Name of a task of which it shows the imitation."""
+    plain: bool = False
+    """Whether that is learned in the plain state, however the scene's own is."""
+
+    @property
+    def shown(self) -> Panel | None:
+        """The panel of all of that imitation; None where it shows the scene's own."""
+        return Panel(task=self.task, plain=self.plain) if self.task else None
 
 
 BASE_PANEL = Panel()

@@ -22,6 +22,8 @@ from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
 
+IN_8 = 0.09
+"""Diameter of the sphere in the 8, metres."""
 BODY, NECK, RIM = (0.035, 0.180), (0.013, 0.265), (0.0155, 0.280)
 """Radius of the bottle's body, neck and rim, and the height at which each ends, metres."""
 SHOULDER, NUM_SHOULDER = 0.05, 8
@@ -123,6 +125,11 @@ def _bottle_in_the_way(task: Task) -> Scenario:
 def _sphere_in_the_letter(task: Task) -> Scenario:
     """Fig. 2."""
     return _avoiding(task, Avoidance(Sphere(task.obstacle_position), plane=plane_of(task)))
+
+
+def _sphere_in_the_8(task: Task) -> Scenario:
+    """Sec. 6: a small sphere, so that the 8 remains one."""
+    return _avoiding(task, Avoidance(Sphere(task.obstacle_position, IN_8), plane=plane_of(task)))
 
 
 def _cube_before_the_attractor(task: Task) -> Scenario:
@@ -264,6 +271,15 @@ SCENES: Mapping[str, PaperScene] = {
         _comparison("others_push", "push, beside other methods", "push_box"),
         _comparison("others_lift", "lift, beside other methods", "lift_box"),
         _comparison("others_s", "the S, beside other methods", "draw_s"),
+        PaperScene(
+            "augmented",
+            "Augmented states (sec. 6)",
+            "An 8 crosses itself. No motion of one field does (left); one that knows its phase can, also around the "
+            "sphere: drag it.",
+            "draw_8",
+            _sphere_in_the_8,
+            view=FIGURE | {"panels": (Panel(task="draw_8", plain=True),), "streamlines": False, "demonstrations": True},
+        ),
         PaperScene(
             "centre_pot",
             "Fig. 8: into the centre pot",

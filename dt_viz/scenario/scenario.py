@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from dt_viz.learning.choice import State
 from dt_viz.learning.imitation import Objective
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
@@ -47,6 +48,9 @@ class View:
     move_slice: bool = False
     """Whether the slice has handles, instead of obstacles and bias points."""
     colour: SliceColour = "none"
+    phase: float = 1.0
+    """Part of a motion that is left, from 1 at its start to 0 at the goal, at which augmented motions are shown on the
+    slice: at each phase they have another field."""
     arm: bool = True
     ghost_arm: bool = False
     """The arm where it would be without avoidance."""
@@ -123,6 +127,9 @@ class Scenario:
     imitation: bool = True
     """Whether the learned transform is in the stack; without it motions are straight."""
     objective: Objective = "trajectory"
+    """What is fitted in the plain state."""
+    state: State = "auto"
+    """Whether motions are learned in the plain state or in the augmented one."""
     warp: float = 1.0
     """s, from 0 to 1: every flow of the stack, the imitation's too, runs for this fraction of its duration."""
     starts: tuple[Point, ...] = ()
@@ -192,7 +199,7 @@ class Scenario:
 
     def learns_like(self, other: Scenario) -> bool:
         """Return whether both need the same fit."""
-        return (self.task, self.objective) == (other.task, other.objective)
+        return (self.task, self.objective, self.state) == (other.task, other.objective, other.state)
 
     def begins_like(self, other: Scenario) -> bool:
         """Return whether both have the same task, fit and scene, so that one is a small edit of the other."""
@@ -204,7 +211,7 @@ class Scenario:
         shows_no_more = all(getattr(before, name) or not getattr(after, name) for name in COMPUTED_VIEWS)
         same_layer = not after.generator or after.generator_layer == before.generator_layer
         same_colour = after.colour in {"none", before.colour}
-        same_place = (after.slice, after.level) == (before.slice, before.level)
+        same_place = (after.slice, after.level, after.phase) == (before.slice, before.level, before.phase)
         same_panels = after.panels in ((), before.panels)
         same_methods = after.compared == () or (after.compared, after.their_arm) == (before.compared, before.their_arm)
         same_pictures = shows_no_more and same_layer and same_colour and same_place and same_panels and same_methods

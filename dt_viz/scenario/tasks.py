@@ -12,8 +12,9 @@ import numpy as np
 from dt_viz.flows.diffeomorphisms import Placed
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.choice import AnyImitation
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
-from dt_viz.learning.imitation import Imitation
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.properties import cached_property
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
@@ -65,11 +66,14 @@ class Task:
         """Transform points (*B, k) of the demonstrations to the world, (*B, 3), metres."""
         return self.origin + self.scale * (points @ self.axes[:, : points.shape[-1]].T)
 
-    def system(self, imitation: Imitation) -> DiffeomorphicSystem:
+    def system(self, imitation: AnyImitation) -> DiffeomorphicSystem:
         """Return the motion learned from the demonstrations, as a system in the world, metres and seconds."""
+        axes = self.axes[:, : len(imitation.goal)]
+        if isinstance(imitation, AugmentedImitation):
+            return imitation.placed(self.origin, axes, self.scale).system
         return DiffeomorphicSystem(
             Placed(imitation.transform, self.origin, self.axes, self.scale),
-            imitation.base.placed(self.origin, self.axes[:, : imitation.base.dim], self.scale),
+            imitation.base.placed(self.origin, axes, self.scale),
         )
 
     @property
@@ -263,6 +267,7 @@ TASKS: Mapping[str, TaskEntry] = {
     "draw_g": TaskEntry("Draw G", partial(letter, "G")),
     "draw_w": TaskEntry("Draw W", partial(letter, "W", obstacle_at=0.36)),  # not between two strokes
     "draw_z": TaskEntry("Draw Z", partial(letter, "Z")),
+    "draw_8": TaskEntry("Draw 8", partial(letter, "8", "The 8 crosses itself: it needs an augmented state.", 0.3)),
     "lift_box": TaskEntry("Lift box", lift_box),
     "push_box": TaskEntry("Push box", push_box),
     "drop_pots": TaskEntry("Drop in pots", drop_pots),

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import viser
 
+from dt_viz.engine.frame import Frame
+from dt_viz.learning.choice import STATES
 from dt_viz.learning.imitation import OBJECTIVES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, tunable, tuned
@@ -32,11 +34,16 @@ def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) 
     hint = "what is fitted to the demonstrations: whole motions, or velocities as in eq. (3) of the paper"
     objective = gui.add_dropdown("Objective", OBJECTIVES, order=order, hint=hint)
     bindings.input(objective, lambda s: s.objective, lambda _s, value: {"objective": value})
-    note = gui.add_html("", order=order)
-    bindings.properties(
-        note, content=lambda _s: learned_html(() if bindings.frame is None else bindings.frame.learned_steps)
+    hint = (
+        "plain: the paper's, one field that needs no memory. augmented: remembers its phase and where it began, so "
+        "that it crosses itself, comes back, and draws the figure from other starts. auto: plain, unless the "
+        "demonstrations conflict or are missed by it"
     )
-    for handle in (objective, note):
+    state = gui.add_dropdown("State", STATES, order=order, hint=hint)
+    bindings.input(state, lambda s: s.state, lambda _s, value: {"state": value})
+    note = gui.add_html("", order=order)
+    bindings.properties(note, content=lambda _s: learned_html(bindings.frame))
+    for handle in (objective, state, note):
         bindings.properties(handle, visible=_is_imitation)
     add_settings(gui, bindings, _settings, tuned, order)
 
@@ -55,8 +62,16 @@ def own(setting: Setting) -> bool:
     return isinstance(setting, Switch) or (isinstance(setting, Number) and not setting.of_flow)
 
 
-def learned_html(steps: tuple[int, ...]) -> str:
-    """Return a note about the imitation's flows, given how many steps each has."""
+def learned_html(frame: Frame | None) -> str:
+    """Return a note about what was learned: in which state and why, and of how many steps the flows are."""
+    steps = () if frame is None else frame.learned_steps
+    if frame is not None and frame.remembers:
+        why = f"Chosen because {frame.reason}. " if frame.reason else ""
+        text = (
+            f"{why}Augmented: each motion remembers its phase and where it began, and follows what is predicted for "
+            "them. ψ is a shear with det J = 1; there are no flows to choose."
+        )
+        return f"<div style='{_SMALL}'>{html.escape(text)}</div>"
     if not steps:
         return f"<div style='{_SMALL}'>Off: motions are straight.</div>"
     flows = f"{len(steps)} flows" if len(steps) > 1 else "One flow"
