@@ -1,0 +1,358 @@
+"""Augmented motions in everything that is live: stacks, certificates, the whole arm, the arm in the loop, pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import avoiding, biases, changed, kinds
+
+import dt_viz as dt
+from dt_viz.engine.frame import Stage
+from dt_viz.errors import DataError, FormatError
+from dt_viz.evaluate.crossings import crossings
+from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
+from dt_viz.learning.choice import MOST_CONFLICTING, conflicts, learn
+from dt_viz.learning.preparation import ImitationError, prepare
+from dt_viz.metrics import discrete_frechet, resample_by_arc_length
+from dt_viz.motion.certificates import Certificates, Shown, certified
+from dt_viz.motion.control import Controller, Phase
+from dt_viz.motion.stack import FINE, LIVE
+from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.scenario.panels import Panel
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.bias import BiasPoint
+from dt_viz.warning import Kind
+
+EIGHT = "draw_8"
+TICK = 0.01
+BY_HAND = {Kind.ARM_ENTERS}
+"""What may be said where only the path of the hand gives way."""
+CASES = crossings()
+
+
+def last(engine, scenario):
+    return list(engine.frames(scenario))[-1]
+
+
+def frechet(a, b):
+    return float(discrete_frechet(resample_by_arc_length(a, 150), resample_by_arc_length(b, 150)))
+
+
+def in_the_way(engine, fraction=0.3, diameter=0.08, **settings):
+    """The 8 with a sphere on its mean path."""
+    place = as_point(engine.task(EIGHT).mean_path[round(100 * fraction)])
+    return avoiding(EIGHT, Sphere(place, diameter), **settings)
+
+
+# --- Plain or augmented ---
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_of_what_ships_only_the_8_needs_the_augmented_state(fits, task):
+    imitation = fits.learned(TASKS[task]().demonstrations)
+    assert isinstance(imitation, AugmentedImitation) == (task == EIGHT)
+    assert task != EIGHT or "in different directions" in imitation.reason
+
+
+@pytest.mark.parametrize("name", ["loop", "eight", "wide eight", "double loop", "reach and retreat"])
+def test_what_crosses_or_comes_back_is_in_conflict(name):
+    assert conflicts(prepare(CASES[name].demonstrations)).phase > MOST_CONFLICTING
+
+
+def test_what_differs_at_one_phase_is_in_conflict_by_its_label_alone():
+    found = conflicts(prepare(CASES["crossing at equal phase"].demonstrations))
+    assert found.label > 0.02 and found.phase < MOST_CONFLICTING
+
+
+def test_a_plain_fit_that_misses_is_not_taken():
+    demonstrations = TASKS["draw_s"]().demonstrations
+    coarse = dt.fit(demonstrations[:2], state="plain")._learned.imitation
+    taken = learn(demonstrations, plain=lambda: coarse)  # not a fit of all of these, but near
+    assert taken is coarse
+    shifted = tuple(
+        replace(d, positions=d.positions + 0.1 * np.sin(np.linspace(0, np.pi, len(d.times)))[:, None])
+        for d in demonstrations
+    )
+    missing = learn(shifted, plain=lambda: coarse)
+    assert isinstance(missing, AugmentedImitation) and "of the extent" in missing.reason
+
+    def fail():
+        raise ImitationError("no map")
+
+    failing = learn(demonstrations, plain=fail)
+    assert isinstance(failing, AugmentedImitation) and "no map" in failing.reason
+
+
+def test_wrong_choices_are_named():
+    demonstrations = TASKS["draw_s"]().demonstrations
+    with pytest.raises(ImitationError, match="state: found 'other'; accepted: auto, plain, augmented"):
+        dt.fit(demonstrations, state="other")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ImitationError, match="none in the plain state"):
+        dt.fit(demonstrations, state="plain", labels=[0.0] * 7)
+
+
+# --- The system ---
+
+
+@pytest.mark.parametrize("name", ["wide eight", "left and right from one start", "helix, 2 turns"])
+def test_the_learned_shear_changes_with_the_condition_as_it_says(name):
+    case = CASES[name]
+    imitation = fit_augmented(case.demonstrations, case.labels)
+    psi, rng = imitation.system.transform, np.random.default_rng(0)
+    states = imitation.demonstrated(np.stack([d.positions[0] for d in case.demonstrations]))
+    states[:, imitation.dim] *= rng.uniform(0.1, 0.9, len(states))
+    states += 0.01 * rng.normal(size=states.shape)
+    image, J = psi.jacobian(states)
+    np.testing.assert_allclose(np.linalg.det(J), 1.0, atol=1e-9)
+    np.testing.assert_allclose(psi.inverse(image), states, atol=1e-14)
+    h = 1e-6
+    for k in range(psi.dim):
+        step = h * np.eye(psi.dim)[k]
+        slope = (psi.forward(states + step) - psi.forward(states - step)) / (2 * h)
+        np.testing.assert_allclose(J[..., k], slope, atol=2e-5)
+
+
+def test_in_the_world_motions_are_those_of_the_drawing_placed_there():
+    case, rng = CASES["left and right from one start"], np.random.default_rng(1)
+    drawn = fit_augmented(case.demonstrations, case.labels)
+    axes, origin, scale = np.linalg.qr(rng.normal(size=(3, 3)))[0][:, :2], rng.normal(size=3), 1.7
+    world = drawn.placed(origin, axes, scale)
+    times = np.linspace(0, 4, 30)
+    for place, label in (([0.01, -0.02], -1.0), ([0.0, 0.03], 1.0), ([0.1, 0.1], None)):
+        path = drawn.system.rollout(drawn.states(np.array(place), label), times)[:, :2]
+        begin = world.states(origin + scale * axes @ np.array(place), label)
+        placed = world.system.rollout(begin, times)[:, :3]
+        np.testing.assert_allclose(placed, origin + scale * path @ axes.T, atol=1e-10)
+
+
+# --- Stacks and their certificates ---
+
+
+@pytest.mark.parametrize(
+    "stack",
+    [
+        {},
+        {"layers": biases(BiasPoint((0.12, -0.5, 0.50)))},
+        {"layers": biases(BiasPoint((-0.2, -0.5, 0.5), moves_goal=True))},
+    ],
+    ids=["a sphere", "and a bias point", "and a moved goal"],
+)
+def test_around_what_is_in_the_way_every_certificate_holds(engine, stack):
+    frame = last(engine, in_the_way(engine, **stack))
+    known = frame.certificates
+    assert kinds(known.warnings) <= BY_HAND and known.lyapunov_falls is True
+    assert known.min_det_jacobian is not None and known.min_det_jacobian > 0
+    assert known.round_trip_error is not None and known.round_trip_error < 1e-6
+    assert known.clearance > 0.0098
+    for path, start in zip(frame.rollouts, frame.task.starts, strict=True):
+        np.testing.assert_allclose(path[0], start, atol=1e-6)
+        np.testing.assert_allclose(path[-1], frame.rollouts[0][-1], atol=1e-6)
+
+
+def test_the_8_is_drawn_as_demonstrated(engine):
+    frame = last(engine, Scenario(EIGHT, ()))
+    off = [frechet(a, b) for a, b in zip(frame.rollouts, frame.task.paths, strict=True)]
+    assert max(off) < 0.015
+    plain = last(engine, Scenario(EIGHT, (), state="plain"))
+    assert max(frechet(a, b) for a, b in zip(plain.rollouts, plain.task.paths, strict=True)) > 0.08
+
+
+def test_certificates_recognise_another_motion(engine):
+    scenario = in_the_way(engine)
+    solved = engine.solved(scenario, FINE)
+    stack, bundle = solved.stack, solved.stack.bundle
+    times = stack.rays.times(bundle.index, bundle.fraction)
+    known = Certificates(0.01)
+    good = Shown(bundle.index, bundle.fraction, times, bundle.positions)
+    assert not certified(known, stack, solved.ends, good).warnings
+    late = replace(good, times=1.05 * times)
+    assert Kind.OTHER_TIMES in kinds(certified(known, stack, solved.ends, late).warnings)
+    beside = replace(good, positions=bundle.positions + 1e-4 * np.sin(40 * bundle.fraction)[:, None])
+    assert Kind.OFF_MOTION in kinds(certified(known, stack, solved.ends, beside).warnings)
+    another = replace(stack, rays=replace(stack.rays, z0=np.roll(stack.rays.z0, 1, axis=0)))  # others' conditions
+    assert Kind.OFF_MOTION in kinds(certified(known, another, solved.ends, good).warnings)
+    back = np.concatenate(
+        [rows[::-1] for rows in np.split(np.arange(len(times)), np.flatnonzero(np.diff(bundle.index)) + 1)]
+    )
+    reversed_ = replace(good, positions=bundle.positions[back])
+    assert Kind.OFF_MOTION in kinds(certified(known, stack, solved.ends, reversed_).warnings)
+
+
+def test_an_added_start_draws_the_8_from_there(engine):
+    task = engine.task(EIGHT)
+    start = as_point(task.starts.mean(axis=0) + np.array([0.05, 0.0, 0.04]))
+    frame = last(engine, Scenario(EIGHT, (), starts=(start,)))
+    added, mean = frame.rollouts[-1], task.mean_path
+    shifted = mean + np.linspace(1, 0, len(mean))[:, None] * (start - mean[0])
+    assert frechet(added, shifted) < 0.02 and not frame.certificates.warnings
+
+
+def test_half_warped_it_is_between_a_straight_line_and_the_8(engine):
+    frame = last(engine, Scenario(EIGHT, (), warp=0.5))
+    assert not frame.certificates.warnings
+    straight = last(engine, Scenario(EIGHT, (), warp=0.0))
+    for path in straight.rollouts:
+        along = (path - path[0]) @ (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
+        assert np.linalg.norm(path - path[0], axis=1) == pytest.approx(along, abs=1e-9)
+
+
+def test_the_whole_arm_gives_way(engine):
+    frame = last(engine, in_the_way(engine, space="cspace"))
+    assert not frame.blocked and not frame.certificates.warnings
+    assert frame.certificates.min_det_jacobian is not None and frame.certificates.min_det_jacobian > 0
+
+
+# --- Pictures ---
+
+
+def test_pictures_are_of_the_phase_that_is_asked_for(engine):
+    scenario = in_the_way(engine)
+    view = replace(scenario.view, streamlines=True, grid=True, colour="lyapunov")
+    pictures = {
+        phase: next(
+            f.pictures
+            for f in engine.frames(replace(scenario, view=replace(view, phase=phase)))
+            if f.stage is Stage.FINE
+        )
+        for phase in (1.0, 0.4)
+    }
+    solved = engine.solved(scenario, FINE)
+    for phase, picture in pictures.items():
+        rest = solved.stack.rays.z0[0, 3:].copy()
+        rest[0] *= phase
+        places = picture.field.points
+        whole = np.column_stack([places, np.broadcast_to(rest, (len(places), len(rest)))])
+        np.testing.assert_allclose(picture.field.velocities, solved.stack.system.velocity(whole)[:, :3], atol=2e-4)
+        assert picture.streamlines and picture.grid.lines and np.isfinite(picture.colour.values).any()
+    one, other = (picture.field.velocities for picture in pictures.values())
+    assert np.abs(one - other).max() > 0.02
+
+
+def test_the_scene_shows_both_states_side_by_side(engine):
+    scene = SCENES["augmented"]
+    frame = last(engine, scene.scenario(engine.task(scene.task)))
+    assert frame.remembers and frame.scenario.view.panels == (Panel(task=EIGHT, plain=True),)
+    beside, own = frame.pictures.panels
+    assert beside.title.startswith("plain") and own.title.startswith("augmented")
+    crossing = [frechet(path, d) for path, d in zip(beside.rollouts, frame.task.paths, strict=True)]
+    assert min(crossing) > 0.05 and kinds(frame.certificates.warnings) <= BY_HAND
+
+
+# --- The arm in the loop ---
+
+
+@pytest.fixture(scope="module", name="loop")
+def _loop(engine):
+    scenario = changed(Scenario(EIGHT), space="cspace", obstacles=(), margin=0.03)
+    solved = engine.solved(scenario, LIVE)
+    return solved, engine.follower.undisturbed(solved.nominal).tracked.q[0]
+
+
+def run(controller, q, seconds, passed):
+    for _ in range(round(seconds / TICK)):
+        velocity = controller.step(q, TICK)
+        q = q + TICK * velocity
+        passed.append(q)
+        if controller.phase is Phase.RESTING and np.abs(velocity).max() < 1e-3:
+            break
+    return q
+
+
+def test_the_arm_draws_the_8(engine, loop):
+    solved, joints = loop
+    controller, passed = Controller(engine.follower, solved), []
+    q = run(controller, joints[0], 30, passed)
+    hand = engine.follower.robot.end_effector(np.array(passed))
+    assert controller.phase is Phase.RESTING
+    assert np.linalg.norm(hand[-1] - solved.nominal.goal) < 1e-3
+    assert frechet(hand, solved.stack.bundle.paths[0]) < 0.015
+    controller.home(0)
+    q = run(controller, q, 30, passed)
+    controller.go()
+    again: list[np.ndarray] = []
+    run(controller, q, 30, again)
+    assert frechet(engine.follower.robot.end_effector(np.array(again)), solved.stack.bundle.paths[0]) < 0.02
+
+
+@pytest.mark.parametrize("way", ["pushed", "held"])
+def test_after_a_disturbance_it_draws_the_rest(engine, loop, way):
+    solved, joints = loop
+    robot, controller, passed = engine.follower.robot, Controller(engine.follower, solved), []
+    q = run(controller, joints[0], 2.5, passed)
+    path = solved.stack.bundle.paths[0]
+    reached = np.linalg.norm(path - robot.end_effector(q), axis=1).argmin()
+    if way == "pushed":
+        q = engine.follower.whole_arm.limits.inside(q + np.array([0.08, 0.0, 0.05, 0.0, 0.0, 0.0]))
+    else:
+        controller.hold(robot.end_effector(q) + np.array([0.05, 0.0, 0.03]))
+        q = run(controller, q, 1.5, passed)
+        controller.release()
+    after: list[np.ndarray] = []
+    run(controller, q, 30, after)
+    hand, rest = robot.end_effector(np.array(after)), path[reached:]
+    near = np.linalg.norm(rest[:, None] - hand, axis=2).min(axis=1) < 0.05 * 0.40
+    assert near.mean() > 0.7
+    assert np.linalg.norm(hand[-1] - solved.nominal.goal) < 1e-3
+
+
+def test_its_velocity_is_that_of_the_system_at_its_phase(engine, loop):
+    solved, joints = loop
+    controller, passed = Controller(engine.follower, solved), []
+    q, compared = joints[0], 0
+    for _ in range(12):
+        q = run(controller, q, 0.25, passed)
+        exact = controller.system.velocity(q)
+        velocity = (passed[-1] - passed[-2]) / TICK
+        along = exact / np.linalg.norm(exact)
+        if np.linalg.norm(velocity) > 0.1:
+            assert np.linalg.norm(velocity - (velocity @ along) * along) < 0.08 * np.linalg.norm(velocity)
+            compared += 1
+    assert compared >= 6
+
+
+# --- The library ---
+
+
+def test_velocities_and_phase_are_what_rollouts_are_made_of():
+    case = CASES["wide eight"]
+    motion = dt.fit(case.demonstrations)
+    around = motion.stack(dt.Avoidance(dt.Sphere((0.0, 0.08, 0.0), diameter=0.05)))
+    start = case.demonstrations[1].positions[0] + 0.01
+    (path,) = around.rollouts(start[None], spacing=0.002)
+    y, phase, step = start, 1.0, 0.004
+    for _ in range(round(2 / step)):
+        middle = y + step / 2 * around.velocity(y, phase, start)
+        between = phase - step / 2 * around.phase_rate(phase, start)
+        y = y + step * around.velocity(middle, between, start)
+        phase -= step * around.phase_rate(between, start)
+    exact = [np.interp(2.0, path.times, x) for x in path.positions.T]
+    np.testing.assert_allclose(y, exact, atol=1e-3)
+    assert around.state == "augmented" and motion.reason and 0 < phase < 1
+    plain = dt.fit(TASKS["draw_s"]().demonstrations)
+    assert (plain.state, plain.reason, plain.phase_rate(0.5)) == ("plain", "", 0.0)
+
+
+def test_saved_motions_come_back_with_their_state_and_labels(tmp_path):
+    case = CASES["left and right from one start"]
+    motion = dt.fit(case.demonstrations, labels=case.labels)
+    start = case.demonstrations[0].positions[:1]
+    left, right = (motion.rollouts(start, label=label)[0].positions for label in (1.0, -1.0))
+    assert left[:, 1].max() > 0.09 and right[:, 1].min() < -0.09
+    motion.save(tmp_path / "motion.npz")
+    again = dt.Motion.load(tmp_path / "motion.npz")
+    np.testing.assert_array_equal(again.rollouts(start, label=1.0)[0].positions, left)
+    with pytest.raises(FormatError, match="label: found 3; accepted: -1, 1"):
+        motion.rollouts(start, label=3.0)
+    with pytest.raises(FormatError, match="none, in the plain state"):
+        dt.fit(TASKS["draw_s"]().demonstrations).velocity(np.zeros(2), label=1.0)
+
+
+def test_a_saved_motion_whose_labels_do_not_fit_is_refused(tmp_path):
+    motion = dt.fit(CASES["wide eight"].demonstrations)
+    learned = motion._learned
+    forged = replace(learned.imitation, labels=(1.0,))
+    motion._learned = replace(learned, imitation=forged)
+    with pytest.raises(DataError, match="labels"):
+        motion.save(tmp_path / "motion.npz")
