@@ -265,7 +265,7 @@ def test_the_arm_draws_the_8(engine, loop):
     controller, passed = Controller(engine.follower, solved), []
     q = run(controller, joints[0], 30, passed)
     hand = engine.follower.robot.end_effector(np.array(passed))
-    assert controller.phase is Phase.RESTING
+    assert controller.phase is Phase.RESTING and controller.left < 1e-3
     assert np.linalg.norm(hand[-1] - solved.nominal.goal) < 1e-3
     assert frechet(hand, solved.stack.bundle.paths[0]) < 0.015
     controller.home(0)
@@ -282,6 +282,7 @@ def test_after_a_disturbance_it_draws_the_rest(engine, loop, way):
     robot, controller, passed = engine.follower.robot, Controller(engine.follower, solved), []
     q = run(controller, joints[0], 2.5, passed)
     path = solved.stack.bundle.paths[0]
+    assert 0.2 < controller.left < 0.9
     reached = np.linalg.norm(path - robot.end_effector(q), axis=1).argmin()
     if way == "pushed":
         q = engine.follower.whole_arm.limits.inside(q + np.array([0.08, 0.0, 0.05, 0.0, 0.0, 0.0]))

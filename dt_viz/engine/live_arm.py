@@ -79,6 +79,12 @@ class LiveArm:
         return None if controller is None else controller.undisturbed
 
     @property
+    def left(self) -> float:
+        """Part of its motion to the goal that is left, from 1 at a start to 0 at the goal."""
+        controller = self._controller
+        return 1.0 if controller is None else controller.left
+
+    @property
     def ahead(self) -> Array:
         """(K, 3) the way of the hand that lies ahead, metres."""
         controller = self._controller

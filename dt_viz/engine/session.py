@@ -163,6 +163,11 @@ class Session:
         with self._lock:
             self._gesture, self._held = ("", 0.0), True
 
+    def take_phase(self) -> None:
+        """Show augmented motions on the slice at the phase at which the arm is."""
+        self.edit("phase", view=replace(self.scenario.view, phase=round(self._engine.arm.left, 2)))
+        self.end_gesture()
+
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
         with self._lock:

@@ -452,6 +452,16 @@ class Controller:
             return np.concatenate([self._ahead.at(self._clock)[None], later])
 
     @property
+    def left(self) -> float:
+        """Part of its motion to the goal that is left, from 1 at a start to 0; 1 while it goes elsewhere."""
+        with self._lock:
+            base = self._solved.stack.rays.base
+            if self._ahead is None or self._aim is not Aim.GOAL:
+                return 1.0
+            whole = float(base.left(self._solved.stack.rays.z0).max())
+            return min(float(base.left(self._image())) / max(whole, ARRIVED), 1.0)
+
+    @property
     def undisturbed(self) -> Array:
         """The posture (6,) at this moment of the motion without what is stacked on the learned one, rad."""
         with self._lock:

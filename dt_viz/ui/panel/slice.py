@@ -50,7 +50,10 @@ class SlicePanel:
         hint = "part of the motion that is left where the slice shows an augmented one, whose field changes on the way"
         phase = gui.add_slider("Phase", 0.0, 1.0, 0.01, 1.0, hint=hint, visible=False)
         bindings.input(phase, lambda s: s.view.phase, lambda s, value: {"view": replace(s.view, phase=value)})
-        bindings.properties(phase, visible=lambda _s: bindings.frame is not None and bindings.frame.remembers)
+        take = gui.add_button("Take the arm's phase", visible=False)
+        bindings.on(take, lambda session, _pressed: session.take_phase())
+        for handle in (phase, take):
+            bindings.properties(handle, visible=lambda _s: bindings.frame is not None and bindings.frame.remembers)
         self.legend: Legend | None = None
         """Legend of the colours that are shown."""
         self.key = gui.add_html("", visible=False)
