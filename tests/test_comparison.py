@@ -11,7 +11,7 @@ from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.eflow import EFlow
 from dt_viz.baselines.registry import METHODS, problem_of
-from dt_viz.engine.comparison import OTHERS, WAITS, curves, scored
+from dt_viz.engine.comparison import NEXT, OTHERS, WAITS, curves, scored
 from dt_viz.engine.frame import Stage
 from dt_viz.evaluate.table1 import drawn
 from dt_viz.interruption import UnwantedError
@@ -56,6 +56,46 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
     assert told == sorted(told) and told[3] == 0 and set(told) == {0, 1, 2, 3}
 
 
+def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
+    engine, first, second = new_engine(), "eflow-repulsive-fine", SLOW
+    planned = type(engine.comparison)._planned
+    begun = []
+
+    def noted(self, method, *args):
+        begun.append(method.name)
+        return planned(self, method, *args)
+
+    monkeypatch.setattr(type(engine.comparison), "_planned", noted)
+    said = []
+    for frame in engine.frames(shown(initial("push_box"), first, second, LIVE)):
+        found = by_name(frame)
+        if found:
+            assert not found[LIVE].note
+            said.append((found[first].note, found[second].note, tuple(begun)))
+    expected = [
+        (WAITS, WAITS, (LIVE,)),  # while it may be dragged on
+        ("planning … (1 of 2)", NEXT, (LIVE,)),  # said before it begins
+        ("", "planning … (2 of 2)", (LIVE, first)),
+        ("", "", (LIVE, first, second)),
+    ]
+    assert list(dict.fromkeys(said)) == expected
+
+
+def test_an_edit_ends_the_planning_of_a_slow_method_at_once(new_engine, initial):
+    engine, scenario = new_engine(), shown(initial("push_box"), SLOW)
+    frames, wanted = [], [True]
+
+    def leave():
+        if not wanted[0]:
+            raise UnwantedError
+
+    with pytest.raises(UnwantedError):
+        for frame in engine.frames(scenario, checkpoint=leave):
+            frames.append(frame)
+            wanted[0] = not by_name(frame).get(SLOW) or "planning" not in by_name(frame)[SLOW].note
+    assert by_name(frames[-1])[SLOW].note == "planning … (1 of 1)"
+
+
 def test_scores_are_those_of_the_motions(beside):
     engine, scenario, frames = beside
     last, task, goal = by_name(frames[-1]), frames[-1].task, frames[-1].goal
@@ -93,7 +133,7 @@ def test_scores_and_curves_find_what_is_wrong_with_a_motion(engine):
 
 def test_what_an_edit_leaves_unchanged_is_not_planned_again(beside, monkeypatch):
     engine, scenario, _ = beside
-    monkeypatch.setattr(type(engine.comparison), "_plan", lambda *_: pytest.fail("planned again"))
+    monkeypatch.setattr(type(engine.comparison), "_planned", lambda *_: pytest.fail("planned again"))
     *_, frame = engine.frames(replace(scenario, arm_rollout=2))
     assert by_name(frame)[SLOW].rollout == 2
     *_, frame = engine.frames(shown(scenario, SLOW))

@@ -253,17 +253,20 @@ class Engine:
         yield frame
         yield from self._compared_at_rest(frame, fine, checkpoint)
 
-    def _compared(self, frame: Frame) -> Frame:
-        """The frame with other methods beside ours, as far as they are known."""
+    def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
+        """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
         learned = self.nominal(frame.scenario).learned
-        return replace(frame, comparison=self.comparison.of(frame, learned))
+        return replace(frame, comparison=self.comparison.of(frame, learned, notes))
 
     def _compared_at_rest(self, frame: Frame, solved: Solved | None, checkpoint: Checkpoint) -> Iterator[Frame]:
         """The last frame again and again, each with more of what is known of other methods."""
-        for step in self.comparison.steps(frame, self.nominal(frame.scenario).learned, solved):
+        left = self.comparison.complete(frame, self.nominal(frame.scenario).learned, solved)
+        while True:
             with _in_turn(checkpoint):
-                step()
-                frame = self._compared(frame)
+                notes = next(left, None)
+                if notes is None:
+                    return
+                frame = self._compared(frame, notes)
             yield frame
 
     def _rollouts(self, scenario: Scenario, precision: Precision) -> Frame:
