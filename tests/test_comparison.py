@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pages import frame_of
-from scenes import changed
+from scenes import avoiding, changed
 
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.eflow import EFlow
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.engine.comparison import NEXT, OTHERS, WAITS, curves, scored
+from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
 from dt_viz.evaluate.table1 import drawn
 from dt_viz.interruption import UnwantedError
@@ -20,6 +21,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.paper_scenes import FIG_6_DIAMETER, FIG_6_PLACES
 from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.compare import ComparePanel, _compare, _with_their_arm, hint, table_html
 from dt_viz.ui.scene.comparison import APART, COLOURS, ComparedMotions, TheirArm
@@ -179,6 +181,19 @@ def test_a_method_that_cannot_plan_says_why(new_engine, initial, monkeypatch, er
     found = by_name(frame)
     assert told in found["eflow"].note and not found["eflow"].paths and found["eflow"].scores is None
     assert found[LIVE].scores.arm_depth is not None
+
+
+def test_of_a_single_demonstration_by_the_user_what_can_be_fitted_is_and_the_rest_says_why_not(fits, robot):
+    (demonstration, *_) = TASKS["draw_j"]().demonstrations
+    own = TaskEntry("Mine", lambda: drawing_task("mine", "Mine", "", (demonstration,)))
+    engine = Engine({"mine": own}, fits, robot)
+    *_, frame = engine.frames(shown(avoiding("mine"), "eflow", "eflow-repulsive", "mpnet", LIVE, "modulation"))
+    found = by_name(frame)
+    for name in ("ours", LIVE, "modulation"):
+        assert len(found[name].paths) == 1 and not found[name].note
+    for name, trained in (("eflow", "eflow"), ("eflow-repulsive", "eflow"), ("mpnet", "mpnet")):
+        assert not found[name].paths and found[name].scores is None
+        assert f"{trained} has not been trained for 'Mine'" in found[name].note
 
 
 def test_interrupted_between_or_within_steps_it_goes_on_later(new_engine, initial):
