@@ -1,8 +1,11 @@
 """Modulation: nothing flows into an obstacle, nothing changes far away, and motions are those of the velocity."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from dt_viz.baselines import modulation
 from dt_viz.baselines.modulation import Modulation, modulated
 from dt_viz.baselines.registry import problem_of
 from dt_viz.baselines.surface import distance_and_normal
@@ -104,6 +107,16 @@ def test_on_the_page_it_stays_near_the_motion_that_is_exact(problem):
     quick, exact = (Modulation(t).fit(problem).plan(obstacle, problem.task.starts) for t in (1.5e-3, 1e-5))
     for a, b in zip(quick.paths, exact.paths, strict=True):
         assert np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1).max() < 0.01
+
+
+def test_the_table_moves_motions_by_less_than_a_tenth_of_a_millimetre(problem):
+    x, y, z = problem.task.mean_path[50]
+    obstacle, starts = Union((Sphere((x, y, z + 0.02), 0.15),)), problem.task.starts
+    planner = Modulation().fit(problem)
+    assert isinstance(planner, modulation._Planner)
+    exact = replace(planner, system=problem.learned.system).plan(obstacle, starts)
+    apart = [np.abs(a - b).max() for a, b in zip(planner.plan(obstacle, starts).paths, exact.paths, strict=True)]
+    assert 0 < max(apart) < 1e-4
 
 
 def test_a_motion_straight_at_the_centre_stops_before_the_obstacle(problem):

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pages import frame_of
-from scenes import changed
+from scenes import avoiding, changed
 
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.eflow import EFlow
 from dt_viz.baselines.registry import METHODS, problem_of
-from dt_viz.engine.comparison import OTHERS, WAITS, curves, scored
+from dt_viz.engine.comparison import NEXT, OTHERS, WAITS, curves, scored
+from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
 from dt_viz.evaluate.table1 import drawn
 from dt_viz.interruption import UnwantedError
@@ -20,6 +21,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.paper_scenes import FIG_6_DIAMETER, FIG_6_PLACES
 from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.compare import ComparePanel, _compare, _with_their_arm, hint, table_html
 from dt_viz.ui.scene.comparison import APART, COLOURS, ComparedMotions, TheirArm
@@ -54,6 +56,46 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
     assert all(len(compared.paths) == 7 and compared.scores.arm_depth is not None for compared in last.values())
     told = [sum(c.scores is not None and c.scores.arm_depth is not None for c in frame.comparison) for frame in frames]
     assert told == sorted(told) and told[3] == 0 and set(told) == {0, 1, 2, 3}
+
+
+def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
+    engine, first, second = new_engine(), "eflow-repulsive-fine", SLOW
+    planned = type(engine.comparison)._planned
+    begun = []
+
+    def noted(self, method, *args):
+        begun.append(method.name)
+        return planned(self, method, *args)
+
+    monkeypatch.setattr(type(engine.comparison), "_planned", noted)
+    said = []
+    for frame in engine.frames(shown(initial("push_box"), first, second, LIVE)):
+        found = by_name(frame)
+        if found:
+            assert not found[LIVE].note
+            said.append((found[first].note, found[second].note, tuple(begun)))
+    expected = [
+        (WAITS, WAITS, (LIVE,)),  # while it may be dragged on
+        ("planning … (1 of 2)", NEXT, (LIVE,)),  # said before it begins
+        ("", "planning … (2 of 2)", (LIVE, first)),
+        ("", "", (LIVE, first, second)),
+    ]
+    assert list(dict.fromkeys(said)) == expected
+
+
+def test_an_edit_ends_the_planning_of_a_slow_method_at_once(new_engine, initial):
+    engine, scenario = new_engine(), shown(initial("push_box"), SLOW)
+    frames, wanted = [], [True]
+
+    def leave():
+        if not wanted[0]:
+            raise UnwantedError
+
+    with pytest.raises(UnwantedError):
+        for frame in engine.frames(scenario, checkpoint=leave):
+            frames.append(frame)
+            wanted[0] = not by_name(frame).get(SLOW) or "planning" not in by_name(frame)[SLOW].note
+    assert by_name(frames[-1])[SLOW].note == "planning … (1 of 1)"
 
 
 def test_scores_are_those_of_the_motions(beside):
@@ -93,7 +135,7 @@ def test_scores_and_curves_find_what_is_wrong_with_a_motion(engine):
 
 def test_what_an_edit_leaves_unchanged_is_not_planned_again(beside, monkeypatch):
     engine, scenario, _ = beside
-    monkeypatch.setattr(type(engine.comparison), "_plan", lambda *_: pytest.fail("planned again"))
+    monkeypatch.setattr(type(engine.comparison), "_planned", lambda *_: pytest.fail("planned again"))
     *_, frame = engine.frames(replace(scenario, arm_rollout=2))
     assert by_name(frame)[SLOW].rollout == 2
     *_, frame = engine.frames(shown(scenario, SLOW))
@@ -139,6 +181,19 @@ def test_a_method_that_cannot_plan_says_why(new_engine, initial, monkeypatch, er
     found = by_name(frame)
     assert told in found["eflow"].note and not found["eflow"].paths and found["eflow"].scores is None
     assert found[LIVE].scores.arm_depth is not None
+
+
+def test_of_a_single_demonstration_by_the_user_what_can_be_fitted_is_and_the_rest_says_why_not(fits, robot):
+    (demonstration, *_) = TASKS["draw_j"]().demonstrations
+    own = TaskEntry("Mine", lambda: drawing_task("mine", "Mine", "", (demonstration,)))
+    engine = Engine({"mine": own}, fits, robot)
+    *_, frame = engine.frames(shown(avoiding("mine"), "eflow", "eflow-repulsive", "mpnet", LIVE, "modulation"))
+    found = by_name(frame)
+    for name in ("ours", LIVE, "modulation"):
+        assert len(found[name].paths) == 1 and not found[name].note
+    for name, trained in (("eflow", "eflow"), ("eflow-repulsive", "eflow"), ("mpnet", "mpnet")):
+        assert not found[name].paths and found[name].scores is None
+        assert f"{trained} has not been trained for 'Mine'" in found[name].note
 
 
 def test_interrupted_between_or_within_steps_it_goes_on_later(new_engine, initial):

@@ -5,25 +5,28 @@ eigenvalues λ_r = 1 − 1/Γ and λ_e = 1 + 1/Γ lead the velocity past it; Γ 
 Written from the published equations, since the authors' library `dynamic_obstacle_avoidance` is on no package index.
 
 Motions are stepped in base space, where the imitation's own are straight: y = ψ⁻¹(z) and ż = (Dψ⁻¹)⁻¹ẏ need ψ⁻¹ only,
-the quick side of ψ.
+the quick side of ψ. The modulation is linear in the velocity, so that its paths do not depend on the imitation's pace:
+they are stepped as if that were 1 in base space, where no step is lost on its changes, and timed afterwards.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.surface import distance_and_normal
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.flows.tabulated import tabulated
 from dt_viz.interruption import checkpoint
-from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
+from dt_viz.properties import cached_property
 
 LEAST_SLANT = 0.1
 """Least n·r: beyond it the surface is not star-shaped about the reference point, and the modulation not defined."""
@@ -41,9 +44,15 @@ NEAR_GOAL = 2e-3
 """Distance from the goal at which a motion counts as arriving, metres."""
 NUM_STEPS = 2000
 """Largest number of steps."""
-SLOWEST = 2e-3
-"""Speed of a motion that is stuck before an obstacle, m/s."""
-NUM_BETWEEN = 4
+SLOWEST = 0.01
+"""Part of the imitation's speed at which a motion is stuck before an obstacle."""
+LEAST = 1e-3
+"""Smallest ‖dy/ds‖ that a step is measured by."""
+NUM_KEPT = 4
+"""Number of sets of starts whose images are kept."""
+MARGIN = 0.2
+"""Distance beyond the imitation's motions, in base space, to which ψ⁻¹ is tabulated, metres."""
+NUM_BETWEEN = 3
 """Number of samples for each step."""
 
 
@@ -85,40 +94,40 @@ def modulated(obstacle: Union, y: Array, v: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Motions at one moment each."""
+    """Motions at one place each; derivatives are by the distance s that the imitation would go in base space."""
 
     z: Array
     rate: Array
-    """ż (N, 3)."""
+    """dz/ds (N, 3)."""
     y: Array
     stretch: Array
     """Dψ⁻¹ (N, 3, 3)."""
     speed: Array
-    """‖ẏ‖ (N,), m/s."""
+    """‖dy/ds‖ (N,)."""
+    share: Array
+    """The same relative to the imitation's (N,)."""
     distance: Array
     """(N,) from the obstacles, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Planner:
-    learned: Learned
+    system: DiffeomorphicSystem
+    """Our imitation; ψ⁻¹ is read from a table where motions pass obstacles of usual size."""
+    goal: Array
+    """(3,), metres."""
     tolerance: float
-
-    @property
-    def system(self) -> DiffeomorphicSystem:
-        """Our imitation."""
-        return self.learned.system
 
     def plan(self, obstacle: Union, starts: Array) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
-        state = self._state(obstacle, self.system.transform.forward(starts))
-        states, times = [state], [np.zeros(len(starts))]
-        moving, h = self._moving(state), FIRST / np.maximum(state.speed, SLOWEST)
+        state = self._state(obstacle, self._images(starts.tobytes()))
+        states, gone = [state], [np.zeros(len(starts))]
+        moving, h = self._moving(state), FIRST / np.maximum(state.speed, LEAST)
         while moving.any() and len(states) < NUM_STEPS:
             checkpoint()
             bend = np.zeros_like(state.z)
             if len(states) > 1:  # the method of Adams and Bashforth, of order 2, with steps of their own
-                last = times[-1] - times[-2]
+                last = gone[-1] - gone[-2]
                 slope = (state.rate - states[-2].rate) / np.where(last > 0, last, 1)[:, None]
                 error = np.linalg.norm((state.stretch @ slope[..., None])[..., 0], axis=1) * last**2 / 2
                 allowed = SAFETY * np.sqrt(self.tolerance / np.maximum(error, np.finfo(float).tiny))
@@ -127,45 +136,60 @@ class _Planner:
             h = np.where(moving, h, 0.0)
             state = self._state(obstacle, state.z + h[:, None] * (state.rate + bend))
             states.append(state)
-            times.append(times[-1] + h)
+            gone.append(gone[-1] + h)
             moving &= self._moving(state)
-        return self._densely(states, np.stack(times, axis=1), starts)
+        return self._densely(states, np.stack(gone, axis=1))
+
+    @cached_property
+    def _images(self) -> Callable[[bytes], Array]:
+        """ψ of starts (R, 3), as bytes; those asked for lately are kept, for they stay while an obstacle is dragged."""
+        forward = self.system.transform.forward
+        return lru_cache(NUM_KEPT)(lambda starts: forward(np.frombuffer(starts).reshape(-1, 3)))
 
     def _state(self, obstacle: Union, z: Array) -> _State:
         y, D = self.system.transform.inverse_jacobian(z)
-        v, distance = modulated(obstacle, y, (D @ self.system.base.velocity(z)[..., None])[..., 0])
+        left = self.system.base.goal - z
+        forward = left / np.maximum(np.linalg.norm(left, axis=1), np.finfo(float).tiny)[:, None]
+        imitated = (D @ forward[..., None])[..., 0]
+        v, distance = modulated(obstacle, y, imitated)
         rate = np.linalg.solve(D, v[..., None])[..., 0]
-        return _State(z, rate, y, D, np.linalg.norm(v, axis=1), distance)
+        speed = np.linalg.norm(v, axis=1)
+        share = speed / np.maximum(np.linalg.norm(imitated, axis=1), np.finfo(float).tiny)
+        return _State(z, rate, y, D, speed, share, distance)
 
     def _bounded(self, h: Array, state: _State) -> Array:
-        """Durations (N,) of the next steps, seconds, within the bounds of their lengths."""
-        to_goal = np.linalg.norm(state.y - self.learned.goal, axis=1)
+        """Steps (N,) of s, metres, within the bounds of their lengths."""
+        to_goal = np.linalg.norm(state.y - self.goal, axis=1)
         most = np.minimum(APPROACH * np.minimum(to_goal, np.maximum(state.distance, 0) + BESIDE), LONGEST)
-        return np.clip(h * state.speed, np.minimum(SHORTEST, most), most) / np.maximum(state.speed, SLOWEST)
+        return np.clip(h * state.speed, np.minimum(SHORTEST, most), most) / np.maximum(state.speed, LEAST)
 
     def _moving(self, state: _State) -> Mask:
         """Which motions (N,) have neither arrived nor got stuck."""
-        return (np.linalg.norm(state.y - self.learned.goal, axis=1) > NEAR_GOAL) & (state.speed > SLOWEST)
+        return (np.linalg.norm(state.y - self.goal, axis=1) > NEAR_GOAL) & (state.share > SLOWEST)
 
-    def _densely(self, states: list[_State], times: Array, starts: Array) -> Plan:
+    def _densely(self, states: list[_State], gone: Array) -> Plan:
         """The motions with samples between their steps, on cubic curves, and with the goal where they arrive."""
         z, rate = (np.stack([getattr(state, name) for state in states], axis=1) for name in ("z", "rate"))
-        base, ends = self.system.base, states[-1]
-        arrived = np.linalg.norm(ends.y - self.learned.goal, axis=1) <= NEAR_GOAL
-        within = np.arange(NUM_BETWEEN) / NUM_BETWEEN
-        images, dues = [], []
-        for k in range(len(starts)):
-            steps = 1 + int((np.diff(times[k]) > 0).sum())
-            t, nodes = times[k, :steps], z[k, :steps]
-            due = np.append((t[:-1, None] + np.diff(t)[:, None] * within).ravel(), t[-1])
-            image = CubicHermiteSpline(t, nodes, rate[k, :steps])(due) if steps > 1 else nodes
+        base, h = self.system.base, np.diff(gone)[..., None, None]
+        u = (np.arange(NUM_BETWEEN) / NUM_BETWEEN)[:, None]
+        chord, start, end = np.diff(z, axis=1)[:, :, None], h * rate[:, :-1, None], h * rate[:, 1:, None]
+        between = z[:, :-1, None] + u * start + u**2 * (3 * chord - 2 * start - end + u * (start + end - 2 * chord))
+        images = [
+            np.concatenate([some[step > 0].reshape(-1, 3), last[None]])
+            for some, step, last in zip(between, h[..., 0, 0], z[:, -1], strict=True)
+        ]
+        counts = np.array([len(image) for image in images])
+        pace = np.linalg.norm(base.velocity(np.concatenate(images)), axis=1)
+        arrived = np.linalg.norm(states[-1].y - self.goal, axis=1) <= NEAR_GOAL
+        arrival = np.maximum(base.arrival_time(z[:, -1], ARRIVED), ARRIVED)
+        dues = []
+        for k, own in enumerate(np.split(pace, np.cumsum(counts)[:-1])):
+            steps = np.repeat(h[k][h[k] > 0] / NUM_BETWEEN, NUM_BETWEEN)
+            due = np.append(0.0, np.cumsum(steps / np.sqrt(own[1:] * own[:-1])))
             if arrived[k]:
-                image = np.vstack([image, base.goal])
-                due = np.append(due, due[-1] + np.maximum(base.arrival_time(nodes[-1], ARRIVED), ARRIVED))
-            images.append(image)
+                images[k], due = np.vstack([images[k], base.goal]), np.append(due, due[-1] + arrival[k])
             dues.append(due)
-        ends_at = np.cumsum([len(image) for image in images])[:-1]
-        paths = np.split(self.system.transform.inverse(np.concatenate(images)), ends_at)
+        paths = np.split(self.system.transform.inverse(np.concatenate(images)), np.cumsum(counts + arrived)[:-1])
         return Plan(tuple(paths), tuple(dues))
 
 
@@ -181,5 +205,8 @@ class Modulation(Method):
         self.tolerance = tolerance
 
     def fit(self, problem: Problem) -> Planner:
-        """Take what is learned already; see `Method`."""
-        return _Planner(problem.learned, self.tolerance)
+        """Take what is learned already, and tabulate it; see `Method`."""
+        learned = problem.learned
+        rays = np.concatenate([learned.demonstrated.rays.z0, [learned.system.base.goal]])
+        transform = tabulated(learned.system.transform, rays, MARGIN)
+        return _Planner(replace(learned.system, transform=transform), learned.goal, self.tolerance)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,11 +33,11 @@ NEWEST = 32
 """Number of plans that are kept."""
 TOLERANCE = 1e-4
 """By how much a maximum collision distance may be too small, metres."""
-WAITS, NO_WAY = "planned when the obstacle rests", "finds no way"
+WAITS, NEXT, NO_WAY = "waits for the obstacle to rest", "waits for its turn", "finds no way"
 
 
 @dataclass(frozen=True, eq=False)
-class _Planned:
+class _Motions:
     """Motions of a method, from the starts of the demonstrations."""
 
     paths: tuple[Array, ...] = ()
@@ -50,6 +50,22 @@ class _Planned:
     note: str = ""
 
 
+@dataclass(eq=False)
+class _Record:
+    """What is known of a method around an obstacle; it grows while the obstacle rests."""
+
+    motions: _Motions | None = None
+    """None until they are planned."""
+    arm_depth: float | None = None
+    """Maximum collision distance of the arm's meshes, metres; None until it is known, or where there is no motion."""
+    is_complete: bool = False
+    """Whether nothing is left to work out."""
+    curves: dict[int, Array] = field(default_factory=dict)
+    """Those of `Compared`, by the rollout."""
+    arms: dict[int, ArmMotion] = field(default_factory=dict)
+    """Motions of the arm, by the rollout that they follow."""
+
+
 class Comparison:
     """Motions of other methods, for one engine and on its thread; what an edit leaves unchanged is kept."""
 
@@ -57,97 +73,104 @@ class Comparison:
         """Compare methods for this arm."""
         self._follower, self._memo = follower, memo
 
-    def of(self, frame: Frame, learned: Learned) -> tuple[Compared, ...]:
+    def of(self, frame: Frame, learned: Learned, notes: Mapping[str, str] | None = None) -> tuple[Compared, ...]:
         """The methods that the view of a frame shows, ours first; those that do not follow a drag as far as known.
 
         Args:
             frame: ours, at any stage.
             learned: its task, learned.
+            notes: what is said of methods, by their names, while they are not planned.
         """
-        scenario = frame.scenario
-        chosen = _chosen(scenario)
-        if not chosen:
-            return ()
-        known = [self._known(method, learned, scenario.obstacle) for method in chosen]
+        chosen = _chosen(frame.scenario)
         rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
+        for method in chosen:
+            if method.live:
+                self._plan(method, frame, learned)
         return tuple(
-            Compared(
-                method,
-                planned.paths,
-                self._with_arm_depth(method, planned.scores, scenario, learned),
-                curves(planned.paths[rollout], learned.task.paths[rollout], scenario.obstacle)
-                if planned.paths
-                else None,
-                rollout,
-                planned.note,
-                self._their_arm(method, planned, learned, scenario, rollout),
-            )
-            for method, planned in ((OURS, _ours(frame)), *zip(chosen, known, strict=True))
+            self._compared(method, frame, learned, rollout, (notes or {}).get(method.name, WAITS))
+            for method in ((OURS, *chosen) if chosen else ())
         )
 
-    def steps(self, frame: Frame, learned: Learned, solved: Solved | None) -> Iterator[Callable[[], object]]:
-        """What is left to work out for a scenario that rests, in steps after each of which `of` tells more.
+    def complete(self, frame: Frame, learned: Learned, solved: Solved | None) -> Iterator[Mapping[str, str]]:
+        """Work out what is left for a scenario that rests; stops whenever `of` would tell more.
 
         Args:
             frame: ours.
             learned: its task, learned.
             solved: our motion; None where there is none.
+
+        Yields:
+            Notes for `of`: which method is planned next, and how many are left.
         """
-        scenario = frame.scenario
-        for method in _chosen(scenario):
-            if not method.live and not self._memo.has("their plan", (method.name, learned, scenario.obstacle)):
-                yield lambda method=method: self._planned(method, learned, scenario.obstacle)
-        if not scenario.obstacle.parts or not _chosen(scenario):
+        chosen = _chosen(frame.scenario)
+        slow = [method for method in chosen if self._record(method, frame, learned).motions is None]
+        for k, method in enumerate(slow):
+            left = {later.name: NEXT for later in slow[k + 1 :]}
+            yield {method.name: f"planning … ({k + 1} of {len(slow)})", **left}
+            self._plan(method, frame, learned)
+        if slow:
+            yield {}
+        if not frame.scenario.obstacle.parts:
             return
-        if solved is not None and not self._memo.has("arm depth", _depth_key(OURS, scenario, learned)):
-            yield lambda: self._memo(
-                "arm depth", _depth_key(OURS, scenario, learned), lambda: self._our_depth(frame, solved), newest=NEWEST
-            )
-        for method in _chosen(scenario):
-            if not self._memo.has("arm depth", _depth_key(method, scenario, learned)):
-                yield lambda method=method: self._memo(
-                    "arm depth",
-                    _depth_key(method, scenario, learned),
-                    lambda: self._depth(method, learned, scenario.obstacle),
-                    newest=NEWEST,
-                )
+        for method in (OURS, *chosen) if chosen else ():
+            record = self._record(method, frame, learned)
+            if not record.is_complete:
+                record.arm_depth = self._arm_depth(method, record, frame, learned, solved)
+                record.is_complete = True
+                yield {}
 
-    def _known(self, method: Method, learned: Learned, obstacle: Union) -> _Planned:
-        if method.live or self._memo.has("their plan", (method.name, learned, obstacle)):
-            return self._planned(method, learned, obstacle)
-        return _Planned(note=WAITS)
+    def _record(self, method: Method, frame: Frame, learned: Learned) -> _Record:
+        """What is known of a method around the obstacle of a frame: one place for all that is kept."""
+        obstacle = frame.scenario.obstacle
+        if method is not OURS:
+            return self._memo("compared", (method.name, learned, obstacle), _Record, newest=NEWEST)
+        shown = tuple(path.tobytes() for path in frame.rollouts), bool(frame.blocked)
+        return self._memo("ours", (learned, frame.scenario.motion, shown), lambda: _Record(_ours(frame)), newest=NEWEST)
 
-    def _planned(self, method: Method, learned: Learned, obstacle: Union) -> _Planned:
-        return self._memo(
-            "their plan",
-            (method.name, learned, obstacle),
-            lambda: self._scored(method, learned, obstacle),
-            newest=NEWEST,
+    def _compared(self, method: Method, frame: Frame, learned: Learned, rollout: int, waiting: str) -> Compared:
+        """What is known of a method; `waiting` is its note while its motions are not."""
+        record, obstacle = self._record(method, frame, learned), frame.scenario.obstacle
+        motions = record.motions or _Motions(note=waiting)
+        if motions.paths and rollout not in record.curves:
+            record.curves[rollout] = curves(motions.paths[rollout], learned.task.paths[rollout], obstacle)
+        shows_arm = frame.scenario.view.their_arm == method.name
+        if shows_arm and rollout not in record.arms and motions.times and len(motions.times[rollout]) > 1:
+            record.arms[rollout] = self._arm(motions, learned, rollout)
+        return Compared(
+            method,
+            motions.paths,
+            motions.scores and replace(motions.scores, arm_depth=record.arm_depth),
+            record.curves.get(rollout),
+            rollout,
+            motions.note,
+            record.arms.get(rollout) if shows_arm else None,
         )
 
-    def _scored(self, method: Method, learned: Learned, obstacle: Union) -> _Planned:
-        """The motions of a method, scored; those that do not avoid are planned once for all obstacles."""
-        seen = obstacle if method.avoids else Union()
-        planned = self._memo(
-            "their motions", (method.name, learned, seen), lambda: self._plan(method, learned, seen), newest=NEWEST
-        )
-        if planned.scores is None or method.avoids:
-            return planned
-        return replace(planned, scores=replace(planned.scores, hand_depth=hand_depth(planned.paths, obstacle)))
+    def _plan(self, method: Method, frame: Frame, learned: Learned) -> None:
+        """Plan a method's motions unless they are known; those that do not avoid are the same around all obstacles."""
+        record, obstacle = self._record(method, frame, learned), frame.scenario.obstacle
+        if record.motions is not None:
+            return
+        if method.avoids:
+            record.motions = self._planned(method, learned, obstacle)
+            return
+        motions = self._memo("motions", (method.name, learned), lambda: self._planned(method, learned, Union()))
+        scores = motions.scores and replace(motions.scores, hand_depth=hand_depth(motions.paths, obstacle))
+        record.motions = replace(motions, scores=scores)
 
-    def _plan(self, method: Method, learned: Learned, obstacle: Union) -> _Planned:
+    def _planned(self, method: Method, learned: Learned, obstacle: Union) -> _Motions:
         planner = self._memo("planner", (method.name, learned), lambda: self._fitted(method, learned), newest=NEWEST)
         if isinstance(planner, str):
-            return _Planned(note=planner)
+            return _Motions(note=planner)
         try:
             plan = planner.plan(obstacle, learned.task.starts)
         except UnreachableError as error:
-            return _Planned(note=str(error))
+            return _Motions(note=str(error))
         stays = sum(len(path) < 2 for path in plan.paths)
         notes = (*plan.warnings, *([f"{NO_WAY} from {stays} of {len(plan.paths)} starts"] if stays else []))
         paths = tuple(path if len(path) > 1 else np.repeat(path, 2, axis=0) for path in plan.paths)
         scores = scored(paths, learned.task, learned.goal, obstacle)
-        return _Planned(paths, plan.times, plan.joints, scores, "; ".join(notes))
+        return _Motions(paths, plan.times, plan.joints, scores, "; ".join(notes))
 
     def _fitted(self, method: Method, learned: Learned) -> Planner | str:
         """The planner of a method for a task, or why there is none."""
@@ -161,58 +184,46 @@ class Comparison:
     def _problem(self, learned: Learned) -> Problem:
         return self._memo("problem", learned, lambda: problem_of(learned, self._follower), newest=NEWEST)
 
-    def _with_arm_depth(
-        self, method: Method, scores: Scores | None, scenario: Scenario, learned: Learned
-    ) -> Scores | None:
-        key = _depth_key(method, scenario, learned)
-        if scores is None or not self._memo.has("arm depth", key):
-            return scores
-        return replace(scores, arm_depth=self._memo("arm depth", key, lambda: None))
-
-    def _their_arm(
-        self, method: Method, planned: _Planned, learned: Learned, scenario: Scenario, rollout: int
-    ) -> ArmMotion | None:
-        """The arm's motion along a rollout of a method, where the view shows it."""
-        if scenario.view.their_arm != method.name or not planned.times or len(planned.times[rollout]) < 2:
-            return None
-        key = (method.name, learned, scenario.obstacle, rollout)
-        return self._memo("their arm", key, lambda: self._moved(planned, learned, rollout), newest=2)
-
-    def _moved(self, planned: _Planned, learned: Learned, rollout: int) -> ArmMotion:
-        q = self._joints(planned, learned, rollout)
-        times = planned.times[rollout]
-        if planned.joints is None:
+    def _arm(self, motions: _Motions, learned: Learned, rollout: int) -> ArmMotion:
+        """The arm's motion along a rollout of a method."""
+        q, times = self._joints(motions, learned, rollout), motions.times[rollout]
+        if motions.joints is None:
             times = times[_tracked(len(times))]
         return ArmMotion(within_velocity_limits(times, q, self._follower.robot.velocity_limits), q, q)
 
-    def _joints(self, planned: _Planned, learned: Learned, rollout: int) -> Array:
+    def _joints(self, motions: _Motions, learned: Learned, rollout: int) -> Array:
         """Postures (N, 6), rad, along a rollout: planned, or tracking it from the demonstration's first posture."""
-        if planned.joints is not None:
-            return planned.joints[rollout]
-        path = planned.paths[rollout]
+        if motions.joints is not None:
+            return motions.joints[rollout]
+        path = motions.paths[rollout]
         start = self._problem(learned).postures[rollout][0]
         return track(self._follower.robot, path[_tracked(len(path))], start).q
 
-    def _depth(self, method: Method, learned: Learned, obstacle: Union) -> float | None:
+    def _arm_depth(
+        self, method: Method, record: _Record, frame: Frame, learned: Learned, solved: Solved | None
+    ) -> float | None:
         """How deep the arm's meshes enter the obstacle along a method's motions, metres; None where there are none."""
-        planned = self._planned(method, learned, obstacle)
-        if not planned.paths:
+        motions, obstacle = record.motions, frame.scenario.obstacle
+        if motions is None or not motions.paths:
             return None
-        return self._deepest([self._joints(planned, learned, k) for k in range(len(planned.paths))], obstacle)
-
-    def _our_depth(self, frame: Frame, solved: Solved) -> float | None:
+        if method is not OURS:
+            return _deepest([self._joints(motions, learned, k) for k in range(len(motions.paths))], obstacle)
+        if solved is None:
+            return None
         try:
             arms = [arm_along(frame, solved, k, self._follower)[0] for k in range(len(frame.rollouts))]
         except UnreachableError:
             return None
-        return self._deepest([arm.q for arm in arms], frame.scenario.obstacle)
+        return _deepest([arm.q for arm in arms], obstacle)
 
-    def _deepest(self, joints: list[Array], obstacle: Union) -> float:
-        model, depth = load_collision_model(), 0.0
-        for q in joints:
-            checkpoint()
-            depth = max(depth, -model.nearest_to_obstacle(q, obstacle).distance)
-        return depth
+
+def _deepest(joints: list[Array], obstacle: Union) -> float:
+    """How deep the arm's meshes enter an obstacle along postures (N_i, 6), rad, metres; 0 when they are clear."""
+    model, depth = load_collision_model(), 0.0
+    for q in joints:
+        checkpoint()
+        depth = max(depth, -model.nearest_to_obstacle(q, obstacle).distance)
+    return depth
 
 
 def scored(paths: tuple[Array, ...], task: Task, goal: Array, obstacle: Union) -> Scores:
@@ -259,17 +270,13 @@ def _chosen(scenario: Scenario) -> list[Method]:
     return [method for method in OTHERS if method.name in scenario.view.compared]
 
 
-def _depth_key(method: Method, scenario: Scenario, learned: Learned) -> tuple[object, ...]:
-    return (scenario.motion,) if method is OURS else (method.name, learned, scenario.obstacle)
-
-
-def _ours(frame: Frame) -> _Planned:
+def _ours(frame: Frame) -> _Motions:
     """Our motions, those from the starts of the demonstrations that have one."""
     if frame.blocked:
-        return _Planned(note="; ".join(warning.text for warning in frame.blocked[:1]))
+        return _Motions(note="; ".join(warning.text for warning in frame.blocked[:1]))
     paths = frame.rollouts[: len(frame.rollouts) - frame.num_added]
     if len(paths) < len(frame.task.starts):
-        return _Planned(note=f"{NO_WAY} from some starts")
-    return _Planned(
+        return _Motions(note=f"{NO_WAY} from some starts")
+    return _Motions(
         paths, frame.times[: len(paths)], None, scored(paths, frame.task, frame.goal, frame.scenario.obstacle)
     )

@@ -257,9 +257,11 @@ class Engine:
         yield frame
         yield from self._compared_at_rest(frame, fine, checkpoint)
 
-    def _compared(self, frame: Frame) -> Frame:
-        """The frame with other methods beside ours, as far as they are known."""
-        return replace(frame, comparison=self.comparison.of(frame, self._plain(frame.scenario)))
+    def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
+        """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
+        if not frame.scenario.view.compared:
+            return replace(frame, comparison=())
+        return replace(frame, comparison=self.comparison.of(frame, self._plain(frame.scenario), notes))
 
     def _plain(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the plain state, which other methods are compared with."""
@@ -267,10 +269,15 @@ class Engine:
 
     def _compared_at_rest(self, frame: Frame, solved: Solved | None, checkpoint: Checkpoint) -> Iterator[Frame]:
         """The last frame again and again, each with more of what is known of other methods."""
-        for step in self.comparison.steps(frame, self._plain(frame.scenario), solved):
+        if not frame.scenario.view.compared:
+            return
+        left = self.comparison.complete(frame, self._plain(frame.scenario), solved)
+        while True:
             with _in_turn(checkpoint):
-                step()
-                frame = self._compared(frame)
+                notes = next(left, None)
+                if notes is None:
+                    return
+                frame = self._compared(frame, notes)
             yield frame
 
     def _rollouts(self, scenario: Scenario, precision: Precision) -> Frame:

@@ -52,10 +52,11 @@ class ComparePanel:
     def __init__(self, gui: viser.GuiApi, bindings: Bindings) -> None:
         """Build the controls in the tab that is open."""
         self._gui, self._drawn = gui, ()
-        for method in OTHERS:
-            label = SHORT.get(method.name, method.title)
-            box = gui.add_checkbox(label, False, disabled=bool(method.missing), hint=hint(method))
-            bindings.input(box, partial(_is_compared, method.name), partial(_compare, method.name))
+        with gui.add_folder("Methods"):  # closed by a click, so that the table is seen at once on a small screen
+            for method in OTHERS:
+                label = SHORT.get(method.name, method.title)
+                box = gui.add_checkbox(label, False, disabled=bool(method.missing), hint=hint(method))
+                bindings.input(box, partial(_is_compared, method.name), partial(_compare, method.name))
         self.table = gui.add_html("", visible=False)
         titles = {method.title: method.name for method in OTHERS if not method.missing}
         by_name = {name: title for title, name in titles.items()}
@@ -104,9 +105,11 @@ def hint(method: Method) -> str:
 
 def table_html(comparison: Sequence[Compared]) -> str:
     """Return a table of how the methods fare, each with its promise or what keeps it from moving."""
-    head = "".join(f"<th title='{escape(why)}' style='{_CELL};opacity:0.65'>{name}</th>" for name, why in COLUMNS)
+    pale = f"{_CELL};opacity:0.65"
+    heads = "".join(f"<th title='{escape(why)}' style='{pale}'>{name}</th>" for name, why in COLUMNS)
+    head = f"<tr><th style='{pale};text-align:left'>mm</th>{heads}</tr>"
     rows = "".join(_row(compared) for compared in comparison)
-    table = f"<table style='border-collapse:collapse;width:100%'><tr><th></th>{head}</tr>{rows}</table>"
+    table = f"<table style='border-collapse:collapse;width:100%'>{head}{rows}</table>"
     return f"<div style='{SMALL}'>{table}</div>"
 
 
@@ -126,7 +129,7 @@ def _row(compared: Compared) -> str:
     cells = "".join(_cell(value, bad=k in (1, 2) and (value or 0) > DEEP) for k, value in enumerate(values))
     said = compared.note or method.promise
     below = f"<td colspan=5 style='opacity:0.65;padding-left:1.2em;white-space:normal'>{escape(said)}</td>"
-    return f"<tr>{name}{cells}</tr><tr>{below}</tr>"
+    return f"<tr style='vertical-align:baseline'>{name}{cells}</tr><tr>{below}</tr>"
 
 
 def _cell(metres: float | None, *, bad: bool) -> str:
