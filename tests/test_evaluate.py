@@ -5,6 +5,7 @@ import json
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,13 +17,14 @@ from dt_viz.arm.collision import load_collision_model
 from dt_viz.engine.frame import Stage
 from dt_viz.evaluate import drag, latency, rollouts
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.held_out import follow
+from dt_viz.evaluate.held_out import WAYS, follow
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.off_course import off_course
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.places import hand_room, shortest_shift
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
 from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
+from dt_viz.evaluate.worst import Case, worst_of
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.learning.augmented import fit_augmented
@@ -203,6 +205,27 @@ def test_held_out_motions_are_compared_at_equal_times(left_out):
                 apart.append(rms_at_equal_times(moments, path, times - times[0], positions))
             assert figures[f"{way}_rms_mm"] == pytest.approx(np.mean(apart), rel=1e-5)
     assert "RMS at equal times" in printed and "off the demonstrations" in printed
+
+
+def test_the_worst_of_what_was_held_out_is_drawn(left_out):
+    out, _ = left_out
+    panels = list(ElementTree.parse(out / "worst.svg").iterfind("{*}g"))
+    distances = [float("".join(panel.itertext()).split("  ")[1].split(" mm")[0]) for panel in panels]
+    (figures,) = json.loads((out / "figures.json").read_text())["held_out"]
+    assert np.mean(distances) == pytest.approx(figures["learned_mm"], abs=0.06)
+    assert distances == sorted(distances, reverse=True)  # of one shape, in which all have one extent
+    learned, goal = (panels[0].findall(f"{{*}}{kind}")[-1].attrib for kind in ("polyline", "circle"))
+    end = learned["points"].split()[-1].split(",")
+    assert [float(x) for x in end] == pytest.approx([float(goal["cx"]), float(goal["cy"])], abs=0.3)
+
+
+def test_the_worst_cases_are_the_farthest_off_for_their_size():
+    def case(name, off, size):
+        path = np.column_stack([np.linspace(0, size, 20), np.zeros(20)])
+        return Case(name, path, [path], dict.fromkeys(WAYS, path + np.array([0.0, off])), 1.0)
+
+    cases = [case("large", 3.0, 100.0), case("small", 1.0, 10.0), case("met", 0.1, 10.0)]
+    assert [c.name for c in worst_of(cases, 2)] == ["small", "large"]
 
 
 def test_what_is_off_course_is_told_of_a_motion_that_is_spoilt():

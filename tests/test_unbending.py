@@ -50,7 +50,7 @@ def same(one, other):
     return len(one) == len(other) and all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-@pytest.mark.parametrize("turns", [2, 3])
+@pytest.mark.parametrize("turns", [2, 4])
 def test_what_winds_is_followed_on_a_map_that_does_not_fold(turns):
     demonstrations = helix(turns)
     imitation = fit(demonstrations)
