@@ -21,6 +21,9 @@ after pushes (see `dt_viz.evaluate.off_course`). ``worst.svg`` shows the held-ou
 met worst, relative to the extent of their shape. ``--crossings`` adds synthetic demonstrations that cross, come back
 or wind (see `dt_viz.evaluate.crossings`).
 
+``--choose SEED`` chooses the constants of the augmented state on one half of the files and measures them on the other,
+both ways round (see `dt_viz.evaluate.choose`); ``choices.json`` holds what it prints.
+
 ``figures.json`` holds what the table shows, and ``shapes.png`` all shapes: the paper's fig. 5.
 """
 
@@ -37,6 +40,7 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.evaluate.choose import GRIDS, Choice, choose, measure
 from dt_viz.evaluate.crossings import crossings
 from dt_viz.evaluate.held_out import (
     WAYS,
@@ -110,21 +114,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--folds", type=whole_number(2), metavar="N", help="hold out in so many folds (default: one for each)"
     )
+    parser.add_argument(
+        "--choose", type=whole_number(0), metavar="SEED", help="also choose constants on half of the files"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 2 if one of the shapes could not be fitted."""
-    if not (options.files or options.crossings):
-        raise InputError("SHAPE", "no file", "files, or --crossings")
-    if options.state == "augmented" and options.objective != OBJECTIVES[0]:
-        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
     learn = partial(fit, settings=ImitationSettings(options.objective)) if options.state == "plain" else fit_augmented
-    if options.folds and not options.leave_one_out:
-        raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
     sources = _sources(options.files)
-    alone = [str(source.path) for source in sources if len(source.demonstrations) == 1]
-    if options.leave_one_out and alone:
-        raise InputError("--leave-one-out", f"one demonstration only in {', '.join(alone)}", "two or more in each")
+    _check(options, sources)
     folder = ready_folder(options.out)
     results: list[Figures] = []
     held_out: list[HeldOut] = []
@@ -162,9 +161,27 @@ def run(options: argparse.Namespace) -> int:
         chosen = {"state": options.state, "objective": options.objective}
         write_json(folder / "figures.json", {**chosen, "shapes": shapes, **written})
         draw_panels(folder / "shapes.png", panels)
+    if options.choose is not None:
+        _report_choices(sources, options.choose, folder)
     if options.crossings:
         _report_crossings(options.state, learn, folder)
     return 0 if len(results) == len(sources) else 2
+
+
+def _check(options: argparse.Namespace, sources: Sequence[Source]) -> None:
+    """Refuse options that do not go together, or with these files."""
+    if not (sources or options.crossings):
+        raise InputError("SHAPE", "no file", "files, or --crossings")
+    if options.state == "augmented" and options.objective != OBJECTIVES[0]:
+        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
+    if options.folds and not options.leave_one_out:
+        raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
+    alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
+    if options.leave_one_out and alone:
+        raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
+    if options.choose is not None and (options.state != "augmented" or len(sources) < 2 or alone):
+        accepted = "it with --state augmented and two or more files, each of two or more demonstrations"
+        raise InputError("--choose", str(options.choose), accepted)
 
 
 def measured(imitation: Learned, source: Source, fit_seconds: float) -> dict[str, Any]:
@@ -225,6 +242,13 @@ def compared(arrays: dict[str, Any], source: Source) -> Figures:
 
 def _held_out(source: Source, learn: Learn, folds: int | None, folder: Path) -> tuple[HeldOut, list[Case]]:
     """Follow each demonstration without having learned from it, and write the paths to the folder."""
+    row, cases, arrays = _followed(source, learn, folds)
+    write_npz(folder / f"{source.path.stem}-held-out.npz", **arrays)
+    return row, cases
+
+
+def _followed(source: Source, learn: Learn, folds: int | None) -> tuple[HeldOut, list[Case], dict[str, Array]]:
+    """Follow each demonstration without having learned from it; the figures, the cases and the paths."""
     num = len(source.demonstrations)
     folds = min(folds or num, num)
     arrays = {
@@ -232,12 +256,11 @@ def _held_out(source: Source, learn: Learn, folds: int | None, folder: Path) -> 
         for i, followed in enumerate(follow(source.demonstrations, learn, folds))
         for name, values in followed.items()
     }
-    write_npz(folder / f"{source.path.stem}-held-out.npz", **arrays)
     demonstrations = [d.positions / source.unit for d in source.demonstrations]
     times = [d.times for d in source.demonstrations]
     name, millimetres = source.path.stem, 1e3 * source.unit
     row = summed_up(name, folds, arrays, demonstrations, times, millimetres)
-    return row, cases_of(name, arrays, demonstrations, millimetres)
+    return row, cases_of(name, arrays, demonstrations, millimetres), arrays
 
 
 def _sources(paths: Sequence[Path]) -> list[Source]:
@@ -317,6 +340,27 @@ def _report_off_course(beside: Sequence[OffCourse]) -> None:
     mean = ("mean", *(f"{value:.3f}" for value in columns.mean(axis=0)))
     worst = (*columns[:, :-1].max(axis=0), columns[:, -1].min())
     print_table(("shape", *heads, "drawn after a push"), [*rows, mean, ("worst", *(f"{value:.3f}" for value in worst))])
+
+
+def _report_choices(sources: Sequence[Source], seed: int, folder: Path) -> None:
+    """Choose constants of the augmented state on each half of the files, and print what they do on the other."""
+    names = [source.path.stem for source in sources]
+    choices: list[Choice] = []
+    for grid in GRIDS:
+        measured = measure(grid, lambda: [_followed(source, fit_augmented, None)[0] for source in sources])
+        choices += choose(grid, measured, names, seed)
+    rows = [
+        (
+            choice.figure,
+            str(len(choice.chosen_on)),
+            ", ".join(f"{name} {value:g}" for name, value in choice.chosen),
+            *(f"{value:.2f}" for value in (choice.others_mm, choice.shipped_mm, choice.best_mm)),
+        )
+        for choice in choices
+    ]
+    print("\nconstants chosen on half of the files, and what they do on the others, mm")
+    print_table(("figure", "files", "chosen", "others", "others, as shipped", "others, their best"), rows)
+    write_json(folder / "choices.json", {"seed": seed, "choices": [asdict(choice) for choice in choices]})
 
 
 def _report_crossings(state: str, learn: Learn, folder: Path) -> None:
