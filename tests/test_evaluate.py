@@ -5,6 +5,7 @@ import json
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -14,17 +15,20 @@ from PIL import Image
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.engine.frame import Stage
-from dt_viz.evaluate import drag, latency, rollouts
+from dt_viz.evaluate import drag, imitation, latency, rollouts
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.held_out import follow
+from dt_viz.evaluate.choose import Grid, choose, measure
+from dt_viz.evaluate.held_out import WAYS, HeldOut, follow
 from dt_viz.evaluate.latency import Recorder
 from dt_viz.evaluate.off_course import off_course
 from dt_viz.evaluate.options import with_negative_values
 from dt_viz.evaluate.places import hand_room, shortest_shift
 from dt_viz.evaluate.rollouts import compare, stepped_adaptively
 from dt_viz.evaluate.starts import MAX_DEPARTURE, stepped_beside
+from dt_viz.evaluate.worst import Case, worst_of
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
+from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 from dt_viz.learning.imitation import fit, grown_grid
@@ -203,6 +207,62 @@ def test_held_out_motions_are_compared_at_equal_times(left_out):
                 apart.append(rms_at_equal_times(moments, path, times - times[0], positions))
             assert figures[f"{way}_rms_mm"] == pytest.approx(np.mean(apart), rel=1e-5)
     assert "RMS at equal times" in printed and "off the demonstrations" in printed
+
+
+def test_the_worst_of_what_was_held_out_is_drawn(left_out):
+    out, _ = left_out
+    panels = list(ElementTree.parse(out / "worst.svg").iterfind("{*}g"))
+    distances = [float("".join(panel.itertext()).split("  ")[1].split(" mm")[0]) for panel in panels]
+    (figures,) = json.loads((out / "figures.json").read_text())["held_out"]
+    assert np.mean(distances) == pytest.approx(figures["learned_mm"], abs=0.06)
+    assert distances == sorted(distances, reverse=True)  # of one shape, in which all have one extent
+    learned, goal = (panels[0].findall(f"{{*}}{kind}")[-1].attrib for kind in ("polyline", "circle"))
+    end = learned["points"].split()[-1].split(",")
+    assert [float(x) for x in end] == pytest.approx([float(goal["cx"]), float(goal["cy"])], abs=0.3)
+
+
+def test_the_worst_cases_are_the_farthest_off_for_their_size():
+    def case(name, off, size):
+        path = np.column_stack([np.linspace(0, size, 20), np.zeros(20)])
+        return Case(name, path, [path], dict.fromkeys(WAYS, path + np.array([0.0, off])), 1.0)
+
+    cases = [case("large", 3.0, 100.0), case("small", 1.0, 10.0), case("met", 0.1, 10.0)]
+    assert [c.name for c in worst_of(cases, 2)] == ["small", "large"]
+
+
+def test_constants_are_chosen_on_one_half_and_measured_on_the_other():
+    """Where each half of the shapes has a best setting of its own, it is chosen, and bad on the other half."""
+    grid, names = Grid({"NOISE": (0.2, augmented.NOISE)}, "learned_mm"), ["a", "b", "c", "d"]
+    first, _ = choose(grid, {setting: np.zeros(4) for setting in grid.settings}, names, seed=3)
+    on = np.array([name in first.chosen_on for name in names])
+    other, shipped = (("NOISE", 0.2),), grid.shipped
+    one, two = choose(grid, {shipped: np.where(on, 2.0, 1.0), other: np.where(on, 1.0, 4.0)}, names, seed=3)
+    assert (one.chosen, one.others_mm, one.shipped_mm, one.best_mm) == (other, 4.0, 1.0, 1.0)
+    assert (two.chosen, two.others_mm, two.shipped_mm, two.best_mm) == (shipped, 2.0, 2.0, 1.0)
+    assert set(one.chosen_on) | set(two.chosen_on) == set(names) and not set(one.chosen_on) & set(two.chosen_on)
+
+
+def test_settings_are_in_force_while_they_are_measured_only():
+    before, found = augmented.NOISE, []
+
+    def measured():
+        found.append(augmented.NOISE)
+        return [HeldOut("a", 2, *([augmented.NOISE] * 6))]
+
+    grid = Grid({"NOISE": (0.2, before, 1.2)}, "learned_mm")
+    values = measure(grid, measured)
+    assert found == [before, 0.2, 1.2] == [float(values[setting][0]) for setting in grid.settings]
+    assert before == augmented.NOISE
+
+
+def test_choosing_writes_what_it_prints(lasa, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(imitation, "GRIDS", (Grid({"NOISE": (augmented.NOISE, 3.0)}, "learned_mm"),))
+    write_mat(tmp_path / "Other.mat")
+    files, out = [str(lasa / "Hook.mat"), str(tmp_path / "Other.mat")], tmp_path / "out"
+    assert main(["imitation", *files, "--state", "augmented", "--choose", "1", "--out", str(out)]) == 0
+    choices = json.loads((out / "choices.json").read_text())["choices"]
+    assert [len(choice["chosen_on"]) for choice in choices] == [1, 1]
+    assert f"{choices[0]['shipped_mm']:.2f}" in capsys.readouterr().out
 
 
 def test_what_is_off_course_is_told_of_a_motion_that_is_spoilt():
@@ -657,6 +717,10 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
         (["avoidance", *TASK, *SPHERE, "--out", "file/a.npz"], "--out: found 'file/a.npz', which cannot be written"),
         (["starts", *TASK, "--out", "folder.npz"], "--out: found 'folder.npz', which cannot be written"),
         (["imitation", "Hook.mat", "--folds", "2", "--out", "out"], "--folds: found 2; accepted: it together with"),
+        (
+            ["imitation", "Hook.mat", "--choose", "0", "--out", "out"],
+            "--choose: found 0; accepted: it with --state aug",
+        ),
         (["drag", *TASK, "--from", "0,0,0", "--out", "a.npz"], "--from, --to: found one of them; accepted: both"),
         (["rollouts", "--task", "Draw S"], "--task: found 'Draw S'; accepted: draw_s, "),
     ],
@@ -709,7 +773,6 @@ def test_arguments_that_make_no_sense_are_refused(capsys, arguments, message):
 
 
 def test_a_shape_that_cannot_be_fitted_does_not_keep_the_others_from_it(lasa, tmp_path, monkeypatch, capsys):
-    from dt_viz.evaluate import imitation
     from dt_viz.learning.imitation import ImitationError
 
     def fit_only_in_the_plane(demonstrations, settings):

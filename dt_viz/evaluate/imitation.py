@@ -8,6 +8,8 @@ For each file the folder gets an npz, all lengths in the file's own unit (LASA: 
     common end of the motions.
 ``fit_seconds``
     the whole of `dt_viz.learning.imitation.fit`, certificates included, never from a cache.
+``start_seconds``
+    until the motion from a new start is known, its image in base space included; median.
 ``min_det_jacobian``, ``round_trip_error``
     smallest det J and largest ‖ψ⁻¹(ψ(x)) − x‖ on a grid over the demonstrations' box grown by half its size on every
     side, computed here, not taken from the fit.
@@ -15,8 +17,12 @@ For each file the folder gets an npz, all lengths in the file's own unit (LASA: 
 With ``--leave-one-out`` each demonstration is also followed by the motion learned from the others, and by two ways that
 need no learning (see `dt_viz.evaluate.held_out`): SHAPE-held-out.npz holds ``learned_i``, ``mean_i`` and ``nearest_i``
 (T, d) for each demonstration i, and ``learned_times_i`` … (T,); and the motion is followed from starts far away and
-after pushes (see `dt_viz.evaluate.off_course`). ``--crossings`` adds synthetic demonstrations that cross, come back or
-wind (see `dt_viz.evaluate.crossings`).
+after pushes (see `dt_viz.evaluate.off_course`). ``worst.svg`` shows the held-out demonstrations of all files that are
+met worst, relative to the extent of their shape. ``--crossings`` adds synthetic demonstrations that cross, come back
+or wind (see `dt_viz.evaluate.crossings`).
+
+``--choose SEED`` chooses the constants of the augmented state on one half of the files and measures them on the other,
+both ways round (see `dt_viz.evaluate.choose`); ``choices.json`` holds what it prints.
 
 ``figures.json`` holds what the table shows, and ``shapes.png`` all shapes: the paper's fig. 5.
 """
@@ -34,12 +40,14 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.evaluate.choose import GRIDS, Choice, choose, measure
 from dt_viz.evaluate.crossings import crossings
 from dt_viz.evaluate.held_out import (
     WAYS,
     HeldOut,
     Learn,
     Learned,
+    begun,
     follow,
     frechet,
     path_from,
@@ -49,6 +57,7 @@ from dt_viz.evaluate.held_out import (
 from dt_viz.evaluate.off_course import AWAY, OffCourse, off_course
 from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json, write_npz
 from dt_viz.evaluate.picture import Panel, draw_panels
+from dt_viz.evaluate.worst import Case, cases_of, draw_worst, worst_of
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
@@ -85,6 +94,8 @@ class Figures:
     rms_mm: float
     """Root mean square distance at the demonstration's own times; mean over demonstrations."""
     fit_seconds: float
+    start_seconds: float
+    """Time until the motion from a new start is known; median over demonstrations."""
     end_error_mm: float
     """Largest distance of a rollout's last point from the goal."""
     round_trip_of_extent: float
@@ -103,25 +114,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--folds", type=whole_number(2), metavar="N", help="hold out in so many folds (default: one for each)"
     )
+    parser.add_argument(
+        "--choose", type=whole_number(0), metavar="SEED", help="also choose constants on half of the files"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 2 if one of the shapes could not be fitted."""
-    if not (options.files or options.crossings):
-        raise InputError("SHAPE", "no file", "files, or --crossings")
-    if options.state == "augmented" and options.objective != OBJECTIVES[0]:
-        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
     learn = partial(fit, settings=ImitationSettings(options.objective)) if options.state == "plain" else fit_augmented
-    if options.folds and not options.leave_one_out:
-        raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
     sources = _sources(options.files)
-    alone = [str(source.path) for source in sources if len(source.demonstrations) == 1]
-    if options.leave_one_out and alone:
-        raise InputError("--leave-one-out", f"one demonstration only in {', '.join(alone)}", "two or more in each")
+    _check(options, sources)
     folder = ready_folder(options.out)
     results: list[Figures] = []
     held_out: list[HeldOut] = []
     beside: list[OffCourse] = []
+    cases: list[Case] = []
     panels: list[Panel] = []
     for source in sources:
         began = time.perf_counter()
@@ -129,7 +136,9 @@ def run(options: argparse.Namespace) -> int:
             imitation = learn(source.demonstrations)
             seconds = time.perf_counter() - began
             if options.leave_one_out:
-                held_out.append(_held_out(source, learn, options.folds, folder))
+                row, of_source = _held_out(source, learn, options.folds, folder)
+                held_out.append(row)
+                cases += of_source
                 beside.append(off_course(source.path.stem, source.demonstrations, imitation))
         except ImitationError as error:
             print(f"{source.path}: {error}", file=sys.stderr)
@@ -147,13 +156,32 @@ def run(options: argparse.Namespace) -> int:
         if held_out:
             _report_held_out(results, held_out)
             _report_off_course(beside)
+            draw_worst(folder / "worst.svg", worst_of(cases))
         written = {"held_out": [asdict(row) for row in held_out], "off_course": [asdict(row) for row in beside]}
         chosen = {"state": options.state, "objective": options.objective}
         write_json(folder / "figures.json", {**chosen, "shapes": shapes, **written})
         draw_panels(folder / "shapes.png", panels)
+    if options.choose is not None:
+        _report_choices(sources, options.choose, folder)
     if options.crossings:
         _report_crossings(options.state, learn, folder)
     return 0 if len(results) == len(sources) else 2
+
+
+def _check(options: argparse.Namespace, sources: Sequence[Source]) -> None:
+    """Refuse options that do not go together, or with these files."""
+    if not (sources or options.crossings):
+        raise InputError("SHAPE", "no file", "files, or --crossings")
+    if options.state == "augmented" and options.objective != OBJECTIVES[0]:
+        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
+    if options.folds and not options.leave_one_out:
+        raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
+    alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
+    if options.leave_one_out and alone:
+        raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
+    if options.choose is not None and (options.state != "augmented" or len(sources) < 2 or alone):
+        accepted = "it with --state augmented and two or more files, each of two or more demonstrations"
+        raise InputError("--choose", str(options.choose), accepted)
 
 
 def measured(imitation: Learned, source: Source, fit_seconds: float) -> dict[str, Any]:
@@ -168,6 +196,7 @@ def measured(imitation: Learned, source: Source, fit_seconds: float) -> dict[str
     transform = imitation.system.transform
     arrays: dict[str, Any] = {
         "fit_seconds": fit_seconds,
+        "start_seconds": float(np.median([_seconds_for(imitation, d.positions[0]) for d in source.demonstrations])),
         "min_det_jacobian": min_det_jacobian(transform.jacobian, grid),
         "round_trip_error": round_trip_error(transform, grid) / source.unit,
         "goal": imitation.goal / source.unit,
@@ -176,6 +205,14 @@ def measured(imitation: Learned, source: Source, fit_seconds: float) -> dict[str
         arrays[f"rollout_{i}"] = rollouts[i] / source.unit
         arrays[f"times_{i}"] = times[i]
     return arrays
+
+
+def _seconds_for(imitation: Learned, start: Array) -> float:
+    """Measure how long the motion from a start (d,) takes to be known."""
+    began = time.perf_counter()
+    system, state = begun(imitation, start)
+    system.transform.forward(state)
+    return time.perf_counter() - began
 
 
 def compared(arrays: dict[str, Any], source: Source) -> Figures:
@@ -196,14 +233,22 @@ def compared(arrays: dict[str, Any], source: Source) -> Figures:
         frechet_max_mm=millimetres * float(distances.max()),
         rms_mm=millimetres * float(np.mean(rms)),
         fit_seconds=arrays["fit_seconds"],
+        start_seconds=arrays["start_seconds"],
         end_error_mm=millimetres * end_error,
         round_trip_of_extent=arrays["round_trip_error"] / float(np.ptp(np.concatenate(demonstrations), axis=0).max()),
         min_det_jacobian=arrays["min_det_jacobian"],
     )
 
 
-def _held_out(source: Source, learn: Learn, folds: int | None, folder: Path) -> HeldOut:
+def _held_out(source: Source, learn: Learn, folds: int | None, folder: Path) -> tuple[HeldOut, list[Case]]:
     """Follow each demonstration without having learned from it, and write the paths to the folder."""
+    row, cases, arrays = _followed(source, learn, folds)
+    write_npz(folder / f"{source.path.stem}-held-out.npz", **arrays)
+    return row, cases
+
+
+def _followed(source: Source, learn: Learn, folds: int | None) -> tuple[HeldOut, list[Case], dict[str, Array]]:
+    """Follow each demonstration without having learned from it; the figures, the cases and the paths."""
     num = len(source.demonstrations)
     folds = min(folds or num, num)
     arrays = {
@@ -211,10 +256,11 @@ def _held_out(source: Source, learn: Learn, folds: int | None, folder: Path) -> 
         for i, followed in enumerate(follow(source.demonstrations, learn, folds))
         for name, values in followed.items()
     }
-    write_npz(folder / f"{source.path.stem}-held-out.npz", **arrays)
     demonstrations = [d.positions / source.unit for d in source.demonstrations]
     times = [d.times for d in source.demonstrations]
-    return summed_up(source.path.stem, folds, arrays, demonstrations, times, 1e3 * source.unit)
+    name, millimetres = source.path.stem, 1e3 * source.unit
+    row = summed_up(name, folds, arrays, demonstrations, times, millimetres)
+    return row, cases_of(name, arrays, demonstrations, millimetres), arrays
 
 
 def _sources(paths: Sequence[Path]) -> list[Source]:
@@ -261,6 +307,7 @@ def _report(results: Sequence[Figures]) -> None:
     print(f"largest of a rollout {largest:.2f} mm; RMS at equal times {np.mean([r.rms_mm for r in results]):.2f} mm")
     median = np.median([r.fit_seconds for r in results])
     print(f"fit: median {median:.2f} s, worst {slowest.fit_seconds:.2f} s ({slowest.name})")
+    print(f"new start: median {1e3 * np.median([r.start_seconds for r in results]):.2f} ms")
     print(f"largest distance from the goal at the end {max(r.end_error_mm for r in results):.3f} mm")
     print(f"largest round trip error {max(r.round_trip_of_extent for r in results):.1e} of the extent")
     print(f"smallest det J {tightest.min_det_jacobian:.2g} ({tightest.name})")
@@ -291,7 +338,29 @@ def _report_off_course(beside: Sequence[OffCourse]) -> None:
     ]
     columns = np.array([[*b.shape_error, *b.speed, b.drawn] for b in beside])
     mean = ("mean", *(f"{value:.3f}" for value in columns.mean(axis=0)))
-    print_table(("shape", *heads, "drawn after a push"), [*rows, mean])
+    worst = (*columns[:, :-1].max(axis=0), columns[:, -1].min())
+    print_table(("shape", *heads, "drawn after a push"), [*rows, mean, ("worst", *(f"{value:.3f}" for value in worst))])
+
+
+def _report_choices(sources: Sequence[Source], seed: int, folder: Path) -> None:
+    """Choose constants of the augmented state on each half of the files, and print what they do on the other."""
+    names = [source.path.stem for source in sources]
+    choices: list[Choice] = []
+    for grid in GRIDS:
+        measured = measure(grid, lambda: [_followed(source, fit_augmented, None)[0] for source in sources])
+        choices += choose(grid, measured, names, seed)
+    rows = [
+        (
+            choice.figure,
+            str(len(choice.chosen_on)),
+            ", ".join(f"{name} {value:g}" for name, value in choice.chosen),
+            *(f"{value:.2f}" for value in (choice.others_mm, choice.shipped_mm, choice.best_mm)),
+        )
+        for choice in choices
+    ]
+    print("\nconstants chosen on half of the files, and what they do on the others, mm")
+    print_table(("figure", "files", "chosen", "others", "others, as shipped", "others, their best"), rows)
+    write_json(folder / "choices.json", {"seed": seed, "choices": [asdict(choice) for choice in choices]})
 
 
 def _report_crossings(state: str, learn: Learn, folder: Path) -> None:
@@ -304,8 +373,8 @@ def _report_crossings(state: str, learn: Learn, folder: Path) -> None:
             if case.labels and learn is fit_augmented:
                 labelled = fit_augmented(demonstrations, case.labels)
                 starts = zip(demonstrations, case.labels, strict=True)
-                begun = [labelled.states(d.positions[0], label) for d, label in starts]
-                paths = [path_from(labelled.system, state, labelled.dim) for state in begun]
+                motions = [labelled.states(d.positions[0], label) for d, label in starts]
+                paths = [path_from(labelled.system, state, labelled.dim) for state in motions]
             else:
                 paths = list(
                     rollouts_from(learn(demonstrations), np.stack([d.positions[0] for d in demonstrations]))[0]

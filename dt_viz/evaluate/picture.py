@@ -50,7 +50,7 @@ def draw_panels(path: Path, panels: Sequence[Panel]) -> None:
 
 def _draw_motions(draw: ImageDraw.ImageDraw, panel: Panel, corner: Array) -> None:
     points = np.concatenate([*panel.demonstrations, *panel.rollouts])
-    axes = _widest_directions(np.concatenate(panel.demonstrations))
+    axes = widest_directions(np.concatenate(panel.demonstrations))
     flat = points @ axes
     lower, upper = flat.min(axis=0), flat.max(axis=0)
     scale = FINER * (PANEL - 2 * BORDER) / float((upper - lower).max())
@@ -72,7 +72,7 @@ def _disc(draw: ImageDraw.ImageDraw, centre: tuple[float, float], colour: tuple[
     draw.ellipse((x - r, y - r, x + r, y + r), fill=colour)
 
 
-def _widest_directions(points: Array) -> Array:
+def widest_directions(points: Array) -> Array:
     """Return orthonormal columns (d, 2): the axes of the plane, or in space the widest horizontal direction and up."""
     if points.shape[1] == 2:
         return np.eye(2)

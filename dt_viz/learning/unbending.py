@@ -3,6 +3,9 @@
 Descent from the identity map cannot find a motion that turns through large angles: the direction in which space bends
 must be known first. The mean demonstration's tangent turns along the motion; scaling that turning by τ from 1
 to 0 unbends it into a straight line. The other demonstrations are carried along in the moving frame of the mean.
+
+A motion that winds around an axis along which it advances all the way, a helix, would swing its ends around far from
+the data. It is pushed onto a straight line instead, across that axis: y ↦ y − m(y∥), a shear, folds no space.
 """
 
 from __future__ import annotations
@@ -16,12 +19,17 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
 from dt_viz.learning.flow_chain import Layer, Stack
 
-SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motion
+SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motion; half of it to find what winds
+MAX_TURN = (
+    np.pi
+)  # turning from its middle from which a motion winds; none in the plane that always advances turns as far
+MIN_ADVANCE = 0.1  # advance along the axis, in parts of its way, that each step of what is sheared makes
 APART = 0.8  # mean distance, in spreads, below which motions belong to one group
 
 
@@ -43,7 +51,10 @@ def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) 
     """
     groups = groups_of(motions)
     members = [groups == group for group in range(groups.max() + 1)]
+    unbendings: list[_Unbending | _Shearing]
     unbendings = [_Unbending(motions[member], keep_arrival=len(members) > 1) for member in members]
+    if len(members) == 1 and (axis := _axis(motions.mean(axis=0))) is not None:
+        unbendings = [_Shearing(motions, axis)]
 
     def shape(tau: float) -> Array:
         result = np.empty_like(motions)
@@ -78,11 +89,10 @@ class _Unbending:
         self._mean = solid.mean(axis=0)
         self._offsets = solid - self._mean
         self._dim = motions.shape[-1]
-        turned, self._frames = _turned(self._mean)
+        turned, self._frames = _turned(_tangents(self._mean, SMOOTHING))
         self._increments = np.diff(turned, axis=0)
         # The element whose direction is kept: the last, or the middle one of all turning, so that no end turns too far.
-        middle = np.linalg.norm(turned[:, None] - turned[None], axis=-1).sum(axis=1)
-        self._kept = len(turned) - 1 if keep_arrival else int(np.argmin(middle))
+        self._kept = len(turned) - 1 if keep_arrival else _middle(turned)
 
     def shape(self, tau: float) -> Array:
         """Return the motions (R, n, d) with their turning scaled by `tau`: 1 keeps them, 0 straightens their mean."""
@@ -93,15 +103,53 @@ class _Unbending:
         return (curve + carried)[..., : self._dim]
 
 
+class _Shearing:
+    """Motions as a function of the remaining part of their mean's offset from a straight line, across an axis."""
+
+    def __init__(self, motions: Array, axis: Array) -> None:
+        mean = motions.mean(axis=0)
+        part = ((mean - mean[0]) @ axis / ((mean[-1] - mean[0]) @ axis))[:, None]
+        self._motions = motions
+        self._offset = mean - (1 - part) * mean[0] - part * mean[-1]
+
+    def shape(self, tau: float) -> Array:
+        """Return the motions (R, n, d) with the offset scaled by `tau`: 1 keeps them, 0 straightens their mean."""
+        return self._motions - (1 - tau) * self._offset
+
+
+def _axis(mean: Array) -> Array | None:
+    """Find the axis (d,) that a motion (n, d) winds around and along which it always advances; None if there is none.
+
+    It is the direction of the shortest convex combination of the tangents, whose length is the smallest advance.
+    """
+    tangents = _tangents(_solid(mean), SMOOTHING / 2)  # smoothed as much as usual, four turns would hardly be left
+    turned, _ = _turned(tangents)
+    if np.linalg.norm(turned - turned[_middle(turned)], axis=1).max() < MAX_TURN:
+        return None
+    weights, _ = nnls(np.vstack([tangents.T, np.ones(len(tangents))]), np.array([0.0, 0.0, 0.0, 1.0]))
+    axis = tangents.T @ weights / weights.sum()
+    advance = float(np.linalg.norm(axis))
+    return axis[: mean.shape[1]] / advance if advance > MIN_ADVANCE else None
+
+
+def _tangents(mean: Array, smoothing: float) -> Array:
+    """Compute unit tangents (n, d) of a motion, smoothed over a part of it."""
+    tangents = np.gradient(gaussian_filter1d(mean, smoothing * len(mean), axis=0, mode="nearest"), axis=0)
+    return tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+
+
+def _middle(turned: Array) -> int:
+    """Index of the middle one of all turning (n, 3)."""
+    return int(np.linalg.norm(turned[:, None] - turned[None], axis=-1).sum(axis=1).argmin())
+
+
 def _solid(motions: Array) -> Array:
     """Return motions in the plane as motions in space."""
     return np.concatenate([motions, np.zeros((*motions.shape[:-1], 3 - motions.shape[-1]))], axis=-1)
 
 
-def _turned(mean: Array) -> tuple[Array, Rotation]:
-    """Compute the tangent's turning (n, 3) up to each point, in the rotation-minimising frame, and that frame."""
-    tangents = np.gradient(gaussian_filter1d(mean, SMOOTHING * len(mean), axis=0, mode="nearest"), axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+def _turned(tangents: Array) -> tuple[Array, Rotation]:
+    """Compute the turning (n, 3) of tangents (n, 3) up to each, in the rotation-minimising frame, and that frame."""
     axis = np.cross(tangents[:-1], tangents[1:])
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
     angle = np.arctan2(sine, (tangents[:-1] * tangents[1:]).sum(axis=1, keepdims=True))
