@@ -172,6 +172,25 @@ def test_numpy_computes_what_torch_is_trained_on(task, exact, points):
     assert np.abs(found).max() > 0.01
 
 
+def test_the_gradient_that_training_follows_is_that_of_finite_differences(task):
+    torch = pytest.importorskip("torch")
+    from dt_viz.baselines.eflow_training import velocity
+
+    arrays = {name: torch.tensor(array) for name, array in weights(task).items()}
+    w, rng = arrays["weights"], np.random.default_rng(3)
+    dim = task.demonstrations[0].dimension
+    x, goal = torch.tensor(rng.uniform(-0.5, 0.5, (20, dim))), torch.zeros(dim, dtype=w.dtype)
+    along, h = torch.tensor(rng.normal(size=w.shape)), 1e-6
+
+    def size(weights):
+        return velocity(x, goal, arrays, {**arrays, "weights": weights}).square().sum()
+
+    (gradient,) = torch.autograd.grad(size(w.requires_grad_()), w)
+    with torch.no_grad():
+        slope = (size(w + h * along) - size(w - h * along)).item() / (2 * h)
+    assert (gradient * along).sum().item() == pytest.approx(slope, rel=1e-5)
+
+
 @pytest.mark.parametrize("path", sorted((ASSETS / "baselines").glob("eflow_*.npz")), ids=lambda path: path.stem)
 def test_shipped_weights_fit_their_task_reach_its_goal_and_are_small(path):
     task = TASKS[path.stem.removeprefix("eflow_")]()

@@ -191,6 +191,7 @@ class TestPlanning:
         collides = load_collision_model().nearest_to_obstacle(joints_of(first)[0], in_the_way).distance < 0
         assert bool(first.warnings) == collides
         assert collides  # its encoder knows of no obstacle
+        np.testing.assert_array_equal(joints_of(first)[0][[0, -1]], problem.postures[0][[0, -1]])
         assert len(joints_of(first)[0]) > 200  # it did not stay with the straight line
 
     def test_an_exception_ends_it(self, problem, in_the_way):

@@ -24,7 +24,17 @@ def test_methods_are_known_by_their_name_and_say_what_they_promise():
     for name, method in METHODS.items():
         assert name == method.name
         assert method.title and method.promise.endswith(".")
+        assert method.promise.startswith("Stable") == method.stable
     assert TRAINED.keys() <= METHODS.keys()
+
+
+def test_no_method_that_plans_a_path_once_is_stable():
+    assert {name for name, method in METHODS.items() if method.stable} == {
+        "ours",
+        "ours-no-avoidance",
+        "eflow",
+        "signed-distance",
+    }
 
 
 def test_the_arm_follows_each_demonstration(problem, robot):

@@ -1,8 +1,10 @@
 """The command that trains: weights that the method reads, and a clear end where something is missing."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from test_baselines_eflow import weights
 
@@ -41,6 +43,30 @@ def test_weights_are_written_for_the_method_to_read_and_the_table_says_how_near_
     assert "eflow, draw_s: 3 epochs, seed 4" in printed
     assert "Fréchet mean" in printed.splitlines()[-1]
     assert EFlow(folder=tmp_path).system(TASKS["draw_s"]()).goal.shape == (3,)
+
+
+def test_in_folds_each_demonstration_is_compared_with_what_was_learned_from_others(monkeypatch, tmp_path, capsys):
+    learned, compared = [], []
+    monkeypatch.setattr(train, "frechet", lambda paths, references: compared.append(references) or np.ones(len(paths)))
+    trained_by(monkeypatch, lambda problem, *_: learned.append(problem.task.paths) or weights(problem.task))
+    assert main([*COMMAND, "--folds", "3", "--out", str(tmp_path)]) == 0
+    paths = TASKS["draw_s"]().paths
+    assert len(learned) == len(compared) == 3
+    for others, held in zip(learned, compared, strict=True):
+        together = sorted((*others, *held), key=lambda path: tuple(path[0]))
+        for found, path in zip(together, sorted(paths, key=lambda path: tuple(path[0])), strict=True):
+            np.testing.assert_array_equal(found, path)
+    assert len({path[0].tobytes() for held in compared for path in held}) == len(paths)
+    assert sorted(folder.name for folder in tmp_path.iterdir()) == ["fold_0", "fold_1", "fold_2"]
+    assert "held out" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_a_single_demonstration_cannot_be_held_out(monkeypatch, tmp_path, capsys):
+    task = TASKS["draw_s"]()
+    alone = replace(task, demonstrations=task.demonstrations[:1])
+    monkeypatch.setattr(train, "TASKS", {"draw_s": lambda: alone})
+    assert main([*COMMAND, "--folds", "3", "--out", str(tmp_path)]) == 2
+    assert "--folds: found one demonstration only in draw_s" in capsys.readouterr().err
 
 
 def test_without_what_it_needs_it_says_how_to_install_it(monkeypatch, tmp_path, capsys):
@@ -86,6 +112,26 @@ def test_training_lowers_the_loss_also_with_a_single_demonstration(num):
     arrays = train_eflow(problem, 50, lambda line: losses.append(float(line.rsplit(" ", 1)[1])))
     assert losses[-1] < losses[0]
     assert (arrays["weights"] != 0).any()
+
+
+def turned_back(learned, monkeypatch):
+    """Share of the velocities that lead away from the goal, of a motion that stands at first and last."""
+    from dt_viz.baselines import eflow_training
+
+    monkeypatch.setattr(eflow_training, "LEARNED", learned)
+    times = np.linspace(0, 4, 200)
+    along = np.clip((times - 0.15) / 3.7, 0, 1)
+    motion = Demonstration(times, np.outer(along, [0.3, -0.2]), "straight")
+    _, velocities, normalisation, _ = eflow_training.samples((motion,))
+    return np.mean((velocities / normalisation[0]) @ [0.3, -0.2] < 0)
+
+
+def test_what_is_learned_from_never_turns_back_where_a_motion_stands(monkeypatch):
+    pytest.importorskip("torch")
+    from dt_viz.baselines.eflow_training import LEARNED, NUM_POINTS
+
+    assert turned_back(LEARNED, monkeypatch) == 0
+    assert turned_back(slice(0, NUM_POINTS - 1), monkeypatch) > 0.01
 
 
 def test_demonstrations_without_a_common_goal_are_refused():

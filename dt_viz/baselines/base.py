@@ -75,7 +75,7 @@ class Method(ABC):
     promise: ClassVar[str]
     """Sentence that says what it guarantees and what it does not."""
     stable: ClassVar[bool]
-    """Whether its motions reach the goal for certain."""
+    """Whether it is a dynamical system whose motions reach the goal for certain; a path planned once is none."""
     whole_arm: ClassVar[bool]
     """Whether the whole arm avoids, not the end effector alone."""
     live: ClassVar[bool]

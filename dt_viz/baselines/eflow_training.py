@@ -6,6 +6,7 @@ An epoch is one step on all points, as theirs is with random Fourier features.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports] - an extra
@@ -24,6 +25,9 @@ NUM_POINTS = 150
 """Number of points of a demonstration, evenly in time."""
 WINDOW = 25 / 150
 """Part of them that is smoothed over, by cubic polynomials (Savitzky and Golay)."""
+LEARNED = slice(6, NUM_POINTS - 3, 2)
+"""Points that are learned from: at the first and the last the polynomials of a motion at rest turn back. Every second
+tells as much as all, in half the time."""
 REPORT_EVERY = 25
 """Number of epochs between two reports."""
 
@@ -81,18 +85,17 @@ def samples(demonstrations: tuple[Demonstration, ...]) -> tuple[Array, Array, Ar
     except ImitationError as error:
         raise NotFittedError(str(error)) from error
     window = 2 * int(WINDOW * NUM_POINTS / 2) + 1
-    paths, steps = [], []
+    points, rates = [], []
     for times, positions in zip(motions.times, motions.positions, strict=True):
         even = np.linspace(times[0], times[-1], NUM_POINTS)
         path = np.asarray(savgol_filter(interpolate(even, times, positions), window, 3, axis=0))
-        paths.append(path + motions.goal - path[-1])
-        steps.append(even[1])
-    every = np.concatenate(paths)
+        points.append(path[LEARNED])
+        rates.append(np.diff(path, axis=0)[LEARNED] / even[1])
+    every = np.concatenate(points)
     lowest, extent = every.min(axis=0), np.ptp(every, axis=0)
     scale = 1 / np.maximum(extent, 1e-6 * extent.max())
-    rates = [np.diff(path, axis=0, append=path[-1:]) * scale / h for path, h in zip(paths, steps, strict=True)]
     shift = -lowest * scale - 0.5
-    return every * scale + shift, np.concatenate(rates), np.stack([scale, shift]), motions.goal
+    return every * scale + shift, np.concatenate(rates) * scale, np.stack([scale, shift]), motions.goal
 
 
 def initial(dim: int, rng: np.random.Generator) -> tuple[Tensors, Tensors]:
@@ -117,20 +120,41 @@ def velocity(x: torch.Tensor, goal: torch.Tensor, fixed: Tensors, learned: Tenso
     """
     dim, z, passed = x.shape[1], torch.cat([x, goal[None]]), []
     for k, (a, b) in enumerate(MASKS):
-        W, w = fixed["frequencies"][k, ..., : num_of(a, dim)], learned["weights"][k, ..., : num_of(b, dim)]
-        phase = torch.einsum("na,kfa->knf", z[:, a], W) + fixed["phases"][k][:, None]
-        stretch, shift = torch.cos(phase) @ w
-        passed.append((a, b, W, w, phase[:, :-1], stretch[:-1], z[:-1][:, b]))
+        num_a, num_b = num_of(a, dim), num_of(b, dim)
+        W, w = fixed["frequencies"][k, ..., :num_a], learned["weights"][k, ..., :num_b]
+        phase = torch.addmm(fixed["phases"][k].flatten(), z[:, a], W.flatten(0, 1).T)
+        cosine, sine = _CosineSine.apply(phase)
+        stretch, shift = (cosine @ torch.block_diag(*w)).split(num_b, dim=1)
+        slopes = -(w[..., None] * W[:, :, None]).flatten(2)
+        derivatives = (sine @ torch.block_diag(*slopes)).unflatten(1, (2, num_b, num_a))
+        passed.append((a, b, stretch[:-1], z[:-1, b], derivatives[:-1]))
         z = _put(z, b, z[:, b] * stretch.exp() + shift)
     U = -torch.nn.functional.normalize(z[:-1] - z[-1])
-    for a, b, W, w, phase, stretch, before in reversed(passed):
-        Ds, Dt = -(torch.sin(phase) * torch.einsum("na,kfa->knf", U[:, a], W)) @ w
+    for a, b, stretch, before, derivatives in reversed(passed):
+        Ds, Dt = torch.einsum("nkba,na->knb", derivatives, U[:, a])
         U = _put(U, b, (U[:, b] - Dt) * torch.exp(-stretch) - before * Ds)
     for k in range(3):
         layer = learned[f"speed_{k}"]
         x = x @ layer[:, :-1].T + layer[:, -1]
         x = torch.nn.functional.leaky_relu(x, SLOPE) if k < 2 else x
     return x.exp() * U
+
+
+class _CosineSine(torch.autograd.Function):
+    """Cosine and sine of the same phases, each the other's derivative: neither is computed twice."""
+
+    @staticmethod
+    def forward(ctx: Any, phase: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # noqa: ANN401 - torch's
+        """Compute both."""
+        values = torch.cos(phase), torch.sin(phase)
+        ctx.save_for_backward(*values)
+        return values
+
+    @staticmethod
+    def backward(ctx: Any, cosine_slope: torch.Tensor, sine_slope: torch.Tensor) -> torch.Tensor:  # noqa: ANN401 - torch's
+        """Chain rule."""
+        cosine, sine = ctx.saved_tensors
+        return sine_slope * cosine - cosine_slope * sine
 
 
 def _put(x: torch.Tensor, columns: slice, values: torch.Tensor) -> torch.Tensor:

@@ -30,8 +30,8 @@ class Linear(Method):
     """The straight line from the start's posture to the demonstrated goal posture, in the demonstrated duration."""
 
     name, title = "linear", "Linear"
-    promise = "A path to the goal, straight in the joints. It neither imitates nor avoids."
-    stable, whole_arm, live = True, False, True
+    promise = "A path planned once, straight in the joints to the goal. It neither imitates nor avoids."
+    stable, whole_arm, live = False, False, True
     avoids = False
 
     def fit(self, problem: Problem) -> Planner:

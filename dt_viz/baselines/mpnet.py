@@ -240,9 +240,10 @@ class MPNet(Method):
 
     name, title = "mpnet", "MPNet"
     promise = (
-        "A path to the goal, planned once. It may collide: trained on demonstrations alone, it has seen no obstacle."
+        "A path planned once, which ends at the goal, through the obstacle where no free way is found: trained on "
+        "demonstrations alone, it has seen no obstacle."
     )
-    stable, whole_arm, live = True, True, False
+    stable, whole_arm, live = False, True, False
 
     def __init__(self, folder: Path = FOLDER) -> None:
         """Choose the folder of the weights."""

@@ -55,7 +55,10 @@ class MPNetRRT(MPNet):
     """MPNet whose colliding stretches RRT-Connect plans again."""
 
     name, title = "mpnet-rrt", "MPNet-RRT"
-    promise = "A path to the goal; the whole arm is clear where RRT-Connect finds a way in time. That imitates nothing."
+    promise = (
+        "A path planned once, which ends at the goal; the whole arm is clear where RRT-Connect finds a way in time. "
+        "That imitates nothing."
+    )
     needs = ("ompl",)
 
     def __init__(self, seconds: float = SECONDS) -> None:

@@ -67,8 +67,7 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
         ImitationError: nothing can be learned from the others.
     """
     followed: list[dict[str, Array]] = [{}] * len(demonstrations)
-    for fold in range(folds):
-        held = range(fold, len(demonstrations), folds)
+    for held in folds_of(len(demonstrations), folds):
         others = [d for i, d in enumerate(demonstrations) if i not in held]
         imitation = learn(others)
         paths = np.stack([resample_by_arc_length(d.positions, NUM_COMPARED) for d in others])
@@ -86,6 +85,11 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
             followed[i] = {way: path for way, (path, _) in zip(WAYS, ways, strict=True)}
             followed[i] |= {f"{way}_times": t for way, (_, t) in zip(WAYS, ways, strict=True)}
     return followed
+
+
+def folds_of(num: int, folds: int) -> list[range]:
+    """Numbers of the demonstrations, of `num`, that each fold holds out."""
+    return [range(fold, num, folds) for fold in range(folds)]
 
 
 def _progress(demonstration: Demonstration) -> Array:

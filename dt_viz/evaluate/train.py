@@ -4,7 +4,9 @@
     python -m dt_viz.evaluate train --lasa DIR --task Sshape Angle --method eflow --epochs 500 --out DIR
 
 A file METHOD_TASK.npz is written for each. The table shows the discrete Fréchet distances of the undisturbed motions
-from the demonstrations that they were learned from, in millimetres of the demonstrations' own unit.
+from the demonstrations that they were learned from, in millimetres of the demonstrations' own unit. With ``--folds N``
+they are those from demonstrations held out, each followed by what was learned from the other folds, as `imitation
+--leave-one-out --folds N` does it; weights of fold k are in DIR/fold_k.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -22,13 +25,13 @@ from dt_viz.arm.robot import load_jaco
 from dt_viz.baselines.base import INSTALL, NotFittedError, Problem
 from dt_viz.baselines.registry import TRAINED, problem_of
 from dt_viz.baselines.weights import save_weights, weights_file
-from dt_viz.evaluate.held_out import frechet
+from dt_viz.evaluate.held_out import folds_of, frechet
 from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number
 from dt_viz.learning.store import FitStore, default_cache_folder
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.tasks import TASKS, lasa_tasks
+from dt_viz.scenario.tasks import TASKS, Task, lasa_tasks
 
 FAILED = 1
 """Exit status if something is not installed, or cannot be trained."""
@@ -42,10 +45,21 @@ class Row:
     task: str
     num_epochs: int
     seconds: float
-    """Processor time of the training."""
+    """Processor time of a training, the longest."""
     frechet_mm: float
     """Mean over the demonstrations."""
     num_bytes: int
+    """Size of a file of weights, the largest."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Demonstrations of a task, by number from 0, to learn from, and those to compare with what was learned."""
+
+    learned: Sequence[int]
+    compared: Sequence[int]
+    folder: Path
+    """Folder for the weights."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", nargs="+", metavar="TASK", help="(default: all that ship)")
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
     parser.add_argument("--epochs", type=whole_number(1), help="(default: the method's)")
+    parser.add_argument("--folds", type=whole_number(2), metavar="N", help="hold out in so many folds (default: none)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of what is random (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the weights")
 
@@ -65,39 +80,67 @@ def run(options: argparse.Namespace) -> int:
     for name in names:
         if name not in tasks:
             raise InputError("--task", repr(name), ", ".join(tasks))
+    alone = [name for name in names if len(tasks[name]().demonstrations) == 1]
+    if options.folds and alone:
+        raise InputError("--folds", f"one demonstration only in {', '.join(alone)}", "two or more in each")
     folder = ready_folder(options.out)
     fits, follower = FitStore(default_cache_folder()), Follower(load_jaco())
     rows: list[Row] = []
     for name in names:
         task = tasks[name]()
-        problem = problem_of(Learned.of(task, fits.get(task.demonstrations), imitates=True), follower)
+        splits = _splits(len(task.demonstrations), options.folds, folder)
+        problems = [_problem(task, split, fits, follower) for split in splits]
         for method in options.method:
             try:
-                rows.append(_trained(problem, method, options, folder))
+                rows.append(_row(task, method, splits, problems, options))
             except ModuleNotFoundError as error:
                 print(f"{method} is trained with {error.name}, which is not installed: {INSTALL}", file=sys.stderr)
                 return FAILED
             except NotFittedError as error:
                 print(f"{method}, {name}: {error}", file=sys.stderr)
-    _report(rows)
+    _report(rows, "held out" if options.folds else "in-sample")
     return 0 if len(rows) == len(names) * len(options.method) else FAILED
 
 
-def _trained(problem: Problem, name: str, options: argparse.Namespace, folder: Path) -> Row:
-    """Train a method for a task, write its weights, and follow the demonstrations with what was written."""
-    trained, task = TRAINED[name], problem.task
+def _splits(num: int, folds: int | None, folder: Path) -> list[Split]:
+    """All of `num` demonstrations twice; or what each fold leaves and what it holds out."""
+    if folds is None:
+        return [Split(range(num), range(num), folder)]
+    return [
+        Split([i for i in range(num) if i not in held], held, ready_folder(folder / f"fold_{k}"))
+        for k, held in enumerate(folds_of(num, min(folds, num)))
+    ]
+
+
+def _problem(task: Task, split: Split, fits: FitStore, follower: Follower) -> Problem:
+    part = replace(task, demonstrations=tuple(task.demonstrations[i] for i in split.learned))
+    return problem_of(Learned.of(part, fits.get(part.demonstrations), imitates=True), follower)
+
+
+def _row(
+    task: Task, method: str, splits: Sequence[Split], problems: Sequence[Problem], options: argparse.Namespace
+) -> Row:
+    """Train a method on each split, write the weights, and follow the demonstrations with what was written."""
+    trained = TRAINED[method]
     num_epochs = options.epochs or trained.num_epochs
-    train, began = import_module(trained.training).train, time.process_time()
-    arrays = train(problem, num_epochs, lambda line: print(f"{name}, {task.name}: {line}", flush=True), options.seed)
-    seconds, path = time.process_time() - began, weights_file(folder, name, task)
-    save_weights(path, name, trained.version, task, arrays)
-    plan = trained.from_folder(folder).fit(problem).plan(Union(), task.starts)
-    distances = 1e3 * frechet(plan.paths, task.paths) / task.scale
-    return Row(name, task.name, num_epochs, seconds, float(distances.mean()), path.stat().st_size)
+    train = import_module(trained.training).train
+    seconds, sizes, distances = [], [], []
+    for split, problem in zip(splits, problems, strict=True):
+        began = time.process_time()
+        arrays = train(
+            problem, num_epochs, lambda line: print(f"{method}, {task.name}: {line}", flush=True), options.seed
+        )
+        seconds.append(time.process_time() - began)
+        path = weights_file(split.folder, method, task)
+        save_weights(path, method, trained.version, problem.task, arrays)
+        sizes.append(path.stat().st_size)
+        plan = trained.from_folder(split.folder).fit(problem).plan(Union(), task.starts[split.compared])
+        distances.extend(1e3 * frechet(plan.paths, [task.paths[i] for i in split.compared]) / task.scale)
+    return Row(method, task.name, num_epochs, max(seconds), float(np.mean(distances)), max(sizes))
 
 
-def _report(rows: list[Row]) -> None:
-    header = ("method", "task", "epochs", "seconds", "Fréchet mean mm", "kB")
+def _report(rows: list[Row], compared: str) -> None:
+    header = ("method", "task", "epochs", "seconds", f"Fréchet mean mm, {compared}", "kB")
     cells = [
         (r.method, r.task, str(r.num_epochs), f"{r.seconds:.0f}", f"{r.frechet_mm:.2f}", f"{r.num_bytes / 1e3:.0f}")
         for r in rows
@@ -107,4 +150,5 @@ def _report(rows: list[Row]) -> None:
         of_method = [row for row in rows if row.method == method]
         mean = np.mean([row.frechet_mm for row in of_method])
         slowest = max(row.seconds for row in of_method)
-        print(f"{method}: Fréchet mean {mean:.2f} mm over {len(of_method)} task(s), at most {slowest:.0f} s a task")
+        reached = f"Fréchet mean {mean:.2f} mm {compared} over {len(of_method)} task(s)"
+        print(f"{method}: {reached}; training at most {slowest:.0f} s")
