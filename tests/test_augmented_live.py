@@ -12,6 +12,7 @@ from dt_viz.errors import DataError, FormatError
 from dt_viz.evaluate.crossings import crossings
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.choice import MOST_CONFLICTING, conflicts, learn
+from dt_viz.learning.imitation import fit
 from dt_viz.learning.preparation import ImitationError, prepare
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.certificates import Certificates, Shown, certified
@@ -68,7 +69,7 @@ def test_what_differs_at_one_phase_is_in_conflict_by_its_label_alone():
 
 def test_a_plain_fit_that_misses_is_not_taken():
     demonstrations = TASKS["draw_s"]().demonstrations
-    coarse = dt.fit(demonstrations[:2], state="plain")._learned.imitation
+    coarse = fit(demonstrations[:2])
     taken = learn(demonstrations, plain=lambda: coarse)  # not a fit of all of these, but near
     assert taken is coarse
     shifted = tuple(
