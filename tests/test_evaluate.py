@@ -721,6 +721,10 @@ SPHERE = ["--obstacle", "0,0,0", "--diameter", "0.1"]
             ["imitation", "Hook.mat", "--choose", "0", "--out", "out"],
             "--choose: found 0; accepted: it with --state aug",
         ),
+        (
+            ["imitation", "Hook.mat", "--state", "augmented", "--regularisation", "1e-4", "--out", "out"],
+            "--regularisation: found 0.0001; accepted: none with --state augmented",
+        ),
         (["drag", *TASK, "--from", "0,0,0", "--out", "a.npz"], "--from, --to: found one of them; accepted: both"),
         (["rollouts", "--task", "Draw S"], "--task: found 'Draw S'; accepted: draw_s, "),
     ],

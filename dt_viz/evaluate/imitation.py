@@ -55,7 +55,15 @@ from dt_viz.evaluate.held_out import (
     summed_up,
 )
 from dt_viz.evaluate.off_course import AWAY, OffCourse, off_course
-from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json, write_npz
+from dt_viz.evaluate.options import (
+    InputError,
+    positive_number,
+    print_table,
+    ready_folder,
+    whole_number,
+    write_json,
+    write_npz,
+)
 from dt_viz.evaluate.picture import Panel, draw_panels
 from dt_viz.evaluate.worst import Case, cases_of, draw_worst, worst_of
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
@@ -108,6 +116,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", type=Path, nargs="*", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and picture")
     parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
+    parser.add_argument(
+        "--regularisation", type=positive_number("weight", 1.0), metavar="R", help="of the plain fit (default: its own)"
+    )
     parser.add_argument("--state", choices=STATES, default=STATES[0], help="default: %(default)s")
     parser.add_argument("--crossings", action="store_true", help="also what crosses itself, comes back or winds")
     parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
@@ -121,7 +132,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 2 if one of the shapes could not be fitted."""
-    learn = partial(fit, settings=ImitationSettings(options.objective)) if options.state == "plain" else fit_augmented
+    learn = partial(fit, settings=_settings(options)) if options.state == "plain" else fit_augmented
     sources = _sources(options.files)
     _check(options, sources)
     folder = ready_folder(options.out)
@@ -168,12 +179,20 @@ def run(options: argparse.Namespace) -> int:
     return 0 if len(results) == len(sources) else 2
 
 
+def _settings(options: argparse.Namespace) -> ImitationSettings:
+    """Settings of the plain fit."""
+    settings = ImitationSettings(options.objective)
+    return replace(settings, regularisation=options.regularisation) if options.regularisation else settings
+
+
 def _check(options: argparse.Namespace, sources: Sequence[Source]) -> None:
     """Refuse options that do not go together, or with these files."""
     if not (sources or options.crossings):
         raise InputError("SHAPE", "no file", "files, or --crossings")
     if options.state == "augmented" and options.objective != OBJECTIVES[0]:
         raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
+    if options.state == "augmented" and options.regularisation:
+        raise InputError("--regularisation", f"{options.regularisation:g}", "none with --state augmented")
     if options.folds and not options.leave_one_out:
         raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
     alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
