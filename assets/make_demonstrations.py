@@ -116,7 +116,7 @@ def draw_z(num_demonstrations: int = 7, seed: int = 71) -> tuple[Demonstration, 
     return _draw(_letter_z(), "draw Z", num_demonstrations, seed)
 
 
-def draw_8(num_demonstrations: int = 7, seed: int = 88) -> tuple[Demonstration, ...]:
+def draw_8(num_demonstrations: int = 7, seed: int = 84) -> tuple[Demonstration, ...]:
     """Draw the figure 8 on a plane, from its top down across itself, round, and up again to the left of where it began.
 
     Returns:

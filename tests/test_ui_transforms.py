@@ -74,7 +74,7 @@ def test_only_what_the_chosen_transform_has_is_shown(controls):
     controls.set("Settings of", AVOIDANCE)
     assert visible(controls) == FLOW | {"Generator", "Temperature T"}
     controls.set("Settings of", IMITATION)
-    assert visible(controls) == {"Settings of", "Objective"}
+    assert visible(controls) == {"Settings of", "Objective", "State"}
 
 
 def test_settings_change_the_transform_that_they_are_shown_for(controls):

@@ -267,7 +267,7 @@ TASKS: Mapping[str, TaskEntry] = {
     "draw_g": TaskEntry("Draw G", partial(letter, "G")),
     "draw_w": TaskEntry("Draw W", partial(letter, "W", obstacle_at=0.36)),  # not between two strokes
     "draw_z": TaskEntry("Draw Z", partial(letter, "Z")),
-    "draw_8": TaskEntry("Draw 8", partial(letter, "8", "The 8 crosses itself: it needs an augmented state.", 0.3)),
+    "draw_8": TaskEntry("Draw 8", partial(letter, "8", "The 8 crosses itself. Drag the sphere through it.", 0.3)),
     "lift_box": TaskEntry("Lift box", lift_box),
     "push_box": TaskEntry("Push box", push_box),
     "drop_pots": TaskEntry("Drop in pots", drop_pots),
