@@ -126,6 +126,15 @@ def draw_8(num_demonstrations: int = 7, seed: int = 84) -> tuple[Demonstration, 
     return _draw(_figure_8(), "draw 8", num_demonstrations, seed)
 
 
+def draw_s_wavy(num_demonstrations: int = 7, seed: int = 73) -> tuple[Demonstration, ...]:
+    """Draw the letter S by another hand, in waves.
+
+    Returns:
+        As `draw_s`.
+    """
+    return _draw(_wavy(_letter_s()), "draw wavy S", num_demonstrations, seed)
+
+
 def drop_pots(num_demonstrations: int = 8, seed: int = 98) -> tuple[Demonstration, ...]:
     """Carry an object forward over the centre one of three pots in a row, and stop above it.
 
@@ -207,6 +216,14 @@ def _figure_8() -> np.ndarray:
     """Return the path of an 8: a Lissajous figure that is open at its top, shape ``(DENSE, 2)``."""
     turn = np.linspace(0.10, 2 * np.pi - 0.40, DENSE)
     return np.stack([0.13 * np.sin(2 * turn), 0.20 * np.cos(turn)], axis=1)
+
+
+def _wavy(path: np.ndarray) -> np.ndarray:
+    """Return a path (DENSE, 2) that is drawn in waves, as a curtate cycloid is; its ends stay."""
+    s = np.linspace(0.0, 1.0, DENSE)
+    turn = 2 * np.pi * 6 * s
+    size = 0.020 * _smooth_step(s / 0.15) * _smooth_step((1 - s) / 0.15)
+    return path + size[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
 def _arc(start: float, end: float) -> np.ndarray:
@@ -320,5 +337,5 @@ def _smooth_step(x: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    for make in (draw_s, lift_box, push_box, draw_j, drop_pots, draw_c, draw_g, draw_w, draw_z, draw_8):
+    for make in (draw_s, lift_box, push_box, draw_j, drop_pots, draw_c, draw_g, draw_w, draw_z, draw_8, draw_s_wavy):
         save_demonstrations(FOLDER / f"{make.__name__}.npz", make())

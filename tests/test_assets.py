@@ -11,7 +11,19 @@ from dt_viz.metrics import arc_length, resample_by_arc_length, sharpest_turn
 from dt_viz.scenario.tasks import POTS
 
 ASSETS = Path(__file__).parents[1] / "assets"
-TASKS = ["draw_s", "lift_box", "push_box", "draw_j", "drop_pots", "draw_c", "draw_g", "draw_w", "draw_z", "draw_8"]
+TASKS = [
+    "draw_s",
+    "lift_box",
+    "push_box",
+    "draw_j",
+    "drop_pots",
+    "draw_c",
+    "draw_g",
+    "draw_w",
+    "draw_z",
+    "draw_8",
+    "draw_s_wavy",
+]
 
 
 @pytest.fixture(scope="module")

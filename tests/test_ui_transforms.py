@@ -20,6 +20,7 @@ from dt_viz.motion.certificates import Certificates
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, anchored
+from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel import warp as warp_module
 from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
@@ -36,6 +37,7 @@ def frame(scenario=SCENARIO, **changes):
     given: dict[str, Any] = {
         "chosen_values": ({"strength": 0.8, "radius": 0.2}, {"duration": 0.4}),
         "learned_steps": (4, 4, 4),
+        "task": TASKS[scenario.task](),
     }
     return frame_of(scenario, **(given | changes))
 

@@ -234,7 +234,7 @@ def _panels(
     if any(panel.plain for panel in scenario.view.panels):
         title = AUGMENTED_TITLE
     elif any(panel.task for panel in scenario.view.panels):
-        title = task.title
+        title = f"{task.title}, {scenario.style} × {scenario.style_amount:g}" if scenario.style else task.title
     else:
         title = _title(names[-1]) if scenario.imitation or len(names) > 1 else BASE_TITLE
     return (*beside, PanelPicture(title, area))

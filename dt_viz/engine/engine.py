@@ -19,8 +19,10 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Rays
 from dt_viz.interruption import Checkpoint, interruptible
+from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.imitation import ImitationSettings, Progress
 from dt_viz.learning.store import FitStore
+from dt_viz.learning.style import Style
 from dt_viz.memo import Memo
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower
@@ -31,7 +33,7 @@ from dt_viz.pictures.arm_field import LiftedField
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
 from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.scenario.tasks import Task, TaskEntry
+from dt_viz.scenario.tasks import STYLES, Task, TaskEntry
 from dt_viz.transforms.base import Transform
 from dt_viz.warning import MotionWarning
 
@@ -131,7 +133,11 @@ class Engine:
     def nominal(self, scenario: Scenario, progress: Progress | None = None) -> Nominal:
         """The undisturbed motion of a scenario, from all of its starts; see `frames`."""
         key = (scenario.task, scenario.imitation, scenario.objective, scenario.state)
-        learned = self.memo("learned", key, lambda: self._learned(scenario, progress))
+        if scenario.style and scenario.imitation:
+            key = (scenario.task, scenario.style, scenario.style_amount)
+            learned = self.memo("styled", key, lambda: self._styled(scenario), newest=NEWEST)
+        else:
+            learned = self.memo("learned", key, lambda: self._learned(scenario, progress))
         strand = learned.strand  # a start that is dragged leaves nothing behind
         added = [self.memo("strand", (learned, s), lambda s=s: strand(s), newest=NEWEST) for s in scenario.starts]
         return self.memo("nominal", (learned, scenario.starts), lambda: learned.nominal(added), newest=4)
@@ -210,6 +216,15 @@ class Engine:
         imitation = self._fits.learned(task.demonstrations, ImitationSettings(scenario.objective), state, progress)
         return Learned.of(task, imitation, imitates=scenario.imitation)
 
+    def _styled(self, scenario: Scenario) -> Learned:
+        """What is learned for a scenario in the augmented state, in its style."""
+        own, usual, other = (
+            self.memo("augmented", name, lambda name=name: fit_augmented(self.task(name).demonstrations))
+            for name in (scenario.task, *STYLES[scenario.style])
+        )
+        imitation = Style.between(usual, other).on(own, scenario.style_amount)
+        return Learned.of(self.task(scenario.task), imitation, imitates=True)
+
     def _admission(self, scenario: Scenario) -> Admission:
         """Whether the scenario has a motion, and from which starts."""
         nominal, avoidance = self.nominal(scenario), scenario.arm_avoidance
@@ -265,7 +280,7 @@ class Engine:
 
     def _plain(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the plain state, which other methods are compared with."""
-        return self.nominal(replace(scenario, state="plain")).learned
+        return self.nominal(replace(scenario, state="plain", style="")).learned
 
     def _compared_at_rest(self, frame: Frame, solved: Solved | None, checkpoint: Checkpoint) -> Iterator[Frame]:
         """The last frame again and again, each with more of what is known of other methods."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Mask
+from dt_viz.flows.phased import Frozen
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.obstacles.union import Union
@@ -84,12 +85,14 @@ def system_panel(
         clearance, lattice = obstacle.signed_distance, area.grid(OUTLINE_SPACING)
         distance = clearance(lattice.reshape(-1, 3)).reshape(lattice.shape[:2])
         outlines = level_line(lattice, np.minimum(distance, 1e3))
+    # those of an augmented system at one phase do not go where its motions go
+    follows = not isinstance(system.base, Frozen)
     return PanelPicture(
         title,
         area,
         rollouts[0][-1],
         rollouts,
-        streamlines(system, area, clearance, coarse=coarse),
+        streamlines(system, area, clearance, coarse=coarse) if follows else (),
         demonstrations,
         outlines=outlines,
     )

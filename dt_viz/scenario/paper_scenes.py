@@ -132,6 +132,11 @@ def _sphere_in_the_8(task: Task) -> Scenario:
     return _avoiding(task, Avoidance(Sphere(task.obstacle_position, IN_8), plane=plane_of(task)))
 
 
+def _in_style(task: Task) -> Scenario:
+    """Sec. 6: a letter in the style of another hand."""
+    return replace(_alone(task), style="wavy")
+
+
 def _cube_before_the_attractor(task: Task) -> Scenario:
     """Fig. 3 (a): motions that are straight but for the cube."""
     middle = (task.starts.mean(axis=0) + task.mean_path[-1]) / 2
@@ -279,6 +284,21 @@ SCENES: Mapping[str, PaperScene] = {
             "draw_8",
             _sphere_in_the_8,
             view=FIGURE | {"panels": (Panel(task="draw_8", plain=True),), "streamlines": False, "demonstrations": True},
+        ),
+        PaperScene(
+            "style",
+            "Style (sec. 6)",
+            "Two hands draw an S (left). What leads from the one to the other is put on the C of the first: "
+            "Stack → Amount.",
+            "draw_c",
+            _in_style,
+            view=FIGURE
+            | {
+                "panels": (Panel(task="draw_s"), Panel(task="draw_s_wavy")),
+                "streamlines": False,
+                "demonstrations": True,
+                "tuned": IMITATION,
+            },
         ),
         PaperScene(
             "centre_pot",

@@ -130,6 +130,10 @@ class Scenario:
     """What is fitted in the plain state."""
     state: State = "auto"
     """Whether motions are learned in the plain state or in the augmented one."""
+    style: str = ""
+    """Name of the style that is put on motions, of `STYLES`; none if empty. They are augmented then."""
+    style_amount: float = 1.0
+    """Part of it that is put on."""
     warp: float = 1.0
     """s, from 0 to 1: every flow of the stack, the imitation's too, runs for this fraction of its duration."""
     starts: tuple[Point, ...] = ()

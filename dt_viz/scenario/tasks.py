@@ -111,7 +111,7 @@ class TaskEntry:
 def letter(character: str, hint: str = "Drag the sphere through the letter.", obstacle_at: float = 0.5) -> Task:
     """Draw a letter that ships with DT-Viz, in a vertical plane before the robot (sec. 5); see `drawing_task`."""
     name = f"draw_{character.lower()}"
-    return drawing_task(name, f"Draw {character}", hint, load_demonstrations(ASSETS / f"{name}.npz"), obstacle_at)
+    return drawing_task(name, TASKS[name].title, hint, load_demonstrations(ASSETS / f"{name}.npz"), obstacle_at)
 
 
 def lift_box() -> Task:
@@ -268,8 +268,11 @@ TASKS: Mapping[str, TaskEntry] = {
     "draw_w": TaskEntry("Draw W", partial(letter, "W", obstacle_at=0.36)),  # not between two strokes
     "draw_z": TaskEntry("Draw Z", partial(letter, "Z")),
     "draw_8": TaskEntry("Draw 8", partial(letter, "8", "The 8 crosses itself. Drag the sphere through it.", 0.3)),
+    "draw_s_wavy": TaskEntry("Draw wavy S", partial(letter, "S_wavy", "The S of another hand, in waves.")),
     "lift_box": TaskEntry("Lift box", lift_box),
     "push_box": TaskEntry("Push box", push_box),
     "drop_pots": TaskEntry("Drop in pots", drop_pots),
 }
 """The tasks that ship with DT-Viz, by name."""
+STYLES: Mapping[str, tuple[str, str]] = {"wavy": ("draw_s", "draw_s_wavy")}
+"""Tasks of the same action, by the usual hand and in a style, by the style's name."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from dataclasses import replace
+from typing import Any
 
 import viser
 
@@ -12,10 +13,12 @@ from dt_viz.learning.choice import STATES
 from dt_viz.learning.imitation import OBJECTIVES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, tunable, tuned
+from dt_viz.scenario.tasks import STYLES
 from dt_viz.transforms.base import Number, Setting, Switch, Transform
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.settings import add_settings
 
+NO_STYLE = "–"
 _SMALL = "font-size:0.8em;line-height:1.45;padding:0.1em 0.9em 0.5em;opacity:0.85"
 
 
@@ -41,11 +44,27 @@ def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) 
     )
     state = gui.add_dropdown("State", STATES, order=order, hint=hint)
     bindings.input(state, lambda s: s.state, lambda _s, value: {"state": value})
+    hint = "how another hand draws, taken off its demonstrations of one letter and put on this one (augmented)"
+    style = gui.add_dropdown("Style", (NO_STYLE, *STYLES), order=order, hint=hint)
+    bindings.input(style, lambda s: s.style or NO_STYLE, _with_style)
+    hint = "part of the style that is put on; below 0 it is taken off"
+    amount = gui.add_slider("Amount", -1.0, 2.0, 0.05, 1.0, order=order, hint=hint)
+    bindings.input(amount, lambda s: s.style_amount, lambda _s, value: {"style_amount": value})
+    bindings.properties(style, visible=lambda s: _is_imitation(s) and _is_drawing(bindings.frame))
+    bindings.properties(amount, visible=lambda s: _is_imitation(s) and bool(s.style))
     note = gui.add_html("", order=order)
     bindings.properties(note, content=lambda _s: learned_html(bindings.frame))
     for handle in (objective, state, note):
         bindings.properties(handle, visible=_is_imitation)
     add_settings(gui, bindings, _settings, tuned, order)
+
+
+def _with_style(_scenario: Scenario, name: str) -> dict[str, Any]:
+    return {"style": "" if name == NO_STYLE else name}
+
+
+def _is_drawing(frame: Frame | None) -> bool:
+    return frame is not None and frame.task.draws
 
 
 def _is_imitation(scenario: Scenario) -> bool:

@@ -1,0 +1,56 @@
+"""Style: how one hand's motions differ from another's, taken off one action and put on a third (the paper's sec. 6).
+
+ψ_A and ψ_B of two augmented imitations are shears along motions over the same phase (see `dt_viz.flows.phased`), so
+that ψ_A∘ψ_B⁻¹, which leads from the one hand to the other, is one, too: along the difference of their mean motions,
+(y, s) ↦ (y + d(s), s). Put on a third motion, whole or in part, it is as stable, and det J stays 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dt_viz.flows.fields import Array
+from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.preparation import ImitationError
+
+
+@dataclass(frozen=True, eq=False)
+class Style:
+    """How a styled motion differs from a plain-handed one of the same action."""
+
+    offsets: Array
+    """(K, d) d at the knots of a motion, from its start, in units of s_max; zero at both ends, which stay."""
+
+    @classmethod
+    def between(cls, usual: AugmentedImitation, styled: AugmentedImitation) -> Style:
+        """What leads from the usual motion of an action to the styled one.
+
+        Raises:
+            ImitationError: they do not have as many coordinates.
+        """
+        _check(len(usual.goal), len(styled.goal))
+        before, after = (one.patterns[0].mean / one.top for one in (usual, styled))
+        offsets = (after - after[-1]) - (before - before[-1])
+        return cls(offsets - np.linspace(1, 0, len(offsets))[:, None] * offsets[0])
+
+    def on(self, imitation: AugmentedImitation, amount: float) -> AugmentedImitation:
+        """A motion in this style.
+
+        Args:
+            imitation: of any action with as many coordinates.
+            amount: part of the style that is put on; a negative one is taken off.
+
+        Raises:
+            ImitationError: it has more or fewer coordinates.
+        """
+        _check(self.offsets.shape[1], len(imitation.goal))
+        moved = amount * imitation.top * self.offsets
+        patterns = tuple(replace(pattern, mean=pattern.mean + moved) for pattern in imitation.patterns)
+        return replace(imitation, patterns=patterns, reason="a style is put on it")
+
+
+def _check(wanted: int, found: int) -> None:
+    if found != wanted:
+        raise ImitationError(f"style: found a motion of {found} coordinates; accepted: {wanted}, as the style has")
