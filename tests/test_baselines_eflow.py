@@ -199,9 +199,10 @@ def test_shipped_weights_fit_their_task_reach_its_goal_and_are_small(path):
     paths, times = system.rollouts(task.starts, 0.012)
     assert max(np.linalg.norm(path[-1] - system.goal) for path in paths) < 1e-6
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in task.paths]
-    assert frechet(paths, task.paths).mean() < 0.1 * np.mean(lengths)
+    follows = frechet(paths, task.paths).mean() < 0.1 * np.mean(lengths)
+    assert follows == (task.name != "draw_8")  # which crosses itself, as no motion of one field does
     durations = [d.times[-1] - d.times[0] for d in task.demonstrations]
-    assert 0.5 < np.mean([t[-1] for t in times]) / np.mean(durations) < 2
+    assert not follows or 0.5 < np.mean([t[-1] for t in times]) / np.mean(durations) < 2
 
 
 def test_weights_ship_for_every_task():
