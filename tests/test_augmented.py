@@ -172,6 +172,8 @@ def test_labels_are_checked():
     case = CASES["left and right from one start"]
     with pytest.raises(ImitationError, match="found 3; accepted: 2, one for each"):
         fit_augmented(case.demonstrations, (1, 2, 3))
+    with pytest.raises(ImitationError, match=r"found .*nan.*; accepted: finite numbers"):
+        fit_augmented(case.demonstrations, (1, float("nan")))
     imitation = fit_augmented(case.demonstrations, case.labels)
     start = case.demonstrations[0].positions[0]
     with pytest.raises(FormatError, match=r"label: found 7; accepted: -1, 1"):

@@ -334,6 +334,8 @@ def fit_augmented(
         raise ImitationError(
             f"labels: found {len(labels)}; accepted: {len(demonstrations)}, one for each demonstration"
         )
+    if labels is not None and not np.isfinite(labels).all():
+        raise ImitationError(f"labels: found {list(labels)}; accepted: finite numbers")
     motions = prepare(demonstrations)
     starts = np.stack([path[0] for path in motions.positions])
     extent = float(np.ptp(np.concatenate(motions.positions), axis=0).max())
