@@ -369,7 +369,8 @@ def fit(
         objective: what is fitted in the plain state: the motions, or their velocities as in eq. (3).
         state: "plain" is the paper's: one vector field of places, which needs no memory. "augmented" remembers its
             phase and where it began: it crosses itself, comes back, winds, and draws the figure from other starts,
-            too. "auto" is plain unless demonstrations conflict or are missed by more than 5 % of their extent.
+            too. "auto" is plain unless demonstrations conflict, or a fit with the default settings misses one by more
+            than 5 % of their extent.
         labels: a number for each demonstration, usually from −1 to 1, where they differ although they begin at one
             place; makes the state augmented.
 

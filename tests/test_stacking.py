@@ -33,7 +33,7 @@ from dt_viz.scenario.stack import (
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import Choice, FlowIntegration, Number, Switch
-from dt_viz.transforms.bias import PLACED_BESIDE, BiasPoint
+from dt_viz.transforms.bias import MAX_TARGET_MISS, PLACED_BESIDE, BiasPoint
 from dt_viz.transforms.registry import KINDS
 
 SIMILAR = ("draw_j", "draw_c", "draw_g", "draw_z")
@@ -200,7 +200,9 @@ def test_two_new_bias_points_do_not_pull_against_each_other(task, engine, initia
     for point in anchored(scenario).values():
         assert isinstance(point, BiasPoint)
         for path in frame.rollouts:
-            assert np.linalg.norm(path - point.position, axis=1).min() <= 0.0105  # between samples, too
+            assert np.linalg.norm(point.offsets(path), axis=1).min() <= 0.0105  # between samples, too
+            # what goes around the obstacle through the depth is not all back in the plane yet
+            assert np.linalg.norm(path - point.position, axis=1).min() <= MAX_TARGET_MISS
 
 
 # settings

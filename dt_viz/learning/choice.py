@@ -6,7 +6,8 @@
     it remembers its phase and where it began (see `dt_viz.learning.augmented`): it crosses, comes back and winds, and
     draws the figure from other starts, too;
 ``auto``
-    plain, unless demonstrations conflict or are missed by it.
+    plain, unless the demonstrations conflict, or a plain fit with the default settings misses one. So the settings of
+    the plain fit do not change the state: who chooses few basis functions sees what they make of it.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def learn(
     state: State = "auto",
     labels: Sequence[float] | None = None,
     progress: Progress | None = None,
-    plain: Callable[[], Imitation] | None = None,
+    plain: Callable[[ImitationSettings | None], Imitation] | None = None,
 ) -> AnyImitation:
     """Learn a stable motion in the state that is asked for.
 
@@ -66,7 +67,7 @@ def learn(
         state: see the module.
         labels: a number for each demonstration; only of the augmented state.
         progress: see `dt_viz.learning.imitation.fit`.
-        plain: gives the plain fit; None fits it here.
+        plain: gives the plain fit with these settings; None fits it here.
 
     Raises:
         ImitationError: nothing can be learned, there is no such state, or the plain state is to have labels.
@@ -75,9 +76,9 @@ def learn(
         raise ImitationError(f"state: found {state!r}; accepted: {', '.join(STATES)}")
     if state == "plain" and labels is not None:
         raise ImitationError("labels: found some; accepted: none in the plain state")
-    plain = plain or (lambda: fit(demonstrations, settings, progress))
+    plain = plain or (lambda settings: fit(demonstrations, settings, progress))
     if state == "plain":
-        return plain()
+        return plain(settings)
     if state == "augmented" or labels is not None:
         return fit_augmented(demonstrations, labels)
     motions = prepare(demonstrations)
@@ -86,12 +87,12 @@ def learn(
         reason = f"on {100 * share:.0f} % of their way the demonstrations pass a place in different directions"
         return replace(fit_augmented(demonstrations), reason=reason)
     try:
-        imitation = plain()
+        usual = plain(None)
     except ImitationError as error:
         return replace(fit_augmented(demonstrations), reason=f"the plain state fails: {error}")
-    off = missed(imitation, motions)
+    off = missed(usual, motions)
     if off <= MOST_MISSED:
-        return imitation
+        return usual if settings in (None, ImitationSettings()) else plain(settings)
     reason = f"the plain state misses a demonstration by {100 * off:.0f} % of the extent"
     return replace(fit_augmented(demonstrations), reason=reason)
 

@@ -130,7 +130,7 @@ class FitStore:
 
         What is learned in the augmented state is not stored: it takes milliseconds.
         """
-        plain = lambda: self.get(demonstrations, settings, progress)  # noqa: E731
+        plain = lambda settings: self.get(demonstrations, settings, progress)  # noqa: E731
         return learn(demonstrations, settings, state, plain=plain)
 
     def get(
