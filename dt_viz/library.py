@@ -168,6 +168,11 @@ class Motion:
         imitation = self._learned.imitation
         return imitation.reason if isinstance(imitation, AugmentedImitation) else ""
 
+    @property
+    def labels(self) -> tuple[float, ...]:
+        """The labels that `rollouts` and `velocity` accept, given or found; none where starts tell what follows."""
+        return self._learned.labels
+
     def certificates(self) -> Certificates:
         """Checks of the paths from the demonstrations' starts, and warnings."""
         nominal, solution = self._learned.demonstrated, self._solution
@@ -372,7 +377,7 @@ def fit(
             too. "auto" is plain unless demonstrations conflict, or a fit with the default settings misses one by more
             than 5 % of their extent.
         labels: a number for each demonstration, usually from −1 to 1, where they differ although they begin at one
-            place; makes the state augmented.
+            place; makes the state augmented. None finds them where that is so; see `Motion.labels`.
 
     Raises:
         ImitationError: no stable motion can be learned from them, or there is no such state.

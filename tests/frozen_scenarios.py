@@ -15,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from scenes import starts_at
 
 from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import Engine
@@ -40,7 +41,7 @@ def scenario_of(engine, description):
         imitation=description["imitation"],
         objective=description["objective"],
         warp=description["warp"],
-        starts=tuple(map(tuple, description["starts"])),
+        starts=starts_at(*description["starts"]),
     )
 
 

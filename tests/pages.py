@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import viser  # noqa: TID251 - a page that no browser shows
-from scenes import biases, changing
+from scenes import biases, changing, starts_at
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
@@ -193,7 +193,7 @@ class Page:
             "test",
             task="draw_s",
             **changing(self.session.scenario, obstacles=obstacles, layers=layers, **avoidance),
-            starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
+            starts=starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
             view=View(generator=True, click_to_start=True, handles=True, **view),
         )
         return self.session.scenario

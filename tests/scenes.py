@@ -2,7 +2,10 @@
 
 from dataclasses import fields, replace
 
-from dt_viz.scenario.scenario import Layer, Scenario
+import numpy as np
+
+from dt_viz.obstacles.shapes import as_point
+from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.stack import avoidance_layer, with_avoidance
 from dt_viz.transforms.avoidance import Avoidance
 
@@ -61,6 +64,16 @@ def kinds(warnings):
 def biases(*points):
     """Layers of bias points, named as on the page."""
     return tuple(Layer(point, name=f"Bias {k}") for k, point in enumerate(points, 1))
+
+
+def starts_at(*places):
+    """Added starts at places (3,), metres."""
+    return tuple(Start(as_point(place)) for place in places)
+
+
+def places_of(starts):
+    """Places (N, 3), metres, of added starts."""
+    return np.array([start.place for start in starts]).reshape(-1, 3)
 
 
 def says(frame, words):

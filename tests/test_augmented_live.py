@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import avoiding, biases, changed, kinds
+from scenes import avoiding, biases, changed, kinds, starts_at
 
 import dt_viz as dt
 from dt_viz.engine.frame import Stage
@@ -12,6 +12,7 @@ from dt_viz.errors import DataError, FormatError
 from dt_viz.evaluate.crossings import crossings
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.choice import MOST_CONFLICTING, MOST_MISSED, conflicts, learn, missed
+from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.learning.preparation import ImitationError, prepare
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
@@ -21,8 +22,8 @@ from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.paper_scenes import SCENES
-from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import TASKS
+from dt_viz.scenario.scenario import Scenario, Start
+from dt_viz.scenario.tasks import TASKS, TaskEntry, drawing_task
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.warning import Kind
 
@@ -99,6 +100,124 @@ def test_a_plain_fit_that_misses_is_not_taken():
 
     failing = learn(demonstrations, plain=fail)
     assert isinstance(failing, AugmentedImitation) and "no map" in failing.reason
+
+
+# --- Labels ---
+
+
+def ways(heights, seed=0, jitter=0.01):
+    """Three demonstrations of each way to the goal, from about one start, in turn."""
+    rng, u = np.random.default_rng(seed), np.linspace(0, 1, 150)[:, None]
+    found = []
+    for height in 3 * tuple(heights):
+        start = np.array([0.3, 0.0]) + jitter * rng.normal(size=2)
+        path = (1 - u) * start + (height + 0.01 * rng.normal()) * np.sin(np.pi * u) * [0.0, 1.0]
+        found.append(Demonstration(np.linspace(0, 3 + rng.uniform(), len(u)), path, "way"))
+    return tuple(found)
+
+
+def found_labels(demonstrations):
+    imitation = learn(demonstrations, state="augmented")
+    assert isinstance(imitation, AugmentedImitation)
+    return imitation.known_labels
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("jitter", [0.0, 0.01, 0.03])
+@pytest.mark.parametrize(
+    ("heights", "labels"),
+    [
+        ((-0.1, 0.1), (-1.0, 1.0)),
+        ((0.17, 0.05), (-1.0, 1.0)),
+        ((-0.15, 0.02, 0.15), (-2.0, 0.0, 2.0)),
+        ((-0.2, -0.07, 0.07, 0.2), (-3.0, -1.0, 1.0, 3.0)),
+    ],
+)
+def test_labels_are_found_where_the_start_does_not_tell_which_way_is_taken(heights, labels, jitter, seed):
+    demonstrations = ways(heights, seed=seed, jitter=jitter)
+    imitation = learn(demonstrations, state="augmented")
+    assert isinstance(imitation, AugmentedImitation)
+    assert imitation.labels == 3 * labels and imitation.known_labels == labels
+    assert missed(imitation, prepare(demonstrations), imitation.labels) < 0.07
+
+
+@pytest.mark.parametrize(("name", "most"), [("left and right from one start", 0.01), ("crossing at equal phase", 0.04)])
+def test_labels_found_are_nearly_as_good_as_given_ones(name, most):
+    demonstrations = CASES[name].demonstrations
+    imitation = learn(demonstrations)
+    assert isinstance(imitation, AugmentedImitation) and len(imitation.known_labels) == 2
+    assert missed(imitation, prepare(demonstrations), imitation.labels) < most
+
+
+def test_labels_follow_the_demonstrations_in_whatever_order_they_come():
+    demonstrations, order = ways((-0.1, 0.1)), np.random.default_rng(0).permutation(6)
+    imitation = learn([demonstrations[k] for k in order], state="augmented")
+    assert isinstance(imitation, AugmentedImitation) and imitation.labels is not None
+    up = np.array([demonstrations[k].positions[:, 1].mean() > 0 for k in order])
+    first = -1.0 if up[0] else 1.0
+    np.testing.assert_array_equal(imitation.labels, np.where(up, first, -first))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_one_pattern_gets_no_labels(fits, task):
+    imitation = fits.learned(TASKS[task]().demonstrations, state="augmented")
+    assert isinstance(imitation, AugmentedImitation) and imitation.known_labels == ()
+
+
+def test_what_crosses_itself_gets_no_labels():
+    for name in ("loop", "wide eight", "reach and retreat", "helix, 4 turns"):
+        assert found_labels(CASES[name].demonstrations) == ()
+
+
+def test_ways_that_begin_far_apart_are_told_by_their_starts():
+    """Each has demonstrations that begin nearest to its own."""
+    left = ways((0.1,))
+    right = tuple(replace(d, positions=d.positions * [-1.0, 1.0]) for d in left)
+    assert found_labels((*left, *right)) == ()
+
+
+def test_demonstrations_that_are_left_out_do_not_shift_the_labels():
+    still = Demonstration(np.linspace(0, 1, 50), np.zeros((50, 2)), "still")
+    demonstrations = ways((-0.1, 0.1))
+    imitation = learn((demonstrations[0], still, *demonstrations[1:]), state="augmented")
+    assert isinstance(imitation, AugmentedImitation) and imitation.labels is not None
+    np.testing.assert_array_equal(np.delete(imitation.labels, 1), 3 * (-1.0, 1.0))
+
+
+def with_ways(new_engine):
+    """An engine with a task in which the start does not tell which way is taken."""
+    engine = new_engine()
+    made = drawing_task("ways", "Ways", "", ways((-0.1, 0.1), jitter=0.0))
+    engine._tasks = {**engine._tasks, "ways": TaskEntry("Ways", lambda: made)}
+    return engine
+
+
+def test_an_added_start_takes_the_way_of_its_label_and_that_of_the_nearest_without(new_engine):
+    engine = with_ways(new_engine)
+    task = engine.task("ways")
+    place = as_point(task.starts.mean(axis=0))
+    labels = (-1.0, 1.0, None, 0.3)
+    frame = last(engine, Scenario("ways", (), starts=tuple(Start(place, label) for label in labels)))
+    assert frame.labels == (-1.0, 1.0) and "misses a demonstration" in frame.reason
+    low, high, nearest, unknown = frame.rollouts[-4:]
+    assert low[:, 2].min() < place[2] - 0.05 and low[:, 2].max() < place[2] + 0.02
+    assert high[:, 2].max() > place[2] + 0.05 and high[:, 2].min() > place[2] - 0.02
+    host = int(np.linalg.norm(task.starts - place, axis=1).argmin())
+    np.testing.assert_array_equal(nearest, unknown)
+    np.testing.assert_array_equal(nearest, (low, high)[host % 2])
+    plain = last(engine, Scenario("ways", (), state="plain", starts=(Start(place, 1.0),)))
+    assert plain.labels == () and len(plain.rollouts) == 6 + 1  # a label means nothing to it
+
+
+def test_what_has_labels_found_is_saved_with_them(tmp_path):
+    motion = dt.fit(ways((-0.1, 0.1), jitter=0.0))
+    assert motion.labels == (-1.0, 1.0)
+    motion.save(tmp_path / "motion.npz")
+    loaded = dt.Motion.load(tmp_path / "motion.npz")
+    start = ways((-0.1, 0.1))[0].positions[0]
+    for label in (-1.0, 1.0):
+        a, b = (m.rollouts(start, label=label)[0].positions for m in (motion, loaded))
+        np.testing.assert_allclose(a, b, atol=1e-9)
 
 
 def test_wrong_choices_are_named():
@@ -199,7 +318,7 @@ def test_certificates_recognise_another_motion(engine):
 def test_an_added_start_draws_the_8_from_there(engine):
     task = engine.task(EIGHT)
     start = as_point(task.starts.mean(axis=0) + np.array([0.05, 0.0, 0.04]))
-    frame = last(engine, Scenario(EIGHT, (), starts=(start,)))
+    frame = last(engine, Scenario(EIGHT, (), starts=starts_at(start)))
     added, mean = frame.rollouts[-1], task.mean_path
     shifted = mean + np.linspace(1, 0, len(mean))[:, None] * (start - mean[0])
     assert frechet(added, shifted) < 0.02 and not frame.certificates.warnings
@@ -357,6 +476,7 @@ def test_saved_motions_come_back_with_their_state_and_labels(tmp_path):
     start = case.demonstrations[0].positions[:1]
     left, right = (motion.rollouts(start, label=label)[0].positions for label in (1.0, -1.0))
     assert left[:, 1].max() > 0.09 and right[:, 1].min() < -0.09
+    assert motion.labels == (-1.0, 1.0)
     motion.save(tmp_path / "motion.npz")
     again = dt.Motion.load(tmp_path / "motion.npz")
     np.testing.assert_array_equal(again.rollouts(start, label=1.0)[0].positions, left)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import changed, kinds
+from scenes import changed, kinds, starts_at
 
 from dt_viz.arm.arm_system import Section
 from dt_viz.arm.collision import SELF_MARGIN, load_collision_model
@@ -279,7 +279,7 @@ class TestStance:
     def test_added_starts_stay_the_last_ones_where_one_of_the_task_s_is_left_out(self, engine, initial):
         scenario = placed(initial("push_box"), around(engine.task("push_box").starts[0], 0.1))
         added = (0.1, -0.45, 0.3), (0.0, -0.45, 0.35)
-        scenario = replace(scenario, starts=added)
+        scenario = replace(scenario, starts=starts_at(*added))
         frame = next(engine.frames(scenario))
         assert Kind.START_COVERED in kinds(frame.certificates.found)
         assert frame.num_added == len(added) < len(frame.rollouts) < 7 + len(added)

@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from scenes import avoiding, biases, changed, changing
+from scenes import avoiding, biases, changed, changing, starts_at
 
 from dt_viz import interruption
 from dt_viz.engine import session as session_module
@@ -743,7 +743,7 @@ def test_the_arm_is_driven_by_the_first_frame_of_each_motion_and_by_the_refined_
 
 
 def test_starts_are_added_and_removed_step_by_step_for_undo_and_another_task_has_none(opened):
-    a, b = (0.1, -0.5, 0.4), (0.2, -0.5, 0.4)
+    a, b = starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))
     for starts in ((a,), (a, b), (b,)):
         opened.edit("starts", starts=starts)
         opened.session.end_gesture()

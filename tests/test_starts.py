@@ -6,7 +6,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from scenes import biases, changed, says
+from scenes import biases, changed, says, starts_at
 
 from dt_viz.arm.whole_arm import MOVED
 from dt_viz.engine.frame import Stage
@@ -15,6 +15,7 @@ from dt_viz.flows.fields import PlacedField
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.starts import with_grid
 from dt_viz.transforms.bias import BiasPoint
@@ -28,7 +29,7 @@ def _task(request):
 
 
 def random_starts(engine, scenario, num=NUM, seed=0, room=0.02):
-    """Places on the slice and up to 3 cm beside it, clear of the obstacle and above the table."""
+    """Starts on the slice and up to 3 cm beside it, clear of the obstacle and above the table."""
     rng, area = np.random.default_rng(seed), engine.task(scenario.task).slice
     axes = np.column_stack([area.axes, np.cross(*area.axes.T)])
     found = []
@@ -36,8 +37,8 @@ def random_starts(engine, scenario, num=NUM, seed=0, room=0.02):
         across = rng.uniform(-1, 1, 3) * (*area.half_size, 0.03)
         start = area.centre + axes @ across
         if start[2] > 0.05 and scenario.obstacle.signed_distance(start) > room:
-            found.append(tuple(float(c) for c in start))
-    return tuple(found)
+            found.append(start)
+    return starts_at(*found)
 
 
 def frame_of(engine, scenario, stage=Stage.FINE):
@@ -51,9 +52,9 @@ def test_added_rollouts_are_motions_of_the_system_and_end_at_the_goal(engine, in
     system = build_stack(engine.nominal(scenario), scenario.active, FINE).system
     assert len(frame.rollouts) == num + NUM
     for start, path, times in zip(scenario.starts, frame.rollouts[num:], frame.times[num:], strict=True):
-        np.testing.assert_allclose(path[0], start, atol=1e-6)
+        np.testing.assert_allclose(path[0], start.place, atol=1e-6)
         np.testing.assert_allclose(path[-1], frame.goal, atol=1e-4)
-        there = system.rollout(np.array([start]), times)[0]
+        there = system.rollout(np.array([start.place]), times)[0]
         np.testing.assert_allclose(there[:-1], path[:-1], atol=1e-5)
         assert (np.diff(system.lyapunov(path)) < 0).all()
 
@@ -92,7 +93,7 @@ def test_the_whole_arm_begins_at_added_starts_and_keeps_clear(engine, initial, r
     frame, num = frame_of(engine, scenario), 7
     assert len(frame.rollouts) == num + NUM and frame.certificates.clearance > 0
     for start, path in zip(scenario.starts, frame.rollouts[num:], strict=True):
-        np.testing.assert_allclose(path[0], start, atol=2e-3)
+        np.testing.assert_allclose(path[0], start.place, atol=2e-3)
         np.testing.assert_allclose(path[-1], frame.goal, atol=2e-3)
         assert scenario.obstacle.signed_distance(path).min() > 0
 
@@ -114,7 +115,7 @@ def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it
     for guest in doubtful:
         assert re.search(rf"added starts? [\d, ]*\b{numbers[guest] - 6}\b", named)
     for guest in np.setdiff1d(np.arange(7, len(frame.rollouts)), doubtful):
-        np.testing.assert_allclose(frame.rollouts[guest][0], grid.starts[numbers[guest] - 7], atol=MOVED)
+        np.testing.assert_allclose(frame.rollouts[guest][0], grid.starts[numbers[guest] - 7].place, atol=MOVED)
         assert engine.follower.whole_arm.clearance(arm.p[arm.index == guest], scenario.obstacle).min() > 0
 
 
@@ -125,7 +126,7 @@ def test_the_arm_follows_an_added_rollout(engine, initial, robot, space):
     frame = frame_of(engine, scenario)
     assert frame.chosen == 9 and frame.arm is not None
     hand = robot.end_effector(frame.arm.q)
-    np.testing.assert_allclose(hand[0], scenario.starts[2], atol=2e-3)
+    np.testing.assert_allclose(hand[0], scenario.starts[2].place, atol=2e-3)
     np.testing.assert_allclose(hand[-1], frame.goal, atol=2e-3)
     assert frame.profiles is not None and frame.profiles.of_mean
     assert not frame_of(engine, replace(scenario, arm_rollout=3)).profiles.of_mean
@@ -134,7 +135,7 @@ def test_the_arm_follows_an_added_rollout(engine, initial, robot, space):
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_a_start_out_of_reach_is_said_to_be_and_blocks_nothing(engine, initial, space):
     near, far = (0.2, -0.5, 0.3), (1.5, -0.5, 0.3)
-    scenario = changed(initial("push_box"), space=space, starts=(near, far, near), arm_rollout=7 + 1)
+    scenario = changed(initial("push_box"), space=space, starts=starts_at(near, far, near), arm_rollout=7 + 1)
     frame = frame_of(engine, scenario)
     assert not frame.blocked and frame.arm is None
     texts = [warning.text for warning in frame.certificates.warnings]
@@ -148,7 +149,7 @@ def test_a_start_out_of_reach_is_said_to_be_and_blocks_nothing(engine, initial, 
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
     scenario = changed(initial("push_box"), space=space)
-    frame = frame_of(engine, replace(scenario, starts=(scenario.obstacles[0].position,)))
+    frame = frame_of(engine, replace(scenario, starts=starts_at(scenario.obstacles[0].position)))
     assert not frame.blocked
     assert says(frame, "added start 1 is inside the obstacle")
 
@@ -156,7 +157,7 @@ def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
 def test_an_added_start_at_the_goal_stays_there(engine, initial):
     scenario = changed(initial("draw_s"), obstacles=())
     goal = engine.nominal(scenario).goal
-    frame = frame_of(engine, replace(scenario, starts=(tuple(float(c) for c in goal),), arm_rollout=7))
+    frame = frame_of(engine, replace(scenario, starts=starts_at(goal), arm_rollout=7))
     np.testing.assert_allclose(frame.rollouts[-1], np.broadcast_to(goal, frame.rollouts[-1].shape), atol=1e-6)
     assert frame.arm is not None and np.isfinite(frame.arm.q).all()
 
@@ -164,7 +165,7 @@ def test_an_added_start_at_the_goal_stays_there(engine, initial):
 def test_dragging_a_start_keeps_only_the_newest_rollouts(new_engine, initial):
     engine, scenario = new_engine(), initial("draw_s")
     for x in np.linspace(-0.1, 0.1, 200):
-        moved = replace(scenario, starts=((float(x), -0.5, 0.45),))
+        moved = replace(scenario, starts=starts_at((x, -0.5, 0.45)))
         assert isinstance(engine.nominal(moved), Nominal)
     assert engine.memo.count("strand") < 100
     assert engine.memo.count("nominal") < 10
@@ -183,7 +184,7 @@ def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine,
 
 def test_the_ground_keeps_what_it_has_of_the_demonstrations(engine, initial):
     nominal = engine.nominal(initial("lift_box"))
-    more = nominal.learned.nominal([nominal.learned.strand((0.1, -0.5, 0.3))])
+    more = nominal.learned.nominal([nominal.learned.strand(Start((0.1, -0.5, 0.3)))])
     assert nominal.learned.nominal(()) is nominal
     np.testing.assert_array_equal(more.starts[:-1], nominal.starts)
     alike, other = more.rays_between(more.ends), nominal.rays_between(nominal.ends)
@@ -203,7 +204,7 @@ def test_a_motion_that_begins_inside_the_obstacle_needs_no_longer_flow_than_the_
     (obstacle,) = scenario.obstacles
     inside = tuple(c + d for c, d in zip(obstacle.position, (0.0, 0.0, 0.07), strict=True))
     before, after = (
-        build_stack(engine.nominal(s), s.active, LIVE) for s in (scenario, replace(scenario, starts=(inside,)))
+        build_stack(engine.nominal(s), s.active, LIVE) for s in (scenario, replace(scenario, starts=starts_at(inside)))
     )
     assert all(applied.satisfied for applied in (*before.built, *after.built))
     assert after.built[0].made.duration < 1.5 * before.built[0].made.duration

@@ -8,13 +8,15 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from scenes import changed
+from pages import Bound, frame_of
+from scenes import avoiding, changed, places_of, starts_at
 
 from dt_viz.engine.frame import Frame
 from dt_viz.motion.following import room_at_rest
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import MAX_STARTS
+from dt_viz.scenario.scenario import MAX_STARTS, Start
 from dt_viz.scenario.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
+from dt_viz.ui.panel.starts import StartsPanel
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.starts import Starts
 
@@ -47,7 +49,7 @@ def test_a_grid_leaves_out_where_the_arm_that_is_to_avoid_the_obstacle_touches_i
     assert not engine.follower.admitted(nominal, scenario.obstacle).left_out
     postures = engine.follower.undisturbed(nominal).tracked.q[7:, 0]
     room = engine.follower.whole_arm.clearance(postures, scenario.obstacle)
-    np.testing.assert_allclose(room, arm_room(np.array(grid.starts)), atol=1e-3)
+    np.testing.assert_allclose(room, arm_room(places_of(grid.starts)), atol=1e-3)
 
 
 def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_that_are_taken(engine, initial):
@@ -56,8 +58,8 @@ def test_a_grid_leaves_out_what_is_in_the_obstacle_or_out_of_reach_and_places_th
     scenario = changed(initial("draw_s"), obstacles=(Sphere((float(x), float(y), float(z))),))
     grid = with_grid(scenario, area, no_arm)
     assert len(grid.starts) + grid.num_blocked + grid.num_far == 16 and grid.num_blocked > 0
-    assert (scenario.obstacle.signed_distance(np.array(grid.starts)) >= scenario.avoidance.margin).all()
-    np.testing.assert_allclose((np.array(grid.starts) - area.centre) @ area.normal, 0, atol=1e-9)
+    assert (scenario.obstacle.signed_distance(places_of(grid.starts)) >= scenario.avoidance.margin).all()
+    np.testing.assert_allclose((places_of(grid.starts) - area.centre) @ area.normal, 0, atol=1e-9)
     again = with_grid(replace(scenario, starts=grid.starts), area, no_arm)
     assert again.starts == grid.starts
     far = with_grid(scenario, replace(area, centre=area.centre + np.array([0.0, -2.0, 0.0])), no_arm)
@@ -70,8 +72,8 @@ def test_starts_are_added_up_to_a_limit_apart_from_each_other_and_moved(initial)
         scenario = replace(scenario, starts=with_start(scenario, np.array([0.03 * k, -0.5, 0.4])))
     assert len(scenario.starts) == MAX_STARTS
     one = replace(scenario, starts=scenario.starts[:1])
-    assert with_start(one, np.array(one.starts[0]) + APART / 2) == one.starts
-    assert with_moved_start(one, 0, np.ones(3)) == ((1.0, 1.0, 1.0),)
+    assert with_start(one, np.array(one.starts[0].place) + APART / 2) == one.starts
+    assert with_moved_start(one, 0, np.ones(3)) == starts_at(np.ones(3))
     assert with_moved_start(one, 5, np.ones(3)) == one.starts  # it was removed a moment ago
 
 
@@ -135,8 +137,8 @@ def test_a_click_adds_a_start_only_while_it_is_asked_for_and_not_on_a_ball(opene
     scenario, area = initial("draw_s"), engine.task("draw_s").slice
     starts.adopt(scenario)
     assert scene.clicks == []
-    first = tuple(float(c) for c in area.at(np.array([0.05, 0.1])))
-    asked = replace(scenario, starts=(first,), view=replace(scenario.view, click_to_start=True))
+    first = area.at(np.array([0.05, 0.1]))
+    asked = replace(scenario, starts=starts_at(first), view=replace(scenario.view, click_to_start=True))
     starts.adopt(asked)
     starts.adopt(asked)
     (click,) = scene.clicks
@@ -154,7 +156,7 @@ def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(
     scene, starts, told = opened
     area = engine.task("draw_s").slice
     places = [area.at(np.array(across)) for across in ((0.0, 0.1), (0.1, 0.0))]
-    scenario = replace(initial("draw_s"), starts=tuple(tuple(float(c) for c in place) for place in places))
+    scenario = replace(initial("draw_s"), starts=starts_at(*places))
     starts.adopt(scenario)
     for item, place in zip(starts.items, places, strict=True):
         np.testing.assert_allclose(item.ball.position, place)
@@ -179,8 +181,36 @@ def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(
 
 def test_balls_are_grey_while_nothing_moves_from_them(opened, initial, engine):
     _, starts, _ = opened
-    starts.adopt(replace(initial("draw_s"), starts=((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))))
+    starts.adopt(replace(initial("draw_s"), starts=starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))))
     area = engine.task("draw_s").slice
     for blocked, colour in ((("no way",), palette.STALE), ((), palette.ADDED)):
         starts.draw(cast(Frame, SimpleNamespace(slice=area, blocked=blocked)))
         assert [item.ball.color for item in starts.items] == [colour] * 2
+
+
+def test_a_label_is_chosen_for_new_starts_and_for_the_one_that_the_arm_follows(server):
+    scenario = avoiding("draw_s")
+    bound = Bound(scenario)
+    StartsPanel(server.gui, bound, lambda _text: None, lambda act: act())
+    num = len(bound.edited.task.demonstrations)
+    bound.adopt(scenario)
+    (control,) = bound.inputs("Label", visible=False)  # nothing is known to have labels
+    handle = control.control.handle
+    bound.report(frame_of(scenario, task=bound.edited.task, labels=(-1.0, 1.0)))
+    assert handle.visible and handle.options == ("nearest", "-1", "1") and handle.value == "nearest"
+    bound.set("Label", "1")
+    assert handle.value == "1"
+    for x in (0.1, 0.2):
+        bound.edited.edit("add start", starts=with_start(bound.edited.scenario, np.array([x, -0.5, 0.4])))
+        bound.set("Label", "-1")
+    assert [start.label for start in bound.edited.scenario.starts] == [1.0, -1.0]
+    bound.edited.edit("Follows rollout", arm_rollout=num)  # the first of them
+    assert handle.value == "1"
+    bound.set("Label", "nearest")
+    assert [start.label for start in bound.edited.scenario.starts] == [None, -1.0]
+    moved = with_moved_start(bound.edited.scenario, 1, np.ones(3))
+    assert moved[1] == Start((1.0, 1.0, 1.0), -1.0)
+    bound.set("Label", "7")  # forged, or gone meanwhile
+    assert handle.value == "nearest"
+    bound.report(frame_of(scenario, task=bound.edited.task))
+    assert not handle.visible

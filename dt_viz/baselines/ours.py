@@ -15,7 +15,7 @@ from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, Precision
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.transforms.avoidance import Avoidance
 
 
@@ -113,4 +113,4 @@ def from_starts(learned: Learned, starts: Array) -> tuple[Nominal, list[int]]:
     points = [as_point(start) for start in starts]
     added = list(dict.fromkeys(point for point in points if point not in known))
     numbers = {**known, **{point: len(learned.task.starts) + k for k, point in enumerate(added)}}
-    return learned.nominal([learned.strand(point) for point in added]), [numbers[point] for point in points]
+    return learned.nominal([learned.strand(Start(point)) for point in added]), [numbers[point] for point in points]

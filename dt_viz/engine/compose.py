@@ -76,6 +76,7 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         blocked=(),
         certificates=Certificates(clearance, found=warnings),
         remembers=isinstance(nominal.imitation, AugmentedImitation),
+        labels=nominal.learned.labels,
         reason=nominal.imitation.reason if isinstance(nominal.imitation, AugmentedImitation) else "",
         learned_steps=_learned_steps(nominal),
         durations=tuple(applied.made.duration if applied else None for applied in made),

@@ -94,6 +94,8 @@ class Frame:
     None where that begins at an added start."""
     remembers: bool = False
     """Whether the imitation is augmented: it remembers its phase and where it began."""
+    labels: tuple[float, ...] = ()
+    """Labels that an added start may have."""
     reason: str = ""
     """Why it is, if nobody asked for it."""
     learned_steps: tuple[int, ...] = ()

@@ -175,6 +175,11 @@ class AugmentedImitation:
         return len(self.goal)
 
     @property
+    def known_labels(self) -> tuple[float, ...]:
+        """The different labels, increasing; none without labels."""
+        return () if self._of_starts is None else tuple(float(label) for label in np.unique(self._of_starts))
+
+    @property
     def num_conditions(self) -> int:
         """Number of coordinates of a condition: those of the start, and the label if there is one."""
         return self.dim + (self._of_starts is not None)
@@ -203,9 +208,8 @@ class AugmentedImitation:
         """
         top = np.full((*places.shape[:-1], 1), self.top)
         parts = [places, top, places]
-        known = () if self._of_starts is None else np.unique(self._of_starts)
-        if label is not None and label not in known:
-            accepted = ", ".join(f"{value:g}" for value in known) or "none: the demonstrations have none"
+        if label is not None and label not in self.known_labels:
+            accepted = ", ".join(f"{value:g}" for value in self.known_labels) or "none: the demonstrations have none"
             raise FormatError("label", f"{label:g}", accepted)
         if self._of_starts is not None:
             nearest = np.linalg.norm(places[..., None, :] - self.starts, axis=-1).argmin(axis=-1)
@@ -217,8 +221,7 @@ class AugmentedImitation:
         """The states (R, d + 1 + c) in which the motions of all demonstrations begin, from their starts (R, d)."""
         if self.labels is None:
             return self.states(starts)
-        known = set() if self._of_starts is None else set(self._of_starts)
-        labels = [label if label in known else None for label in self.labels]
+        labels = [label if label in self.known_labels else None for label in self.labels]
         return np.stack([self.states(start, label) for start, label in zip(starts, labels, strict=True)])
 
     def caught(self, state: Array) -> float:

@@ -19,10 +19,12 @@ from typing import Literal, get_args
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
+from dt_viz.learning.unbending import groups_of
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 
 State = Literal["auto", "plain", "augmented"]
@@ -38,7 +40,12 @@ are in conflict."""
 MOST_CONFLICTING = 0.03
 """Largest share of the way on which demonstrations may conflict for the plain state."""
 MOST_MISSED = 0.05
-"""Largest Fréchet distance of a plain motion from its demonstration, relative to the extent."""
+"""Largest Fréchet distance of a motion from its demonstration, relative to the extent."""
+MOST_UNTOLD = 0.12
+"""The same from which a motion's start does not tell which pattern it follows, so that labels are looked for. What
+demonstrations of one pattern differ by stays below 9 % on handwriting."""
+MOST_PATTERNS = 4
+"""Largest number of patterns that are looked for in demonstrations which their starts do not tell apart."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,8 @@ def learn(
         demonstrations: at least one, all ending at (about) the same place.
         settings: of the plain fit; None takes the defaults.
         state: see the module.
-        labels: a number for each demonstration; only of the augmented state.
+        labels: a number for each demonstration; only of the augmented state. None looks for some where it misses
+            demonstrations without; see `patterns_of`.
         progress: see `dt_viz.learning.imitation.fit`.
         plain: gives the plain fit with these settings; None fits it here.
 
@@ -79,22 +87,68 @@ def learn(
     plain = plain or (lambda settings: fit(demonstrations, settings, progress))
     if state == "plain":
         return plain(settings)
-    if state == "augmented" or labels is not None:
+    if labels is not None:
         return fit_augmented(demonstrations, labels)
-    motions = prepare(demonstrations)
+    motions, reason = prepare(demonstrations), ""
+    if state == "auto":
+        usual, reason = _usual(motions, plain)
+        if usual is not None:
+            return usual if settings in (None, ImitationSettings()) else plain(settings)
+    return replace(_with_patterns(demonstrations, motions), reason=reason)
+
+
+def _usual(motions: Motions, plain: Callable[[ImitationSettings | None], Imitation]) -> tuple[Imitation | None, str]:
+    """The plain fit with the default settings, or why it is not to be taken."""
     share = conflicts(motions).phase
     if share > MOST_CONFLICTING:
-        reason = f"on {100 * share:.0f} % of their way the demonstrations pass a place in different directions"
-        return replace(fit_augmented(demonstrations), reason=reason)
+        return None, f"on {100 * share:.0f} % of their way the demonstrations pass a place in different directions"
     try:
-        usual = plain(None)
+        imitation = plain(None)
     except ImitationError as error:
-        return replace(fit_augmented(demonstrations), reason=f"the plain state fails: {error}")
-    off = missed(usual, motions)
-    if off <= MOST_MISSED:
-        return usual if settings in (None, ImitationSettings()) else plain(settings)
-    reason = f"the plain state misses a demonstration by {100 * off:.0f} % of the extent"
-    return replace(fit_augmented(demonstrations), reason=reason)
+        return None, f"the plain state fails: {error}"
+    off = missed(imitation, motions)
+    if off > MOST_MISSED:
+        return None, f"the plain state misses a demonstration by {100 * off:.0f} % of the extent"
+    return imitation, ""
+
+
+def _with_patterns(demonstrations: Sequence[Demonstration], motions: Motions) -> AugmentedImitation:
+    """The augmented state; with the fewest labels that tell what follows, where starts do not."""
+    imitation = fit_augmented(demonstrations)
+    if missed(imitation, motions) > MOST_UNTOLD or not _told_apart(imitation):
+        for num in range(2, min(MOST_PATTERNS, len(motions.positions)) + 1):
+            labels = patterns_of(motions, num)
+            known = dict(zip(motions.numbers, labels, strict=True))
+            labelled = fit_augmented(demonstrations, [known.get(k, labels[0]) for k in range(len(demonstrations))])
+            if missed(labelled, motions, labels) <= MOST_UNTOLD:
+                return labelled
+    return imitation
+
+
+def _told_apart(imitation: AugmentedImitation) -> bool:
+    """Whether each motion begins nearest to one of its own pattern, where it has several."""
+    starts = np.concatenate([pattern.conditions for pattern in imitation.patterns])
+    sizes = [len(pattern.conditions) for pattern in imitation.patterns]
+    of, num = np.repeat(np.arange(len(sizes)), sizes), np.repeat(sizes, sizes)
+    apart = np.linalg.norm(starts[:, None] - starts, axis=-1) + np.diag(np.full(len(starts), np.inf))
+    return bool((of[apart.argmin(axis=1)] == of)[num > 1].all())
+
+
+def patterns_of(motions: Motions, num: int) -> tuple[float, ...]:
+    """Tell motions apart by their shapes, wherever they begin.
+
+    Args:
+        motions: R of them.
+        num: of the patterns, at least 2.
+
+    Returns:
+        A label for each motion: evenly, 2 apart, around 0, in the order in which patterns come first.
+    """
+    shapes = motions.resampled(NUM_COMPARED)
+    fading = np.linspace(1.0, 0.0, NUM_COMPARED)[:, None]
+    groups = groups_of(shapes - fading * shapes[:, :1], num)
+    first = list(dict.fromkeys(groups))
+    return tuple(2.0 * first.index(group) - (len(first) - 1) for group in groups)
 
 
 def conflicts(motions: Motions) -> Conflicts:
@@ -113,15 +167,17 @@ def conflicts(motions: Motions) -> Conflicts:
     return Conflicts(float((against & far).any(axis=1).mean()), float((against & ~far & other).any(axis=1).mean()))
 
 
-def missed(imitation: Imitation, motions: Motions) -> float:
+def missed(imitation: AnyImitation, motions: Motions, labels: Sequence[float] | None = None) -> float:
     """Largest discrete Fréchet distance of a learned motion from its demonstration, relative to the extent."""
     extent = float(np.ptp(np.concatenate(motions.positions), axis=0).max())
-    return max(_missed(imitation, path) for path in motions.positions) / extent
+    of = [None] * len(motions.positions) if labels is None else labels
+    pairs = zip(motions.positions, of, strict=True)
+    return max(_missed(imitation.system, path, label) for path, label in pairs) / extent
 
 
-def _missed(imitation: Imitation, path: Array) -> float:
-    transform, base = imitation.transform, imitation.base
+def _missed(system: DiffeomorphicSystem, path: Array, label: float | None) -> float:
+    begun = system.transform.forward(system.base.states(path[0], label))
     left = np.linspace(1, 0, NUM_COMPARED)
-    drawn = transform.inverse(base.at_fraction(transform.forward(path[0]), left))
+    drawn = system.transform.inverse(system.base.at_fraction(begun, left))[:, : path.shape[1]]
     a, b = (resample_by_arc_length(p, NUM_COMPARED) for p in (drawn, path))
     return float(discrete_frechet(a, b))

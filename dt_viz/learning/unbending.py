@@ -72,13 +72,13 @@ def unbending(motions: Array, num_stages: int, longest: float, max_stages: int) 
     return [rays, *shapes]
 
 
-def groups_of(motions: Array) -> NDArray[np.integer[Any]]:
-    """Number the groups of the motions, (R,), from 0."""
+def groups_of(motions: Array, num: int | None = None) -> NDArray[np.integer[Any]]:
+    """Number the groups of the motions, (R,), from 0: `num` of them at most; None decides by how far they are apart."""
     if len(motions) == 1:
         return np.zeros(1, dtype=int)
     distance = np.linalg.norm(motions[:, None] - motions[None], axis=-1).mean(axis=-1)
     tree = linkage(distance[np.triu_indices(len(motions), 1)], "average")
-    return fcluster(tree, APART, "distance") - 1
+    return (fcluster(tree, APART, "distance") if num is None else fcluster(tree, num, "maxclust")) - 1
 
 
 class _Unbending:

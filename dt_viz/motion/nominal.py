@@ -11,9 +11,10 @@ from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import AnyImitation
-from dt_viz.obstacles.shapes import Point
 from dt_viz.properties import cached_property
+from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
 
@@ -85,9 +86,15 @@ class Learned:
         """Places (N, 3), metres, of base states (N, k): the first coordinates of ψ⁻¹."""
         return self.system.transform.inverse(base_states)[:, :3]
 
-    def strand(self, start: Point) -> Strand:
-        """The rollout from an added start, metres."""
-        return self._strands(self.system.base.states(np.array([start])), NUM_ADDED_SAMPLES)[0]
+    @property
+    def labels(self) -> tuple[float, ...]:
+        """The labels that a start may have."""
+        return self.imitation.known_labels if isinstance(self.imitation, AugmentedImitation) else ()
+
+    def strand(self, start: Start) -> Strand:
+        """The rollout from an added start; a label that it cannot have is that of the nearest demonstrated start."""
+        label = start.label if start.label in self.labels else None
+        return self._strands(self.system.base.states(np.array([start.place]), label), NUM_ADDED_SAMPLES)[0]
 
     def nominal(self, added: Sequence[Strand]) -> Nominal:
         """The rollouts from the task's starts and from added ones."""

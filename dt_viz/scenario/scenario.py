@@ -81,6 +81,8 @@ class View:
     """Systems beside the scene, such as the base attractor."""
     click_to_start: bool = False
     """Whether a click on the slice adds a start."""
+    start_label: float | None = None
+    """Label that new starts get; see `Start`."""
     playing: bool = True
     """Whether the arm moves."""
     replay: bool = False
@@ -101,6 +103,16 @@ class View:
     def shows_arm_motion(self) -> bool:
         """Whether something is drawn from the arm's motion along its rollout, as replay is."""
         return self.replay or self.onion or self.joint_plots
+
+
+@dataclass(frozen=True)
+class Start:
+    """A place where a motion begins that nobody demonstrated."""
+
+    place: Point
+    """Place, metres."""
+    label: float | None = None
+    """Label of the motion, in the augmented state; None is that of the nearest demonstrated start."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +148,8 @@ class Scenario:
     """Part of it that is put on."""
     warp: float = 1.0
     """s, from 0 to 1: every flow of the stack, the imitation's too, runs for this fraction of its duration."""
-    starts: tuple[Point, ...] = ()
-    """Places where motions begin besides the task's starts, metres."""
+    starts: tuple[Start, ...] = ()
+    """Those from which motions begin besides the task's."""
     arm_rollout: int = 0
     """Number of the rollout that the arm follows: those from the task's starts come first, then those from `starts`."""
     scene: str = ""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import Point, as_point
-from dt_viz.scenario.scenario import MAX_STARTS, Scenario
+from dt_viz.obstacles.shapes import as_point
+from dt_viz.scenario.scenario import MAX_STARTS, Scenario, Start
 from dt_viz.scenario.slices import Slice
 
 GRID = (4, 4)
@@ -30,7 +30,7 @@ REACH = 0.95
 class Grid:
     """A grid of starts, and the numbers of places left out."""
 
-    starts: tuple[Point, ...]
+    starts: tuple[Start, ...]
     """Starts of the scenario, the new ones last."""
     num_blocked: int = 0
     """Number of places at or inside an obstacle, or where the arm that avoids it would touch it."""
@@ -54,17 +54,17 @@ def struck(area: Slice, origin: Array, direction: Array) -> Array | None:
     return place if along > 0 and (np.abs(area.across(place)) <= area.half_size).all() else None
 
 
-def with_start(scenario: Scenario, place: Array) -> tuple[Point, ...]:
+def with_start(scenario: Scenario, place: Array) -> tuple[Start, ...]:
     """Return the scenario's starts with one more at `place` (3,), metres, if there is room for it."""
     taken = len(scenario.starts) >= MAX_STARTS or _is_taken(scenario.starts, place)
-    return scenario.starts if taken else (*scenario.starts, as_point(place))
+    return scenario.starts if taken else (*scenario.starts, _new(scenario, place))
 
 
-def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Point, ...]:
+def with_moved_start(scenario: Scenario, index: int, place: Array) -> tuple[Start, ...]:
     """Return the scenario's starts with one of them moved to `place` (3,), metres; unchanged if it was removed."""
     starts = list(scenario.starts)
     if index < len(starts):
-        starts[index] = as_point(place)
+        starts[index] = replace(starts[index], place=as_point(place))
     return tuple(starts)
 
 
@@ -89,7 +89,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
         elif place[2] < MIN_HEIGHT or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
             far += 1
         elif len(starts) < MAX_STARTS and not _is_taken(starts, place):
-            starts = (*starts, as_point(place))
+            starts = (*starts, _new(scenario, place))
     return Grid(starts, blocked, far)
 
 
@@ -98,5 +98,23 @@ def followed(scenario: Scenario, num_demonstrated: int) -> int:
     return scenario.arm_rollout % (num_demonstrated + len(scenario.starts))
 
 
-def _is_taken(starts: tuple[Point, ...], place: Array) -> bool:
-    return any(np.linalg.norm(place - np.array(start)) < APART for start in starts)
+def with_label(scenario: Scenario, num_demonstrated: int, label: float | None) -> tuple[Start, ...]:
+    """Return the scenario's starts with a label on the one that the arm follows; unchanged if that is demonstrated."""
+    starts, index = list(scenario.starts), followed(scenario, num_demonstrated) - num_demonstrated
+    if index >= 0:
+        starts[index] = replace(starts[index], label=label)
+    return tuple(starts)
+
+
+def label_of(scenario: Scenario, num_demonstrated: int) -> float | None:
+    """Return the label of the added start that the arm follows, or else that of new starts."""
+    index = followed(scenario, num_demonstrated) - num_demonstrated
+    return scenario.starts[index].label if index >= 0 else scenario.view.start_label
+
+
+def _new(scenario: Scenario, place: Array) -> Start:
+    return Start(as_point(place), scenario.view.start_label)
+
+
+def _is_taken(starts: tuple[Start, ...], place: Array) -> bool:
+    return any(np.linalg.norm(place - np.array(start.place)) < APART for start in starts)

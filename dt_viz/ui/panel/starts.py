@@ -5,17 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import viser
 
 from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.tracking import UnreachableError
+from dt_viz.engine.frame import Frame
 from dt_viz.engine.session import Session
 from dt_viz.motion.following import room_at_rest
-from dt_viz.scenario.scenario import MAX_STARTS
-from dt_viz.scenario.starts import followed, with_grid
+from dt_viz.scenario.scenario import MAX_STARTS, Scenario
+from dt_viz.scenario.starts import followed, label_of, with_grid, with_label
 from dt_viz.ui.chores import Later
 from dt_viz.ui.panel.bindings import Bindings
+
+NEAREST = "nearest"
+LABEL_HINT = (
+    "which of the patterns that the demonstrations show is followed, where they differ although they begin at one "
+    "place: of new starts, and of an added start that the arm follows. nearest: that of the nearest demonstration"
+)
 
 
 class StartsPanel:
@@ -31,6 +39,14 @@ class StartsPanel:
                 ),
                 lambda s: s.view.click_to_start,
                 lambda s, value: {"view": replace(s.view, click_to_start=value)},
+            )
+            label = gui.add_dropdown("Label", (NEAREST,), initial_value=NEAREST, hint=LABEL_HINT)
+            labels = partial(_labels, bindings)
+            bindings.properties(label, options=lambda _s: (NEAREST, *labels()), visible=lambda _s: bool(labels()))
+            bindings.input(
+                label,
+                lambda s: _label_shown(s, bindings.frame),
+                lambda s, name: _labelled(s, len(bindings.session.task.demonstrations), labels().get(name)),
             )
             buttons = gui.add_button_group(
                 "Starts",
@@ -79,3 +95,26 @@ def clear(session: Session) -> None:
     arm_rollout = number if number < len(session.task.demonstrations) else 0
     session.edit("clear starts", starts=(), arm_rollout=arm_rollout)
     session.end_gesture()
+
+
+def _labelled(scenario: Scenario, num_demonstrated: int, label: float | None) -> dict[str, Any]:
+    """What changes when new starts, and the added start that the arm follows, get a label."""
+    starts = with_label(scenario, num_demonstrated, label)
+    return {"starts": starts, "view": replace(scenario.view, start_label=label)}
+
+
+def _labels(bindings: Bindings) -> dict[str, float]:
+    """The labels of the frame that is shown, by their names."""
+    return {} if bindings.frame is None else {_named(label): label for label in bindings.frame.labels}
+
+
+def _label_shown(scenario: Scenario, frame: Frame | None) -> str:
+    """The name of the label that starts of the scenario have in a frame."""
+    if frame is None:
+        return NEAREST
+    label = label_of(scenario, len(frame.task.demonstrations))
+    return _named(label) if label in frame.labels else NEAREST
+
+
+def _named(label: float) -> str:
+    return f"{label:g}"

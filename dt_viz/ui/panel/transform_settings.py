@@ -90,6 +90,11 @@ def learned_html(frame: Frame | None) -> str:
             f"{why}Augmented: each motion remembers its phase and where it began, and follows what is predicted for "
             "them. ψ is a shear with det J = 1; there are no flows to choose."
         )
+        if frame.labels:
+            text += (
+                f" The demonstrations show {len(frame.labels)} patterns that their starts do not tell apart: a label "
+                "does. Starts → Label chooses that of added starts."
+            )
         return f"<div style='{_SMALL}'>{html.escape(text)}</div>"
     if not steps:
         return f"<div style='{_SMALL}'>Off: motions are straight.</div>"

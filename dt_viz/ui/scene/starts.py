@@ -101,7 +101,7 @@ class Starts(Picture):
             ball = StartBall(self._scene, len(self.items), self._moved, self._chosen, lambda: self._slice)
             self.items.append(ball)
         for item, start in zip(self.items, scenario.starts, strict=True):
-            item.ball.position = start
+            item.ball.position = start.place
         self._clicks.listen(scenario.view.click_to_start)
 
     def click(self, origin: Array, direction: Array) -> None:
