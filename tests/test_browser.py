@@ -682,8 +682,8 @@ def test_a_click_on_the_slice_starts_a_rollout_and_a_drag_of_the_camera_does_not
         if session.scenario.starts:  # else the page was not listening yet
             break
     wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "its rollout")
-    np.testing.assert_allclose(session.scenario.starts[0], place, atol=0.01)
-    np.testing.assert_allclose(visitor.shown.rollouts[-1][0], session.scenario.starts[0], atol=1e-5)
+    np.testing.assert_allclose(session.scenario.starts[0].place, place, atol=0.01)
+    np.testing.assert_allclose(visitor.shown.rollouts[-1][0], session.scenario.starts[0].place, atol=1e-5)
     np.testing.assert_allclose(visitor.shown.rollouts[-1][-1], visitor.shown.goal, atol=1e-4)
     drag(page, (60, 60), (90, 80), steps=4)
     until_drawn(visitor)

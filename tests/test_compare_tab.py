@@ -96,8 +96,12 @@ def test_methods_are_ticked_followed_and_shown_with_their_arm(opened, initial):
     assert found == {compared.method.title: read(compared.scores) for compared in visitor.shown.comparison}
     for title in TITLES:
         page.get_by_text(title).wait_for()
-    page.locator(".uplot").last.scroll_into_view_if_needed()
-    wait_until(lambda: len(ink := page.evaluate(INK)) == 2 and min(ink) > 30, "curves in both plots")
+
+    def drawn():
+        page.locator(".uplot").last.scroll_into_view_if_needed()  # again: the page grows while it is filled
+        return len(ink := page.evaluate(INK)) == 2 and min(ink) > 30
+
+    wait_until(drawn, "curves in both plots")
 
     for _ in range(TRIES):  # a page drawn by software may not show the sphere in its place yet
         until_drawn(visitor)

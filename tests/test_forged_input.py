@@ -223,7 +223,7 @@ def test_what_is_dragged_in_the_scene_moves_and_what_is_far_away_stays(page):
 DRAGGED = {
     "/obstacles/0/surface": lambda scenario: scenario.obstacles[0].position,
     "/bias/0/ball": lambda scenario: next(filter(None, (layer.transform.anchor for layer in scenario.stack))),
-    "/starts/1": lambda scenario: scenario.starts[1],
+    "/starts/1": lambda scenario: scenario.starts[1].place,
 }
 """Where things stand, by the name of what is dragged in the scene."""
 
