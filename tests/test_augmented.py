@@ -168,6 +168,18 @@ def test_a_start_on_the_goal_draws_the_whole_figure():
     assert np.ptp(path, axis=0).max() > 0.3 * extent(demonstrations)
 
 
+@pytest.mark.parametrize("beside", [0.0, 1e-6, 1e-3, 1e-2])
+def test_from_the_goal_it_is_not_in_a_hurry_where_the_way_is_straight(beside):
+    u = np.linspace(0, 1, 100)[:, None]
+    imitation = fit_augmented([Demonstration(3 * u[:, 0], (1 - u) * [0.3, 0.0], "straight")])
+    state = imitation.states(np.add(imitation.goal, [beside, 0.0]))
+    state[0] += 0.05  # pushed
+    usual = imitation.states(np.array([0.3, 0.0]))
+    usual[0] += 0.05
+    speeds = [float(np.linalg.norm(imitation.system.velocity(one)[:2])) for one in (state, usual)]
+    assert speeds[0] < 5 * speeds[1]
+
+
 def test_labels_are_checked():
     case = CASES["left and right from one start"]
     with pytest.raises(ImitationError, match="found 3; accepted: 2, one for each"):

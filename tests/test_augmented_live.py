@@ -1,5 +1,6 @@
 """Augmented motions in everything that is live: stacks, certificates, the whole arm, the arm in the loop, pictures."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import dt_viz as dt
 from dt_viz.engine.frame import Stage
 from dt_viz.errors import DataError, FormatError
 from dt_viz.evaluate.crossings import crossings
+from dt_viz.learning import choice
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.choice import MOST_CONFLICTING, MOST_MISSED, conflicts, learn, missed
 from dt_viz.learning.demonstrations import Demonstration
@@ -176,6 +178,42 @@ def test_ways_that_begin_far_apart_are_told_by_their_starts():
     assert found_labels((*left, *right)) == ()
 
 
+def test_what_labels_cannot_tell_apart_is_said(monkeypatch):
+    monkeypatch.setattr(choice, "MOST_PATTERNS", 2)
+    demonstrations = ways((-0.2, -0.07, 0.07, 0.2), jitter=0.0)
+    imitation = learn(demonstrations, state="augmented")
+    assert "a motion misses its demonstration by" in imitation.warnings[-1]
+    monkeypatch.undo()
+    assert not learn(demonstrations, state="augmented").warnings
+
+
+def test_five_ways_are_told_apart():
+    assert len(found_labels(ways((-0.2, -0.1, 0.0, 0.1, 0.2)))) == 5
+
+
+def test_a_hand_that_trembles_at_rest_passes_no_place_twice():
+    u, rng, found = np.linspace(0, 1, 300), np.random.default_rng(0), []
+    moved = np.interp(u, [0.0, 0.35, 0.65, 1.0], [0.0, 0.5, 0.5, 1.0])[:, None]
+    for k in range(3):
+        path = 0.3 * (1 - moved) * [1.0, 0.02 * k] + 0.05 * np.sin(np.pi * moved) * [0.0, 1.0]
+        found.append(Demonstration(5 * u, path + 5e-4 * rng.normal(size=path.shape), "rest"))
+    assert conflicts(prepare(found)).phase < 0.2 * MOST_CONFLICTING
+    back = np.concatenate([np.arange(150), np.arange(150, 90, -1), np.arange(90, 300)])  # and again
+    again = [Demonstration(np.linspace(0, 5, len(back)), d.positions[back], d.name) for d in found]
+    assert conflicts(prepare(again)).phase > MOST_CONFLICTING
+
+
+def test_conflicts_of_very_many_demonstrations_are_found_in_little_memory():
+    many = 50 * CASES["wide eight"].demonstrations
+    tracemalloc.start()
+    try:
+        found = conflicts(prepare(many))
+        assert tracemalloc.get_traced_memory()[1] < 5e7
+    finally:
+        tracemalloc.stop()
+    assert found.phase == pytest.approx(conflicts(prepare(many[:40])).phase, abs=0.02)
+
+
 def test_demonstrations_that_are_left_out_do_not_shift_the_labels():
     still = Demonstration(np.linspace(0, 1, 50), np.zeros((50, 2)), "still")
     demonstrations = ways((-0.1, 0.1))
@@ -207,6 +245,18 @@ def test_an_added_start_takes_the_way_of_its_label_and_that_of_the_nearest_witho
     np.testing.assert_array_equal(nearest, (low, high)[host % 2])
     plain = last(engine, Scenario("ways", (), state="plain", starts=(Start(place, 1.0),)))
     assert plain.labels == () and len(plain.rollouts) == 6 + 1  # a label means nothing to it
+
+
+def test_a_style_leaves_the_ways_apart(new_engine):
+    engine = with_ways(new_engine)
+    for amount, least in ((0.0, 0.0), (1.0, 0.005)):
+        usual, styled = (
+            last(engine, Scenario("ways", (), state="augmented", style=style, style_amount=amount))
+            for style in ("", "wavy")
+        )
+        assert usual.labels == styled.labels == (-1.0, 1.0)
+        for a, b in zip(usual.rollouts, styled.rollouts, strict=True):
+            assert least <= frechet(a, b) < 0.04 if amount else frechet(a, b) < 1e-6
 
 
 def test_what_has_labels_found_is_saved_with_them(tmp_path):
@@ -327,7 +377,11 @@ def test_an_added_start_draws_the_8_from_there(engine):
 def test_half_warped_it_is_between_a_straight_line_and_the_8(engine):
     frame = last(engine, Scenario(EIGHT, (), warp=0.5))
     assert not frame.certificates.warnings
-    straight = last(engine, Scenario(EIGHT, (), warp=0.0))
+    straight, whole = (last(engine, Scenario(EIGHT, (), warp=warp)) for warp in (0.0, 1.0))
+    for line, half, figure in zip(straight.rollouts, frame.rollouts, whole.rollouts, strict=True):
+        apart = frechet(line, figure)
+        assert 0.2 * apart < min(frechet(half, line), frechet(half, figure))
+        assert max(frechet(half, line), frechet(half, figure)) < 0.9 * apart
     for path in straight.rollouts:
         along = (path - path[0]) @ (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
         assert np.linalg.norm(path - path[0], axis=1) == pytest.approx(along, abs=1e-9)
@@ -444,6 +498,7 @@ def test_its_velocity_is_that_of_the_system_at_its_phase(engine, loop):
         along = exact / np.linalg.norm(exact)
         if np.linalg.norm(velocity) > 0.1:
             assert np.linalg.norm(velocity - (velocity @ along) * along) < 0.08 * np.linalg.norm(velocity)
+            assert 0 < velocity @ along < 1.2 * np.linalg.norm(exact)  # joints may be slower than it asks
             compared += 1
     assert compared >= 6
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scenes import kinds
 
+from dt_viz.evaluate.crossings import crossings
 from dt_viz.flows.phased import Shear
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.preparation import ImitationError
@@ -90,6 +91,12 @@ def test_taken_off_again_nothing_is_left_and_ends_stay(style, task):
     states = on.states(on.starts)
     states[:, on.dim] *= 0.4
     np.testing.assert_allclose(np.linalg.det(on.system.transform.jacobian(states)[1]), 1.0, atol=1e-9)
+
+
+def test_a_hand_of_several_patterns_is_no_style():
+    usual, case = learned("draw_s"), crossings()["left and right from one start"]
+    with pytest.raises(ImitationError, match="found a hand of 2 patterns; accepted: 1"):
+        Style.between(usual, fit_augmented(case.demonstrations, case.labels))
 
 
 def test_it_fits_motions_of_as_many_coordinates(style):

@@ -7,7 +7,9 @@ it started, and a label if there is one. The motion c(s; a) predicted for a is
     c(u s_max; a) = mean(u) + u (start − mean(1)) + GP(a)(u),
 
 the mean demonstration, an offset that fades, and a Gaussian process over the starts. The shear along it (see
-`dt_viz.flows.phased`) is ψ; the base system runs s down on a clock that is predicted for a, too.
+`dt_viz.flows.phased`) is ψ; the base system runs s down on a clock that is predicted for a, too. Where demonstrations
+fall into groups of different shapes, each has a mean and a process of its own, and a start follows the group that
+begins nearest: for each a ψ is a diffeomorphism of (y, s), but from group to group it jumps with a.
 """
 
 from __future__ import annotations
@@ -49,6 +51,9 @@ NUM_PACES, NUM_TIMED = 80, 120
 CAUGHT_WITHIN, LEAST_PHASE, NUM_CAUGHT = 0.15, 0.05, 61
 """Largest change of the phase of a motion that is pushed, and the least phase that it gets, relative to s_max, and
 number of phases that are compared."""
+SHORTEST = 0.1
+"""Least length of a motion that its clock is predicted for, relative to that of the mean: from the goal to the goal a
+motion still takes some time."""
 SLOWEST = 2e-3
 """Smallest speed of the phase, relative to the mean: it never stands still."""
 NUM_KEPT = 64
@@ -299,7 +304,9 @@ class AugmentedImitation:
         return PhaseCurve.through(self.top * np.linspace(0.0, 1.0, len(points)), points[::-1])
 
     def _clock(self, condition: Array) -> TimedAttractor:
-        return self._timed(self._pattern(condition), condition, float(arc_length(self._points(condition))[-1]))
+        pattern = self._pattern(condition)
+        length, usual = (float(arc_length(points)[-1]) for points in (self._points(condition), pattern.mean))
+        return self._timed(pattern, condition, max(length, SHORTEST * usual))
 
     def _timed(self, pattern: Pattern, condition: Array, length: float) -> TimedAttractor:
         """The clock of a motion of a length, metres."""

@@ -18,7 +18,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
@@ -32,6 +32,8 @@ State = Literal["auto", "plain", "augmented"]
 STATES: tuple[State, ...] = get_args(State)
 AnyImitation = Imitation | AugmentedImitation
 
+MOST_COMPARED = 40
+"""Largest number of demonstrations that are compared with each other; of more, as many evenly among them."""
 NUM_COMPARED = 120
 """Number of points of a demonstration, evenly by arc length, at which conflicts are looked for."""
 NEAR, ANGLE, APART = 0.1, 45.0, 0.1
@@ -44,7 +46,7 @@ MOST_MISSED = 0.05
 MOST_UNTOLD = 0.12
 """The same from which a motion's start does not tell which pattern it follows, so that labels are looked for. What
 demonstrations of one pattern differ by stays below 9 % on handwriting."""
-MOST_PATTERNS = 4
+MOST_PATTERNS = 8
 """Largest number of patterns that are looked for in demonstrations which their starts do not tell apart."""
 
 
@@ -115,13 +117,20 @@ def _usual(motions: Motions, plain: Callable[[ImitationSettings | None], Imitati
 def _with_patterns(demonstrations: Sequence[Demonstration], motions: Motions) -> AugmentedImitation:
     """The augmented state; with the fewest labels that tell what follows, where starts do not."""
     imitation = fit_augmented(demonstrations)
-    if missed(imitation, motions) > MOST_UNTOLD or not _told_apart(imitation):
+    off = missed(imitation, motions)
+    if off > MOST_UNTOLD or not _told_apart(imitation):
         for num in range(2, min(MOST_PATTERNS, len(motions.positions)) + 1):
             labels = patterns_of(motions, num)
             known = dict(zip(motions.numbers, labels, strict=True))
             labelled = fit_augmented(demonstrations, [known.get(k, labels[0]) for k in range(len(demonstrations))])
-            if missed(labelled, motions, labels) <= MOST_UNTOLD:
+            off_labelled = missed(labelled, motions, labels)
+            if off_labelled <= MOST_UNTOLD:
                 return labelled
+            if off_labelled < off:
+                imitation, off = labelled, off_labelled
+    if off > MOST_UNTOLD:
+        warning = f"a motion misses its demonstration by {100 * off:.0f} % of the extent"
+        return replace(imitation, warnings=(*imitation.warnings, warning))
     return imitation
 
 
@@ -152,19 +161,38 @@ def patterns_of(motions: Motions, num: int) -> tuple[float, ...]:
 
 
 def conflicts(motions: Motions) -> Conflicts:
-    """Measure how much of the way of motions is in conflict; near the goal, where all meet, nothing is."""
+    """Measure how much of the way of motions is in conflict; near the goal, where all meet, nothing is.
+
+    Nor is a place in conflict with itself while a motion stays there: recordings tremble.
+    """
     points = motions.resampled(NUM_COMPARED) / motions.spread
+    points = points[np.unique(np.linspace(0, len(points) - 1, MOST_COMPARED).round().astype(int))]
     directions = np.gradient(points, axis=1)
     directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
-    num = len(points)
-    phase, whose = np.tile(np.linspace(0, 1, NUM_COMPARED), num), np.repeat(np.arange(num), NUM_COMPARED)
-    at, along = (values.reshape(num * NUM_COMPARED, -1) for values in (points, directions))
-    close = ((at[:, None] - at) ** 2).sum(axis=-1) < NEAR**2
-    close &= (np.linalg.norm(at - motions.goal / motions.spread, axis=1) > 2 * NEAR)[:, None]
-    against = close & (along @ along.T < np.cos(np.radians(ANGLE)))
-    far = np.abs(phase[:, None] - phase) > APART
-    other = whose[:, None] != whose
-    return Conflicts(float((against & far).any(axis=1).mean()), float((against & ~far & other).any(axis=1).mean()))
+    goal, phase = motions.goal / motions.spread, np.linspace(0, 1, NUM_COMPARED)
+    later, told = [], []
+    for k, (path, along) in enumerate(zip(points, directions, strict=True)):
+        first, last = _stays(path)
+        far = (phase < phase[first, None] - APART) | (phase > phase[last, None] + APART)
+        away = (np.linalg.norm(path - goal, axis=1) > 2 * NEAR)[:, None]
+        found = np.zeros((2, NUM_COMPARED), dtype=bool)
+        for other in range(len(points)):
+            close = np.linalg.norm(path[:, None] - points[other], axis=-1) < NEAR
+            against = close & away & (along @ directions[other].T < np.cos(np.radians(ANGLE)))
+            found[0] |= (against & far).any(axis=1)
+            found[1] |= (against & ~far).any(axis=1) & (other != k)
+        later.append(found[0])
+        told.append(found[1])
+    return Conflicts(float(np.mean(later)), float(np.mean(told)))
+
+
+def _stays(path: Array) -> tuple[Indices, Indices]:
+    """For each point of a path (n, d) the first and the last one, in a row with it, that are near it."""
+    leaves = np.linalg.norm(path[:, None] - path, axis=-1) >= NEAR
+    number, last = np.arange(len(path)), len(path) - 1
+    before, behind = leaves & (number < number[:, None]), leaves & (number > number[:, None])
+    first = np.where(before.any(axis=1), last - before[:, ::-1].argmax(axis=1) + 1, 0)
+    return first, np.where(behind.any(axis=1), behind.argmax(axis=1) - 1, last)
 
 
 def missed(imitation: AnyImitation, motions: Motions, labels: Sequence[float] | None = None) -> float:

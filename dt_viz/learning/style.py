@@ -28,9 +28,12 @@ class Style:
         """What leads from the usual motion of an action to the styled one.
 
         Raises:
-            ImitationError: they do not have as many coordinates.
+            ImitationError: they do not have as many coordinates, or one shows several patterns: it has no mean motion.
         """
         _check(len(usual.goal), len(styled.goal))
+        num = max(max(len(one.patterns), len(one.known_labels)) for one in (usual, styled))
+        if num > 1:
+            raise ImitationError(f"style: found a hand of {num} patterns; accepted: 1, demonstrations of one figure")
         before, after = (one.patterns[0].mean / one.top for one in (usual, styled))
         offsets = (after - after[-1]) - (before - before[-1])
         return cls(offsets - np.linspace(1, 0, len(offsets))[:, None] * offsets[0])
