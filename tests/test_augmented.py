@@ -7,10 +7,11 @@ import pytest
 
 from dt_viz.errors import FormatError
 from dt_viz.evaluate.crossings import crossings
+from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import fit
-from dt_viz.learning.preparation import ImitationError
+from dt_viz.learning.preparation import ImitationError, prepare
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length, rms_at_equal_times
 from dt_viz.scenario.tasks import TASKS
 
@@ -25,8 +26,8 @@ def path_from(imitation, start, label=None, num=400):
     return system.transform.inverse(z)[:, : len(start)]
 
 
-def frechet(a, b):
-    return float(discrete_frechet(resample_by_arc_length(a, NUM), resample_by_arc_length(b, NUM)))
+def frechet(a, b, num=NUM):
+    return float(discrete_frechet(resample_by_arc_length(a, num), resample_by_arc_length(b, num)))
 
 
 def extent(demonstrations):
@@ -43,6 +44,44 @@ def test_what_crosses_comes_back_or_winds_is_followed(name):
         for d, label in zip(case.demonstrations, labels, strict=True)
     ]
     assert max(off) <= (0.03 if case.labels else 0.04) * extent(case.demonstrations)
+
+
+def drawn_often(num, seed=0):
+    """An eight that is drawn `num` times in a row."""
+    rng, u = np.random.default_rng(seed), np.linspace(0, 1, 60 * num + 1)
+    angle = 2 * np.pi * num * u + 0.5 * (1 - u)
+    eight = 0.1 * np.column_stack([np.sin(angle), np.sin(2 * angle) / 2])
+    beside = 0.005 * rng.normal(size=(3, 2))
+    return [Demonstration(4 * num * u, eight + (1 - u)[:, None] * b, "eight") for b in beside]
+
+
+@pytest.mark.parametrize("num", [1, 4, 8, 16])
+def test_a_figure_that_is_drawn_often_gets_the_knots_that_it_needs(num, monkeypatch):
+    demonstrations = drawn_often(num)
+
+    def off():
+        imitation, many = fit_augmented(demonstrations), 100 * num
+        paths = [path_from(imitation, d.positions[0], num=many) for d in demonstrations]
+        distances = [frechet(path, d.positions, many) for path, d in zip(paths, demonstrations, strict=True)]
+        return max(distances) / extent(demonstrations)
+
+    assert off() < 0.05
+    if num > 1:
+        monkeypatch.setattr(augmented, "MOST_KNOTS", augmented.FEWEST_KNOTS)
+        assert off() > 0.07
+
+
+def test_the_size_of_demonstrations_does_not_depend_on_how_they_are_turned():
+    demonstrations = TASKS["draw_w"]().demonstrations
+    motions = prepare(demonstrations)
+    for angle in np.linspace(0, np.pi, 7):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        turned = [replace(d, positions=d.positions @ turn.T) for d in demonstrations]
+        assert prepare(turned).extent == pytest.approx(motions.extent, rel=1e-9)
+        path = path_from(fit_augmented(turned), turned[0].positions[0])
+        wanted = path_from(fit_augmented(demonstrations), demonstrations[0].positions[0]) @ turn.T
+        np.testing.assert_allclose(path, wanted, atol=1e-9)
+    assert 0.9 < motions.extent / extent(demonstrations) < 1.5
 
 
 def test_plain_imitation_misses_an_eight():

@@ -249,14 +249,14 @@ def test_an_added_start_takes_the_way_of_its_label_and_that_of_the_nearest_witho
 
 def test_a_style_leaves_the_ways_apart(new_engine):
     engine = with_ways(new_engine)
-    for amount, least in ((0.0, 0.0), (1.0, 0.005)):
+    for amount, least, most in ((0.0, 0.0, 1e-6), (1.0, 0.005, 0.04)):
         usual, styled = (
             last(engine, Scenario("ways", (), state="augmented", style=style, style_amount=amount))
             for style in ("", "wavy")
         )
         assert usual.labels == styled.labels == (-1.0, 1.0)
         for a, b in zip(usual.rollouts, styled.rollouts, strict=True):
-            assert least <= frechet(a, b) < 0.04 if amount else frechet(a, b) < 1e-6
+            assert least <= frechet(a, b) < most
 
 
 def test_what_has_labels_found_is_saved_with_them(tmp_path):

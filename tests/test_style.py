@@ -8,6 +8,7 @@ from scenes import kinds
 
 from dt_viz.evaluate.crossings import crossings
 from dt_viz.flows.phased import Shear
+from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.learning.style import Style
@@ -91,6 +92,17 @@ def test_taken_off_again_nothing_is_left_and_ends_stay(style, task):
     states = on.states(on.starts)
     states[:, on.dim] *= 0.4
     np.testing.assert_allclose(np.linalg.det(on.system.transform.jacobian(states)[1]), 1.0, atol=1e-9)
+
+
+def test_hands_of_other_detail_give_a_style_too(style, monkeypatch):
+    usual = learned("draw_s")
+    monkeypatch.setattr(augmented, "FEWEST_KNOTS", 60)
+    finer = learned(STYLES["wavy"][1])
+    mixed, own = Style.between(usual, finer), learned("draw_c")
+    assert len(mixed.offsets) == 60 and len(style.offsets) == 30
+    for on in (style, mixed):
+        path, wanted = (path_of(one.on(own, 1.0), own.starts[0]) for one in (on, style))
+        assert np.linalg.norm(path - wanted, axis=1).max() < 0.05 * own.top
 
 
 def test_a_hand_of_several_patterns_is_no_style():

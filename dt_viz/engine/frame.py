@@ -94,10 +94,10 @@ class Frame:
     None where that begins at an added start."""
     remembers: bool = False
     """Whether the imitation is augmented: it remembers its phase and where it began."""
+    reason: str = ""
+    """Why it is augmented, if nobody asked for that."""
     labels: tuple[float, ...] = ()
     """Labels that an added start may have."""
-    reason: str = ""
-    """Why it is, if nobody asked for it."""
     learned_steps: tuple[int, ...] = ()
     """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
     durations: tuple[float | None, ...] = ()

@@ -69,6 +69,7 @@ from dt_viz.evaluate.worst import Case, cases_of, draw_worst, worst_of
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
+from dt_viz.learning.choice import learn as learn_in_state
 from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
 from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, fit, grown_grid
 from dt_viz.metrics import rms_at_equal_times
@@ -78,6 +79,7 @@ GRID = {2: 101, 3: 25}
 NUM_PHASES = 7
 """Number of phases at which the certificates of augmented motions are computed."""
 STATES = ("plain", "augmented")
+learn_augmented = partial(learn_in_state, state="augmented")
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; 2 if one of the shapes could not be fitted."""
-    learn = partial(fit, settings=_settings(options)) if options.state == "plain" else fit_augmented
+    learn = partial(fit, settings=_settings(options)) if options.state == "plain" else learn_augmented
     sources = _sources(options.files)
     _check(options, sources)
     folder = ready_folder(options.out)
@@ -366,7 +368,7 @@ def _report_choices(sources: Sequence[Source], seed: int, folder: Path) -> None:
     names = [source.path.stem for source in sources]
     choices: list[Choice] = []
     for grid in GRIDS:
-        measured = measure(grid, lambda: [_followed(source, fit_augmented, None)[0] for source in sources])
+        measured = measure(grid, lambda: [_followed(source, learn_augmented, None)[0] for source in sources])
         choices += choose(grid, measured, names, seed)
     rows = [
         (
@@ -383,27 +385,27 @@ def _report_choices(sources: Sequence[Source], seed: int, folder: Path) -> None:
 
 
 def _report_crossings(state: str, learn: Learn, folder: Path) -> None:
-    """Follow what crosses, comes back or winds, and print and draw it."""
+    """Follow what crosses, comes back or winds, and print and draw it; labels are found, and given as well."""
     rows, panels = [], []
     for name, case in crossings().items():
         demonstrations = case.demonstrations
+        ways: dict[str, Learn] = {name: learn}
+        if case.labels and state == "augmented":
+            ways = {f"{name}, labels found": learn, f"{name}, given": partial(fit_augmented, labels=case.labels)}
         extent = float(np.ptp(np.concatenate([d.positions for d in demonstrations]), axis=0).max())
-        try:
-            if case.labels and learn is fit_augmented:
-                labelled = fit_augmented(demonstrations, case.labels)
-                starts = zip(demonstrations, case.labels, strict=True)
-                motions = [labelled.states(d.positions[0], label) for d, label in starts]
-                paths = [path_from(labelled.system, state, labelled.dim) for state in motions]
-            else:
-                paths = list(
-                    rollouts_from(learn(demonstrations), np.stack([d.positions[0] for d in demonstrations]))[0]
-                )
-        except ImitationError as error:
-            rows.append((name, f"{1e3 * extent:.0f}", "–", "–", str(error)))
-            continue
-        worst = float(frechet(paths, [d.positions for d in demonstrations]).max())
-        rows.append((name, f"{1e3 * extent:.0f}", f"{1e3 * worst:.1f}", f"{100 * worst / extent:.1f}", ""))
-        panels.append(Panel(name, [d.positions for d in demonstrations], paths))
+        for title, way in ways.items():
+            try:
+                imitation = way(demonstrations)
+            except ImitationError as error:
+                rows.append((title, f"{1e3 * extent:.0f}", "–", "–", str(error)))
+                continue
+            labels = imitation.labels if isinstance(imitation, AugmentedImitation) else None
+            begins = zip(demonstrations, labels or [None] * len(demonstrations), strict=True)
+            states = [imitation.system.base.states(d.positions[0], label) for d, label in begins]
+            paths = [path_from(imitation.system, state, len(imitation.goal)) for state in states]
+            worst = float(frechet(paths, [d.positions for d in demonstrations]).max())
+            rows.append((title, f"{1e3 * extent:.0f}", f"{1e3 * worst:.1f}", f"{100 * worst / extent:.1f}", ""))
+            panels.append(Panel(title, [d.positions for d in demonstrations], paths))
     print(f"\nwhat crosses, comes back or winds, by the {state} state; worst of each case, in-sample")
     print_table(("case", "extent mm", "Fréchet mm", "% of the extent", ""), rows)
     draw_panels(folder / "crossings.png", panels)

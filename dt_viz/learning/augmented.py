@@ -27,14 +27,17 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.phased import PhaseCurve, PhasedAttractor, Shear
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.learning.preparation import ImitationError, prepare
+from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
 from dt_viz.learning.unbending import groups_of
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.properties import cached_property
 
-NUM_POINTS, NUM_KNOTS = 150, 30
-"""Number of points of a demonstration, evenly by arc length, and number of knots of a predicted motion."""
+FEWEST_KNOTS, MOST_KNOTS, POINTS_PER_KNOT = 30, 240, 5
+"""Smallest and largest number of knots of a predicted motion, and number of points of a demonstration for each."""
+KNOT_ERROR = 0.003
+"""Mean distance of a demonstration from the curve through its knots, relative to the extent, up to which these are
+enough; handwriting stays below 0.1 % with the fewest."""
 TOP = 0.5
 """s_max relative to the extent of the demonstrations."""
 SMALLEST_SPREAD = 0.04
@@ -226,7 +229,8 @@ class AugmentedImitation:
         """The states (R, d + 1 + c) in which the motions of all demonstrations begin, from their starts (R, d)."""
         if self.labels is None:
             return self.states(starts)
-        labels = [label if label in self.known_labels else None for label in self.labels]
+        known = self.known_labels
+        labels = [label if label in known else None for label in self.labels]
         return np.stack([self.states(start, label) for start, label in zip(starts, labels, strict=True)])
 
     def caught(self, state: Array) -> float:
@@ -339,19 +343,28 @@ def fit_augmented(
     Raises:
         ImitationError: nothing can be learned from these demonstrations, or there are not as many labels.
     """
-    began = time.perf_counter()
     if labels is not None and len(labels) != len(demonstrations):
         raise ImitationError(
             f"labels: found {len(labels)}; accepted: {len(demonstrations)}, one for each demonstration"
         )
     if labels is not None and not np.isfinite(labels).all():
         raise ImitationError(f"labels: found {list(labels)}; accepted: finite numbers")
-    motions = prepare(demonstrations)
+    return augmented_from(prepare(demonstrations), labels, power=power)
+
+
+def augmented_from(
+    motions: Motions, labels: Sequence[float] | None = None, *, power: float = 3.0
+) -> AugmentedImitation:
+    """Learn prepared motions in the augmented state; `labels` are those of all demonstrations, also of those left out.
+
+    See `fit_augmented`.
+    """
+    began = time.perf_counter()
     starts = np.stack([path[0] for path in motions.positions])
-    extent = float(np.ptp(np.concatenate(motions.positions), axis=0).max())
-    spread = max(float(np.sqrt(((starts - starts.mean(axis=0)) ** 2).sum(axis=1).mean())), SMALLEST_SPREAD * extent)
-    unit, top, kept = LABEL_SPREAD * spread, TOP * extent, None
-    conditions, points = starts, motions.resampled(NUM_POINTS)
+    scatter = float(np.sqrt(((starts - starts.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    spread = max(scatter, SMALLEST_SPREAD * motions.extent)
+    unit, top, kept = LABEL_SPREAD * spread, TOP * motions.extent, None
+    conditions, (points, at_knots) = starts, _at_knots(motions)
     if labels is None:
         group = groups_of((points - points.mean(axis=(0, 1))) / motions.spread)
     else:
@@ -360,8 +373,6 @@ def fit_augmented(
     durations = np.array([t[-1] for t in motions.times])
     clock = _plain_clock(top, float(durations.mean()))
     profiles = np.stack([_profile(*motion) for motion in zip(motions.times, motions.positions, strict=True)])
-    knots = np.linspace(0, NUM_POINTS - 1, NUM_KNOTS)
-    at_knots = np.stack([interpolate(knots, np.arange(NUM_POINTS, dtype=float), path) for path in points])
     lengths = np.array([arc_length(path)[-1] for path in at_knots])
     noise = NOISE if labels is None else LABEL_NOISE
     patterns = []
@@ -403,6 +414,20 @@ def _pattern(
         float(durations.mean()),
         OverStarts.of(conditions, timing, spread=spread, noise=TIME_NOISE, narrow=TIME_WIDTH),
     )
+
+
+def _at_knots(motions: Motions) -> tuple[Array, Array]:
+    """Demonstrations at even points along each (R, n, d), and at as few knots as they are followed by (R, K, d)."""
+    num = FEWEST_KNOTS
+    while True:
+        points = motions.resampled(POINTS_PER_KNOT * num)
+        even, knots = np.linspace(0.0, 1.0, points.shape[1]), np.linspace(0.0, 1.0, num)
+        at_knots = np.stack([interpolate(knots, even, path) for path in points])
+        between = PhaseCurve.through(knots, at_knots.swapaxes(0, 1)).at(even).swapaxes(0, 1)
+        missed = np.linalg.norm(between - points, axis=-1).mean(axis=1).max()
+        if missed <= KNOT_ERROR * motions.extent or 2 * num > MOST_KNOTS:
+            return points, at_knots
+        num *= 2
 
 
 def _plain_clock(top: float, duration: float) -> TimedAttractor:

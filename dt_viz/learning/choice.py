@@ -6,12 +6,13 @@
     it remembers its phase and where it began (see `dt_viz.learning.augmented`): it crosses, comes back and winds, and
     draws the figure from other starts, too;
 ``auto``
-    plain, unless the demonstrations conflict, or a plain fit with the default settings misses one. So the settings of
-    the plain fit do not change the state: who chooses few basis functions sees what they make of it.
+    plain, unless the demonstrations conflict, or a plain fit with the default settings misses one. Other settings do
+    not change the state: who chooses fewer layers, or another objective, sees what these make of the plain motion.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -20,7 +21,7 @@ import numpy as np
 
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
+from dt_viz.learning.augmented import AugmentedImitation, augmented_from, fit_augmented
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
@@ -42,10 +43,11 @@ are in conflict."""
 MOST_CONFLICTING = 0.03
 """Largest share of the way on which demonstrations may conflict for the plain state."""
 MOST_MISSED = 0.05
-"""Largest Fréchet distance of a motion from its demonstration, relative to the extent."""
+"""Largest Fréchet distance of a plain motion from its demonstration, relative to the extent; with a larger one *auto*
+takes the augmented state."""
 MOST_UNTOLD = 0.12
-"""The same from which a motion's start does not tell which pattern it follows, so that labels are looked for. What
-demonstrations of one pattern differ by stays below 9 % on handwriting."""
+"""Largest Fréchet distance of an augmented motion from its demonstration, relative to the extent; with a larger one the
+starts do not tell which pattern is followed, and labels are looked for. Handwriting of one pattern stays below 9 %."""
 MOST_PATTERNS = 8
 """Largest number of patterns that are looked for in demonstrations which their starts do not tell apart."""
 
@@ -91,12 +93,14 @@ def learn(
         return plain(settings)
     if labels is not None:
         return fit_augmented(demonstrations, labels)
-    motions, reason = prepare(demonstrations), ""
+    began, reason = time.perf_counter(), ""
+    motions = prepare(demonstrations)
     if state == "auto":
         usual, reason = _usual(motions, plain)
         if usual is not None:
             return usual if settings in (None, ImitationSettings()) else plain(settings)
-    return replace(_with_patterns(demonstrations, motions), reason=reason)
+    imitation = _with_patterns(motions, len(demonstrations))
+    return replace(imitation, reason=reason, fit_seconds=time.perf_counter() - began)
 
 
 def _usual(motions: Motions, plain: Callable[[ImitationSettings | None], Imitation]) -> tuple[Imitation | None, str]:
@@ -114,15 +118,15 @@ def _usual(motions: Motions, plain: Callable[[ImitationSettings | None], Imitati
     return imitation, ""
 
 
-def _with_patterns(demonstrations: Sequence[Demonstration], motions: Motions) -> AugmentedImitation:
+def _with_patterns(motions: Motions, num_demonstrations: int) -> AugmentedImitation:
     """The augmented state; with the fewest labels that tell what follows, where starts do not."""
-    imitation = fit_augmented(demonstrations)
+    imitation = augmented_from(motions)
     off = missed(imitation, motions)
     if off > MOST_UNTOLD or not _told_apart(imitation):
         for num in range(2, min(MOST_PATTERNS, len(motions.positions)) + 1):
             labels = patterns_of(motions, num)
             known = dict(zip(motions.numbers, labels, strict=True))
-            labelled = fit_augmented(demonstrations, [known.get(k, labels[0]) for k in range(len(demonstrations))])
+            labelled = augmented_from(motions, [known.get(k, labels[0]) for k in range(num_demonstrations)])
             off_labelled = missed(labelled, motions, labels)
             if off_labelled <= MOST_UNTOLD:
                 return labelled
@@ -197,15 +201,15 @@ def _stays(path: Array) -> tuple[Indices, Indices]:
 
 def missed(imitation: AnyImitation, motions: Motions, labels: Sequence[float] | None = None) -> float:
     """Largest discrete Fréchet distance of a learned motion from its demonstration, relative to the extent."""
-    extent = float(np.ptp(np.concatenate(motions.positions), axis=0).max())
     of = [None] * len(motions.positions) if labels is None else labels
-    pairs = zip(motions.positions, of, strict=True)
-    return max(_missed(imitation.system, path, label) for path, label in pairs) / extent
+    drawn = np.stack(
+        [_drawn(imitation.system, path[0], label) for path, label in zip(motions.positions, of, strict=True)]
+    )
+    return float(discrete_frechet(drawn, motions.resampled(NUM_COMPARED)).max()) / motions.extent
 
 
-def _missed(system: DiffeomorphicSystem, path: Array, label: float | None) -> float:
-    begun = system.transform.forward(system.base.states(path[0], label))
-    left = np.linspace(1, 0, NUM_COMPARED)
-    drawn = system.transform.inverse(system.base.at_fraction(begun, left))[:, : path.shape[1]]
-    a, b = (resample_by_arc_length(p, NUM_COMPARED) for p in (drawn, path))
-    return float(discrete_frechet(a, b))
+def _drawn(system: DiffeomorphicSystem, start: Array, label: float | None) -> Array:
+    """Places (n, d) of a learned motion, evenly along it."""
+    begun = system.transform.forward(system.base.states(start, label))
+    path = system.transform.inverse(system.base.at_fraction(begun, np.linspace(1, 0, NUM_COMPARED)))
+    return resample_by_arc_length(path[:, : len(start)], NUM_COMPARED)

@@ -42,13 +42,27 @@ class Motions:
     """RMS distance of all points from their mean."""
     warnings: tuple[str, ...]
     """Descriptions of the changes to the demonstrations."""
-    crossing: tuple[str, ...] = ()
-    """Descriptions of what the plain state cannot follow."""
+
+    @cached_property
+    def crossing(self) -> tuple[str, ...]:
+        """Descriptions of what the plain state cannot follow."""
+        return tuple(
+            f"'{name}' crosses itself, which no motion of a first-order system can; the crossing is smoothed"
+            for name, path in zip(self.names, self.positions, strict=True)
+            if path.shape[1] == 2 and _crosses_itself(resample_by_arc_length(path, 120))
+        )
 
     @cached_property
     def length(self) -> float:
         """Mean length of the motions, in units of the spread."""
         return float(np.mean([arc_length(path)[-1] for path in self.positions])) / self.spread
+
+    @cached_property
+    def extent(self) -> float:
+        """Length of all motions together along the principal axis in which it is largest, however they are turned."""
+        points = np.concatenate(self.positions)
+        _, axes = np.linalg.eigh(np.cov(points, rowvar=False))
+        return float(np.ptp(points @ axes, axis=0).max())
 
     def resampled(self, num: int) -> Array:
         """Resample all motions at `num` points equally spaced along each, (R, num, d)."""
@@ -77,7 +91,7 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
     spread = _spread(list(usable.values()))
     usable, goal = _with_common_goal(usable, spread, warnings)
 
-    numbers, names, times, positions, crossing = [], [], [], [], []
+    numbers, names, times, positions = [], [], [], []
     for number, demonstration in usable.items():
         t, path = demonstration.times, _end_moved(demonstration.positions, goal)
         away = np.flatnonzero(np.linalg.norm(path - goal, axis=1) > AT_GOAL * spread)
@@ -92,20 +106,13 @@ def prepare(demonstrations: Sequence[Demonstration]) -> Motions:
             )
             t, path = t[first:] - t[first], path[first:]
         _warn_about(demonstration.name, t, path, spread, warnings)
-        if path.shape[1] == 2 and _crosses_itself(resample_by_arc_length(path, 120)):
-            crossing.append(
-                f"'{demonstration.name}' crosses itself, which no motion of a first-order system can; the crossing is "
-                "smoothed"
-            )
         numbers.append(number)
         names.append(demonstration.name)
         times.append(t)
         positions.append(path)
     if not positions:
         raise ImitationError("every demonstration starts at the goal and stays there; there is nothing to learn")
-    return Motions(
-        tuple(numbers), tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings), tuple(crossing)
-    )
+    return Motions(tuple(numbers), tuple(names), tuple(times), tuple(positions), goal, spread, tuple(warnings))
 
 
 def _spread(demonstrations: Sequence[Demonstration]) -> float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.flows.phased import PhaseCurve
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.preparation import ImitationError
 
@@ -34,7 +35,9 @@ class Style:
         num = max(max(len(one.patterns), len(one.known_labels)) for one in (usual, styled))
         if num > 1:
             raise ImitationError(f"style: found a hand of {num} patterns; accepted: 1, demonstrations of one figure")
-        before, after = (one.patterns[0].mean / one.top for one in (usual, styled))
+        means = [one.patterns[0].mean / one.top for one in (usual, styled)]
+        num_knots = max(len(mean) for mean in means)
+        before, after = (_at_knots(mean, num_knots) for mean in means)
         offsets = (after - after[-1]) - (before - before[-1])
         return cls(offsets - np.linspace(1, 0, len(offsets))[:, None] * offsets[0])
 
@@ -49,9 +52,14 @@ class Style:
             ImitationError: it has more or fewer coordinates.
         """
         _check(self.offsets.shape[1], len(imitation.goal))
-        moved = amount * imitation.top * self.offsets
+        moved = amount * imitation.top * _at_knots(self.offsets, len(imitation.patterns[0].mean))
         patterns = tuple(replace(pattern, mean=pattern.mean + moved) for pattern in imitation.patterns)
         return replace(imitation, patterns=patterns, reason="a style is put on it")
+
+
+def _at_knots(values: Array, num: int) -> Array:
+    """Values (K, d) at even knots, at `num` of them."""
+    return PhaseCurve.through(np.linspace(0, 1, len(values)), values).at(np.linspace(0, 1, num))
 
 
 def _check(wanted: int, found: int) -> None:

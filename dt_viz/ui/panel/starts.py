@@ -27,7 +27,7 @@ LABEL_HINT = (
 
 
 class StartsPanel:
-    """The folder "Starts": adds starts by clicks and in a grid, and removes them."""
+    """The folder "Starts": adds starts by clicks and in a grid, labels and removes them."""
 
     def __init__(self, gui: viser.GuiApi, bindings: Bindings, say: Callable[[str], None], later: Later) -> None:
         """Build the controls; `say` shows a message."""
