@@ -188,8 +188,7 @@ class Motion:
     @property
     def demonstrated_labels(self) -> tuple[float, ...]:
         """The label of each demonstration, given or found; none where there are none."""
-        imitation = self._learned.imitation
-        return (imitation.labels or ()) if isinstance(imitation, AugmentedImitation) else ()
+        return self._learned.demonstrated_labels
 
     def certificates(self) -> Certificates:
         """Checks of the paths from the demonstrations' starts, and warnings."""

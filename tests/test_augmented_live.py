@@ -259,7 +259,7 @@ def test_an_added_start_takes_the_way_of_its_label_and_that_of_the_nearest_witho
     place = as_point(task.starts.mean(axis=0))
     labels = (-1.0, 1.0, None, 0.3)
     frame = last(engine, Scenario("ways", (), starts=tuple(Start(place, label) for label in labels)))
-    assert frame.labels == (-1.0, 1.0) and "misses a demonstration" in frame.reason
+    assert frame.labels == 3 * (-1.0, 1.0) and "misses a demonstration" in frame.reason
     low, high, nearest, unknown = frame.rollouts[-4:]
     assert low[:, 2].min() < place[2] - 0.05 and low[:, 2].max() < place[2] + 0.02
     assert high[:, 2].max() > place[2] + 0.05 and high[:, 2].min() > place[2] - 0.02
@@ -277,7 +277,7 @@ def test_a_style_leaves_the_ways_apart(new_engine):
             last(engine, Scenario("ways", (), state="augmented", style=style, style_amount=amount))
             for style in ("", "wavy")
         )
-        assert usual.labels == styled.labels == (-1.0, 1.0)
+        assert usual.labels == styled.labels == 3 * (-1.0, 1.0)
         for a, b in zip(usual.rollouts, styled.rollouts, strict=True):
             assert least <= frechet(a, b) < most
 
@@ -525,6 +525,26 @@ def test_its_velocity_is_that_of_the_system_at_its_phase(engine, loop):
             assert 0 < velocity @ along < 1.2 * np.linalg.norm(exact)  # joints may be slower than it asks
             compared += 1
     assert compared >= 6
+
+
+@pytest.mark.parametrize("rollout", [0, 1])
+def test_the_arm_draws_the_pattern_of_the_rollout_that_it_begins(new_engine, rollout):
+    engine = with_ways(new_engine)
+    solved = engine.solved(Scenario("ways", (), state="augmented"), LIVE)
+    q = engine.follower.undisturbed(solved.nominal).tracked.q[rollout][0]
+    path, other = (solved.nominal.paths[k] for k in (rollout, 1 - rollout))
+    for aim in ("begin", "home"):
+        controller, passed = Controller(engine.follower, solved), []
+        if aim == "begin":
+            controller.begin(q, rollout)
+        else:
+            controller.home(rollout)
+            q = run(controller, q, 30, [])
+            controller.go()
+        run(controller, q, 30, passed)
+        hand = engine.follower.robot.end_effector(np.array(passed))
+        near, far = (np.linalg.norm(p[:, None] - hand, axis=2).min(axis=1).max() for p in (path, other))
+        assert near < 0.01 and far > 0.05
 
 
 # --- The library ---

@@ -77,7 +77,7 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         certificates=Certificates(clearance, found=warnings),
         remembers=isinstance(nominal.imitation, AugmentedImitation),
         reason=nominal.imitation.reason if isinstance(nominal.imitation, AugmentedImitation) else "",
-        labels=nominal.learned.labels,
+        labels=nominal.learned.demonstrated_labels,
         learned_steps=_learned_steps(nominal),
         durations=tuple(applied.made.duration if applied else None for applied in made),
         chosen_values=tuple(applied.made.chosen if applied else {} for applied in made),

@@ -92,8 +92,8 @@ def learned_html(frame: Frame | None) -> str:
         )
         if frame.labels:
             text += (
-                f" The demonstrations show {len(frame.labels)} patterns that begin at about the same place. A number, "
-                "their label, tells them apart: World → Starts → Label chooses it for starts that you add."
+                f" The demonstrations show {len(set(frame.labels))} patterns that begin at about the same place. A "
+                "number, their label, tells them apart: World → Starts → Label chooses it for starts that you add."
             )
         return f"<div style='{_SMALL}'>{html.escape(text)}</div>"
     if not steps:
