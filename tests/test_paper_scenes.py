@@ -87,7 +87,7 @@ def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certi
     assert frame.scenario.avoidance.space == "cspace"
     assert bottle.signed_distance(frame.pictures.field.points).min() > 0
     undisturbed = max(maximum_collision_distance(path, bottle.signed_distance) for path in frame.ghost)
-    assert undisturbed > 0.008  # it is in the way
+    assert undisturbed > 0.01  # it is in the way
     assert frame.certificates.clearance > 0
     assert frame.arm_duration > 0
     assert frame.certificates.collision.warnings == ()

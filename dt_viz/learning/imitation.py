@@ -36,7 +36,8 @@ MIN_STEP_DETERMINANT = 0.05  # smallest determinant of an Euler step's derivativ
 STEP_LENGTH = 0.8  # longest Euler step of the initial guess, in σ
 MAX_LAYERS = 10
 MAX_ATTEMPTS = 5  # number of fits, each smoother than the one before
-EXPECTED = 0.25  # weight of all motions that are predicted for starts between the demonstrated ones, against theirs
+EXPECTED = 0.25  # weight of all motions that are predicted for starts around the demonstrated ones, against these; in
+# space none are, where they would cost in-sample more than they give from left-out starts
 STRAYED = 0.6  # distance of a rollout from its demonstration, in spreads, from which a warning is given
 VELOCITY_REGULARISATION = 100.0  # factor on the regularisation for the velocity objective
 NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
@@ -71,7 +72,7 @@ class ImitationSettings:
     """Weight of the squared RKHS norm, summed over layers, against the mean squared distance."""
     num_points: int = 30
     """Smallest number of points of a demonstration that are fitted; long motions get more."""
-    max_iterations: int = 30
+    max_iterations: int = 20
     """Largest number of Gauss–Newton iterations; L-BFGS, whose iterations are cheaper, takes up to ten times more."""
 
     def __post_init__(self) -> None:
@@ -226,9 +227,9 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
     """Fit ψ by the trajectory objective, as closely as possible without folding space."""
     num_points = int(np.clip(4 * motions.length, settings.num_points, max(settings.num_points, 60)))
     points = motions.resampled(num_points)
-    expected = np.stack([resample_by_arc_length(path, num_points) for path in expected_motions(motions)])
-    importance = np.repeat([1.0, EXPECTED * len(points) / len(expected)], [len(points), len(expected)])
-    points = np.concatenate([points, expected])
+    expected = expected_motions(motions) if points.shape[-1] == 2 else []
+    importance = np.repeat([1.0, EXPECTED * len(points) / max(1, len(expected))], [len(points), len(expected)])
+    points = np.concatenate([points, *(resample_by_arc_length(path, num_points)[None] for path in expected)])
     centre, scale = points.mean(axis=(0, 1)), motions.spread
     normalised = (points - centre) / scale
     fractions = np.broadcast_to(np.linspace(0.0, 1.0, num_points), points.shape[:2])

@@ -279,8 +279,8 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "augmented",
             "Augmented states (sec. 6)",
-            "An 8 crosses itself. Motions of one field never do (left); one that remembers how much of it is left can, "
-            "also around the sphere: drag it.",
+            "An 8 crosses itself. Motions of one field never do (left). One that remembers how far it is does: drag "
+            "the sphere.",
             "draw_8",
             _sphere_in_the_8,
             view=FIGURE
