@@ -15,10 +15,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dt_viz.errors import DataError
+    from dt_viz.errors import DataError, FormatError
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
-    from dt_viz.library import Arm, BlockedError, Controller, JointPath, Motion, Path, fit, load_jaco
+    from dt_viz.learning.preparation import ImitationError
+    from dt_viz.library import Arm, BlockedError, Controller, HandController, JointPath, Motion, Path, fit, load_jaco
     from dt_viz.motion.certificates import Certificates
     from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
     from dt_viz.transforms.avoidance import Avoidance
@@ -37,6 +38,9 @@ __all__ = [
     "Cylinder",
     "DataError",
     "Demonstration",
+    "FormatError",
+    "HandController",
+    "ImitationError",
     "Integration",
     "JointPath",
     "Motion",
@@ -50,10 +54,21 @@ __all__ = [
 ]
 
 _MODULES = {
-    "errors": ("DataError",),
+    "errors": ("DataError", "FormatError"),
     "flows.diffeomorphisms": ("Integration",),
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
-    "library": ("Arm", "BlockedError", "Controller", "JointPath", "Motion", "Path", "fit", "load_jaco"),
+    "learning.preparation": ("ImitationError",),
+    "library": (
+        "Arm",
+        "BlockedError",
+        "Controller",
+        "HandController",
+        "JointPath",
+        "Motion",
+        "Path",
+        "fit",
+        "load_jaco",
+    ),
     "motion.certificates": ("Certificates",),
     "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
     "transforms.avoidance": ("Avoidance",),
@@ -72,4 +87,4 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - classes and functions
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

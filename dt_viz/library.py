@@ -20,11 +20,12 @@ from dt_viz.arm.retiming import within_velocity_limits
 from dt_viz.arm.robot import Robot
 from dt_viz.arm.robot import load_jaco as load_robot
 from dt_viz.arm.tracking import inverse_kinematics, track
-from dt_viz.flows.fields import Array
+from dt_viz.errors import FormatError, check_between
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
 from dt_viz.flows.systems import CONTROLLER_TOLERANCE, DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.augmented import AugmentedImitation, unknown_label
 from dt_viz.learning.choice import State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
@@ -110,17 +111,21 @@ class Motion:
         Args:
             starts: (R, d) where they begin, metres; None is where the demonstrations do.
             spacing: largest distance between neighbouring samples, metres.
-            label: of the motions from `starts`; None takes that of the nearest demonstrated start.
+            label: of the motions from `starts`, None takes that of the nearest demonstrated start; without starts only
+                the demonstrations with this label are followed, None follows all.
 
         Raises:
-            FormatError: no demonstration has such a label.
+            FormatError: no demonstration has such a label, starts are not (R, d) finite numbers, or the spacing is not
+                above 0.
         """
+        if not spacing > 0:
+            raise FormatError("spacing", f"{spacing:g}", "metres, above 0")
         solution = self._solution
         system = solution.system
         if starts is None:
-            rays = solution.rays
+            rays = solution.rays if label is None else replace(solution.rays, z0=solution.rays.z0[self._with(label)])
         else:
-            states = self._states(np.atleast_2d(np.asarray(starts, float)), label)
+            states = self._states(self._places(np.atleast_2d(np.asarray(starts, float)), "starts"), label)
             rays = Rays(system.transform.forward(states), system.base)
         evaluate = lambda index, fraction: system.transform.inverse(rays.at(index, fraction))[:, None, :3]  # noqa: E731
         bundle = refined(evenly_sampled(evaluate, len(rays.z0), NUM_SAMPLES), evaluate, spacing)
@@ -128,29 +133,36 @@ class Motion:
         return tuple(Path(path[:, : self.dimension], t) for path, t in zip(bundle.paths, times, strict=True))
 
     def velocity(
-        self, y: ArrayLike, phase: float = 1.0, start: ArrayLike | None = None, label: float | None = None
+        self, y: ArrayLike, phase: float | None = None, start: ArrayLike | None = None, label: float | None = None
     ) -> Array:
-        """ẏ (*B, d), m/s, at the places `y` (*B, d), metres: what a controller follows.
+        """ẏ (*B, d), m/s, at the places `y` (*B, d), metres.
 
         It is exact to about a thousandth of its speed, and quickest for a single place. In the augmented state there is
-        one such field for each phase and each start, which a controller remembers; see `phase_rate`.
+        one such field for each phase and each start; `HandController` keeps both, and is what a robot follows.
 
         Args:
             y: places, metres.
-            phase: part of the motion that is left, from 1 at its start to 0 at the goal.
+            phase: part of the motion that is left, from 1 at its start to 0 at the goal; only of the augmented state,
+                which needs it.
             start: (d,) where it began, metres; None is where the first demonstration does.
             label: of the motion; None takes that of the nearest demonstrated start.
 
         Raises:
-            FormatError: no demonstration has such a label.
+            FormatError: the phase is missing or not from 0 to 1, no demonstration has such a label, or places are not
+                d finite numbers each.
         """
         points = np.asarray(y, float)
+        self._places(points.reshape(-1, points.shape[-1] if points.ndim else 1), "y")
         system = frozen(self._controlled, self._rest(phase, start, label))
         velocity = system.velocity(self._in_space(points.reshape(-1, self.dimension)))
         return velocity[:, : self.dimension].reshape(points.shape)
 
     def phase_rate(self, phase: float, start: ArrayLike | None = None, label: float | None = None) -> float:
-        """How fast the phase falls at a phase, 1/s; 0 in the plain state, which has none. See `velocity`."""
+        """How fast the phase falls at a phase, 1/s; 0 in the plain state, which has none. See `velocity`.
+
+        Raises:
+            FormatError: as `velocity`.
+        """
         base, rest = self._solution.rays.base, self._rest(phase, start, label)
         if not len(rest):
             return 0.0
@@ -172,6 +184,11 @@ class Motion:
     def labels(self) -> tuple[float, ...]:
         """The labels that `rollouts` and `velocity` accept, given or found; none where starts tell what follows."""
         return self._learned.labels
+
+    @property
+    def demonstrated_labels(self) -> tuple[float, ...]:
+        """The label of each demonstration, given or found; none where there are none."""
+        return self._learned.demonstrated_labels
 
     def certificates(self) -> Certificates:
         """Checks of the paths from the demonstrations' starts, and warnings."""
@@ -199,11 +216,14 @@ class Motion:
         imitation = learned.imitation
         augmented = isinstance(imitation, AugmentedImitation)
         labels = imitation.labels if isinstance(imitation, AugmentedImitation) else None
-        save_motion(path, SavedMotion(learned.task.demonstrations, self._layers, augmented, labels), imitation)
+        saved = SavedMotion(learned.task.demonstrations, self._layers, augmented, labels, self.reason)
+        save_motion(path, saved, imitation)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Motion:
         """Read the motion that `save` wrote: its paths, velocities and certificates are the same to the last bit.
+
+        An augmented motion is learned again from its demonstrations, so that this holds for one version of DT-Viz.
 
         Raises:
             DataError: there is no such file, it cannot be read, or is no saved motion. Nothing else is raised,
@@ -232,12 +252,31 @@ class Motion:
         """The states (R, k) in which motions from places (R, d) begin."""
         return self._solution.rays.base.states(self._in_space(places), label)
 
-    def _rest(self, phase: float, start: ArrayLike | None, label: float | None) -> Array:
+    def _rest(self, phase: float | None, start: ArrayLike | None, label: float | None) -> Array:
         """What the state of a motion from a start (d,) consists of besides the place, at a phase."""
         began = self._learned.task.starts[0, : self.dimension] if start is None else np.asarray(start, float)
-        rest = self._states(began[None], label)[0, NUM_COORDINATES:]
-        rest[:1] *= phase
+        rest = self._states(self._places(began[None], "start"), label)[0, NUM_COORDINATES:]
+        if phase is None and len(rest):
+            raise FormatError("phase", "none", "a number from 0 to 1: this motion was learned in the augmented state")
+        if phase is not None:
+            check_between("phase", phase, 0.0, 1.0)
+            rest[:1] *= phase
         return rest
+
+    def _with(self, label: float) -> Indices:
+        """The numbers of the demonstrations with a label."""
+        if label not in self.labels:
+            raise unknown_label(label, self.labels)
+        return np.flatnonzero(np.array(self.demonstrated_labels) == label)
+
+    def _places(self, places: Array, field: str) -> Array:
+        """Places (N, d) that were given, checked."""
+        if places.ndim != 2 or places.shape[1] != self.dimension or not len(places):
+            shape = "×".join(str(n) for n in places.shape)
+            raise FormatError(field, f"{shape} numbers", f"places of {self.dimension} coordinates, metres")
+        if not np.isfinite(places).all():
+            raise FormatError(field, "a number that is not finite", "finite numbers, metres")
+        return places
 
     def _in_space(self, points: Array) -> Array:
         """Points (N, 3) of points (N, d)."""
@@ -248,6 +287,61 @@ NUM_COORDINATES = 3
 """Coordinates of motions in space."""
 PLANE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """The plane of motions with two coordinates."""
+
+
+class HandController:
+    """The velocities of a hand in the loop, wherever it is, in either state.
+
+        controller = dt.HandController(motion, start)
+        velocity = controller.step(position, dt)
+
+    In the augmented state it keeps the phase and where the motion began. Where the hand was pushed, the phase is chosen
+    again, so that the rest of the motion is drawn.
+    """
+
+    def __init__(self, motion: Motion, start: ArrayLike, label: float | None = None) -> None:
+        """Begin a motion.
+
+        Args:
+            motion: in the plane or in space.
+            start: (d,) where the hand is, metres.
+            label: of the motion; None takes that of the nearest demonstrated start.
+
+        Raises:
+            FormatError: no demonstration has such a label, or the start is not d finite numbers.
+        """
+        self._motion = motion
+        self._rest = motion._rest(1.0, start, label)
+        self._top = float(self._rest[0]) if len(self._rest) else 0.0
+        self._expected = motion._in_space(np.asarray(start, float)[None])[0]
+
+    @property
+    def phase(self) -> float:
+        """Part of the motion that is left, from 1 to 0; 0 in the plain state, which has none."""
+        return float(self._rest[0]) / self._top if self._top else 0.0
+
+    def step(self, position: ArrayLike, dt: float) -> Array:
+        """ẏ (d,), m/s, that takes a hand at `position` (d,), metres, to where the motion is `dt` seconds later.
+
+        Motions may end abruptly, at any period this is stable.
+
+        Raises:
+            FormatError: the position is not d finite numbers, or the period is not above 0.
+        """
+        if not 0 < dt < np.inf:
+            raise FormatError("dt", f"{dt:g}", "seconds, above 0")
+        motion, solution = self._motion, self._motion._solution
+        place = motion._in_space(motion._places(np.asarray(position, float)[None], "position"))[0]
+        state = np.concatenate([place, self._rest])
+        if np.linalg.norm(place - self._expected) > PUSHED * self._top:
+            state = solution.system.base.caught(state, solution.stacked.forward(place))
+        reached = solution.system.rollout(state, np.array([dt]))[0]
+        self._expected, self._rest = reached[:NUM_COORDINATES], reached[NUM_COORDINATES:]
+        return (self._expected - place)[: motion.dimension] / dt
+
+
+PUSHED = 0.05
+"""Distance from where the hand should be, relative to half the demonstrations' extent, from which it was pushed."""
 
 
 class Arm:
@@ -323,15 +417,22 @@ class Controller(control.Controller):
     The arm goes to the goal around what the motion avoids by hand, and by the whole arm (`Avoidance(space="cspace")`).
     """
 
-    def __init__(self, motion: Motion, arm: Arm) -> None:
+    def __init__(self, motion: Motion, arm: Arm, label: float | None = None) -> None:
         """Take a motion in space, in the frame of the arm's base, and the arm.
 
+        Args:
+            motion: as above.
+            arm: as above.
+            label: of the pattern that is drawn; None takes that of the demonstration that begins nearest to the hand.
+
         Raises:
+            FormatError: no demonstration has such a label.
             UnreachableError: the arm cannot get to where the motion starts.
             ValueError: the motion is one in a plane that has no place in space.
         """
         super().__init__(arm._follower, _live(motion))
         self._motion = motion
+        self._home = None if label is None else int(motion._with(label)[0])
 
     @property
     def motion(self) -> Motion:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,9 +53,11 @@ class SavedMotion:
     """The transforms on the imitation, from the inside out."""
     augmented: bool = False
     """Whether it was learned in the augmented state: then it is learned again from the demonstrations when it is
-    read, which takes milliseconds."""
+    read, which takes milliseconds; by another version of DT-Viz perhaps otherwise."""
     labels: tuple[float, ...] | None = None
     """Labels of the demonstrations, of the augmented state."""
+    reason: str = ""
+    """Why it was learned in the augmented state, if nobody asked for that."""
 
 
 def save_motion(path: str | os.PathLike[str], motion: SavedMotion, imitation: AnyImitation) -> None:
@@ -123,7 +125,7 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
 def _again(motion: SavedMotion) -> AugmentedImitation:
     """Learn a motion again. Raises FormatError where that fails."""
     try:
-        return fit_augmented(motion.demonstrations, motion.labels)
+        return replace(fit_augmented(motion.demonstrations, motion.labels), reason=motion.reason)
     except ImitationError as error:
         raise FormatError("demonstrations", str(error), "some that a motion is learned from") from error
 

@@ -74,7 +74,7 @@ def test_the_warped_grid_is_made_of_images_of_points_of_planes(engine, scenario,
         if len(outside) > 1:
             middle.append(on_slice(frame.task, stack.transform.forward(outside)))
     assert len(middle) > 20
-    close = 2e-3 if wanted is Stage.LIVE else 5e-4  # ψ of the live stack itself is no more exact
+    close = 2.5e-3 if wanted is Stage.LIVE else 5e-4  # ψ of the live stack itself is no more exact
     assert straightness(middle) < close
 
 

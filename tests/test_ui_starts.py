@@ -196,16 +196,17 @@ def test_a_label_is_chosen_for_new_starts_and_for_the_one_that_the_arm_follows(s
     bound.adopt(scenario)
     (control,) = bound.inputs("Label", visible=False)  # nothing is known to have labels
     handle = control.control.handle
-    bound.report(frame_of(scenario, task=bound.edited.task, labels=(-1.0, 1.0)))
-    assert handle.visible and handle.options == ("nearest", "-1", "1") and handle.value == "nearest"
-    bound.set("Label", "1")
-    assert handle.value == "1"
+    low, high = "−1: as 1", "1: as 2, 3, 4 …"
+    bound.report(frame_of(scenario, task=bound.edited.task, labels=(-1.0, 1.0, 1.0, 1.0, 1.0)))
+    assert handle.visible and handle.options == ("nearest", low, high) and handle.value == "nearest"
+    bound.set("Label", high)
+    assert handle.value == high
     for x in (0.1, 0.2):
         bound.edited.edit("add start", starts=with_start(bound.edited.scenario, np.array([x, -0.5, 0.4])))
-        bound.set("Label", "-1")
+        bound.set("Label", low)
     assert [start.label for start in bound.edited.scenario.starts] == [1.0, -1.0]
     bound.edited.edit("Follows rollout", arm_rollout=num)  # the first of them
-    assert handle.value == "1"
+    assert handle.value == high
     bound.set("Label", "nearest")
     assert [start.label for start in bound.edited.scenario.starts] == [None, -1.0]
     moved = with_moved_start(bound.edited.scenario, 1, np.ones(3))

@@ -77,7 +77,7 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         certificates=Certificates(clearance, found=warnings),
         remembers=isinstance(nominal.imitation, AugmentedImitation),
         reason=nominal.imitation.reason if isinstance(nominal.imitation, AugmentedImitation) else "",
-        labels=nominal.learned.labels,
+        labels=nominal.learned.demonstrated_labels,
         learned_steps=_learned_steps(nominal),
         durations=tuple(applied.made.duration if applied else None for applied in made),
         chosen_values=tuple(applied.made.chosen if applied else {} for applied in made),
@@ -232,10 +232,14 @@ def _panels(
         replace(picture, offset=area.centre - picture.area.centre + by)
         for picture, by in zip(shown, places, strict=True)
     ]
-    if any(panel.plain for panel in scenario.view.panels):
+    if any(panel.state == "plain" for panel in scenario.view.panels):
         title = AUGMENTED_TITLE
     elif any(panel.task for panel in scenario.view.panels):
-        title = f"{task.title}, {scenario.style} × {scenario.style_amount:g}" if scenario.style else task.title
+        title = (
+            f"{task.title}, {scenario.style} × {scenario.style_amount:g}".replace("-", "−")
+            if scenario.style
+            else task.title
+        )
     else:
         title = _title(names[-1]) if scenario.imitation or len(names) > 1 else BASE_TITLE
     return (*beside, PanelPicture(title, area))
@@ -254,7 +258,7 @@ def _panel(
     book, stack = books[panel.shown or Panel(task=scenario.task)], solved.stack
     names = levels(scenario)[: 1 + len(stack.built)]
     if panel.task:
-        return book.imitation(book.task.slice, PLAIN_TITLE if panel.plain else book.task.title)
+        return book.imitation(book.task.slice, PLAIN_TITLE if panel.state == "plain" else book.task.title)
     if panel == BASE_PANEL:
         return book.base(area, grid=scenario.view.grid)
     if panel.level not in names:

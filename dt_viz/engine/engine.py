@@ -144,7 +144,7 @@ class Engine:
 
     def _imitated(self, panel: Panel, progress: Progress | None = None) -> Nominal:
         """The undisturbed motion that a panel shows."""
-        return self.nominal(Scenario(panel.task, state="plain" if panel.plain else "auto"), progress)
+        return self.nominal(Scenario(panel.task, state=panel.state), progress)
 
     def solved(self, scenario: Scenario, precision: Precision) -> Solved:
         """The motion of a scenario that is not blocked, at a precision; what it raises see `frames`.

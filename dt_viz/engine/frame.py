@@ -97,7 +97,7 @@ class Frame:
     reason: str = ""
     """Why it is augmented, if nobody asked for that."""
     labels: tuple[float, ...] = ()
-    """Labels that an added start may have."""
+    """Label of each demonstration; an added start may have one of them. None where no labels are needed."""
     learned_steps: tuple[int, ...] = ()
     """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
     durations: tuple[float | None, ...] = ()

@@ -144,7 +144,7 @@ class LiveArm:
             controller, q = Controller(self._follower, solved), self._q
             if q is None:
                 q = _posture(self._follower, solved, first)
-            controller.begin(q)
+            controller.begin(q, first)
             with self._changing:
                 self._q, self._number, self._controller = q, nominal.numbers[first], controller
                 self._homing = False

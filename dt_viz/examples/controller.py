@@ -23,11 +23,12 @@ ARRIVED = 2e-3
 
 def run(motion: dt.Motion, start: np.ndarray, longest: float = 60.0) -> np.ndarray:
     """Positions (T, 3), metres, of a hand from `start` (3,) until it arrives, or `longest` seconds have gone."""
+    controller = dt.HandController(motion, start)
     position, passed = start.copy(), [start.copy()]
     for command in range(round(longest / PERIOD)):
         if np.linalg.norm(position - motion.goal) < ARRIVED:
             break
-        velocity = motion.velocity(position)  # from where the hand is, not from where it should be
+        velocity = controller.step(position, PERIOD)  # from where the hand is, not from where it should be
         position = position + PERIOD * velocity
         if command == PUSH_AT:
             position = position + PUSH

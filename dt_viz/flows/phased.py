@@ -194,6 +194,12 @@ class PhasedAttractor(Attractor):
         """See `Attractor`."""
         return self.predictions.states(places, label)
 
+    def states_like(self, places: Array, image: Array) -> Array:
+        """See `Attractor`."""
+        states, label = self.states(places), slice(2 * self.predictions.dim + 1, None)
+        states[..., label] = image[label]  # ψ leaves phase and condition as they are
+        return states
+
     def demonstrated(self, starts: Array) -> Array:
         """See `Attractor`."""
         return self.predictions.demonstrated(starts)

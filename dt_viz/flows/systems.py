@@ -42,7 +42,17 @@ class Attractor:
             FormatError: no demonstration has such a label.
         """
         if label is not None:
-            raise FormatError("label", f"{label:g}", "none, in the plain state")
+            raise FormatError("label", f"{label!r}", "none, in the plain state")
+        return places
+
+    def states_like(self, places: Array, image: Array) -> Array:
+        """The states (*B, d) in which motions from places (*B, d) begin that have the label of another motion.
+
+        Args:
+            places: metres.
+            image: (d,) where the other motion is in base space.
+        """
+        del image
         return places
 
     def demonstrated(self, starts: Array) -> Array:

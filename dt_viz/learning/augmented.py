@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from numbers import Real
 from typing import TypeVar
 
 import numpy as np
@@ -44,8 +45,9 @@ SMALLEST_SPREAD = 0.04
 """Smallest spread of the starts, relative to the extent: starts nearer to each other teach nothing of what they do."""
 WIDTH, NOISE = 2.0, 0.6
 """Width of the kernel over the starts, in their spreads, and variance of what it does not explain, relative to it."""
-LABEL_SPREAD, LABEL_NOISE = 3.0, 0.02
-"""Distance of labels that differ by 1, in spreads of the starts, and the variance that replaces `NOISE` with labels."""
+LABEL_SPREAD, LABEL_VARIANCE = 3.0, 100.0
+"""Distance of labels that differ by 1, in spreads of the starts, and variance of what the label alone explains wherever
+a motion begins, relative to that of what the starts explain."""
 TIME_NOISE, TIME_WIDTH, JITTER = 1.0, 0.1, 0.02
 """Variance of the clocks that the starts do not explain, width of the kernel that it has instead of being noise, so
 that a demonstration's own start has its own timing, in spreads, and the part of it that remains noise."""
@@ -54,6 +56,9 @@ NUM_PACES, NUM_TIMED = 80, 120
 CAUGHT_WITHIN, LEAST_PHASE, NUM_CAUGHT = 0.15, 0.05, 61
 """Largest change of the phase of a motion that is pushed, and the least phase that it gets, relative to s_max, and
 number of phases that are compared."""
+AWAY, LEAST_EXPECTED = 1.2, 0.03
+"""Distance of the starts for which motions are predicted from the mean one, in standard deviations along a principal
+axis, and the least such deviation, relative to the extent."""
 SHORTEST = 0.1
 """Least length of a motion that its clock is predicted for, relative to that of the mean: from the goal to the goal a
 motion still takes some time."""
@@ -79,19 +84,21 @@ class OverStarts:
     noise: float
     narrow: float | None
     """Width of the kernel of the noise, in spreads; None for noise of each condition by itself."""
+    dim: int
+    """Number of the first coordinates of a condition, those of a place; what follows is a label."""
 
     @classmethod
     def of(
-        cls, conditions: Array, values: Array, *, spread: float, noise: float, narrow: float | None = None
+        cls, conditions: Array, values: Array, *, dim: int, spread: float, noise: float, narrow: float | None = None
     ) -> OverStarts:
         """Learn `values` (R, …) of `conditions` (R, k)."""
         mean = conditions.mean(axis=0)
         known = (conditions - mean) / spread
         own = JITTER if narrow else 1.0
-        made = cls(mean, spread, known, np.empty(0), noise, narrow)
+        made = cls(mean, spread, known, np.empty(0), noise, narrow, dim)
         kernel = made._kernel(known) + own * noise * np.eye(len(known))
         flat = np.linalg.solve(kernel, values.reshape(len(known), -1))
-        return cls(mean, spread, known, flat.reshape(values.shape), noise, narrow)
+        return replace(made, coefficients=flat.reshape(values.shape))
 
     def at(self, condition: Array) -> Array:
         """The value at a condition (k,)."""
@@ -100,7 +107,9 @@ class OverStarts:
     def slope_at(self, condition: Array) -> Array:
         """The derivative (…, k) of the value with respect to the condition (k,); of values without a narrow kernel."""
         offset = (condition - self.mean) / self.spread - self.known
-        weights = -self._kernel((condition - self.mean)[None] / self.spread)[0][:, None] * offset
+        of_place, of_label = (kernel[0] for kernel in self._kernels((condition - self.mean)[None] / self.spread))
+        own = np.where(np.arange(offset.shape[1]) < self.dim, of_place[:, None], (of_place + of_label)[:, None])
+        weights = -own * offset
         return np.moveaxis(np.tensordot(weights, self.coefficients, (0, 0)), 0, -1) / (WIDTH**2 * self.spread)
 
     def placed(self, origin: Array, axes: Array, scale: float, vectors: Array) -> OverStarts:
@@ -113,13 +122,23 @@ class OverStarts:
             mean=_placed_conditions(self.mean[None], origin, axes, scale)[0],
             spread=scale * self.spread,
             known=_placed_conditions(self.known, np.zeros(len(origin)), axes, 1.0),
+            dim=len(origin),
             coefficients=self.coefficients @ vectors,
         )
 
     def _kernel(self, at: Array) -> Array:
+        of_place, of_label = self._kernels(at)
+        if not self.narrow:
+            return of_place + of_label
         squared = ((at[:, None] - self.known) ** 2).sum(axis=-1)
-        kernel = np.exp(-squared / (2 * WIDTH**2))
-        return kernel + self.noise * np.exp(-squared / (2 * self.narrow**2)) if self.narrow else kernel
+        return of_place + of_label + self.noise * np.exp(-squared / (2 * self.narrow**2))
+
+    def _kernels(self, at: Array) -> tuple[Array, Array]:
+        """What is alike of conditions `at` (N, k) and the known ones, (N, R): by place and label, and by the label."""
+        squared = (at[:, None] - self.known) ** 2 / (2 * WIDTH**2)
+        alike = np.exp(-squared[..., self.dim :].sum(axis=-1))
+        by_label = LABEL_VARIANCE * alike if squared.shape[-1] > self.dim else np.zeros_like(alike)
+        return alike * np.exp(-squared[..., : self.dim].sum(axis=-1)), by_label
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +236,7 @@ class AugmentedImitation:
         top = np.full((*places.shape[:-1], 1), self.top)
         parts = [places, top, places]
         if label is not None and label not in self.known_labels:
-            accepted = ", ".join(f"{value:g}" for value in self.known_labels) or "none: the demonstrations have none"
-            raise FormatError("label", f"{label:g}", accepted)
+            raise unknown_label(label, self.known_labels)
         if self._of_starts is not None:
             nearest = np.linalg.norm(places[..., None, :] - self.starts, axis=-1).argmin(axis=-1)
             labels = self._of_starts[nearest][..., None] if label is None else np.full_like(top, label)
@@ -343,13 +361,27 @@ def fit_augmented(
     Raises:
         ImitationError: nothing can be learned from these demonstrations, or there are not as many labels.
     """
-    if labels is not None and len(labels) != len(demonstrations):
-        raise ImitationError(
-            f"labels: found {len(labels)}; accepted: {len(demonstrations)}, one for each demonstration"
-        )
-    if labels is not None and not np.isfinite(labels).all():
+    given = None if labels is None else checked_labels(labels, len(demonstrations))
+    return augmented_from(prepare(demonstrations), given, power=power)
+
+
+def unknown_label(label: float, known: tuple[float, ...]) -> FormatError:
+    """The error about a label that no demonstration has."""
+    accepted = ", ".join(f"{value:g}" for value in known) or "none: the demonstrations have none"
+    return FormatError("label", f"{label!r}", accepted)
+
+
+def checked_labels(labels: Sequence[float], num: int) -> tuple[float, ...]:
+    """The labels of `num` demonstrations as numbers.
+
+    Raises:
+        ImitationError: there are more or fewer, or one is no finite number.
+    """
+    if len(labels) != num:
+        raise ImitationError(f"labels: found {len(labels)}; accepted: {num}, one for each demonstration")
+    if not all(isinstance(label, Real) and np.isfinite(float(label)) for label in labels):
         raise ImitationError(f"labels: found {list(labels)}; accepted: finite numbers")
-    return augmented_from(prepare(demonstrations), labels, power=power)
+    return tuple(float(label) for label in labels)
 
 
 def augmented_from(
@@ -374,20 +406,17 @@ def augmented_from(
     clock = _plain_clock(top, float(durations.mean()))
     profiles = np.stack([_profile(*motion) for motion in zip(motions.times, motions.positions, strict=True)])
     lengths = np.array([arc_length(path)[-1] for path in at_knots])
-    noise = NOISE if labels is None else LABEL_NOISE
     patterns = []
     for number in range(int(group.max()) + 1):
         of = group == number
         patterns.append(
-            _pattern(
-                conditions[of], at_knots[of], np.log(durations[of] / np.sqrt(lengths[of])), profiles[of], spread, noise
-            )
+            _pattern(conditions[of], at_knots[of], np.log(durations[of] / np.sqrt(lengths[of])), profiles[of], spread)
         )
     seconds = time.perf_counter() - began
     return AugmentedImitation(
         starts,
         motions.goal,
-        None if labels is None else tuple(float(label) for label in labels),
+        None if labels is None else tuple(labels),
         top,
         power,
         tuple(patterns),
@@ -399,9 +428,25 @@ def augmented_from(
     )
 
 
-def _pattern(
-    conditions: Array, points: Array, durations: Array, profiles: Array, spread: float, noise: float
-) -> Pattern:
+def expected_motions(motions: Motions) -> list[Array]:
+    """Motions (n, d), metres, that are predicted for starts on both sides of the mean one, along each principal axis.
+
+    They tell a fit that knows places alone what to do between demonstrations and beside them.
+    """
+    imitation, found = augmented_from(motions), []
+    for pattern in imitation.patterns:
+        starts = pattern.conditions
+        variances, axes = np.linalg.eigh(np.cov(starts, rowvar=False, bias=True))
+        widths = np.maximum(np.sqrt(np.maximum(variances, 0.0)), LEAST_EXPECTED * motions.extent)
+        for offset in (AWAY * widths * axes).T:
+            for start in (starts.mean(axis=0) + offset, starts.mean(axis=0) - offset):
+                curve = imitation.curve(start)
+                found.append(curve.at(np.linspace(imitation.top, 0, POINTS_PER_KNOT * len(curve.spline.x))))
+    return found
+
+
+def _pattern(conditions: Array, points: Array, durations: Array, profiles: Array, spread: float) -> Pattern:
+    dim = points.shape[-1]
     fading = np.linspace(1.0, 0.0, points.shape[1])[:, None]
     mean = points.mean(axis=0)
     rest = points - mean - fading * (points[:, :1] - mean[0])
@@ -409,10 +454,10 @@ def _pattern(
     return Pattern(
         conditions,
         mean,
-        OverStarts.of(conditions, rest, spread=spread, noise=noise),
+        OverStarts.of(conditions, rest, dim=dim, spread=spread, noise=NOISE),
         profiles.mean(axis=0),
         float(durations.mean()),
-        OverStarts.of(conditions, timing, spread=spread, noise=TIME_NOISE, narrow=TIME_WIDTH),
+        OverStarts.of(conditions, timing, dim=dim, spread=spread, noise=TIME_NOISE, narrow=TIME_WIDTH),
     )
 
 

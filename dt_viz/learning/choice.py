@@ -21,7 +21,7 @@ import numpy as np
 
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.augmented import AugmentedImitation, augmented_from, fit_augmented
+from dt_viz.learning.augmented import AugmentedImitation, augmented_from, checked_labels
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
@@ -91,10 +91,12 @@ def learn(
     plain = plain or (lambda settings: fit(demonstrations, settings, progress))
     if state == "plain":
         return plain(settings)
-    if labels is not None:
-        return fit_augmented(demonstrations, labels)
     began, reason = time.perf_counter(), ""
     motions = prepare(demonstrations)
+    if labels is not None:
+        given = checked_labels(labels, len(demonstrations))
+        imitation = augmented_from(motions, given)
+        return _judged(imitation, missed(imitation, motions, [given[number] for number in motions.numbers]))
     if state == "auto":
         usual, reason = _usual(motions, plain)
         if usual is not None:
@@ -132,10 +134,15 @@ def _with_patterns(motions: Motions, num_demonstrations: int) -> AugmentedImitat
                 return labelled
             if off_labelled < off:
                 imitation, off = labelled, off_labelled
-    if off > MOST_UNTOLD:
-        warning = f"a motion misses its demonstration by {100 * off:.0f} % of the extent"
-        return replace(imitation, warnings=(*imitation.warnings, warning))
-    return imitation
+    return _judged(imitation, off)
+
+
+def _judged(imitation: AugmentedImitation, off: float) -> AugmentedImitation:
+    """The imitation, with a warning where a motion is `off` its demonstration, relative to the extent, by too much."""
+    if off <= MOST_UNTOLD:
+        return imitation
+    warning = f"a motion misses its demonstration by {100 * off:.0f} % of the extent"
+    return replace(imitation, warnings=(*imitation.warnings, warning))
 
 
 def _told_apart(imitation: AugmentedImitation) -> bool:

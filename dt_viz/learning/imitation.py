@@ -15,6 +15,7 @@ from dt_viz.flows.diffeomorphisms import MOST_STEPS, Chain, Diffeomorphism, Flow
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.learning.augmented import expected_motions
 from dt_viz.learning.demonstrations import DIMENSIONS, Demonstration
 from dt_viz.learning.flow_chain import Layer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
@@ -22,7 +23,7 @@ from dt_viz.learning.timing import TimedAttractor, learn_timing
 from dt_viz.learning.trajectory import TrajectoryFit
 from dt_viz.learning.unbending import layers_along, regress, unbending
 from dt_viz.learning.velocity import VelocityFit
-from dt_viz.metrics import interpolate
+from dt_viz.metrics import interpolate, resample_by_arc_length
 from dt_viz.properties import cached_property
 
 Progress = Callable[[float, str], None]
@@ -35,6 +36,8 @@ MIN_STEP_DETERMINANT = 0.05  # smallest determinant of an Euler step's derivativ
 STEP_LENGTH = 0.8  # longest Euler step of the initial guess, in σ
 MAX_LAYERS = 10
 MAX_ATTEMPTS = 5  # number of fits, each smoother than the one before
+EXPECTED = 0.25  # weight of all motions that are predicted for starts around the demonstrated ones, against these; in
+# space none are, where they would cost in-sample more than they give from left-out starts
 STRAYED = 0.6  # distance of a rollout from its demonstration, in spreads, from which a warning is given
 VELOCITY_REGULARISATION = 100.0  # factor on the regularisation for the velocity objective
 NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"
@@ -224,6 +227,9 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
     """Fit ψ by the trajectory objective, as closely as possible without folding space."""
     num_points = int(np.clip(4 * motions.length, settings.num_points, max(settings.num_points, 60)))
     points = motions.resampled(num_points)
+    expected = expected_motions(motions) if points.shape[-1] == 2 else []
+    importance = np.repeat([1.0, EXPECTED * len(points) / max(1, len(expected))], [len(points), len(expected)])
+    points = np.concatenate([points, *(resample_by_arc_length(path, num_points)[None] for path in expected)])
     centre, scale = points.mean(axis=(0, 1)), motions.spread
     normalised = (points - centre) / scale
     fractions = np.broadcast_to(np.linspace(0.0, 1.0, num_points), points.shape[:2])
@@ -246,7 +252,7 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
             done = 0.1 + 0.8 * iteration / settings.max_iterations
             progress(done, f"fitting, {100 * rms:.1f} % of the spread off")
 
-        problem = TrajectoryFit(stack, normalised, fractions, regularisation)
+        problem = TrajectoryFit(stack, normalised, fractions, regularisation, importance)
         ends = np.concatenate([shapes[0][:, 0], shapes[0][:1, -1]])
         thetas, ends, _ = problem.solve(thetas, ends, max_iterations=settings.max_iterations, report=report)
         if stack.min_step_determinant(thetas) > MIN_STEP_DETERMINANT:

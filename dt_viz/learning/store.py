@@ -20,7 +20,7 @@ from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fi
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 2
+FORMAT = 3
 """Version of the fit and its file; raised with every change, so that older files are not used."""
 
 MAX_BYTES = 40 * 10**6

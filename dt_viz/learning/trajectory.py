@@ -29,6 +29,8 @@ class TrajectoryFit:
     fractions: Array
     """(R, n) place of each point on its ray, from 0 (start) to 1 (goal)."""
     regularisation: float
+    importance: Array
+    """(R,) weights of the demonstrations' squared distances, relative to their mean."""
     end_weight: float = 20.0
     """Weight of a residual at a ray's end against one between."""
     along_weight: float = 0.3
@@ -41,7 +43,7 @@ class TrajectoryFit:
         tangents /= np.maximum(np.linalg.norm(tangents, axis=-1, keepdims=True), 1e-12)
         weights = np.eye(d) - (1 - self.along_weight) * tangents[..., :, None] * tangents[..., None, :]
         weights[:, [0, -1]] = self.end_weight * np.eye(d)
-        return weights
+        return np.sqrt(self.importance / self.importance.mean())[:, None, None, None] * weights
 
     def solve(
         self,

@@ -31,7 +31,7 @@ from dt_viz.arm.retiming import RAMP, within_velocity_limits
 from dt_viz.arm.robot import NUM_JOINTS
 from dt_viz.arm.tracking import track
 from dt_viz.arm.whole_arm import ROUNDING
-from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
+from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
@@ -241,7 +241,10 @@ class Controller:
         self._sighting = self._seen = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0)
         """The obstacles that the dodge is made for, and where they were seen last."""
         self._section = Section(self.robot, follower.reference(solved.nominal))
-        self._aim, self._home, self._then = Aim.GOAL, 0, Aim.GOAL
+        self._aim, self._then = Aim.GOAL, Aim.GOAL
+        self._home: int | None = None
+        """Number of the rollout whose start it goes home to, and whose pattern it draws from there; None draws that of
+        the nearest demonstration."""
         self._rest: Array | None = None
         """What else the state was, besides the place, when it last went to the goal: phase and condition of an
         augmented one; None where it begins anew."""
@@ -331,10 +334,15 @@ class Controller:
 
     # --- What happens to it ---
 
-    def begin(self, q: ArrayLike) -> None:
-        """Begin at a posture (6,), rad, before the first tick: what lies ahead is known from then on."""
+    def begin(self, q: ArrayLike, rollout: int | None = None) -> None:
+        """Begin at a posture (6,), rad, before the first tick: what lies ahead is known from then on.
+
+        Args:
+            q: the posture.
+            rollout: number of the one that is begun, from 0; None is that of the nearest demonstration.
+        """
         with self._lock:
-            self._q = np.array(q, float)
+            self._q, self._home = np.array(q, float), rollout
             self._anchor(self._q, NO_DODGE)
 
     def go(self) -> None:
@@ -650,15 +658,14 @@ class Controller:
     def _course(self, q: Array, z: Array | None = None, near: Course | None = None) -> Course:
         """The undisturbed motion from a posture (6,) to where it is to go; see `_towards`."""
         stack, nominal = self._solved.stack, self._solved.nominal
-        outer: list[Diffeomorphism] = [applied.made.transform for applied in stack.built]
-        stacked = Chain(outer) if outer else Identity(3)
+        stacked = stack.stacked
         hand = self.robot.end_effector(q)
         if self._aim is Aim.HOME:
-            start = stacked.forward(nominal.starts[self._home % len(nominal.starts)])
+            start = stacked.forward(nominal.starts[(self._home or 0) % len(nominal.starts)])
             base = Attractor(start, HOMING_SPEED * stack.rays.base.speed, stack.rays.base.smoothing)
             return _towards(DiffeomorphicSystem(stacked, base), self._section, q, hand, z, near)
-        base = stack.rays.base
-        state = base.states(hand)
+        base, images = stack.rays.base, stack.rays.z0
+        state = base.states(hand) if self._home is None else base.states_like(hand, images[self._home % len(images)])
         if self._rest is not None and len(self._rest) == len(state) - 3:
             state = base.caught(np.concatenate([hand, self._rest]), stacked.forward(hand))
         return _towards(stack.system, self._section, q, state, z, near)

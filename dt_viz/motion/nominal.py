@@ -91,6 +91,11 @@ class Learned:
         """The labels that a start may have."""
         return self.imitation.known_labels if isinstance(self.imitation, AugmentedImitation) else ()
 
+    @property
+    def demonstrated_labels(self) -> tuple[float, ...]:
+        """The label of each demonstration; none where there are none."""
+        return (self.imitation.labels or ()) if isinstance(self.imitation, AugmentedImitation) else ()
+
     def strand(self, start: Start) -> Strand:
         """The rollout from an added start; a label that it cannot have is that of the nearest demonstrated start."""
         label = start.label if start.label in self.labels else None

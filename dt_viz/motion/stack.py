@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism
+from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.phased import OnPlaces, frozen, on_places
 from dt_viz.flows.rollouts import Bundle, Rays, refined
@@ -78,6 +78,12 @@ class Solution:
         """What ψ is a chain of: the same objects wherever they stay the same."""
         parts = Chain([self.transform]).parts
         return tuple(part.transform if isinstance(part, OnPlaces) else part for part in parts)
+
+    @property
+    def stacked(self) -> Diffeomorphism:
+        """The transforms on the imitation together, of places (3,)."""
+        parts: list[Diffeomorphism] = [applied.made.transform for applied in self.built]
+        return Chain(parts) if parts else Identity(3)
 
     def at_phase(self, rest: Array) -> DiffeomorphicSystem:
         """The system of places (3,), for the other coordinates (k − 3,) of the state; see `frozen`."""

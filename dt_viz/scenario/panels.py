@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.learning.choice import State
 from dt_viz.obstacles.shapes import Point
 from dt_viz.scenario.slices import Slice
 
@@ -28,13 +29,13 @@ class Panel:
     """Whether it shows the vector field that leads to this level from the one below it."""
     task: str = ""
     """Name of a task of which it shows the imitation."""
-    plain: bool = False
-    """Whether that is learned in the plain state, however the scene's own is."""
+    state: State = "auto"
+    """State in which that is learned, whichever the scene's own is."""
 
     @property
     def shown(self) -> Panel | None:
         """The panel of all of that imitation; None where it shows the scene's own."""
-        return Panel(task=self.task, plain=self.plain) if self.task else None
+        return Panel(task=self.task, state=self.state) if self.task else None
 
 
 BASE_PANEL = Panel()

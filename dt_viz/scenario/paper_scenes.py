@@ -279,11 +279,12 @@ SCENES: Mapping[str, PaperScene] = {
         PaperScene(
             "augmented",
             "Augmented states (sec. 6)",
-            "An 8 crosses itself. No motion of one field does (left); one that knows its phase can, also around the "
-            "sphere: drag it.",
+            "An 8 crosses itself. Motions of one field never do (left). One that remembers how far it is does: drag "
+            "the sphere.",
             "draw_8",
             _sphere_in_the_8,
-            view=FIGURE | {"panels": (Panel(task="draw_8", plain=True),), "streamlines": False, "demonstrations": True},
+            view=FIGURE
+            | {"panels": (Panel(task="draw_8", state="plain"),), "streamlines": False, "demonstrations": True},
         ),
         PaperScene(
             "style",
@@ -294,7 +295,7 @@ SCENES: Mapping[str, PaperScene] = {
             _in_style,
             view=FIGURE
             | {
-                "panels": (Panel(task="draw_s"), Panel(task="draw_s_wavy")),
+                "panels": (Panel(task="draw_s", state="augmented"), Panel(task="draw_s_wavy", state="augmented")),
                 "streamlines": False,
                 "demonstrations": True,
                 "tuned": IMITATION,

@@ -68,7 +68,8 @@ PLOTS = {"joint_plots", "health_plots"}
 """Fields of `View` whose pictures are in the panel, not in the scene."""
 VIEW_HINTS: Mapping[str, str] = {
     "field": "velocities on the slice: longer and darker is faster",
-    "streamlines": "motions from all over the slice: exact, as images of straight rays",
+    "streamlines": "motions from all over the slice, exact; of an augmented motion the lines of its field at one "
+    "phase, which no motion follows for long",
     "ghost": "what was learned, without obstacles and bias points",
     "ghost_arm": "at the same moment; links that coincide are left out",
     "onion": f"{NUM_ARMS} of them, from start to goal, evenly along the path of the hand",

@@ -47,13 +47,20 @@ class SlicePanel:
             lambda s: COLOUR_LABELS[s.view.colour],
             lambda s, label: {"view": replace(s.view, colour=names[label])},
         )
-        hint = "part of the motion that is left where the slice shows an augmented one, whose field changes on the way"
+        hint = (
+            "of an augmented motion, whose field changes on the way: the part of it that is left, from 1 at its start "
+            "to 0 at the goal, for which vector field, streamlines, grid and colours are shown"
+        )
         phase = gui.add_slider("Phase", 0.0, 1.0, 0.01, 1.0, hint=hint, visible=False)
         bindings.input(phase, lambda s: s.view.phase, lambda s, value: {"view": replace(s.view, phase=value)})
         take = gui.add_button("Take the arm's phase", visible=False)
         bindings.on(take, lambda session, _pressed: session.take_phase())
         for handle in (phase, take):
-            bindings.properties(handle, visible=lambda _s: bindings.frame is not None and bindings.frame.remembers)
+            bindings.properties(
+                handle,
+                visible=lambda _s: bindings.frame is not None and bindings.frame.remembers,
+                disabled=lambda s: not _shows_velocities(s),
+            )
         self.legend: Legend | None = None
         """Legend of the colours that are shown."""
         self.key = gui.add_html("", visible=False)
@@ -79,8 +86,12 @@ def _put_back(session: Session, _pressed: bool) -> None:
     session.end_gesture()
 
 
+def _shows_velocities(scenario: Scenario) -> bool:
+    """Whether the slice shows something of the vector field or of ψ."""
+    view = scenario.view
+    return view.colour != "none" or view.field or view.streamlines or view.grid
+
+
 def _lacks_whole_arm(scenario: Scenario) -> bool:
     """Whether the slice shows something that the whole arm's avoidance would change."""
-    view = scenario.view
-    shown = view.colour != "none" or view.field or view.streamlines or view.grid
-    return shown and scenario.arm_avoidance is not None and bool(scenario.obstacles)
+    return _shows_velocities(scenario) and scenario.arm_avoidance is not None and bool(scenario.obstacles)

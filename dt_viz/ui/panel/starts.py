@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,9 +20,12 @@ from dt_viz.ui.chores import Later
 from dt_viz.ui.panel.bindings import Bindings
 
 NEAREST = "nearest"
+MOST_NAMED = 3
+"""Largest number of demonstrations by which a label is named."""
 LABEL_HINT = (
     "which of the patterns that the demonstrations show is followed, where they differ although they begin at one "
-    "place: of new starts, and of an added start that the arm follows. nearest: that of the nearest demonstration"
+    "place: of new starts, and of an added start that the arm follows. Numbers are those of demonstrations with that "
+    "pattern, as in Follows rollout. nearest: that of the nearest demonstration"
 )
 
 
@@ -105,7 +108,10 @@ def _labelled(scenario: Scenario, num_demonstrated: int, label: float | None) ->
 
 def _labels(bindings: Bindings) -> dict[str, float]:
     """The labels of the frame that is shown, by their names."""
-    return {} if bindings.frame is None else {_named(label): label for label in bindings.frame.labels}
+    if bindings.frame is None:
+        return {}
+    labels = bindings.frame.labels
+    return {_named(label, labels): label for label in sorted(set(labels))}
 
 
 def _label_shown(scenario: Scenario, frame: Frame | None) -> str:
@@ -113,8 +119,11 @@ def _label_shown(scenario: Scenario, frame: Frame | None) -> str:
     if frame is None:
         return NEAREST
     label = label_of(scenario, len(frame.task.demonstrations))
-    return _named(label) if label in frame.labels else NEAREST
+    return NEAREST if label is None or label not in frame.labels else _named(label, frame.labels)
 
 
-def _named(label: float) -> str:
-    return f"{label:g}"
+def _named(label: float, labels: Sequence[float]) -> str:
+    """The name of a label, which tells the first demonstrations that have it."""
+    numbers = [str(k + 1) for k, other in enumerate(labels) if other == label]
+    more = " …" if len(numbers) > MOST_NAMED else ""
+    return f"{label:g}: as {', '.join(numbers[:MOST_NAMED])}{more}".replace("-", "−")

@@ -88,12 +88,12 @@ def learned_html(frame: Frame | None) -> str:
         why = f"Chosen because {frame.reason}. " if frame.reason else ""
         text = (
             f"{why}Augmented: each motion remembers its phase and where it began, and follows what is predicted for "
-            "them. ψ is a shear with det J = 1; there are no flows to choose."
+            "them. Space is shifted along that prediction, not bent by flows (det J = 1): there are no steps to choose."
         )
         if frame.labels:
             text += (
-                f" The demonstrations show {len(frame.labels)} patterns that their starts do not tell apart: a label "
-                "does. Starts → Label chooses that of added starts."
+                f" The demonstrations show {len(set(frame.labels))} patterns that begin at about the same place. A "
+                "number, their label, tells them apart: World → Starts → Label chooses it for starts that you add."
             )
         return f"<div style='{_SMALL}'>{html.escape(text)}</div>"
     if not steps:
