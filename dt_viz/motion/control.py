@@ -339,10 +339,10 @@ class Controller:
 
         Args:
             q: the posture.
-            rollout: number of the one that is begun, from 0; None is that of the nearest demonstration.
+            rollout: number of the one that is begun, from 0; None leaves the pattern that is drawn as it is.
         """
         with self._lock:
-            self._q, self._home = np.array(q, float), rollout
+            self._q, self._home = np.array(q, float), self._home if rollout is None else rollout
             self._anchor(self._q, NO_DODGE)
 
     def go(self) -> None:
