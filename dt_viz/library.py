@@ -323,7 +323,7 @@ class HandController:
     def step(self, position: ArrayLike, dt: float) -> Array:
         """ẏ (d,), m/s, that takes a hand at `position` (d,), metres, to where the motion is `dt` seconds later.
 
-        Motions may end abruptly, at any period this is stable.
+        It is stable at any period, also where a motion ends abruptly.
 
         Raises:
             FormatError: the position is not d finite numbers, or the period is not above 0.
@@ -418,11 +418,11 @@ class Controller(control.Controller):
     """
 
     def __init__(self, motion: Motion, arm: Arm, label: float | None = None) -> None:
-        """Take a motion in space, in the frame of the arm's base, and the arm.
+        """Take a motion and the arm.
 
         Args:
-            motion: as above.
-            arm: as above.
+            motion: in space, in the frame of the arm's base.
+            arm: the arm that follows it.
             label: of the pattern that is drawn; None takes that of the demonstration that begins nearest to the hand.
 
         Raises:

@@ -21,8 +21,8 @@ from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
 from dt_viz.files.values import Codec
-from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
-from dt_viz.learning.choice import AnyImitation
+from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.learning.choice import AnyImitation, learn
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
 from dt_viz.learning.preparation import ImitationError
@@ -125,9 +125,11 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
 def _again(motion: SavedMotion) -> AugmentedImitation:
     """Learn a motion again. Raises FormatError where that fails."""
     try:
-        return replace(fit_augmented(motion.demonstrations, motion.labels), reason=motion.reason)
+        imitation = learn(motion.demonstrations, state="augmented", labels=motion.labels)
     except ImitationError as error:
         raise FormatError("demonstrations", str(error), "some that a motion is learned from") from error
+    assert isinstance(imitation, AugmentedImitation)
+    return replace(imitation, reason=motion.reason)
 
 
 def _codec() -> Codec:

@@ -235,11 +235,8 @@ def _panels(
     if any(panel.state == "plain" for panel in scenario.view.panels):
         title = AUGMENTED_TITLE
     elif any(panel.task for panel in scenario.view.panels):
-        title = (
-            f"{task.title}, {scenario.style} × {scenario.style_amount:g}".replace("-", "−")
-            if scenario.style
-            else task.title
-        )
+        amount = f"{scenario.style_amount:g}".replace("-", "−")
+        title = f"{task.title}, {scenario.style} × {amount}" if scenario.style else task.title
     else:
         title = _title(names[-1]) if scenario.imitation or len(names) > 1 else BASE_TITLE
     return (*beside, PanelPicture(title, area))

@@ -96,12 +96,13 @@ def learn(
     if labels is not None:
         given = checked_labels(labels, len(demonstrations))
         imitation = augmented_from(motions, given)
-        return _judged(imitation, missed(imitation, motions, [given[number] for number in motions.numbers]))
-    if state == "auto":
-        usual, reason = _usual(motions, plain)
-        if usual is not None:
-            return usual if settings in (None, ImitationSettings()) else plain(settings)
-    imitation = _with_patterns(motions, len(demonstrations))
+        imitation = _judged(imitation, missed(imitation, motions, [given[number] for number in motions.numbers]))
+    else:
+        if state == "auto":
+            usual, reason = _usual(motions, plain)
+            if usual is not None:
+                return usual if settings in (None, ImitationSettings()) else plain(settings)
+        imitation = _with_patterns(motions, len(demonstrations))
     return replace(imitation, reason=reason, fit_seconds=time.perf_counter() - began)
 
 

@@ -36,8 +36,8 @@ MIN_STEP_DETERMINANT = 0.05  # smallest determinant of an Euler step's derivativ
 STEP_LENGTH = 0.8  # longest Euler step of the initial guess, in σ
 MAX_LAYERS = 10
 MAX_ATTEMPTS = 5  # number of fits, each smoother than the one before
-EXPECTED = 0.25  # weight of all motions that are predicted for starts around the demonstrated ones, against these; in
-# space none are, where they would cost in-sample more than they give from left-out starts
+EXPECTED = 0.25  # weight of all motions that are expected from starts around the demonstrated ones, against these; only
+# in the plane: in space the fit of `lift_box` loses by them
 STRAYED = 0.6  # distance of a rollout from its demonstration, in spreads, from which a warning is given
 VELOCITY_REGULARISATION = 100.0  # factor on the regularisation for the velocity objective
 NOT_INVERTIBLE = "no invertible map follows these demonstrations; do they contradict each other?"

@@ -126,4 +126,4 @@ def _named(label: float, labels: Sequence[float]) -> str:
     """The name of a label, which tells the first demonstrations that have it."""
     numbers = [str(k + 1) for k, other in enumerate(labels) if other == label]
     more = " …" if len(numbers) > MOST_NAMED else ""
-    return f"{label:g}: as {', '.join(numbers[:MOST_NAMED])}{more}".replace("-", "−")
+    return f"{label:g}".replace("-", "−") + f": as {', '.join(numbers[:MOST_NAMED])}{more}"
