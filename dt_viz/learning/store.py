@@ -20,7 +20,7 @@ from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fi
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 3
+FORMAT = 4
 """Version of the fit and its file; raised with every change, so that older files are not used."""
 
 MAX_BYTES = 40 * 10**6

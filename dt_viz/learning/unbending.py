@@ -29,6 +29,7 @@ SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motio
 MAX_TURN = (
     np.pi
 )  # turning from its middle from which a motion winds; none in the plane that always advances turns as far
+BLUNT, MEDIAN_ITERATIONS = 0.1, 50  # rounding, rad, of the geometric median of all turning, and iterations for it
 MIN_ADVANCE = 0.1  # advance along the axis, in parts of its way, that each step of what is sheared makes
 APART = 0.8  # mean distance, in spreads, below which motions belong to one group
 
@@ -91,12 +92,14 @@ class _Unbending:
         self._dim = motions.shape[-1]
         turned, self._frames = _turned(_tangents(self._mean, SMOOTHING))
         self._increments = np.diff(turned, axis=0)
-        # The element whose direction is kept: the last, or the middle one of all turning, so that no end turns too far.
-        self._kept = len(turned) - 1 if keep_arrival else _middle(turned)
+        # The turning that is kept: of the arrival, or the middle of all turning, so that no end turns too far.
+        self._fixed = len(turned) - 1 if keep_arrival else len(turned) // 2
+        self._from_kept = turned[self._fixed] - (turned[-1] if keep_arrival else _middle(turned))
 
     def shape(self, tau: float) -> Array:
         """Return the motions (R, n, d) with their turning scaled by `tau`: 1 keeps them, 0 straightens their mean."""
-        rotation = _chain_rotations(tau * self._increments, self._kept, self._frames[self._kept]) * self._frames.inv()
+        start = self._frames[self._fixed] * Rotation.from_rotvec((tau - 1) * self._from_kept)
+        rotation = _chain_rotations(tau * self._increments, self._fixed, start) * self._frames.inv()
         segments = rotation[:-1].apply(np.diff(self._mean, axis=0))
         curve = self._mean[-1] - np.concatenate([np.cumsum(segments[::-1], axis=0)[::-1], np.zeros((1, 3))])
         carried = np.stack([rotation.apply(offset) for offset in self._offsets])
@@ -124,7 +127,7 @@ def _axis(mean: Array) -> Array | None:
     """
     tangents = _tangents(_solid(mean), SMOOTHING / 2)  # smoothed as much as usual, four turns would hardly be left
     turned, _ = _turned(tangents)
-    if np.linalg.norm(turned - turned[_middle(turned)], axis=1).max() < MAX_TURN:
+    if np.linalg.norm(turned - _middle(turned), axis=1).max() < MAX_TURN:
         return None
     weights, _ = nnls(np.vstack([tangents.T, np.ones(len(tangents))]), np.array([0.0, 0.0, 0.0, 1.0]))
     axis = tangents.T @ weights / weights.sum()
@@ -138,9 +141,17 @@ def _tangents(mean: Array, smoothing: float) -> Array:
     return tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
 
 
-def _middle(turned: Array) -> int:
-    """Index of the middle one of all turning (n, 3)."""
-    return int(np.linalg.norm(turned[:, None] - turned[None], axis=-1).sum(axis=1).argmin())
+def _middle(turned: Array) -> Array:
+    """Compute the middle (3,) of all turning (n, 3): its geometric median, rounded off by `BLUNT`.
+
+    Minimises Σ √(‖turned_k − m‖² + BLUNT²) by Weiszfeld's iteration. Unlike the element in the middle, which two
+    elements of a motion in the plane tie for, it is a continuous function of the motion.
+    """
+    middle = turned.mean(axis=0)
+    for _ in range(MEDIAN_ITERATIONS):
+        weights = 1.0 / np.sqrt(((turned - middle) ** 2).sum(axis=1) + BLUNT**2)
+        middle = weights @ turned / weights.sum()
+    return middle
 
 
 def _solid(motions: Array) -> Array:
