@@ -1,18 +1,29 @@
 """What several test modules share: a robot, learned tasks in a temporary cache, scenarios."""
 
+import atexit
 import os
-import re
+import shutil
+import tempfile
 from pathlib import Path
 
 # Tests run beside each other, each on one core: read when numpy is imported, by its BLAS.
 os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"} | os.environ)
 
+# Temporary files and caches of this process lie where it is seen which of them a test leaves behind.
+OWN_FOLDER = Path(tempfile.mkdtemp(prefix="dt-viz-tests-", dir=os.environ.get("PYTEST_DEBUG_TEMPROOT")))
+atexit.register(shutil.rmtree, OWN_FOLDER, ignore_errors=True)
+tempfile.tempdir = os.environ["TMPDIR"] = str(OWN_FOLDER / "tmp")
+os.environ["XDG_CACHE_HOME"] = str(OWN_FOLDER / "cache")
+for folder in (tempfile.tempdir, os.environ["XDG_CACHE_HOME"]):
+    Path(folder).mkdir()
+
+import leftovers
 import pytest
 import viser  # noqa: TID251 - a page for tests of pictures and controls
 from chromium import ARGUMENTS, CHROMIUM
 from hypothesis import HealthCheck, settings
 from playwright.sync_api import sync_playwright
-from scenes import avoiding
+from scenes import avoiding, frame_at
 
 from dt_viz.arm.robot import Robot, load_jaco
 from dt_viz.engine.engine import Engine
@@ -31,13 +42,13 @@ settings.register_profile(
 settings.load_profile("dt-viz")
 
 
-def pytest_collection_modifyitems(config, items):
-    """What is marked slow or package runs when asked for by its marker; the browser begins, as it waits longest."""
-    items.sort(key=lambda item: item.get_closest_marker("browser") is None)
-    for name in {"slow", "package"} - set(re.findall(r"\w+", config.getoption("-m"))):
-        for item in items:
-            if item.get_closest_marker(name):
-                item.add_marker(pytest.mark.skip(reason=f"{name}: run with pytest -m {name}"))
+@pytest.fixture(autouse=True)
+def _leaves_nothing_behind():
+    """A test that leaves a thread, a process, a port or a file behind fails."""
+    before = leftovers.found()
+    yield
+    left = leftovers.left_behind(before)
+    assert not left, f"left behind: {', '.join(sorted(left))}"
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +105,21 @@ def _nothing_shown_before_a_module():
 def _nothing_shown_before_a_test(_nothing_shown_before_a_module):
     for engine in _shared:
         engine._shown.clear()
+
+
+@pytest.fixture(scope="session")
+def at_rest(engine):
+    """The frame of a scenario at a stage, without history; each is computed once and must not be changed."""
+    known = {}
+
+    def frame(scenario, stage):
+        if (scenario, stage) not in known:
+            engine._shown.clear()
+            known[scenario, stage] = frame_at(engine, scenario, stage)
+            engine._shown.clear()
+        return known[scenario, stage]
+
+    return frame
 
 
 @pytest.fixture(scope="session")

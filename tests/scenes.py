@@ -4,11 +4,13 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from dt_viz.obstacles.shapes import as_point
+from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.stack import avoidance_layer, with_avoidance
 from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.bias import BiasPoint
 
+RANDOM_TASKS = ("draw_s", "lift_box", "push_box")
 OF_AVOIDANCE = {field.name for field in fields(Avoidance)}
 
 
@@ -79,3 +81,40 @@ def places_of(starts):
 def says(frame, words):
     """Whether some warning of a frame has these words."""
     return any(words in warning.text for warning in frame.certificates.warnings)
+
+
+def random_scenario(engine, seed):
+    """Up to three obstacles and two bias points near the motion of a task."""
+    rng = np.random.default_rng(seed)
+    task = engine.task(RANDOM_TASKS[seed % len(RANDOM_TASKS)])
+
+    def place():
+        path = task.paths[int(rng.integers(len(task.paths)))]
+        x, y, z = path[int(rng.integers(len(path)))] + rng.normal(scale=0.06, size=3)
+        return float(x), float(y), float(z)
+
+    def obstacle():
+        turn = rng.normal(size=4)
+        w, x, y, z = (float(c) for c in turn / np.linalg.norm(turn))
+        a, b, c = (float(size) for size in rng.uniform(0.04, 0.16, 3))
+        kind = rng.integers(3)
+        if kind == 0:
+            return Sphere(place(), a)
+        return Box(place(), (a, b, c), (w, x, y, z)) if kind == 1 else Cylinder(place(), a, b, (w, x, y, z))
+
+    layers = biases(*(BiasPoint(place(), moves_goal=bool(rng.integers(4) == 0)) for _ in range(rng.integers(3))))
+    return avoiding(
+        task.name,
+        tuple(obstacle() for _ in range(rng.integers(4))),
+        layers=layers,
+        level=int(rng.integers(len(layers) + 1)),
+        temperature=float(rng.uniform(2, 12)),
+    )
+
+
+def frame_at(engine, scenario, stage):
+    """The frame of a scenario at a stage; nothing finer is computed."""
+    frames = engine.frames(scenario)
+    frame = next(frame for frame in frames if frame.stage is stage)
+    frames.close()
+    return frame

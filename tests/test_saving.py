@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_hostile_files import npz_member
-from test_new_transform import shown_in_the_readme
+from twirl import shown_in_the_readme
 
 import dt_viz as dt
 from dt_viz.examples import controller
@@ -389,7 +388,6 @@ def test_other_files_are_refused(saved, tmp_path):
         saved[:-1],
         saved[: len(saved) // 2],
         b"{}",
-        npz_member(3),
         hostile.npz(points=np.zeros((9, 3))),
     ):
         refusal(content)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_baselines_eflow import weights
+from plans import eflow_weights as weights
 
 from dt_viz.baselines import repulsive
 from dt_viz.baselines.eflow import EFlowSystem

@@ -10,8 +10,8 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
+import hostile
 import numpy as np
 import pytest
 import trimesh
@@ -58,7 +58,7 @@ class ReadingProcess:
 def reading(*arguments: str) -> Iterator[ReadingProcess]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
     environment["OPENBLAS_NUM_THREADS"] = "1"
-    command = [sys.executable, "-W", "error", str(Path(__file__).with_name("hostile.py")), *arguments]
+    command = [sys.executable, "-W", "error", hostile.__file__, *arguments]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe) as process:
         try:

@@ -2,46 +2,15 @@
 
 import numpy as np
 import pytest
-from scenes import avoiding, beside, biases, says
+from scenes import beside, random_scenario, says
 
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
-from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
-from dt_viz.transforms.bias import MAX_TARGET_MISS, BiasPoint
+from dt_viz.transforms.bias import MAX_TARGET_MISS
 from dt_viz.warning import Kind
 
-TASK_NAMES = ("draw_s", "lift_box", "push_box")
 BETWEEN_SAMPLES = 1e-4
 """Metres by which a motion may be elsewhere between its samples."""
-
-
-def random_scenario(engine, seed):
-    """Up to three obstacles and two bias points near the motion of a task."""
-    rng = np.random.default_rng(seed)
-    task = engine.task(TASK_NAMES[seed % len(TASK_NAMES)])
-
-    def place():
-        path = task.paths[int(rng.integers(len(task.paths)))]
-        x, y, z = path[int(rng.integers(len(path)))] + rng.normal(scale=0.06, size=3)
-        return float(x), float(y), float(z)
-
-    def obstacle():
-        turn = rng.normal(size=4)
-        w, x, y, z = (float(c) for c in turn / np.linalg.norm(turn))
-        a, b, c = (float(size) for size in rng.uniform(0.04, 0.16, 3))
-        kind = rng.integers(3)
-        if kind == 0:
-            return Sphere(place(), a)
-        return Box(place(), (a, b, c), (w, x, y, z)) if kind == 1 else Cylinder(place(), a, b, (w, x, y, z))
-
-    layers = biases(*(BiasPoint(place(), moves_goal=bool(rng.integers(4) == 0)) for _ in range(rng.integers(3))))
-    return avoiding(
-        task.name,
-        tuple(obstacle() for _ in range(rng.integers(4))),
-        layers=layers,
-        level=int(rng.integers(len(layers) + 1)),
-        temperature=float(rng.uniform(2, 12)),
-    )
 
 
 def check(engine, seed):

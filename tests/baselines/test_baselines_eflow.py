@@ -5,9 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from plans import eflow_weights as weights
 
 from dt_viz.baselines.base import NotFittedError
-from dt_viz.baselines.eflow import NUM_BLOCKS, NUM_FEATURES, NUM_HIDDEN, Coupling, EFlow, EFlowSystem, Speed
+from dt_viz.baselines.eflow import Coupling, EFlow, EFlowSystem, Speed
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.flows.diffeomorphisms import Chain, round_trip_error
 from dt_viz.flows.systems import stepped
@@ -15,25 +16,6 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.shipped import ASSETS
 
 NAMES = ("draw_s", "push_box")
-
-
-def weights(task, seed=0, amplitude=0.01):
-    """Some weights, as training leaves them; the goal is that of the task."""
-    rng = np.random.default_rng(seed)
-    dim, goal = task.demonstrations[0].dimension, task.demonstrations[0].positions[-1]
-    moved = (dim + 1) // 2
-    points = np.concatenate([d.positions for d in task.demonstrations])
-    scale = 1 / np.ptp(points, axis=0)
-    return {
-        "frequencies": rng.normal(size=(NUM_BLOCKS, 2, NUM_FEATURES, moved)) / 0.45,
-        "phases": rng.uniform(0, 6.28, size=(NUM_BLOCKS, 2, NUM_FEATURES)),
-        "weights": rng.normal(size=(NUM_BLOCKS, 2, NUM_FEATURES, moved)) * amplitude,
-        "normalisation": np.stack([scale, -points.min(axis=0) * scale - 0.5]),
-        "goal": goal,
-        "speed_0": rng.normal(size=(NUM_HIDDEN, dim + 1)) * 0.1,
-        "speed_1": rng.normal(size=(NUM_HIDDEN, NUM_HIDDEN + 1)) * 0.1,
-        "speed_2": rng.normal(size=(1, NUM_HIDDEN + 1)) * 0.1,
-    }
 
 
 @pytest.fixture(params=NAMES)

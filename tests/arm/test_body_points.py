@@ -15,7 +15,7 @@ from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.shipped import ASSETS
 
-SCRIPT = Path(__file__).parents[1] / "assets" / "make_body_points.py"
+SCRIPT = Path(__file__).parents[2] / "assets" / "make_body_points.py"
 OVERSHOOT = {-1: 0.0375, 0: 0.0295, 1: 0.0455, 2: 0.043, 3: 0.031, 4: 0.031, 5: 0.0255}
 """How far the spheres of each joint may stick out of its links, metres: about a millimetre more than they do."""
 

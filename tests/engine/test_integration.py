@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import avoiding, biases, changed
-from test_stacks import random_scenario
+from scenes import avoiding, biases, changed, random_scenario
 
 from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import AUTO, METHODS, AdaptiveFlow, Chain, Conjugated, Flow, Integration

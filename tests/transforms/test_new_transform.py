@@ -1,51 +1,18 @@
 """A new kind of transform, as the README shows it: one file with a subclass like this one, one line in the registry."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, ClassVar, cast  # noqa: F401 - of the README's example
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from pages import Bound
 from scenes import avoiding, changed
+from twirl import shown_in_the_readme
 
-import dt_viz
 from dt_viz.engine.frame import Stage
-from dt_viz.flows.diffeomorphisms import Flow  # noqa: F401
-from dt_viz.flows.fields import Array
 from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
 from dt_viz.transforms import registry
-from dt_viz.transforms.base import Built, MotionBelow, Number, Setting, Transform  # noqa: F401
 from dt_viz.ui.panel.transforms import add, add_transform_controls, addable
-
-
-@dataclass(frozen=True)
-class Whirl:
-    """V(s) = exp(−‖s − c‖²/r²)·ẑ × (s − c): turns space around a vertical axis through c."""
-
-    centre: Array
-    radius: float
-
-    dim = 3
-
-    def __call__(self, s):
-        return self.with_jacobian(s)[0]
-
-    def with_jacobian(self, s):
-        offset = s - self.centre
-        weight = np.exp(-(offset**2).sum(axis=1) / self.radius**2)
-        turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-        V = weight[:, None] * offset @ turn.T
-        return V, weight[:, None, None] * turn - 2 / self.radius**2 * V[:, :, None] * offset[:, None, :]
-
-
-def shown_in_the_readme():
-    """The class that dt_viz/README.md shows, made from its text."""
-    text = (Path(dt_viz.__file__).parent / "README.md").read_text(encoding="utf-8")
-    code = text.split("## Adding a new transform")[1].split("```python")[1].split("```")[0]
-    names = dict(globals())
-    exec(compile("from __future__ import annotations\n" + code, "README.md", "exec"), names)
-    return names["Twirl"]
 
 
 @pytest.fixture(params=[("Twirl 1", "Avoidance"), ("Avoidance", "Twirl 1")], ids=" below ".join)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_baselines_eflow import weights
+from plans import eflow_weights as weights
 
 from dt_viz.baselines import registry
 from dt_viz.baselines.base import INSTALL, NotFittedError

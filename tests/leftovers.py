@@ -1,0 +1,79 @@
+"""What a test may leave behind: threads, processes, listening ports, and files where it has no business."""
+
+import os
+import re
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+PATIENCE = 20.0
+"""Seconds in which what was told to end may end; reached only by what would never end."""
+OF_POOLS = re.compile(r"ThreadPoolExecutor|asyncio_\d|Thread-\d+ \(_do_work\)|pytest|execnet|hypothesis|playwright")
+"""Names of threads that a pool starts when it first needs one; a pool ends with the server that owns it."""
+PROC = Path("/proc")
+WATCHED = (Path.cwd(), Path.cwd() / "assets", Path.cwd() / "dt_viz")
+"""Folders in which no test may make a file."""
+HARMLESS = {".hypothesis", ".pytest_cache", ".ruff_cache", "__pycache__"}
+
+
+def found() -> set[str]:
+    """Everything that would stay if the test ended now, described in words."""
+    return _threads() | _processes() | _ports() | _files()
+
+
+def left_behind(before: set[str]) -> set[str]:
+    """What was not there before and does not go by itself."""
+    deadline = time.monotonic() + PATIENCE
+    while (left := found() - before) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return left
+
+
+def _threads() -> set[str]:
+    return {
+        f"thread {thread.name} ({thread.ident})"
+        for thread in threading.enumerate()
+        if thread is not threading.main_thread() and not OF_POOLS.search(thread.name)
+    }
+
+
+def _processes() -> set[str]:
+    """Child processes; only on Linux."""
+    children = set()
+    for file in PROC.glob("self/task/*/children"):
+        for pid in _read(file).split():
+            command = _read(PROC / pid / "cmdline").replace("\0", " ")
+            if "resource_tracker" not in command:
+                children.add(f"process {pid}: {command[:100]}")
+    return children
+
+
+def _ports() -> set[str]:
+    """Ports on which this process listens; only on Linux."""
+    own = set()
+    for file in PROC.glob("self/fd/*"):
+        try:
+            own.update(re.findall(r"socket:\[(\d+)\]", os.readlink(file)))
+        except OSError:
+            continue  # closed meanwhile
+    rows = [line.split() for name in ("tcp", "tcp6") for line in _read(PROC / "net" / name).splitlines()[1:]]
+    return {f"port {int(row[1].rsplit(':', 1)[1], 16)}" for row in rows if row[3] == "0A" and row[9] in own}
+
+
+def _files() -> set[str]:
+    folders = (*WATCHED, Path(tempfile.gettempdir()), Path(os.environ["XDG_CACHE_HOME"]))
+    return {
+        f"file {file}"
+        for folder in folders
+        if folder.is_dir()
+        for file in folder.iterdir()
+        if file.name not in HARMLESS
+    }
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
