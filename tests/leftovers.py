@@ -54,7 +54,7 @@ def _ports() -> set[str]:
     own = set()
     for file in PROC.glob("self/fd/*"):
         try:
-            own.update(re.findall(r"socket:\[(\d+)\]", os.readlink(file)))
+            own.update(re.findall(r"socket:\[(\d+)\]", str(file.readlink())))
         except OSError:
             continue  # closed meanwhile
     rows = [line.split() for name in ("tcp", "tcp6") for line in _read(PROC / "net" / name).splitlines()[1:]]
