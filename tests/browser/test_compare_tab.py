@@ -26,7 +26,7 @@ from dt_viz.ui.panel.compare import TITLES
 from dt_viz.ui.server import Server
 
 SIZE = (1280, 720)
-pytestmark = [pytest.mark.browser, needs_chromium]
+pytestmark = [pytest.mark.browser, pytest.mark.slow, needs_chromium]
 
 OF_CHROMIUM = "GPU stall due to ReadPixels"
 """Said by Chromium where it draws by software."""

@@ -11,6 +11,7 @@ from dt_viz.scenario.paper_scenes import SCENES
 pytestmark = [pytest.mark.browser, needs_chromium]
 
 
+@pytest.mark.slow
 def test_a_scene_is_seen_with_its_panels_and_nothing_is_complained_of(tmp_path, capsys):
     """A picture of fig. 2 has the colours of rollouts and goals in each third of what the panel leaves."""
     assert main(["pictures", "--only", "steps", "--size", "1280,720", "--out", str(tmp_path)]) == 0

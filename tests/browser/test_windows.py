@@ -30,7 +30,7 @@ from dt_viz.ui.ruler import STEP
 from dt_viz.ui.scene.camera import camera_for, window
 from dt_viz.ui.server import Server
 
-SIZES = [(1280, 720), (1920, 1080), (390, 844), (844, 390)]
+PHONE, PROJECTOR, LAPTOP, PHONE_ON_ITS_SIDE = (390, 844), (1920, 1080), (1280, 720), (844, 390)
 
 NEAR = 8.0
 """Accepted distance of what is dragged from the finger, pixels."""
@@ -66,7 +66,7 @@ def server(fits):
 
 @pytest.fixture(scope="module")
 def opened(browser, server):
-    page, visitor = open_page(browser, server, SIZES[0])
+    page, visitor = open_page(browser, server, PHONE)
     yield page, visitor
     close_page(page, server, visitor)
 
@@ -87,7 +87,11 @@ def visit(opened, initial, request):
     assert [error for error in page_errors if OF_VISER not in error] == []
 
 
-in_all_windows = pytest.mark.parametrize("visit", SIZES, indirect=True, ids=str)
+def windows(*sizes):
+    """In windows of these sizes; in the slow tests of the others, too."""
+    others = {PHONE, PROJECTOR, LAPTOP, PHONE_ON_ITS_SIDE} - set(sizes)
+    slow = [pytest.param(size, marks=pytest.mark.slow) for size in sorted(others)]
+    return pytest.mark.parametrize("visit", [*sizes, *slow], indirect=True, ids=str)
 
 
 def boxes(page):
@@ -113,13 +117,13 @@ def faults(boxes):
     return found
 
 
-@in_all_windows
+@windows(PHONE, PROJECTOR)
 def test_nothing_of_the_first_controls_is_cut_or_overlaps(visit):
     page, _ = visit
     assert faults(boxes(page)) == []
 
 
-@in_all_windows
+@windows(PROJECTOR)
 def test_the_presentation_has_a_caption_and_buttons_in_place_of_the_panel(visit):
     page, visitor = visit
     page.evaluate("document.activeElement.blur()")
@@ -144,7 +148,7 @@ SPOILT = {
 """What the check must find, and the style that does it."""
 
 
-@pytest.mark.parametrize("visit", SIZES[:1], indirect=True, ids=str)
+@pytest.mark.parametrize("visit", [PROJECTOR], indirect=True, ids=str)
 def test_the_check_finds_what_is_cut_or_overlaps(visit):
     page, _ = visit
     for fault, style in SPOILT.items():
@@ -170,7 +174,7 @@ def touch(page, start, end, steps=6):
     finger.detach()
 
 
-@in_all_windows
+@windows(PHONE)
 def test_a_touch_drags_the_sphere(visit):
     page, visitor = visit
     session, camera = visitor.session, visitor.client.camera
@@ -206,12 +210,13 @@ def test_a_touch_drags_the_sphere(visit):
     assert session.wait_idle(PATIENCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [2, 3])
 def test_the_view_fits_the_window_whatever_pixels_the_screen_has(browser, server, ratio):
     page_errors.clear()
-    page, visitor = open_page(browser, server, SIZES[2], ratio)
+    page, visitor = open_page(browser, server, PHONE, ratio)
     tripod, camera = visitor._tripod, visitor.client.camera
-    for width, height in (SIZES[2], SIZES[3], SIZES[2]):
+    for width, height in (PHONE, PHONE_ON_ITS_SIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
         exact = camera_for(TASKS["draw_s"](), SimpleNamespace(image_width=width, image_height=height))
         near = 0.05 * np.linalg.norm(exact[0] - exact[1])
@@ -223,7 +228,6 @@ def test_the_view_fits_the_window_whatever_pixels_the_screen_has(browser, server
 
 
 GROUP = ("Front", "Side", "Top", "Hand", "Home")
-SCREENS = pytest.mark.parametrize("visit", SIZES[:2], indirect=True, ids=str)
 
 
 def open_tab(page, name):
@@ -248,7 +252,8 @@ def tabs(page):
     return {tab.inner_text(): tab.evaluate(BOX) for tab in page.get_by_role("tab").all()}
 
 
-@SCREENS
+@pytest.mark.slow
+@pytest.mark.parametrize("visit", [LAPTOP, PROJECTOR], indirect=True, ids=str)
 def test_big_type_is_larger_and_nothing_is_cut_or_overlaps(visit):
     page, visitor = visit
     usual, home = boxes(page), visitor.client.camera.position
@@ -272,7 +277,7 @@ def test_big_type_is_larger_and_nothing_is_cut_or_overlaps(visit):
     wait_until(lambda: np.abs(camera.position - home).max() < 0.005, "the view as before")
 
 
-@in_all_windows
+@windows(PHONE)
 def test_the_views_lie_in_one_row(visit):
     page, _ = visit
     open_tab(page, "Picture")
