@@ -9,7 +9,7 @@ from laws.registry import OBSTACLES, PLACE, SIMILAR, TILTED
 from oracles import central_differences
 
 from dt_viz.flows.integrators import integrate_adaptive
-from dt_viz.obstacles.shapes import MAX_BALLS, SHAPES, UPRIGHT, CloudObstacle, MeshObstacle, Obstacle, rotation
+from dt_viz.obstacles.shapes import MAX_BALLS, SHAPES, UPRIGHT, Box, CloudObstacle, MeshObstacle, Obstacle, rotation
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.avoidance import clearing_duration
 
@@ -169,12 +169,33 @@ def test_equal_obstacles_are_equal_and_others_are_not(obstacle):
     assert sum(other == obstacle for other in OBSTACLES.values()) == 1
 
 
-NEAR_EACH_OTHER = ("sphere", "plate", "disc", "U")
+@pytest.mark.parametrize("name", ["U", "scan"])
+def test_what_is_resized_is_as_large_as_that_and_keeps_place_shape_and_all_that_was_computed(name):
+    shape = OBSTACLES[name]
+    assert isinstance(shape, MeshObstacle | CloudObstacle)
+    half = shape.resized(shape.size / 2)
+    assert half.size == pytest.approx(shape.size / 2) and (half.position, half.wxyz) == (shape.position, shape.wxyz)
+    assert half.resized(shape.size).signed_distance(around(shape, 50)) == pytest.approx(
+        shape.signed_distance(around(shape, 50)), abs=1e-12
+    )
+    assert np.ptp(half.surface()[0], axis=0).max() == pytest.approx(half.size)
+    assert half.solid is shape.solid
+    offset = around(shape, 200) - shape.position
+    for quantity in (lambda o, s: o.signed_distance(s), lambda o, s: o.field("free-space", 3.0)(s)):
+        whole = quantity(shape, shape.position + offset)
+        np.testing.assert_allclose(quantity(half, half.position + offset / 2), whole / 2, rtol=0, atol=1e-9)
+
+
+def test_boxes_of_the_same_proportions_share_one_map():
+    one, other = (Box(PLACE, sizes).field("free-space", 3.0).inner for sizes in ((0.1, 0.2, 0.3), (0.15, 0.15, 0.1)))
+    assert one.inner.occupancy is other.inner.occupancy  # pyright: ignore[reportAttributeAccessIssue]
+
+
 UNIONS = {
     "of nothing else": ("cube",),
     "of blocks": ("sphere", "cylinder", "plate"),
     "of two spheres": ("sphere", "sphere"),
-    "of all kinds": NEAR_EACH_OTHER,
+    "of all kinds": ("sphere", "plate", "disc", "U"),
 }
 
 
