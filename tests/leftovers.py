@@ -57,6 +57,8 @@ def _ports() -> set[str]:
             own.update(re.findall(r"socket:\[(\d+)\]", str(file.readlink())))
         except OSError:
             continue  # closed meanwhile
+    if not own:
+        return set()  # the tables of all ports take long to read
     rows = [line.split() for name in ("tcp", "tcp6") for line in _read(PROC / "net" / name).splitlines()[1:]]
     return {f"port {int(row[1].rsplit(':', 1)[1], 16)}" for row in rows if row[3] == "0A" and row[9] in own}
 

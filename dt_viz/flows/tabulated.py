@@ -63,7 +63,7 @@ class Tabulated(Diffeomorphism):
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         place = (s - self.lowest) / self.spacing
         cell = np.floor(place).astype(int)
-        if U is None or not inverse or (cell < 1).any() or (cell > np.subtract(self.shape, 3)).any():
+        if U is None or not inverse or not len(s) or (cell < 1).any() or (cell > np.subtract(self.shape, 3)).any():
             return self.exact._map(s, U, inverse=inverse)
         along = (place - cell)[:, :, None, None] ** np.arange(4) @ CUBIC.T  # (N, d, 1, 4)
         weights, index = np.ones((len(s), 1)), np.zeros((len(s), 1), dtype=int)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -111,12 +111,15 @@ def test_adaptive_error_falls_with_its_tolerance(duration):
     assert errors[3] < errors[2] < errors[1] < errors[0]
 
 
-@pytest.mark.parametrize("duration", [-0.9, -0.6, -0.3, 0.3, 0.9])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("duration", [-0.9, pytest.param(-0.6, marks=SLOW), pytest.param(-0.3, marks=SLOW), 0.9])
 def test_adaptive_is_not_deceived_by_a_first_step_that_is_far_too_long(duration):
     """In several times the time in which a field turns motions around, some error estimate is small by chance."""
-    s = np.random.default_rng(0).normal(size=(1500, 3))
-    s *= np.linspace(0.001, 0.08, 1500)[:, None] / np.linalg.norm(s, axis=1, keepdims=True)
-    for temperature in (3.0, 6.0, 9.0):
+    s = np.random.default_rng(0).normal(size=(500, 3))
+    s *= np.linspace(0.001, 0.08, 500)[:, None] / np.linalg.norm(s, axis=1, keepdims=True)
+    for temperature in (3.0, 9.0):
         field = Sphere((0.0, 0.0, 0.0), 0.15).field("free-space", temperature)
         reference, _ = integrate(rk4, field, s, None, duration, 300)
         for tolerance, largest in ((2e-5, 1e-3), (2e-9, 1e-7)):
@@ -146,6 +149,7 @@ class Counting:
         return self.inner.with_jacobian(s)
 
 
+@settings(max_examples=8)
 @given(seeds, st.floats(-1.0, 1.0))
 def test_adaptive_points_do_not_depend_on_their_batch(seed, duration):
     rng = np.random.default_rng(seed)
@@ -155,6 +159,7 @@ def test_adaptive_points_do_not_depend_on_their_batch(seed, duration):
     np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
 
 
+@settings(max_examples=8)
 @given(seeds)
 def test_adaptive_tangents_are_the_derivative_of_the_flow(seed):
     rng = np.random.default_rng(seed)
@@ -167,21 +172,13 @@ def test_adaptive_tangents_are_the_derivative_of_the_flow(seed):
     np.testing.assert_allclose(V, fine, rtol=0, atol=2e-3 * np.abs(fine).max())
 
 
-def test_adaptive_leaves_its_arguments_alone():
-    rng = np.random.default_rng(2)
-    s, U = rng.normal(size=(4, 2)), rng.normal(size=(4, 2, 1))
-    copies = s.copy(), U.copy()
-    integrate_adaptive(smooth_field(rng), s, U, 1.0, 1e-6)
-    integrate_adaptive(smooth_field(rng), s, None, 0.0, 1e-6)
-    np.testing.assert_array_equal(s, copies[0])
-    np.testing.assert_array_equal(U, copies[1])
-
-
-def test_adaptive_takes_no_points_and_no_time():
-    field = smooth_field(np.random.default_rng(3))
+def test_adaptive_takes_no_points_and_no_time_and_leaves_its_arguments_alone():
+    field, U = smooth_field(np.random.default_rng(3)), np.broadcast_to(np.eye(2), (3, 2, 2))
     assert integrate_adaptive(field, np.empty((0, 2)), None, 1.0, 1e-6)[0].shape == (0, 2)
     s = np.ones((3, 2))
+    s.setflags(write=False)
     np.testing.assert_array_equal(integrate_adaptive(field, s, None, 0.0, 1e-6)[0], s)
+    assert (integrate_adaptive(field, s, U, 1.0, 1e-6)[0] != s).all()
 
 
 def test_adaptive_gives_up_with_a_reason_on_a_field_that_is_too_steep():

@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import avoiding, biases
 
 from dt_viz.flows.diffeomorphisms import Flow, round_trip_error
-from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import FINE, LIVE, Solution, build_stack
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import DRAWING_AXES, POTS
 from dt_viz.transforms.avoidance import ACCEPTED_MARGIN
@@ -23,7 +22,6 @@ from dt_viz.transforms.bias import (
     AIM,
     MAX_DURATION,
     BiasPoint,
-    Point,
     closest_distances,
     closest_points,
     unit_field,
@@ -31,11 +29,6 @@ from dt_viz.transforms.bias import (
 from dt_viz.warning import Kind, MotionWarning
 
 seeds = st.integers(0, 2**32 - 1)
-
-
-def as_point(v) -> Point:
-    x, y, z = (float(c) for c in v)
-    return x, y, z
 
 
 PLANE = as_point(DRAWING_AXES[:, 0]), as_point(DRAWING_AXES[:, 1])
@@ -135,48 +128,28 @@ def test_the_field_ends_smoothly(dim):
         assert np.abs(DV).max() < 10 * bound / gap
 
 
-@given(seeds, st.sampled_from([None, PLANE]))
-def test_the_derivative_of_a_placed_field_is_that_of_its_values(seed, plane):
-    rng = np.random.default_rng(seed)
-    field = BiasPoint((0.1, -0.4, 0.3), plane=plane).field(0.25)
-    s = np.array([0.1, -0.4, 0.3]) + rng.uniform(-0.2, 0.2, (40, 3))
-    V, DV = field.with_jacobian(s)
-    np.testing.assert_allclose(V, field(s), rtol=1e-12, atol=1e-12)
-    h = 1e-5
-    for j, step in enumerate(h * np.eye(3)):
-        np.testing.assert_allclose(DV[:, :, j], (field(s + step) - field(s - step)) / (2 * h), atol=1e-6)
-
-
 def test_a_dragged_or_resized_bias_point_learns_nothing_again():
     fields = [BiasPoint(place).field(radius) for place in ((0.0, -0.4, 0.3), (0.1, -0.5, 0.2)) for radius in (0.1, 0.3)]
     assert len({id(field.inner) for field in fields}) == 1
-
-
-@given(seeds)
-def test_in_a_plane_nothing_moves_out_of_it(seed):
-    rng = np.random.default_rng(seed)
-    s = np.array([0.0, -0.5, 0.4]) + rng.uniform(-0.3, 0.3, (50, 3))
-    V = BiasPoint((0.0, -0.5, 0.4), plane=PLANE).field(0.3)(s)
-    assert V.any() and np.abs(V @ DRAWING_AXES[:, 2]).max() < 1e-13
 
 
 # motions
 
 
 @pytest.mark.parametrize("task", ["draw_s", "lift_box", pytest.param("push_box", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("num", [15, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num", [6, pytest.param(30, marks=pytest.mark.slow)])
 def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(nominal, task, num):
     g, rng, off, turns = nominal(task), np.random.default_rng(7), [], []
     for number in range(num):
         point = BiasPoint(beside(g, rng, plane_of(task)), plane=plane_of(task))
-        solution = biased(g, point, precision=FINE if number % 3 == 0 else LIVE)
+        solution = biased(g, point, precision=FINE if number % 5 == 0 else LIVE)
         assert satisfied(solution) and solution.warnings == ()
         assert missed(g, solution, point) <= ACCEPTED
         off.append(closest_distances(point, motion_of(g, g.bundle)).max())
         turns.append(max(sharpest_turn(path, 0.02) for path in solution.bundle.paths))
-        if number % 3 == 0:
+        if number % 5 == 0:
             assert_sound(g, solution)
-    assert max(off) > 0.12  # the targets were not all on the path
+    assert max(off) > (0.12 if num > 6 else 0.07)  # the targets were not all on the path
     before = max(sharpest_turn(path, 0.02) for path in g.bundle.paths)
     assert np.median(turns) < before + 65  # on two centimetres, degrees
 
@@ -187,14 +160,6 @@ def test_a_drawing_stays_in_its_plane(nominal):
     assert np.ptp(solution.bundle.positions[:, 1]) < 1e-12
 
 
-def test_a_biased_motion_is_still_the_motion_of_a_stable_system(nominal):
-    g = nominal("lift_box")
-    solution = biased(g, BiasPoint(beside(g, np.random.default_rng(2))))
-    system: DiffeomorphicSystem = solution.system
-    for path in solution.bundle.paths:
-        assert (np.diff(system.lyapunov(path)) < 0).all()
-
-
 def straight(distance, num=401, **changes):
     """A straight motion that passes the origin at this distance."""
     path = np.stack([np.linspace(-0.6, 0.6, num), np.full(num, distance), np.zeros(num)], axis=1)
@@ -202,6 +167,7 @@ def straight(distance, num=401, **changes):
     return MotionBelow(path[:1], path[-1], np.zeros(num, dtype=int), path, **changes)
 
 
+@settings(max_examples=6)
 @given(st.floats(0.02, 0.15), st.sampled_from([None, 0.3]))
 def test_the_auto_duration_is_the_shortest(distance, radius):
     motion, point = straight(distance), BiasPoint((0.0, 0.0, 0.0), radius)
@@ -256,9 +222,15 @@ def test_a_chosen_strength_is_taken_as_it_is():
 # several
 
 
-@pytest.mark.parametrize("order", [1, -1])
 @pytest.mark.parametrize(
-    "task", ["draw_s", "lift_box", *(pytest.param(task, marks=pytest.mark.slow) for task in ("draw_j", "push_box"))]
+    ("task", "order"),
+    [
+        *(("draw_s", 1), ("draw_s", -1), ("lift_box", 1)),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("lift_box", -1), ("draw_j", 1), ("draw_j", -1), ("push_box", 1), ("push_box", -1))
+        ),
+    ],
 )
 def test_two_bias_points_in_either_order(nominal, task, order):
     g, plane = nominal(task), plane_of(task)
@@ -283,7 +255,7 @@ def test_fig_4_a_letter_biased_to_two_points(nominal):
     assert_sound(g, solution)
 
 
-@pytest.mark.parametrize("pot", POTS[::2])
+@pytest.mark.parametrize("pot", [POTS[0], pytest.param(POTS[2], marks=pytest.mark.slow)])
 def test_fig_8_the_object_falls_into_the_chosen_pot(nominal, pot):
     g = nominal("drop_pots")
     assert POTS[1].catches(g.goal) and not pot.catches(g.goal)
@@ -380,8 +352,3 @@ def test_a_bias_point_is_told_the_targets_below_it(nominal):
     points = [BiasPoint(as_point(path[50]), radius=0.3), BiasPoint(as_point(path[55]), radius=0.3)]
     solution = biased(nominal("lift_box"), *points, precision=LIVE)
     assert [bool(misplaced(applied.made.warnings)) for applied in solution.built] == [False, True]
-
-
-def test_equal_bias_points_are_equal_layers():
-    point = BiasPoint((0.0, -0.4, 0.3), plane=PLANE)
-    assert biases(point) == biases(replace(point)) and hash(biases(point)) == hash(biases(replace(point)))

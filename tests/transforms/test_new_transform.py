@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from pages import Bound
-from scenes import avoiding, changed
+from scenes import avoiding, changed, frame_at
 from twirl import shown_in_the_readme
 
 from dt_viz.engine.frame import Stage
@@ -48,12 +48,12 @@ def test_a_new_transform_needs_a_file_and_a_line(engine, scenario):
 
 def test_it_turns_motions_as_it_says_and_not_when_it_is_off(engine, scenario):
     alone = changed(scenario, avoids=False)
-    *_, frame = engine.frames(alone)
+    frame = frame_at(engine, alone, Stage.LIVE)
     below, turned = frame.levels
     moved = max(np.linalg.norm(a - b, axis=1).max() for a, b in zip(below, turned, strict=True))
     assert 0.02 < moved < 0.2
     off = replace(alone, stack=switched(alone, "Twirl 1"))
-    *_, frame = engine.frames(off)
+    frame = frame_at(engine, off, Stage.LIVE)
     for path, before in zip(frame.rollouts, frame.ghost, strict=True):
         assert max(np.linalg.norm(before - point, axis=1).min() for point in path) < 1e-3
 

@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from scenes import avoiding, beside, biases, changed
+from scenes import avoiding, beside, biases, changed, frame_at
 
 from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Integration
@@ -36,8 +36,8 @@ from dt_viz.transforms.base import Choice, FlowIntegration, Number, Switch
 from dt_viz.transforms.bias import MAX_TARGET_MISS, PLACED_BESIDE, BiasPoint
 from dt_viz.transforms.registry import KINDS
 
-SIMILAR = ("draw_j", "draw_c", "draw_g", "draw_z")
-"""Tasks that behave much as "draw_s" and "draw_w" do."""
+QUICK = ("draw_s", "draw_8", "push_box")
+"""Tasks whose new bias points are followed in the quick tests, too."""
 PLACES = ((0.1, -0.5, 0.4), (0.2, -0.5, 0.4), (0.3, -0.5, 0.4))
 SPHERE = Sphere((0.0, -0.5, 0.4))
 AVOIDANCE = Avoidance.title
@@ -164,7 +164,7 @@ def test_a_stack_without_avoidance_gets_one_outermost_with_the_first_obstacle():
 def test_levels_have_the_names_of_what_the_engine_stacks(engine, changes, expected):
     scenario = changed(stack(2, level=1), **changes)
     assert levels(scenario) == expected
-    assert len(next(engine.frames(scenario)).levels) == len(expected)
+    assert len(frame_at(engine, scenario, Stage.ROLLOUTS).levels) == len(expected)
 
 
 def placed_beside(task, scenario):
@@ -190,12 +190,12 @@ def test_new_bias_points_lie_beside_the_motion_apart_from_each_other_and_in_the_
     assert len(anchored(scenario)) == BiasPoint.most
 
 
-@pytest.mark.parametrize("task", [pytest.param(t, marks=[pytest.mark.slow] * (t in SIMILAR)) for t in TASKS])
+@pytest.mark.parametrize("task", [pytest.param(t, marks=[pytest.mark.slow] * (t not in QUICK)) for t in TASKS])
 def test_two_new_bias_points_do_not_pull_against_each_other(task, engine, initial):
     scenario = initial(task)
     for _ in range(2):
         scenario = added(scenario, placed_beside(engine.task(task), scenario))
-    frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.FINE)
+    frame = frame_at(engine, scenario, Stage.FINE)
     assert frame.certificates.warnings == ()
     for point in anchored(scenario).values():
         assert isinstance(point, BiasPoint)

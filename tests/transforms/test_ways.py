@@ -159,11 +159,6 @@ def test_starts_and_goal_stay_where_they_are(seed):
     flow = passes.flow(some_directions(seed, 1)[0], 1e-9)
     ends = np.concatenate([motion.starts, motion.goal[None]])
     np.testing.assert_allclose(flow.inverse(ends), ends, atol=1e-9)
-    field, s = flow.field, np.random.default_rng(seed).uniform(-0.15, 0.15, (20, 3))
-    v, DV = field.with_jacobian(s)
-    np.testing.assert_allclose(v, field(s), atol=1e-15)
-    steps = [(field(s + 1e-6 * axis) - field(s - 1e-6 * axis)) / 2e-6 for axis in np.eye(3)]
-    np.testing.assert_allclose(DV, np.stack(steps, axis=2), atol=1e-6)
 
 
 def test_in_a_plane_motions_stay_there():
