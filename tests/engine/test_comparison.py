@@ -10,6 +10,7 @@ from scenes import avoiding, changed
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.eflow import EFlow
+from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.engine.comparison import NEXT, OTHERS, WAITS, curves, scored
 from dt_viz.engine.engine import Engine
@@ -37,12 +38,25 @@ def by_name(frame):
     return {compared.method.name: compared for compared in frame.comparison}
 
 
+def straight(_method, problem):
+    """In the place of MPNet's planner, which takes seconds to find most of the same motions."""
+    return METHODS[LIVE].fit(problem)
+
+
 @pytest.fixture
+def quick(monkeypatch):
+    """The slow method plans at once; it waits for its turn all the same."""
+    monkeypatch.setattr(MPNet, "fit", straight)
+
+
+@pytest.fixture(scope="module")
 def beside(new_engine, initial):
     """Frames of a new engine for ours beside two methods, and the engine."""
     engine = new_engine()
     scenario = shown(changed(initial("push_box"), space="cspace"), LIVE, SLOW)
-    return engine, scenario, list(engine.frames(scenario))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MPNet, "fit", straight)
+        return engine, scenario, list(engine.frames(scenario))
 
 
 def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(beside):
@@ -58,6 +72,7 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
     assert told == sorted(told) and told[3] == 0 and set(told) == {0, 1, 2, 3}
 
 
+@pytest.mark.usefixtures("quick")
 def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
     engine, first, second = new_engine(), "eflow-repulsive-fine", SLOW
     planned = type(engine.comparison)._planned
@@ -83,6 +98,7 @@ def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_le
     assert list(dict.fromkeys(said)) == expected
 
 
+@pytest.mark.usefixtures("quick")
 def test_an_edit_ends_the_planning_of_a_slow_method_at_once(new_engine, initial):
     engine, scenario = new_engine(), shown(initial("push_box"), SLOW)
     frames, wanted = [], [True]
@@ -196,6 +212,7 @@ def test_of_a_single_demonstration_by_the_user_what_can_be_fitted_is_and_the_res
         assert f"{trained} has not been trained for 'Mine'" in found[name].note
 
 
+@pytest.mark.usefixtures("quick")
 def test_interrupted_between_or_within_steps_it_goes_on_later(new_engine, initial):
     engine, scenario = new_engine(), shown(initial("push_box"), LIVE, SLOW)
     calls, patience = [], [40]
@@ -283,13 +300,13 @@ def test_motions_are_drawn_in_their_colours_with_names_apart(scene, beside):
         assert motions.node.visible
         for lines in motions.lines.values():
             np.testing.assert_array_equal(lines.colour, COLOURS[name])
-    # MPNet's motions are those of Linear here
     apart = np.subtract(*(motions.label.position for motions in picture.motions.values()))
     assert np.linalg.norm(apart) > 0.8 * APART
     picture.draw(frame_of(scenario, rollouts=frames[-1].rollouts, goal=frames[-1].goal))
     assert not any(motions.node.visible for motions in picture.motions.values())
 
 
+@pytest.mark.usefixtures("quick")
 def test_their_arm_is_hidden_until_their_motion_is_known(scene, robot, beside):
     engine, scenario, _ = beside
     arm = TheirArm(scene, robot)
