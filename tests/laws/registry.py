@@ -359,10 +359,8 @@ OBSTACLES: dict[str, Obstacle] = {
     "cube": Box(PLACE, wxyz=TILTED),
     "box 3:1": Box(PLACE, (0.3, 0.1, 0.1), TILTED),
     "plate": Box(PLACE, (0.2, 0.2, 0.03), TILTED),
-    "rod": Box(PLACE, (0.04, 0.4, 0.04)),
-    "cylinder": Cylinder(PLACE, 0.12, 0.2, TILTED),
+    "cylinder": Cylinder(PLACE, 0.12, 0.2),
     "disc": Cylinder(PLACE, 0.2, 0.03, TILTED),
-    "pole": Cylinder(PLACE, 0.05, 0.4),
     "round mesh": MeshObstacle(PLACE, as_solid(trimesh.creation.icosphere(4, 0.075)), TILTED),
     "capsule": MeshObstacle(PLACE, as_solid(trimesh.creation.capsule(0.1, 0.04)), TILTED),
     "torus": MeshObstacle(PLACE, as_solid(trimesh.creation.torus(0.06, 0.025)), TILTED),
@@ -373,7 +371,7 @@ OBSTACLES: dict[str, Obstacle] = {
     "labelled cloud": CloudObstacle(PLACE, LABELLED),
     "larger cloud": CloudObstacle(PLACE, LABELLED, TILTED).resized(0.2),
 }
-SIMILAR = {"rod", "pole", "round mesh", "capsule", "labelled cloud"}
+SIMILAR = {"round mesh", "capsule", "labelled cloud"}
 """Obstacles that behave as others do; they are swept over only."""
 
 # --- transforms ---
