@@ -283,12 +283,9 @@ FIELDS: dict[str, Generator] = {
     "in a plane": Generator(InPlane(bent(3), tilted_axes()[:, :2]), uniform(3)),
     "sum": Generator(Sum((bent(3), PLACES[1])), uniform(3)),
     "repeated": Generator(Repeated(PLACES), uniform(3)),
-    **{
-        f"{generator}, T = {temperature}": Generator(
-            AvoidanceField(unit_sphere_map(), generator, temperature), uniform(3, 2.0), 1e-4, 1e-6
-        )
-        for generator, temperature in (("free-space", 1.0), ("free-space", 12.0), ("probability", 3.0))
-    },
+    "free space": Generator(AvoidanceField(unit_sphere_map(), "free-space", 1.0), uniform(3, 2.0), 1e-4, 1e-6),
+    "free space, hot": Generator(AvoidanceField(unit_sphere_map(), "free-space", 12.0), uniform(3, 2.0), 1e-4, 1e-6),
+    "probability": Generator(AvoidanceField(unit_sphere_map(), "probability"), uniform(3, 2.0), 1e-4, 1e-6),
     "stretched": Generator(StretchedField(BALL_FIELD, tilted_axes() * [1.0, 0.4, 2.0]), uniform(3), 1e-4, 1e-6),
     "bias": Generator(unit_field(3), uniform(3, 0.7), 1e-4, 1e-6),
     "bias in a plane": Generator(
