@@ -70,23 +70,12 @@ def test_contract_gives_partial_derivatives_up_to_second_order(seed, dim, num_su
 
 
 @given(seeds, dims)
-def test_contract_answers_in_the_order_of_the_question(seed, dim):
-    rng = np.random.default_rng(seed)
-    grid = random_grid(rng, dim)
-    weights = rng.normal(size=(grid.num_points, 2))
-    s = rng.uniform(-1, 1, (5, dim))
-    orders = [(0,) * dim, *unit_orders(dim), *second_orders(dim).values()]
-    shuffled = [orders[i] for i in rng.permutation(len(orders))]
-    for order, column in zip(shuffled, grid.contract(s, weights, tuple(shuffled)), strict=True):
-        np.testing.assert_allclose(column, grid.contract(s, weights, (order,))[0], rtol=0, atol=1e-12)
-
-
-@given(seeds, dims)
-def test_contract_gives_any_selection_of_partial_derivatives(seed, dim):
+def test_contract_gives_any_partial_derivatives_in_the_order_of_the_question(seed, dim):
     rng = np.random.default_rng(seed)
     grid, s = random_grid(rng, dim), rng.uniform(-1, 1, (5, dim))
     weights = rng.normal(size=(grid.num_points, 2))
-    orders = tuple(tuple(int(n) for n in row) for row in np.unique(rng.integers(0, 4, (4, dim)), axis=0))
+    some = rng.permutation(np.unique(rng.integers(0, 4, (4, dim)), axis=0))
+    orders = tuple(tuple(int(n) for n in row) for row in some)
     values = grid._gaussians(s, 3)  # (derivative, Σn_j, N)
     for order, found in zip(orders, grid.contract(s, weights, orders), strict=True):
         columns = np.ones((len(s), 1))

@@ -283,12 +283,9 @@ FIELDS: dict[str, Generator] = {
     "in a plane": Generator(InPlane(bent(3), tilted_axes()[:, :2]), uniform(3)),
     "sum": Generator(Sum((bent(3), PLACES[1])), uniform(3)),
     "repeated": Generator(Repeated(PLACES), uniform(3)),
-    **{
-        f"{generator}, T = {temperature}": Generator(
-            AvoidanceField(unit_sphere_map(), generator, temperature), uniform(3, 2.0), 1e-4, 1e-6
-        )
-        for generator, temperature in (("free-space", 1.0), ("free-space", 12.0), ("probability", 3.0))
-    },
+    "free space": Generator(AvoidanceField(unit_sphere_map(), "free-space", 1.0), uniform(3, 2.0), 1e-4, 1e-6),
+    "free space, hot": Generator(AvoidanceField(unit_sphere_map(), "free-space", 12.0), uniform(3, 2.0), 1e-4, 1e-6),
+    "probability": Generator(AvoidanceField(unit_sphere_map(), "probability"), uniform(3, 2.0), 1e-4, 1e-6),
     "stretched": Generator(StretchedField(BALL_FIELD, tilted_axes() * [1.0, 0.4, 2.0]), uniform(3), 1e-4, 1e-6),
     "bias": Generator(unit_field(3), uniform(3, 0.7), 1e-4, 1e-6),
     "bias in a plane": Generator(
@@ -359,10 +356,8 @@ OBSTACLES: dict[str, Obstacle] = {
     "cube": Box(PLACE, wxyz=TILTED),
     "box 3:1": Box(PLACE, (0.3, 0.1, 0.1), TILTED),
     "plate": Box(PLACE, (0.2, 0.2, 0.03), TILTED),
-    "rod": Box(PLACE, (0.04, 0.4, 0.04)),
-    "cylinder": Cylinder(PLACE, 0.12, 0.2, TILTED),
+    "cylinder": Cylinder(PLACE, 0.12, 0.2),
     "disc": Cylinder(PLACE, 0.2, 0.03, TILTED),
-    "pole": Cylinder(PLACE, 0.05, 0.4),
     "round mesh": MeshObstacle(PLACE, as_solid(trimesh.creation.icosphere(4, 0.075)), TILTED),
     "capsule": MeshObstacle(PLACE, as_solid(trimesh.creation.capsule(0.1, 0.04)), TILTED),
     "torus": MeshObstacle(PLACE, as_solid(trimesh.creation.torus(0.06, 0.025)), TILTED),
@@ -373,7 +368,7 @@ OBSTACLES: dict[str, Obstacle] = {
     "labelled cloud": CloudObstacle(PLACE, LABELLED),
     "larger cloud": CloudObstacle(PLACE, LABELLED, TILTED).resized(0.2),
 }
-SIMILAR = {"rod", "pole", "round mesh", "capsule", "labelled cloud"}
+SIMILAR = {"round mesh", "capsule", "labelled cloud"}
 """Obstacles that behave as others do; they are swept over only."""
 
 # --- transforms ---

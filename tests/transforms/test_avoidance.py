@@ -93,14 +93,6 @@ def motion(*paths, **changes):
     return MotionBelow(starts, paths[0][-1], index, positions, name="Avoidance", tolerance=1e-8, **changes)
 
 
-def test_the_built_transform_clears_the_motion_it_was_built_for():
-    before = motion(passing_points(1), passing_points(2))
-    built = AVOIDANCE.build(before)
-    assert built.warnings == ()
-    assert not AVOIDANCE.satisfied(before)
-    assert AVOIDANCE.satisfied(replace(before, positions=built.transform.inverse(before.positions)))
-
-
 @given(seeds, st.floats(0.0005, 0.02), st.floats(0, 1), st.floats(0.05, 0.5), st.floats(1, 6))
 def test_the_duration_hardly_depends_on_where_a_path_is_sampled(seed, miss, phase, bend, uneven):
     """What leaves last lies between samples, mostly: there the path is closest to where the field vanishes."""
