@@ -10,16 +10,9 @@ from dt_viz.arm.robot import collision_meshes
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.postures import NUM_SAMPLES, Query, Surroundings, planned
-from dt_viz.baselines.registry import problem_of
 from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.scenario import Scenario
-
-
-@pytest.fixture(scope="module")
-def problem(engine):
-    return problem_of(engine.nominal(Scenario("push_box")).learned, engine.follower)
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):

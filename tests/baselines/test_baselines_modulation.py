@@ -7,12 +7,10 @@ import pytest
 
 from dt_viz.baselines import modulation
 from dt_viz.baselines.modulation import Modulation, modulated
-from dt_viz.baselines.registry import problem_of
 from dt_viz.baselines.surface import distance_and_normal
 from dt_viz.flows.systems import stepped
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.scenario import Scenario
 
 SPHERE = Union((Sphere((0.1, -0.5, 0.3), 0.15),))
 OBSTACLES = (
@@ -66,11 +64,6 @@ def test_where_it_leads_away_the_radial_velocity_stays():
 def test_without_an_obstacle_nothing_is_modulated():
     v = np.ones((3, 3))
     assert modulated(Union(), np.zeros((3, 3)), v)[0] is v
-
-
-@pytest.fixture(scope="module")
-def problem(engine):
-    return problem_of(engine.nominal(Scenario("push_box")).learned, engine.follower)
 
 
 def departure(plan, places, times):
