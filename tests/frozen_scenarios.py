@@ -1,22 +1,13 @@
-"""Rollouts of random scenarios, kept to be compared with those of another version.
+"""Frozen scenarios: a few, described by plain data that no change of the classes touches, and their rollouts.
 
-Scenarios are described by plain data (`frozen/scenarios.json`), which no change of the classes touches. All sixty are
-compared on one machine, where versions that compute the same agree to rounding:
+They begin from the fits in `frozen/fits.npz`, so that neither a change of learning nor another machine's fit touches
+them. A version that is to give other rollouts writes them anew, and the fits only where their format changes:
 
-    PYTHONPATH=. python tests/frozen_scenarios.py write before.npz        # in a checkout of the version before
-    PYTHONPATH=. python tests/frozen_scenarios.py compare before.npz      # here: metres, largest difference first
-
-`test_frozen_scenarios.py` compares some of them with `frozen/rollouts.npz`. These begin from the fits in
-`frozen/fits.npz`, so that neither a change of learning nor another machine's fit touches them. A version that is to
-give other rollouts writes them anew, and the fits only if their format changes:
-
-    PYTHONPATH=. python tests/frozen_scenarios.py freeze
-    PYTHONPATH=. python tests/frozen_scenarios.py freeze-fits
+    PYTHONPATH=.:tests python tests/frozen_scenarios.py [fits]
 """
 
 import json
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +30,6 @@ from dt_viz.transforms.bias import BiasPoint
 FOLDER = Path(__file__).parent / "frozen"
 DESCRIPTIONS = json.loads((FOLDER / "scenarios.json").read_text(encoding="utf-8"))
 FITS, ROLLOUTS = FOLDER / "fits.npz", FOLDER / "rollouts.npz"
-FROZEN = (3, 9, 12, 17, 18, 27, 39, 57)
-"""Numbers of the scenarios in `ROLLOUTS`: of the hand, of the whole arm, with bias points, added starts and a warp."""
 NUM_KEPT = 15
 """Number of samples that are kept of each path."""
 
@@ -113,43 +102,15 @@ def rollouts_of(engine, description):
     return found if frame.arm is None else {**found, "joints": frame.arm.q}
 
 
-def all_rollouts(fits, robot):
-    """The same of many scenarios, each by an engine that has computed nothing yet."""
-    found = {}
-    for number, description in enumerate(DESCRIPTIONS):
-        print(number, end=" ", flush=True)
-        paths = rollouts_of(Engine(TASKS, fits, robot), description)
-        found |= {f"{number}/{name}": path for name, path in paths.items()}
-    return found
-
-
-def freeze(robot):
-    found = {number: frozen_rollouts(number, robot) for number in FROZEN}
-    ROLLOUTS.write_bytes(
-        npz_bytes({f"{number}/{name}": path for number, paths in found.items() for name, path in paths.items()})
-    )
-
-
-def freeze_fits():
-    fits = {task: fit(TASKS[task]().demonstrations) for task in sorted({DESCRIPTIONS[n]["task"] for n in FROZEN})}
-    FITS.write_bytes(
-        npz_bytes({f"{task}/{k}": v for task, found in fits.items() for k, v in found.to_arrays().items()})
-    )
-
-
-def main(command, file=None):
-    if command.startswith("freeze"):
-        freeze_fits() if command == "freeze-fits" else freeze(load_jaco())
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        found = all_rollouts(FitStore(Path(folder)), load_jaco())
-    if command == "write":
-        np.savez_compressed(file, **found)
-        return
-    with np.load(file) as before:
-        assert set(before.files) == set(found)
-        off = {name: float(np.abs(before[name] - path).max(initial=0)) for name, path in found.items()}
-    print(*(f"\n{name}: {by:.1e}" for name, by in sorted(off.items(), key=lambda item: -item[1])[:20]))
+def main(*what):
+    if what == ("fits",):
+        fits = {task: fit(TASKS[task]().demonstrations) for task in sorted({d["task"] for d in DESCRIPTIONS.values()})}
+        arrays = {f"{task}/{k}": array for task, found in fits.items() for k, array in found.to_arrays().items()}
+        FITS.write_bytes(npz_bytes(arrays))
+    robot = load_jaco()
+    found = {number: frozen_rollouts(number, robot) for number in DESCRIPTIONS}
+    arrays = {f"{number}/{name}": path for number, paths in found.items() for name, path in paths.items()}
+    ROLLOUTS.write_bytes(npz_bytes(arrays))
 
 
 if __name__ == "__main__":

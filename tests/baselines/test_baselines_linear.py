@@ -10,16 +10,9 @@ from dt_viz.arm.robot import collision_meshes
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.postures import NUM_SAMPLES, Query, Surroundings, planned
-from dt_viz.baselines.registry import problem_of
 from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.scenario import Scenario
-
-
-@pytest.fixture(scope="module")
-def problem(engine):
-    return problem_of(engine.nominal(Scenario("push_box")).learned, engine.follower)
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):
@@ -99,16 +92,16 @@ class TestSurroundings:
         part = Sphere(place, 0.15) if shape == "sphere" else Box(place, (0.1, 0.2, 0.12))
         around = Surroundings.of(problem.robot, Union((part,)))
         verdicts = []
-        for line in lines:
+        for line in lines[:30]:
             verdicts.append(around.is_free(*line))
             if verdicts[-1]:
                 assert self.depth(problem.robot, around.obstacle, *line) > 0
-        assert 5 < sum(verdicts) < 55
+        assert 3 < sum(verdicts) < 27
 
     def test_what_is_far_from_everything_is_free(self, problem, lines):
         far = Surroundings.of(problem.robot, Union((Sphere((5.0, 0.0, 0.0), 0.1),)))
         nothing, model = Surroundings.of(problem.robot, Union()), load_collision_model()
-        for line in lines:
+        for line in lines[:15]:
             itself = model.nearest_to_itself(np.stack(line))
             clear = self.depth(problem.robot, far.obstacle, *line) > 1e-3 and (itself is None or itself.distance > 0)
             assert far.is_free(*line) == nothing.is_free(*line)
@@ -119,7 +112,7 @@ class TestSurroundings:
         free = [line for line in lines if Surroundings.of(problem.robot, Union()).is_free(*line)]
         assert len(free) > 10
         rng, mesh = np.random.default_rng(2), collision_meshes()[-1]
-        for start, end in free:
+        for start, end in free[:15]:
             poses = Poses.of(problem.robot, (start + rng.uniform() * (end - start))[None])
             vertex = mesh.vertices[rng.integers(len(mesh.vertices))]
             place = poses.rotations[0, mesh.joint + 1] @ vertex + poses.origins[0, mesh.joint + 1]

@@ -27,11 +27,9 @@ from dt_viz.baselines.mpnet import (
 )
 from dt_viz.baselines.mpnet_rrt import MPNetRRT
 from dt_viz.baselines.postures import Surroundings
-from dt_viz.baselines.registry import problem_of
 from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.scenario import Scenario
 
 needs_torch = pytest.mark.skipif(find_spec("torch") is None, reason="torch is an extra")
 needs_ompl = pytest.mark.skipif(find_spec("ompl") is None, reason="ompl is an extra")
@@ -47,11 +45,6 @@ def weights(seed=0):
             arrays[f"{name}_c_{k}"] = rng.normal(size=num_out) * 0.1
         arrays[f"{name}_slopes"] = rng.uniform(0.1, 0.3, size=len(widths) - 2)
     return arrays
-
-
-@pytest.fixture(scope="module")
-def problem(engine):
-    return problem_of(engine.nominal(Scenario("push_box")).learned, engine.follower)
 
 
 @pytest.fixture(scope="module")

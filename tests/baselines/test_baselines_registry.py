@@ -3,16 +3,10 @@
 import numpy as np
 import pytest
 
-from dt_viz.baselines.registry import METHODS, TRAINED, problem_of
+from dt_viz.baselines.registry import METHODS, TRAINED
 from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.scenario import Scenario
-
-
-@pytest.fixture(scope="module")
-def problem(engine):
-    return problem_of(engine.nominal(Scenario("push_box")).learned, engine.follower)
 
 
 @pytest.fixture(scope="module")

@@ -57,9 +57,27 @@ class Loop:
         assert (q >= self.robot.lower).all() and (q <= self.robot.upper).all() and np.isfinite(q).all()
 
 
+@pytest.fixture(scope="module")
+def known(new_engine):
+    """An engine of this module's own, which finds again what it has computed for another test."""
+    return new_engine()
+
+
+@pytest.fixture
+def begin(known):
+    """Begins a loop with an arm that has not moved yet."""
+
+    def loop(scenario):
+        known._shown.clear()
+        known.arm = LiveArm(known.follower)
+        return Loop(known, scenario)
+
+    return loop
+
+
 @pytest.fixture(name="whole")
-def _whole(new_engine, initial):
-    return Loop(new_engine(), changed(initial("push_box"), space="cspace"))
+def _whole(begin, initial):
+    return begin(changed(initial("push_box"), space="cspace"))
 
 
 def sphere_at(place, diameter=0.15):
@@ -67,8 +85,8 @@ def sphere_at(place, diameter=0.15):
 
 
 @pytest.mark.parametrize(("task", "space"), [("push_box", "cspace"), ("draw_s", "task"), ("drop_pots", "cspace")])
-def test_it_goes_from_start_to_goal_and_home_to_the_next_start(new_engine, initial, task, space):
-    loop = Loop(new_engine(), changed(initial(task), space=space))
+def test_it_goes_from_start_to_goal_and_home_to_the_next_start(begin, initial, task, space):
+    loop = begin(changed(initial(task), space=space))
     arm, starts = loop.arm, loop.engine.nominal(loop.scenario).starts
     np.testing.assert_allclose(loop.hand, loop.frame.rollouts[0][0], atol=5e-3)
     loop.run(30, lambda: arm.arrived > 0)
@@ -104,8 +122,8 @@ def test_the_sphere_is_thrown_in_its_way_and_it_flows_around_it(whole):
     assert load_collision_model().nearest_to_obstacle(passed, sphere_at(near)).distance > 0
 
 
-def test_another_task_does_not_move_it_at_once(new_engine, initial):
-    loop = Loop(new_engine(), changed(initial("push_box"), space="cspace")).run(1.0)
+def test_another_task_does_not_move_it_at_once(begin, initial):
+    loop = begin(changed(initial("push_box"), space="cspace")).run(1.0)
     loop.show(changed(initial("draw_s"), space="task"))
     assert loop.arm.phase is Phase.MOVING
     loop.run(30, lambda: loop.phases[-2:] == [Phase.RESTING] * 2)
@@ -141,9 +159,9 @@ class TestPush:
         assert load_collision_model().nearest_to_obstacle(q, whole.scenario.obstacle).distance > 0
         assert whole.robot.end_effector(q)[:, 2].min() > 0
 
-    def test_directions_differ_and_are_the_same_every_time(self, new_engine, initial):
+    def test_directions_differ_and_are_the_same_every_time(self, begin, initial):
         def pushed(times):
-            loop = Loop(new_engine(), changed(initial("draw_s"), space="task")).run(2.0)
+            loop = begin(changed(initial("draw_s"), space="task")).run(2.0)
             for _ in range(times):
                 loop.arm.push()
                 loop.run(0.4)
@@ -286,8 +304,8 @@ def test_it_is_put_elsewhere_and_goes_on_from_there(whole):
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
-def test_the_undisturbed_posture_is_on_the_learned_motion(new_engine, initial, space):
-    loop = Loop(new_engine(), changed(initial("push_box"), space=space))
+def test_the_undisturbed_posture_is_on_the_learned_motion(begin, initial, space):
+    loop = begin(changed(initial("push_box"), space=space))
     learned, apart = loop.engine.nominal(loop.scenario).paths[0], 0.0
     for _ in range(12):
         loop.run(0.3)
