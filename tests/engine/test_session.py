@@ -168,11 +168,12 @@ def test_an_edit_that_changes_nothing_does_nothing(opened):
     assert opened.session.scenario == fresh("draw_s")
 
 
-def test_a_view_is_adopted_and_nothing_is_computed(opened):
-    asked, hidden = len(opened.engine.asked), View(ghost=False)
-    opened.edit("ghost", view=hidden)
+@pytest.mark.parametrize("layer", ["ghost", "ghost_arm", "onion", "body_points", "joint_plots"])
+def test_a_view_of_what_is_there_is_adopted_and_nothing_is_computed(opened, layer):
+    asked, other = len(opened.engine.asked), replace(View(), **{layer: not getattr(View(), layer)})
+    opened.edit(layer, view=other)
     opened.settle()
-    assert opened.page.adopted[-1].view == opened.session.scenario.view == hidden
+    assert opened.page.adopted[-1].view == opened.session.scenario.view == other
     assert len(opened.engine.asked) == asked
 
 
@@ -601,24 +602,6 @@ def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(open
     assert len(opened.engine.asked) == asked + 1
     opened.session.undo()
     assert opened.session.scenario == replace(fresh("draw_s"), view=View(generator_layer=2))
-
-
-@pytest.mark.parametrize("layer", ["ghost_arm", "onion", "body_points", "joint_plots"])
-def test_what_is_drawn_from_the_motion_itself_needs_no_new_frame(opened, layer):
-    asked = len(opened.engine.asked)
-    opened.edit(layer, view=replace(View(), **{layer: True}))
-    opened.settle()
-    assert len(opened.engine.asked) == asked
-    assert getattr(opened.page.adopted[-1].view, layer)
-
-
-def test_who_avoids_can_be_undone(opened):
-    opened.edit("Avoid with", space="cspace")
-    opened.settle()
-    assert opened.shown.avoidance.space == "cspace"
-    opened.session.undo()
-    opened.settle()
-    assert opened.shown.avoidance.space == "task"
 
 
 def test_a_scene_is_seen_as_it_wants_to_be_and_undo_brings_back_what_was_seen_before(opened):
