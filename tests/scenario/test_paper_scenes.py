@@ -23,8 +23,7 @@ SHIPPED = [scene.name for scene in offered(TASKS)]
 
 
 CERTIFIED = {"cube", "learned", "left_pot", "augmented"}
-"""Names of scenes whose certificates are quick to compute: of a bare attractor, an imitation, a bias point, an augmented
-state."""
+"""Names of scenes whose certificates are quick to compute."""
 
 
 @pytest.fixture(scope="session")
