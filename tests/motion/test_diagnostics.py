@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import avoiding, biases, changed, says
+from scenes import avoiding, biases, changed, frame_at, says
 
 from dt_viz.arm.collision import Nearest, load_collision_model
 from dt_viz.engine.frame import Stage
@@ -19,8 +19,7 @@ from dt_viz.warning import ARM, Kind, MotionWarning, told
 
 
 def stage(engine, scenario, wanted=Stage.ROLLOUTS):
-    """The frame of one stage; what comes after it is not computed."""
-    return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+    return frame_at(engine, scenario, wanted)
 
 
 def near(goal, obstacle_position, clearance, diameter=0.15):
@@ -163,7 +162,7 @@ def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
         assert margin_warnings(changed(scenario, **asks_for_none), nearest(0.001), (0,)) == ()
 
 
-@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize("kept", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_the_last_frame_says_what_margin_the_meshes_keep(engine, new_engine, initial, monkeypatch, kept):
     if not kept:  # the flow ends where the covering spheres are clear
         monkeypatch.setattr("dt_viz.arm.whole_arm.MESH_ROUNDING", np.inf)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import changed, kinds, starts_at
+from scenes import changed, frame_at, kinds, starts_at
 
 from dt_viz.arm.arm_system import Section
 from dt_viz.arm.collision import SELF_MARGIN, load_collision_model
@@ -234,7 +234,7 @@ class TestStance:
         moved = changed(scenario, obstacles=Sphere((x, y, z + 0.003)))
         assert solve(moved, nominal, LIVE, follower, shown).nominal is nominal
 
-    @pytest.mark.parametrize("precision", [LIVE, FINE])
+    @pytest.mark.parametrize("precision", [LIVE, pytest.param(FINE, marks=pytest.mark.slow)], ids=["live", "fine"])
     def test_no_way_is_said_instead_of_shown_where_the_arm_would_touch(
         self, engine, follower, initial, monkeypatch, precision
     ):
@@ -325,12 +325,9 @@ class TestFollowing:
 
 
 class TestBlocked:
-    def last(self, engine, scenario, wanted=Stage.LIVE):
-        return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
-
     def test_the_last_good_motion_is_shown_marked_until_the_obstacle_moves_away(self, new_engine, initial):
         engine, free = new_engine(), placed(initial("push_box"), *initial("push_box").obstacles)
-        good = self.last(engine, free, Stage.FINE)
+        good = frame_at(engine, free, Stage.FINE)
         assert good.blocked == ()
         covered = placed(initial("push_box"), around(good.goal))
         frames = list(engine.frames(covered))
@@ -341,22 +338,22 @@ class TestBlocked:
             assert frame.arm is good.arm and frame.rollouts is good.rollouts
             assert frame.certificates.clearance < 0  # of the motion that is shown, from the obstacle where it is now
             assert frame.certificates.min_det_jacobian is None  # certificates of another scenario certify nothing
-        recovered = self.last(engine, free, Stage.FINE)
+        recovered = frame_at(engine, free, Stage.FINE)
         assert recovered.blocked == ()
         for a, b in zip(recovered.rollouts, good.rollouts, strict=True):
             np.testing.assert_array_equal(a, b)
 
     def test_a_drag_that_ends_blocked_shows_the_arm_along_its_last_good_motion(self, new_engine, initial):
         engine = new_engine()
-        good = self.last(engine, placed(initial("push_box"), *initial("push_box").obstacles))
+        good = frame_at(engine, placed(initial("push_box"), *initial("push_box").obstacles), Stage.LIVE)
         assert good.arm is None  # nothing showed it
-        blocked = self.last(engine, placed(initial("push_box"), around(good.goal)))
+        blocked = frame_at(engine, placed(initial("push_box"), around(good.goal)), Stage.LIVE)
         assert blocked.blocked and blocked.arm is not None
         hand = engine.follower.robot.end_effector(blocked.arm.q)
         np.testing.assert_allclose(hand, good.rollouts[good.chosen], atol=1e-9)
 
     def test_without_a_motion_before_it_is_the_undisturbed_one(self, new_engine, initial):
-        frame = self.last(new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3)))
+        frame = frame_at(new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3)), Stage.LIVE)
         assert Kind.ARM_BLOCKED in kinds(frame.blocked)
         for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
             assert np.linalg.norm(path[:, None] - ghost, axis=-1).min(axis=0).max() < 1e-12

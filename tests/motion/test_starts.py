@@ -6,7 +6,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from scenes import biases, changed, says, starts_at
+from scenes import biases, changed, frame_at, says, starts_at
 
 from dt_viz.arm.whole_arm import MOVED
 from dt_viz.engine.frame import Stage
@@ -15,7 +15,7 @@ from dt_viz.flows.fields import PlacedField
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import Start
+from dt_viz.scenario.scenario import Start, View
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.starts import with_grid
 from dt_viz.transforms.bias import BiasPoint
@@ -41,14 +41,13 @@ def random_starts(engine, scenario, num=NUM, seed=0, room=0.02):
     return starts_at(*found)
 
 
-def frame_of(engine, scenario, stage=Stage.FINE):
-    return next(frame for frame in engine.frames(scenario) if frame.stage is stage)
-
-
 def test_added_rollouts_are_motions_of_the_system_and_end_at_the_goal(engine, initial, task):
     scenario = initial(task)
     scenario = replace(scenario, starts=random_starts(engine, scenario))
-    frame, num = frame_of(engine, scenario), len(engine.task(task).demonstrations)
+    frame, num = (
+        frame_at(engine, replace(scenario, view=View(field=False)), Stage.FINE),
+        len(engine.task(task).demonstrations),
+    )
     system = build_stack(engine.nominal(scenario), scenario.active, FINE).system
     assert len(frame.rollouts) == num + NUM
     for start, path, times in zip(scenario.starts, frame.rollouts[num:], frame.times[num:], strict=True):
@@ -66,7 +65,8 @@ def test_the_obstacle_is_avoided_by_added_rollouts_too(engine, initial, task):
     num = len(engine.task(task).demonstrations)
 
     def clearance(scenario):
-        return min(scenario.obstacle.signed_distance(path).min() for path in frame_of(engine, scenario).rollouts[num:])
+        paths = frame_at(engine, scenario, Stage.ROLLOUTS).rollouts[num:]
+        return min(scenario.obstacle.signed_distance(path).min() for path in paths)
 
     assert clearance(without) < 0 < clearance(scenario)
 
@@ -90,7 +90,7 @@ def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(eng
 def test_the_whole_arm_begins_at_added_starts_and_keeps_clear(engine, initial, robot):
     scenario = changed(initial("push_box"), space="cspace")
     scenario = replace(scenario, starts=random_starts(engine, scenario, seed=3, room=0.12))
-    frame, num = frame_of(engine, scenario), 7
+    frame, num = frame_at(engine, scenario, Stage.ROLLOUTS), 7
     assert len(frame.rollouts) == num + NUM and frame.certificates.clearance > 0
     for start, path in zip(scenario.starts, frame.rollouts[num:], strict=True):
         np.testing.assert_allclose(path[0], start.place, atol=2e-3)
@@ -101,7 +101,7 @@ def test_the_whole_arm_begins_at_added_starts_and_keeps_clear(engine, initial, r
 def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it_does_not_suit(engine, initial):
     scenario = changed(initial("draw_s"), space="cspace")
     grid = with_grid(changed(scenario, space="task"), engine.task("draw_s").slice, lambda places: np.zeros(len(places)))
-    alone, frame = (frame_of(engine, replace(scenario, starts=starts), Stage.LIVE) for starts in ((), grid.starts))
+    alone, frame = (frame_at(engine, replace(scenario, starts=starts), Stage.LIVE) for starts in ((), grid.starts))
     assert frame.arm_duration == pytest.approx(alone.arm_duration, rel=1e-3)
     assert frame.certificates.clearance == pytest.approx(alone.certificates.clearance, abs=1e-4)
     for path, other in zip(alone.rollouts, frame.rollouts, strict=False):
@@ -121,27 +121,35 @@ def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_the_arm_follows_an_added_rollout(engine, initial, robot, space):
-    scenario = changed(initial("push_box"), space=space, view=replace(initial("push_box").view, health_plots=True))
+    scenario = changed(
+        initial("push_box"), space=space, view=replace(initial("push_box").view, field=False, health_plots=True)
+    )
     scenario = replace(scenario, starts=random_starts(engine, scenario, seed=3, room=0.12), arm_rollout=7 + 2)
-    frame = frame_of(engine, scenario)
+    frame = frame_at(engine, scenario, Stage.FINE)
     assert frame.chosen == 9 and frame.arm is not None
     hand = robot.end_effector(frame.arm.q)
     np.testing.assert_allclose(hand[0], scenario.starts[2].place, atol=2e-3)
     np.testing.assert_allclose(hand[-1], frame.goal, atol=2e-3)
     assert frame.profiles is not None and frame.profiles.of_mean
-    assert not frame_of(engine, replace(scenario, arm_rollout=3)).profiles.of_mean
+    assert not frame_at(engine, replace(scenario, arm_rollout=3), Stage.FINE).profiles.of_mean
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_a_start_out_of_reach_is_said_to_be_and_blocks_nothing(engine, initial, space):
     near, far = (0.2, -0.5, 0.3), (1.5, -0.5, 0.3)
-    scenario = changed(initial("push_box"), space=space, starts=starts_at(near, far, near), arm_rollout=7 + 1)
-    frame = frame_of(engine, scenario)
+    scenario = changed(
+        initial("push_box"),
+        space=space,
+        view=View(field=False, arm=True),
+        starts=starts_at(near, far, near),
+        arm_rollout=7 + 1,
+    )
+    frame = frame_at(engine, scenario, Stage.FINE)
     assert not frame.blocked and frame.arm is None
     texts = [warning.text for warning in frame.certificates.warnings]
     assert texts.count("added start 2 is out of the arm's reach") == 1
     assert len(frame.rollouts) == (10 if space == "task" else 9)
-    other = frame_of(engine, replace(scenario, arm_rollout=9))
+    other = frame_at(engine, replace(scenario, arm_rollout=9), Stage.FINE)
     assert other.arm is not None and other.chosen == len(other.rollouts) - 1
     np.testing.assert_allclose(other.rollouts[other.chosen][0], near, atol=2e-3)
 
@@ -149,7 +157,7 @@ def test_a_start_out_of_reach_is_said_to_be_and_blocks_nothing(engine, initial, 
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
     scenario = changed(initial("push_box"), space=space)
-    frame = frame_of(engine, replace(scenario, starts=starts_at(scenario.obstacles[0].position)))
+    frame = frame_at(engine, replace(scenario, starts=starts_at(scenario.obstacles[0].position)), Stage.ROLLOUTS)
     assert not frame.blocked
     assert says(frame, "added start 1 is inside the obstacle")
 
@@ -157,14 +165,14 @@ def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
 def test_an_added_start_at_the_goal_stays_there(engine, initial):
     scenario = changed(initial("draw_s"), obstacles=())
     goal = engine.nominal(scenario).goal
-    frame = frame_of(engine, replace(scenario, starts=starts_at(goal), arm_rollout=7))
+    frame = frame_at(engine, replace(scenario, starts=starts_at(goal), arm_rollout=7), Stage.FINE)
     np.testing.assert_allclose(frame.rollouts[-1], np.broadcast_to(goal, frame.rollouts[-1].shape), atol=1e-6)
     assert frame.arm is not None and np.isfinite(frame.arm.q).all()
 
 
 def test_dragging_a_start_keeps_only_the_newest_rollouts(new_engine, initial):
     engine, scenario = new_engine(), initial("draw_s")
-    for x in np.linspace(-0.1, 0.1, 200):
+    for x in np.linspace(-0.1, 0.1, 110):
         moved = replace(scenario, starts=starts_at((x, -0.5, 0.45)))
         assert isinstance(engine.nominal(moved), Nominal)
     assert engine.memo.count("strand") < 100
@@ -175,9 +183,9 @@ def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine,
     scenario = changed(initial("lift_box"), obstacles=(Sphere((0.13, -0.463, 0.192), 0.12),), space="cspace")
     starts = random_starts(engine, scenario, seed=4, room=0.12)
     used = new_engine()
-    for some in (starts, starts[2:], (), starts[:3], starts[3:]):
-        last = frame_of(used, replace(scenario, starts=some), Stage.LIVE)
-    fresh = frame_of(new_engine(), replace(scenario, starts=starts[3:]), Stage.LIVE)
+    for some in (starts, (), starts[:3], starts[3:]):
+        last = frame_at(used, replace(scenario, starts=some), Stage.LIVE)
+    fresh = frame_at(new_engine(), replace(scenario, starts=starts[3:]), Stage.LIVE)
     for a, b in zip(last.rollouts, fresh.rollouts, strict=True):
         assert max(np.linalg.norm(b - point, axis=1).min() for point in a) < 2e-3
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes import changed
+from scenes import changed, frame_at
 
 from dt_viz.arm.arm_system import ArmSystem, Section
 from dt_viz.engine.frame import Stage
@@ -16,10 +16,7 @@ from dt_viz.pictures.slice_fields import FieldPicture
 @pytest.fixture(scope="module", name="scene", params=["draw_s", "lift_box"])
 def _scene(request, engine, initial):
     scenario = changed(initial(request.param), space="cspace")
-    below, above = (
-        next(frame for frame in engine.frames(s) if frame.stage is Stage.FINE).pictures.field
-        for s in (changed(scenario, obstacles=()), scenario)
-    )
+    below, above = (frame_at(engine, s, Stage.FINE).pictures.field for s in (changed(scenario, obstacles=()), scenario))
     return engine, scenario, below, above
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import frame_at
 
 from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.clouds import Cloud
@@ -64,8 +65,7 @@ def test_the_picture_is_worked_out_only_while_it_is_shown(engine, initial):
     scenario = initial("draw_s")
     shown = replace(scenario, view=View(colour="occupancy"))
     assert not shown.computes_like(scenario)
-    assert all(frame.pictures.occupancy is None for frame in engine.frames(scenario))
-    frames = list(engine.frames(shown))
-    assert [frame.pictures.occupancy is not None for frame in frames] == [frame.stage >= Stage.LIVE for frame in frames]
-    outline = frames[-1].pictures.occupancy.outline
+    assert frame_at(engine, scenario, Stage.LIVE).pictures.occupancy is None
+    assert frame_at(engine, shown, Stage.ROLLOUTS).pictures.occupancy is None
+    outline = frame_at(engine, shown, Stage.LIVE).pictures.occupancy.outline
     assert np.abs(Union(scenario.obstacles).signed_distance(outline)).max() < 1e-3

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import avoiding, biases, changed
+from scenes import avoiding, biases, changed, frame_at
 
 from dt_viz.engine.frame import Stage
 from dt_viz.flows.rollouts import Rays
@@ -30,8 +30,8 @@ def biased(engine, initial, *panels):
     return changed(initial("draw_s"), layers=biases(point), space="task", view=View(panels=panels))
 
 
-def frame_of(engine, scenario, wanted=Stage.LIVE):
-    return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+def frame_of(engine, scenario):
+    return frame_at(engine, scenario, Stage.LIVE)
 
 
 def lines_towards(lines, goal):
@@ -77,7 +77,7 @@ def test_base_space_is_scaled_until_its_rays_fit_and_never_enlarged(seed):
 
 @pytest.mark.parametrize("name", ["draw_s", "lift_box"])
 def test_the_base_attractor_has_straight_motions_and_a_lattice(engine, initial, name):
-    scenario = replace(initial(name), view=View(panels=(BASE_PANEL,), grid=True))
+    scenario = replace(initial(name), view=View(field=False, panels=(BASE_PANEL,), grid=True))
     base, own = frame_of(engine, scenario).pictures.panels
     assert len(base.rollouts) == len(engine.task(name).demonstrations)
     assert len(base.streamlines) > 20 and len(base.grid) > 5
@@ -87,7 +87,7 @@ def test_the_base_attractor_has_straight_motions_and_a_lattice(engine, initial, 
         assert (np.abs(base.area.across(line)) <= half).all()
     assert min(np.ptp(base.area.across(line), axis=0).min() for line in base.grid) < 1e-9
     np.testing.assert_array_equal(own.area.centre, engine.task(name).slice.centre)
-    without = replace(scenario, view=View(panels=(BASE_PANEL,)))
+    without = replace(scenario, view=View(field=False, panels=(BASE_PANEL,)))
     assert frame_of(engine, without).pictures.panels[0].grid == ()
 
 
@@ -170,7 +170,7 @@ def test_only_what_a_drag_changes_is_drawn_again(engine, initial, scene):
         for nodes, (streamlines, rollouts) in zip(panels.panels, before, strict=True)
     ]
     assert same == [True, True, False, False, True]  # the bias is built below the avoidance, but for other samples
-    panels.draw(frame_of(engine, replace(scenario, view=View(panels=(BASE_PANEL,)))))
+    panels.draw(frame_of(engine, replace(scenario, view=View(field=False, panels=(BASE_PANEL,)))))
     assert [nodes.frame.visible for nodes in panels.panels] == [True, True, False, False, False]
 
 

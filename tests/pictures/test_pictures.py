@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import changed
+from scenes import changed, frame_at
 from scipy.spatial.transform import Rotation
 
 from dt_viz.engine.frame import Stage
@@ -25,7 +25,7 @@ def _scenario(request, initial):
 
 
 def picture_at(engine, scenario, wanted=Stage.FINE):
-    frame = next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+    frame = frame_at(engine, scenario, wanted)
     return frame, frame.pictures
 
 
@@ -41,11 +41,10 @@ def straightness(lines):
 
 
 def test_pictures_are_worked_out_only_while_they_are_shown_and_never_before_the_rollouts(engine, scenario):
-    hidden = [frame.pictures for frame in engine.frames(replace(scenario, view=View()))]
-    assert all((p.generator, p.grid, p.panels) == (None, None, ()) for p in hidden)
-    for frame in engine.frames(scenario):
-        shown = (frame.pictures.generator, frame.pictures.grid, frame.pictures.panels or None)
-        assert all((picture is not None) == (frame.stage >= Stage.LIVE) for picture in shown)
+    for shown, stage in ((False, Stage.LIVE), (True, Stage.ROLLOUTS), (True, Stage.LIVE)):
+        pictures = frame_at(engine, scenario if shown else replace(scenario, view=View()), stage).pictures
+        made = (pictures.generator, pictures.grid, pictures.panels or None)
+        assert all((picture is not None) == (shown and stage is Stage.LIVE) for picture in made)
 
 
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
@@ -61,7 +60,7 @@ def test_the_warped_grid_of_the_identity_is_the_grid(engine, scenario, wanted):
     assert pictures.generator is None  # nothing is learned that could be shown
 
 
-@pytest.mark.parametrize("avoidance", [False, True])
+@pytest.mark.parametrize("avoidance", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
 def test_the_warped_grid_is_made_of_images_of_points_of_planes(engine, scenario, wanted, avoidance):
     """ψ by another way, the forward side of the whole stack, makes the lines straight again, seen along the normal."""
@@ -108,8 +107,8 @@ def test_the_grid_covers_the_slice_also_where_it_is_tilted(engine, initial):
         turn = Rotation.from_rotvec([0.0, 0.1, 0.5]) * Rotation.from_quat(np.roll(home.pose.wxyz, -1))
         x, y, z = (float(c) for c in home.centre + 0.03)
         w, i, j, k = (float(c) for c in np.roll(turn.as_quat(), 1))
-        tilted = replace(ALL, slice=SlicePose((x, y, z), (w, i, j, k)))
-        frame, pictures = picture_at(engine, replace(scenario, view=tilted))
+        tilted = View(grid=True, slice=SlicePose((x, y, z), (w, i, j, k)))
+        frame, pictures = picture_at(engine, replace(scenario, view=tilted), Stage.LIVE)
         area = frame.slice
         points = np.concatenate(pictures.grid.lines)
         assert np.abs((points - area.centre) @ area.normal).max() < 3e-3
@@ -118,17 +117,18 @@ def test_the_grid_covers_the_slice_also_where_it_is_tilted(engine, initial):
 
 
 def test_the_grid_keeps_out_of_the_obstacle_as_the_motions_do(engine, scenario):
-    _, pictures = picture_at(engine, scenario)
+    scenario = replace(scenario, view=View(grid=True))
+    _, pictures = picture_at(engine, scenario, Stage.LIVE)
     points = np.concatenate(pictures.grid.lines)
     inside = (scenario.obstacle.signed_distance(points) < -0.01).mean()
-    bare = np.concatenate(picture_at(engine, changed(scenario, avoids=False))[1].grid.lines)
+    bare = np.concatenate(picture_at(engine, changed(scenario, avoids=False), Stage.LIVE)[1].grid.lines)
     assert inside < 0.25 * (scenario.obstacle.signed_distance(bare) < -0.01).mean()
 
 
 def test_far_from_the_obstacle_the_grid_does_not_move(engine, scenario):
     away = changed(scenario, obstacles=(Sphere((0.0, 3.0, 3.0)),))
-    moved = picture_at(engine, away)[1].grid.lines
-    still = picture_at(engine, changed(away, avoids=False))[1].grid.lines
+    moved = picture_at(engine, away, Stage.LIVE)[1].grid.lines
+    still = picture_at(engine, changed(away, avoids=False), Stage.LIVE)[1].grid.lines
     for a, b in zip(moved, still, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import biases, changed
+from scenes import biases, changed, frame_at
 from scipy.spatial.transform import Rotation
 
 from dt_viz.engine.frame import Stage
@@ -34,7 +34,7 @@ def tilted(task, seed=0):
 
 def shown(engine, scenario, wanted=Stage.FINE, **view):
     scenario = replace(scenario, view=View(**view))
-    return next(frame for frame in engine.frames(scenario) if frame.stage is wanted)
+    return frame_at(engine, scenario, wanted)
 
 
 def solved(engine, scenario, precision=FINE):
@@ -67,8 +67,8 @@ def test_everything_lies_on_the_slice_wherever_it_is(engine, scenario, colour):
     assert made.area.lies_like(area)
 
 
-def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, scenario, monkeypatch):
-    engine = new_engine()
+def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, initial, monkeypatch):
+    engine, scenario = new_engine(), initial("lift_box")
     before = list(engine.frames(scenario))
     monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
     monkeypatch.setattr("dt_viz.engine.engine.certify", lambda *_: pytest.fail("certified again"))
@@ -83,18 +83,19 @@ def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, s
         next(engine.frames(changed(moved, obstacles=(scenario.obstacles[0].moved((x, y, z + 0.01)),))))
 
 
-def test_another_rollout_for_the_arm_solves_nothing_again(new_engine, scenario, monkeypatch):
-    engine = new_engine()
-    list(engine.frames(scenario))
+def test_another_rollout_for_the_arm_solves_nothing_again(new_engine, initial, monkeypatch):
+    engine, scenario = new_engine(), initial("draw_s")
+    frame_at(engine, scenario, Stage.FINE)
     monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
-    first, other = (list(engine.frames(replace(scenario, arm_rollout=number)))[-1] for number in (0, 3))
+    first, other = (frame_at(engine, replace(scenario, arm_rollout=number), Stage.FINE) for number in (0, 3))
     assert (first.chosen, other.chosen) == (0, 3)
     assert not np.array_equal(first.arm.q[0], other.arm.q[0])
 
 
-def test_frames_of_a_changed_view_are_those_of_a_fresh_start(engine, new_engine, scenario):
+def test_frames_of_a_changed_view_are_those_of_a_fresh_start(engine, new_engine, initial):
+    scenario = initial("draw_s")
     view = {"slice": tilted(engine.task(scenario.task), 1), "colour": "lyapunov", "streamlines": True}
-    list(engine.frames(scenario))
+    frame_at(engine, scenario, Stage.FINE)
     again, fresh = (shown(e, scenario, **view).pictures for e in (engine, new_engine()))
     np.testing.assert_array_equal(again.field.velocities, fresh.field.velocities)
     np.testing.assert_array_equal(again.colour.values, fresh.colour.values)
@@ -114,8 +115,17 @@ def test_what_is_not_shown_is_not_computed(engine, scenario):
 # --- Streamlines ---
 
 
-@pytest.mark.parametrize(("wanted", "moved"), [(Stage.LIVE, True), (Stage.FINE, False)])
-def test_streamlines_follow_the_velocity_and_the_lyapunov_value_falls_along_them(engine, scenario, wanted, moved):
+@pytest.mark.parametrize(
+    ("task", "wanted", "moved"),
+    [
+        ("draw_s", Stage.FINE, False),
+        ("lift_box", Stage.LIVE, True),
+        pytest.param("draw_s", Stage.LIVE, True, marks=pytest.mark.slow),
+        pytest.param("lift_box", Stage.FINE, False, marks=pytest.mark.slow),
+    ],
+)
+def test_streamlines_follow_the_velocity_and_the_lyapunov_value_falls_along_them(engine, initial, task, wanted, moved):
+    scenario = initial(task)
     view = {"slice": tilted(engine.task(scenario.task))} if moved else {}
     frame = shown(engine, scenario, wanted, streamlines=True, **view)
     system = solved(engine, scenario, LIVE if wanted is Stage.LIVE else FINE)[1].system
@@ -207,8 +217,8 @@ def test_the_system_of_each_level_has_the_rollouts_of_that_level(engine, scenari
             np.testing.assert_allclose(path[:-1], again, atol=2e-6)
 
 
-def test_the_pictures_are_those_of_the_selected_level(engine, scenario):
-    scenario = with_bias(engine, scenario)
+def test_the_pictures_are_those_of_the_selected_level(engine, initial):
+    scenario = with_bias(engine, initial("draw_s"))
     names = levels(scenario)
     for level, name in enumerate(names):
         frame = shown(engine, scenario, Stage.FINE, level=name, colour="lyapunov")
@@ -218,14 +228,14 @@ def test_the_pictures_are_those_of_the_selected_level(engine, scenario):
         np.testing.assert_allclose(field.velocities, system.velocity(field.points), rtol=1e-4, atol=1e-6)
         known = ~np.isnan(colour.values)
         assert known.all() == (name != "Avoidance")  # only there the obstacle is in the way
-    top, whole = (shown(engine, scenario, Stage.FINE, level=name, colour="lyapunov") for name in (names[-1], ""))
+    whole = shown(engine, scenario, Stage.FINE, level="", colour="lyapunov")
     assert whole.level is None
-    np.testing.assert_array_equal(whole.pictures.colour.values, top.pictures.colour.values)
+    np.testing.assert_array_equal(whole.pictures.colour.values, colour.values)
 
 
 def test_the_grid_of_the_imitation_is_that_of_the_stack_without_the_obstacle(engine, scenario):
-    below = shown(engine, scenario, grid=True, level="Imitation").pictures.grid.lines
-    without = shown(engine, changed(scenario, avoids=False), grid=True).pictures.grid.lines
+    below = shown(engine, scenario, Stage.LIVE, grid=True, level="Imitation").pictures.grid.lines
+    without = shown(engine, changed(scenario, avoids=False), Stage.LIVE, grid=True).pictures.grid.lines
     assert len(below) == len(without)
     for a, b in zip(below, without, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -238,10 +248,10 @@ def test_a_level_that_is_not_in_the_stack_is_no_level(engine, scenario):
 
 def test_the_slice_can_be_moved_while_there_is_no_motion(new_engine, initial):
     engine, scenario = new_engine(), changed(initial("draw_s"), space="cspace")
-    list(engine.frames(scenario))
+    frame_at(engine, scenario, Stage.LIVE)
     base = changed(scenario, obstacles=(scenario.obstacles[0].moved((0.0, 0.0, 0.1)),))
     blocked = next(engine.frames(base))
     assert blocked.blocked
-    moved = shown(engine, base, slice=tilted(engine.task("draw_s")), colour="lyapunov")
+    moved = shown(engine, base, Stage.LIVE, slice=tilted(engine.task("draw_s")), colour="lyapunov")
     assert moved.blocked
     assert moved.pictures.colour.area.lies_like(moved.slice)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import scipy.io
 import trimesh
-from scenes import changed
+from scenes import changed, frame_at
 
 from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Stage
 from dt_viz.learning.store import FitStore
-from dt_viz.metrics import maximum_collision_distance
+from dt_viz.metrics import maximum_collision_distance, resample_by_arc_length
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Sphere
 from dt_viz.scenario.paper_scenes import SCENES, clover, in_clover, offered
@@ -21,28 +22,35 @@ from dt_viz.scenario.tasks import POTS, TASKS, known_tasks
 SHIPPED = [scene.name for scene in offered(TASKS)]
 
 
-@pytest.fixture(scope="module")
-def certified(engine):
-    """The last frame of each scene, computed once."""
-    frames = {}
+CERTIFIED = {"cube", "learned", "left_pot", "augmented"}
+"""Names of scenes whose certificates are quick to compute."""
 
-    def frame(name):
-        if name not in frames:
-            scene = SCENES[name]
-            *_, frames[name] = engine.frames(scene.scenario(engine.task(scene.task)))
-        return frames[name]
 
-    return frame
+@pytest.fixture(scope="session")
+def live(engine, at_rest):
+    """The frame of a scene by its name that follows a drag."""
+    return lambda name: at_rest(SCENES[name].scenario(engine.task(SCENES[name].task)), Stage.LIVE)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_scene_is_computed_without_warnings(certified, name):
-    frame, scene = certified(name), SCENES[name]
+def test_a_scene_is_shown_without_warnings(live, name):
+    frame, scene = live(name), SCENES[name]
     assert frame.scenario.scene == name == scene.name
     assert scene.task in TASKS
     assert scene.title and scene.line.endswith(".")
+    assert frame.blocked == () and frame.certificates.warnings == ()
+    for path in frame.rollouts:
+        np.testing.assert_allclose(path[-1], frame.reached, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in CERTIFIED else pytest.mark.slow) for name in SHIPPED]
+)
+def test_certificates_of_a_scene_hold(engine, name):
+    *_, frame = engine.frames(SCENES[name].scenario(engine.task(SCENES[name].task)))
     assert frame.blocked == ()
-    known = () if frame.scenario.view.arm else frame.certificates.collision.warnings
+    avoids = frame.scenario.view.arm or frame.scenario.avoidance.space == "cspace"
+    known = () if avoids else frame.certificates.collision.warnings
     assert set(frame.certificates.warnings) <= set(known)
     assert frame.certificates.min_det_jacobian > 0
     assert frame.certificates.round_trip_error < 1e-6
@@ -62,7 +70,7 @@ def test_letters_of_the_lasa_data_are_a_scene_where_the_user_has_them_all(tmp_pa
     tasks = known_tasks(tmp_path)
     assert scene in offered(tasks) and len(scene.tasks) == 8
     engine = Engine(tasks, FitStore(None), robot)
-    *_, frame = engine.frames(scene.scenario(engine.task(scene.task)))
+    frame = frame_at(engine, scene.scenario(engine.task(scene.task)), Stage.LIVE)
     assert [panel.title for panel in frame.pictures.panels][-1] == "LASA Sshape"
     assert {panel.title for panel in frame.pictures.panels} == {f"LASA {name}" for name in scene.tasks}
     assert frame.certificates.warnings == ()
@@ -73,8 +81,8 @@ def test_scenes_have_titles_of_their_own():
 
 
 @pytest.mark.parametrize("name", ["lift", "push"])
-def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certified, name):
-    frame = certified(name)
+def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(live, name):
+    frame = live(name)
     (bottle,) = frame.scenario.obstacles
     assert isinstance(bottle, MeshObstacle)
     vertices, faces = bottle.surface()
@@ -90,7 +98,6 @@ def test_the_whole_arm_gives_way_to_a_standing_bottle_and_reaches_the_goal(certi
     assert undisturbed > 0.01  # it is in the way
     assert frame.certificates.clearance > 0
     assert frame.arm_duration > 0
-    assert frame.certificates.collision.warnings == ()
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
 
 
@@ -104,8 +111,8 @@ def assert_only_the_stroke_gives_way(frame, obstacle, until):
             assert max(np.linalg.norm(there - point, axis=1).min() for point in away) < 0.03
 
 
-def test_the_clover_is_known_by_labelled_points_only_and_every_stroke_leaves_it(certified):
-    frame = certified("cloud")
+def test_the_clover_is_known_by_labelled_points_only_and_every_stroke_leaves_it(live):
+    frame = live("cloud")
     (cloud,) = frame.scenario.obstacles
     assert isinstance(cloud, CloudObstacle) and cloud.cloud == clover()
     points, occupied = cloud.labelled()
@@ -131,8 +138,8 @@ def test_the_clover_is_the_same_every_time():
 
 
 @pytest.mark.parametrize("name", ["steps", "cube"])
-def test_motions_of_a_flat_figure_give_way_in_its_plane(certified, name):
-    frame = certified(name)
+def test_motions_of_a_flat_figure_give_way_in_its_plane(live, name):
+    frame = live(name)
     assert min(maximum_collision_distance(path, frame.scenario.obstacle.signed_distance) for path in frame.ghost) > 0.02
     clearance = [frame.scenario.obstacle.signed_distance(path).min() for path in frame.rollouts]
     assert min(clearance) > 0.009
@@ -141,8 +148,8 @@ def test_motions_of_a_flat_figure_give_way_in_its_plane(certified, name):
         assert np.abs(height).max() <= np.abs(usual).max() + 1e-4
 
 
-def test_panels_show_each_step_from_the_base_attractor(certified):
-    titles = {name: [panel.title for panel in certified(name).pictures.panels] for name in SHIPPED}
+def test_panels_show_each_step_from_the_base_attractor(live):
+    titles = {name: [panel.title for panel in live(name).pictures.panels] for name in SHIPPED}
     assert titles["steps"] == ["base attractor", "imitation", "+ avoidance"]
     assert titles["cube"] == ["base attractor", "+ avoidance"]
     assert titles["learned"] == ["base attractor", "field −V of imitation", "imitation"]
@@ -162,20 +169,20 @@ def test_a_scene_is_changed_by_what_acts_in_it_not_by_how_it_is_looked_at(engine
         assert scene.is_changed(changed(own, **other), task)
 
 
-def test_every_stroke_of_the_j_passes_both_points_within_a_centimetre(certified):
-    frame = certified("two_points")
+def test_every_stroke_of_the_j_passes_both_points_within_a_centimetre(live):
+    frame = live("two_points")
     points = anchored(frame.scenario)
     assert len(points) == 2
     for point in points.values():
         assert min(np.linalg.norm(path - point.anchor, axis=1).min() for path in frame.ghost) > 0.02
         for path in frame.rollouts:
-            assert np.linalg.norm(path - point.anchor, axis=1).min() <= 0.0105  # between samples, too
+            assert np.linalg.norm(resample_by_arc_length(path, 2000) - point.anchor, axis=1).min() <= 0.0105
     np.testing.assert_allclose(frame.reached, frame.goal, atol=1e-3)
 
 
 @pytest.mark.parametrize(("name", "chosen"), [("left_pot", 0), ("centre_pot", 1), ("right_pot", 2)])
-def test_the_object_falls_into_the_chosen_pot(certified, name, chosen):
-    frame = certified(name)
+def test_the_object_falls_into_the_chosen_pot(live, name, chosen):
+    frame = live(name)
     assert frame.task.pots == POTS
     assert [pot.x for pot in POTS] == sorted(pot.x for pot in POTS)
     for before, path in zip(frame.ghost, frame.rollouts, strict=True):
