@@ -47,12 +47,12 @@ def assert_said(scenario, frame):
         assert passed < MAX_TARGET_MISS + BETWEEN_SAMPLES or layer.name in sources, layer
 
 
-@pytest.mark.parametrize("seed", [1, 1122])  # the last one is squeezed most
+@pytest.mark.parametrize("seed", [1014, 1022])  # the last one covers starts
 def test_a_random_stack_is_a_diffeomorphism_that_leads_to_its_goal(engine, seed):
     check(engine, seed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1000, 1200))
-def test_so_are_two_hundred(engine, seed):
+@pytest.mark.parametrize("seed", [1, *range(1000, 1200)])
+def test_so_are_two_hundred_of_which_one_squeezes_space_by_nine_orders_of_magnitude(engine, seed):
     check(engine, seed)
