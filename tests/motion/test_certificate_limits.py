@@ -26,7 +26,7 @@ IDENTITY = Identity(3)
 around_the_limit = pytest.mark.parametrize(("part", "said"), [(0.9, False), (1.1, True)])
 
 
-def certificates_of(shown=SHOWN, ends=ENDS, transform=IDENTITY, known=KNOWN, **options):
+def certificates_of(shown=SHOWN, ends=ENDS, transform: Diffeomorphism = IDENTITY, known=KNOWN, **options):
     """Certificates of the straight motions, said to be those of a transform."""
     return certified(known, Solution(transform, RAYS, BUNDLE, ()), ends, shown, **options)
 
