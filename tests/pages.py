@@ -180,6 +180,10 @@ class Page:
             self.scene._handle_transform_controls_drag_end(CLIENT, messages.TransformControlsDragEndMessage(name)),
         )
 
+    def click(self, name: str) -> None:
+        message = messages.SceneNodeClickMessage(name, None, (0.8, -1.6, 0.8), (0.0, 1.0, 0.0), (0.5, 0.5), None)
+        self.run(self.scene._handle_node_click_updates(CLIENT, message))
+
     def drag(self, name: str, start: Any, end: Any, phase: Any = "update") -> None:
         at = {
             "start_position": start,
