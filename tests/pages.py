@@ -2,13 +2,13 @@
 
 import asyncio
 import contextlib
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import viser  # noqa: TID251 - a page that no browser shows
-from scenes import biases, changing, starts_at
+from scenes import biases, changed, starts_at
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
@@ -117,7 +117,15 @@ class Page:
         self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
         titles = {name: entry.title for name, entry in TASKS.items()}
         self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, titles, "draw_s")
+        self._loop = asyncio.new_event_loop()
+        self.visitor._panel._chores.later(lambda: None)  # begins its thread now, not in the test that first needs it
         self.session = self.visitor.session
+        self._initial = self.session.scenario
+
+    def close(self) -> None:
+        """The visitor leaves."""
+        self.visitor.close()
+        self._loop.close()
 
     @property
     def inputs(self) -> list[Any]:
@@ -150,7 +158,7 @@ class Page:
                 with contextlib.suppress(Exception):
                     await coroutine
 
-        asyncio.run(one_after_the_other())
+        self._loop.run_until_complete(one_after_the_other())
         self.session.wait_idle(10)
 
     def claim(self, handle: Any, value: Any) -> None:
@@ -172,6 +180,10 @@ class Page:
             self.scene._handle_transform_controls_drag_end(CLIENT, messages.TransformControlsDragEndMessage(name)),
         )
 
+    def click(self, name: str) -> None:
+        message = messages.SceneNodeClickMessage(name, None, (0.8, -1.6, 0.8), (0.0, 1.0, 0.0), (0.5, 0.5), None)
+        self.run(self.scene._handle_node_click_updates(CLIENT, message))
+
     def drag(self, name: str, start: Any, end: Any, phase: Any = "update") -> None:
         at = {
             "start_position": start,
@@ -185,17 +197,16 @@ class Page:
         self.run(self.scene._handle_node_drag(CLIENT, message))
 
     def busy(self, **view: Any) -> Scenario:
-        """A scenario in which most controls are shown, and most things stand in the scene."""
+        """A scenario in which most controls are shown, and most things stand in the scene; all else is as at first."""
         obstacles = (Cylinder(MIDDLE, 0.08, 0.16), Box(MIDDLE, (0.1, 0.1, 0.1)), Sphere(MIDDLE))
         avoidance = {"space": "cspace", "duration": 0.5, "integration": Integration("rk4", 8)}
         layers = biases(BiasPoint(MIDDLE, radius=0.1, strength=0.5))
-        self.session.edit(
-            "test",
-            task="draw_s",
-            **changing(self.session.scenario, obstacles=obstacles, layers=layers, **avoidance),
+        scenario = replace(
+            changed(self._initial, obstacles=obstacles, layers=layers, **avoidance),
             starts=starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
             view=View(generator=True, click_to_start=True, handles=True, **view),
         )
+        self.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(scenario)})
         return self.session.scenario
 
 

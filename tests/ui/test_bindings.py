@@ -21,7 +21,7 @@ def page(server, robot):
     page = Page(server, robot)
     page.visitor.pictures.slice.draw(frame_of(page.busy(), task=page.session.task))
     yield page
-    page.visitor.close()
+    page.close()
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ def test_an_edit_leaves_alone_what_a_browser_has_moved_meanwhile(server, sent):
     slider._impl.value = 0.9  # in vain
     bound.restore()
     assert slider.value == 0.5
-    server.gui.reset()
+    slider.remove()
 
 
 def test_what_is_not_known_is_kept_until_a_frame_tells_it(server):

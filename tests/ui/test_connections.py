@@ -4,11 +4,13 @@ import asyncio
 import functools
 import logging
 import math
+import os
 import socket
 import time
 import urllib.error
 import urllib.request
 from contextlib import AsyncExitStack
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -18,6 +20,7 @@ import websockets
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
+from dt_viz.engine.session import Pace
 from dt_viz.evaluate.protocol_client import OBSTACLE, LostError, ProtocolClient
 from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.scenario.tasks import TASKS
@@ -396,13 +399,19 @@ async def test_a_visitor_who_does_not_listen_costs_no_memory(url, server):
     """What is not sent yet is replaced by what is newer."""
     async with Client(url) as client:
         await open_page(client)
-        client._receiving.cancel()
-        await client.grab()
-        for k in range(200):
-            await client.move([0.1, -0.5, 0.3 + 0.002 * k])
-            await asyncio.sleep(0.01)
+        (visitor,) = server.visitors
         (state,) = server._server._websock_server._client_state_from_id.values()
-        assert len(state.message_buffer.message_from_id) < 200
+        client._receiving.cancel()
+        await asyncio.gather(client._receiving, return_exceptions=True)
+        client._socket.transport.pause_reading()
+        visitor.client.add_notification("", os.urandom(2**23).hex())  # fills all buffers on the way
+        frames = visitor.shown, replace(visitor.shown, rollouts=tuple(path + 0.01 for path in visitor.shown.rollouts))
+        held = []
+        for frame in 10 * frames:
+            visitor.draw(frame, Pace(0.02, 10.0, 0))
+            held.append(len(state.message_buffer.message_from_id))
+            await asyncio.sleep(0.01)
+        assert 5 < held[-1] < 50, held  # a frame has about ten messages
         client._socket.transport.abort()  # who does not listen says no goodbye either
         client._receiving = asyncio.create_task(asyncio.sleep(0))
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import itertools
 import math
 import threading
 from typing import Any
@@ -23,7 +24,24 @@ SCENES = offered(TASKS)
 BORDERS = {controls.__name__, gestures.__name__, handles.__name__}
 UPLOAD = viser.GuiUploadButtonHandle
 FILE = viser.UploadedFile(name="x", content=b"\0" * 100)
-CLAIMS = [math.nan, math.inf, -math.inf, 1e300, -1e300, 1e6, -9, 0, 2**70, True, None, "", "x" * 100_000, [], {}, FILE]
+CLAIMS = [
+    math.nan,
+    math.inf,
+    -math.inf,
+    1e300,
+    -1e300,
+    1e6,
+    -9,
+    0,
+    2**70,
+    True,
+    None,
+    "",
+    "x" * 1_000_000,
+    [],
+    {},
+    FILE,
+]
 NUMBERS = (math.nan, math.inf, -math.inf, 1e300, -1e300, 6.0)
 PLACES = [
     *((number, 0.1, 0.2) for number in NUMBERS),
@@ -42,7 +60,7 @@ TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.
 def page(server, robot):
     page = Page(server, robot)
     yield page
-    page.visitor.close()
+    page.close()
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +100,7 @@ def assert_sound(page: Page) -> None:
             assert value in handle.options
         elif isinstance(handle, viser.GuiCheckboxHandle):
             assert isinstance(value, bool)
+        assert not isinstance(value, str) or len(value) < 100
     for gizmo in page.gizmos.values():
         assert gizmo.position.shape == (3,) and np.isfinite(gizmo.position.astype(float)).all()
         assert gizmo.wxyz.shape == (4,) and np.isfinite(gizmo.wxyz.astype(float)).all()
@@ -109,14 +128,17 @@ def test_nothing_that_a_page_sends_passes_by_the_border(page):
         assert inspect.iscoroutinefunction(callback), f"{name} would wait in the pool that all visitors share"
 
 
-@pytest.mark.parametrize("selected", range(3))
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: repr(claim)[:20])
-def test_a_forged_value_is_refused_or_moved_to_the_limits(page, claim, selected):
-    page.busy(selected=selected)
-    for handle in page.inputs:
-        if not isinstance(handle, UPLOAD):
-            page.claim(handle, claim)
-            assert_sound(page)
+def test_a_forged_value_is_refused_or_moved_to_the_limits(page, claim):
+    seen = []
+    for selected in range(3):  # each kind of obstacle has sizes of its own
+        page.busy(selected=selected)
+        shown = [handle for handle in page.inputs if handle.visible]
+        for handle in page.inputs if selected == 0 else shown:
+            if not isinstance(handle, UPLOAD) and handle not in seen:
+                page.claim(handle, claim)
+                assert_sound(page)
+        seen += shown
 
 
 @pytest.mark.parametrize(
@@ -240,13 +262,12 @@ def test_what_is_dragged_is_under_the_pointer_however_late_the_browser_sees_it_m
         np.testing.assert_allclose(seen[-1] - began, shift, atol=1e-9)
 
 
-@pytest.mark.parametrize("phase", ["start", "update", "end", "again", None])
 @pytest.mark.parametrize("place", PLACES, ids=repr)
-def test_what_is_dragged_in_the_scene_goes_nowhere_that_is_no_place(page, place, phase):
+def test_what_is_dragged_in_the_scene_goes_nowhere_that_is_no_place(page, place):
     page.busy()
     dragged = [name for name, node in page.nodes.items() if node._impl.drag_cb]
     assert len(dragged) >= 7
-    for name in dragged:
+    for name, phase in itertools.product(dragged, ("start", "update", "end", "again", None)):
         page.drag(name, place, MIDDLE, phase)
         page.drag(name, MIDDLE, place, phase)
         assert_sound(page)
@@ -300,14 +321,6 @@ def test_clicks_on_save_png_are_not_done_by_the_threads_that_welcome_visitors(pa
     answer.set()
     page.visitor._panel._saver._thread.join(30)
     assert [thread.name for thread in asked] == ["picture"]
-
-
-def test_a_long_text_is_not_kept(page):
-    page.busy()
-    for handle in page.inputs:
-        if not isinstance(handle, UPLOAD):
-            page.claim(handle, "x" * 1_000_000)
-            assert not isinstance(handle.value, str) or len(handle.value) < 100
 
 
 def test_commands_do_what_the_controls_do_each_on_a_key_of_its_own(page):

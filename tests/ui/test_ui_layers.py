@@ -360,6 +360,8 @@ def test_plots_open_first_in_their_tab_right_under_their_checkbox(server):
     orders = [handle.order for handle in of_tab]
     assert orders == sorted(orders)
     assert len({handle._impl.parent_container_id for handle in of_tab}) == 1
+    panel.close()
+    server.gui.reset()
 
 
 def test_every_layer_has_a_checkbox():

@@ -229,7 +229,7 @@ LEGENDS = {
 }
 
 
-@pytest.mark.parametrize(("what", "height"), [("det", 720), ("lyapunov", 1080), ("occupancy", 2160)])
+@pytest.mark.parametrize(("what", "height"), [("det", 540), ("lyapunov", 720), ("occupancy", 1080)])
 def test_a_saved_picture_has_the_legend_in_its_corner_and_nothing_else_is_changed(what, height):
     legend, blank = LEGENDS[what], Image.new("RGBA", (height * 16 // 9, height))
     pixels = np.asarray(legend.drawn_onto(blank))

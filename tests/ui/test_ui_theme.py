@@ -34,7 +34,7 @@ def page(server, robot):
     page = Page(server, robot)
     page.busy()
     yield page
-    page.visitor.close()
+    page.close()
 
 
 def colours(page):

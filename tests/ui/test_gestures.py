@@ -1,0 +1,141 @@
+"""What a visitor does on the page, from the browser's message to what is drawn: clicks, drags, checkboxes."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from pages import MIDDLE, Page
+from scenes import avoiding, beside, biases, frame_at
+
+from dt_viz.engine.frame import Stage
+from dt_viz.engine.session import Pace
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.panels import BASE_PANEL
+from dt_viz.scenario.scenario import View
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.transforms.bias import BiasPoint
+from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
+
+PACE = Pace(0.02, 10.0, 0)
+AREA = TASKS["draw_s"]().slice
+EVERYTHING = View(**{name: True for name in VIEW_LABELS if name != "panels"}, panels=(BASE_PANEL,))
+SCENARIO = avoiding("draw_s", Sphere(TASKS["draw_s"]().obstacle_position), view=EVERYTHING)
+
+
+@pytest.fixture(scope="module")
+def page(server, robot):
+    page = Page(server, robot)
+    yield page
+    page.close()
+
+
+def begin(page, scenario):
+    page.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(scenario)})
+
+
+def handle(page, label):
+    """The first that is shown with this label: of two it is the obstacle's."""
+    return next(handle for handle in page.inputs if handle.label == label and handle.visible)
+
+
+def done(page):
+    """Wait until the work of buttons is done."""
+    page.visitor._panel._chores._executor.submit(lambda: None).result(30)
+
+
+def test_a_click_on_an_obstacle_selects_it_and_shows_its_handles_and_another_hides_them(page):
+    page.busy(selected=0)
+    items = page.visitor.pictures.obstacles.items
+    for name, index, expected in (("/obstacles/2", 2, [0, 0, 1]), ("/obstacles/1", 1, [0, 1, 0]), ("", 1, [0, 0, 0])):
+        page.click(f"{name or '/obstacles/1'}/surface")
+        assert page.session.scenario.selected == index
+        assert [item.handles.shown for item in items] == expected
+    assert handle(page, "Handles").value is False
+
+
+def test_delete_removes_the_selected_obstacle_and_its_handles(page):
+    before = page.busy(selected=1).obstacles
+    page.claim(handle(page, "Change"), "Delete")
+    done(page)
+    assert page.session.scenario.obstacles == (before[0], before[2])
+    items = page.visitor.pictures.obstacles.items
+    np.testing.assert_allclose([item.gizmo.position for item in items], [before[0].position, before[2].position])
+    assert sorted(name for name in page.gizmos if name.startswith("/obstacles")) == ["/obstacles/0", "/obstacles/1"]
+
+
+def test_rollouts_pass_where_the_handles_of_a_bias_point_are_dragged_to(page, engine):
+    begin(page, replace(avoiding("draw_s", (), layers=biases(BiasPoint(MIDDLE))), view=View(bias_handles=True)))
+    target = engine.task("draw_s").mean_path[50] + 0.05 * AREA.axes[:, 0]
+    page.move("/bias/0", tuple(target))
+    (layer,) = beside(page.session.scenario)
+    np.testing.assert_allclose(layer.transform.anchor, target)
+    for path in frame_at(engine, page.session.scenario, Stage.ROLLOUTS).rollouts:
+        assert np.linalg.norm(path - target, axis=1).min() < 0.01
+
+
+def test_the_slice_moves_along_the_arrow_that_is_dragged(page):
+    page.busy(move_slice=True)
+    page.move("/slice", tuple(AREA.centre + 0.1 * AREA.normal), AREA.pose.wxyz)
+    moved = AREA.posed(page.session.scenario.view.slice)
+    np.testing.assert_allclose(moved.centre - AREA.centre, 0.1 * AREA.normal, atol=1e-9)
+    np.testing.assert_allclose(moved.axes, AREA.axes, atol=1e-9)
+
+
+@pytest.fixture
+def drawn(page, at_rest):
+    """The page with a frame that holds all that can be shown, of which nothing is."""
+    begin(page, SCENARIO)
+    page.visitor.draw(at_rest(SCENARIO, Stage.LIVE), PACE)
+    nothing = {name: False for name in VIEW_LABELS if name != "panels"}
+    page.session.edit("test", view=View(**nothing))
+    return page
+
+
+@pytest.mark.parametrize("name", VIEW_LABELS)
+def test_each_layer_is_shown_while_its_checkbox_is_on(drawn, name):
+    arms, panel = drawn.visitor.arms, drawn.visitor._panel
+    beside_layers = {
+        "arm": arms.arm,
+        "ghost_arm": arms.ghost,
+        "body_points": arms.body,
+        "joint_plots": panel.joints,
+        "health_plots": panel.health,
+    }
+    picture = beside_layers[name] if name in beside_layers else drawn.visitor.pictures.layer(name)
+    assert not picture.visible
+    drawn.claim(handle(drawn, VIEW_LABELS[name]), True)
+    assert picture.visible
+    if name not in PLOTS | {"arm"}:
+        arrays = shown_in(drawn, picture.node.name)
+        assert all(np.isfinite(array.astype(float)).all() for array in arrays)
+        assert name in {"ghost_arm", "table"} or max(np.ptp(array, axis=0).max() for array in arrays) > 0.05
+    drawn.claim(handle(drawn, VIEW_LABELS[name]), False)
+    assert not picture.visible
+
+
+def shown_in(page, folder):
+    """The points of a node and of those below it in the tree."""
+    nodes = [node for name, node in page.nodes.items() if name == folder or name.startswith(f"{folder}/")]
+    kinds = ("points", "vertices", "batched_positions")
+    arrays = [getattr(node, kind).reshape(-1, 3) for node in nodes for kind in kinds if hasattr(node, kind)]
+    return [array for array in arrays if len(array)]
+
+
+def test_the_ball_at_the_hand_holds_the_arm_where_it_is_dragged_and_lets_go(page, monkeypatch):
+    page.busy()
+    told, live = [], page.visitor.playback.live
+    monkeypatch.setattr(live, "hold", told.append)
+    monkeypatch.setattr(live, "release", lambda: told.append("released"))
+    monkeypatch.setattr(type(page.visitor), "_hand", lambda _: None)
+    (ball,) = (name for name in page.nodes if name.endswith("/grip"))
+    page.visitor.grip.ball.visible = True
+    dragged = [MIDDLE, (0.15, -0.5, 0.45), (0.2, -0.5, 0.3)]  # parallel to the slice
+    for phase, end in zip(("start", "update", "end"), dragged, strict=True):
+        page.drag(ball, MIDDLE, end, phase)
+    *places, released = told
+    np.testing.assert_allclose(places, dragged)
+    assert released == "released"
+    told.clear()
+    page.visitor.grip.ball.visible = False
+    page.drag(ball, MIDDLE, dragged[-1])
+    assert told == []
