@@ -436,8 +436,8 @@ def expected_motions(motions: Motions) -> list[Array]:
     imitation, found = augmented_from(motions), []
     for pattern in imitation.patterns:
         starts = pattern.conditions
-        variances, axes = np.linalg.eigh(np.cov(starts, rowvar=False, bias=True))
-        widths = np.maximum(np.sqrt(np.maximum(variances, 0.0)), LEAST_EXPECTED * motions.extent)
+        axes = motions.principal_axes(starts, starts.mean(axis=0) - motions.goal)
+        widths = np.maximum((starts @ axes).std(axis=0), LEAST_EXPECTED * motions.extent)
         for offset in (AWAY * widths * axes).T:
             for start in (starts.mean(axis=0) + offset, starts.mean(axis=0) - offset):
                 curve = imitation.curve(start)

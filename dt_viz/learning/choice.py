@@ -48,6 +48,9 @@ takes the augmented state."""
 MOST_UNTOLD = 0.12
 """Largest Fréchet distance of an augmented motion from its demonstration, relative to the extent; with a larger one the
 starts do not tell which pattern is followed, and labels are looked for. Handwriting of one pattern stays below 9 %."""
+LEAST_TELLING = 0.01
+"""Least distance of the starts of different patterns, relative to the extent, that tells these apart; nearer to each
+other, what is followed would hang on how a start is rounded."""
 MOST_PATTERNS = 8
 """Largest number of patterns that are looked for in demonstrations which their starts do not tell apart."""
 
@@ -125,7 +128,7 @@ def _with_patterns(motions: Motions, num_demonstrations: int) -> AugmentedImitat
     """The augmented state; with the fewest labels that tell what follows, where starts do not."""
     imitation = augmented_from(motions)
     off = missed(imitation, motions)
-    if off > MOST_UNTOLD or not _told_apart(imitation):
+    if off > MOST_UNTOLD or not _told_apart(imitation, LEAST_TELLING * motions.extent):
         for num in range(2, min(MOST_PATTERNS, len(motions.positions)) + 1):
             labels = patterns_of(motions, num)
             known = dict(zip(motions.numbers, labels, strict=True))
@@ -146,13 +149,14 @@ def _judged(imitation: AugmentedImitation, off: float) -> AugmentedImitation:
     return replace(imitation, warnings=(*imitation.warnings, warning))
 
 
-def _told_apart(imitation: AugmentedImitation) -> bool:
-    """Whether each motion begins nearest to one of its own pattern, where it has several."""
+def _told_apart(imitation: AugmentedImitation, least: float) -> bool:
+    """Whether each motion begins nearest to one of its own pattern, where it has several, and `least` from others."""
     starts = np.concatenate([pattern.conditions for pattern in imitation.patterns])
     sizes = [len(pattern.conditions) for pattern in imitation.patterns]
     of, num = np.repeat(np.arange(len(sizes)), sizes), np.repeat(sizes, sizes)
     apart = np.linalg.norm(starts[:, None] - starts, axis=-1) + np.diag(np.full(len(starts), np.inf))
-    return bool((of[apart.argmin(axis=1)] == of)[num > 1].all())
+    own = (of[apart.argmin(axis=1)] == of)[num > 1]
+    return bool(own.all() and apart[of[:, None] != of].min(initial=np.inf) >= least)
 
 
 def patterns_of(motions: Motions, num: int) -> tuple[float, ...]:

@@ -21,6 +21,7 @@ from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 
 JITTER = 1e-4  # diagonal added to the kernel matrix, since overlapping Gaussians are nearly dependent
+ROUNDING = 1e-9  # part of a distance by which inducing points on the edge of the reach, as in even data, count as near
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class Layer:
         """
         grid = GaussianGrid.covering(points, sigma, spacing=spacing, pad=reach)
         distance, _ = KDTree(points).query(grid.inducing_points)
-        return cls.of(grid, np.flatnonzero(distance <= max(reach, 0.5 * spacing * np.sqrt(grid.dim)) * sigma))
+        farthest = max(reach, 0.5 * spacing * np.sqrt(grid.dim)) * sigma * (1 + ROUNDING)
+        return cls.of(grid, np.flatnonzero(distance <= farthest))
 
     @classmethod
     def of(cls, grid: GaussianGrid, active: NDArray[np.integer[Any]] | None = None) -> Layer:

@@ -18,6 +18,7 @@ SAME_GOAL = 1e-3  # distance from the goal up to which an end is at the goal
 MAX_MOVED_END = 0.3  # distance from the goal up to which an end is moved there
 AT_GOAL = 0.05  # distance from the goal up to which a start is at the goal
 STANDING_STEP = 1e-3  # length of a step, lasting 1 % of the motion, below which the motion stands still
+DECIDING = 1e-3  # deviation that points are given along a way, to decide between axes that are alike
 LONG_STAND = 0.1  # part of the duration from which standing still is reported
 
 
@@ -61,8 +62,16 @@ class Motions:
     def extent(self) -> float:
         """Length of all motions together along the principal axis in which it is largest, however they are turned."""
         points = np.concatenate(self.positions)
-        _, axes = np.linalg.eigh(np.cov(points, rowvar=False))
-        return float(np.ptp(points @ axes, axis=0).max())
+        way = np.mean([path[0] for path in self.positions], axis=0) - self.goal
+        return float(np.ptp(points @ self.principal_axes(points, way), axis=0).max())
+
+    def principal_axes(self, points: Array, way: Array) -> Array:
+        """Return the principal axes (d, d), as columns, of points (N, d).
+
+        Where these scatter alike to all sides, or not at all, a `way` (d,) decides, not rounding.
+        """
+        along = DECIDING * self.spread * way / max(float(np.linalg.norm(way)), 1e-12 * self.spread)
+        return np.linalg.eigh(np.cov(points, rowvar=False, bias=True) + np.outer(along, along))[1]
 
     def resampled(self, num: int) -> Array:
         """Resample all motions at `num` points equally spaced along each, (R, num, d)."""

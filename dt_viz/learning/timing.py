@@ -222,10 +222,10 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array
     smooth = np.diff(np.eye(len(knots)), n=2, axis=0) * SMOOTHNESS * elapsed[-1]
     A = np.concatenate([weight * rows, smooth])
     b = np.concatenate([weight[:, 0] * elapsed, np.zeros(len(smooth))])
-    pace = lsq_linear(A, b, bounds=(MIN_PACE, np.inf), tol=1e-6).x
+    pace = lsq_linear(A, b, bounds=(MIN_PACE, np.inf), method="bvls", tol=1e-12).x
     # A demonstration starts from rest. Motions that come from farther away must not be that slow all the way.
-    pace[int(np.ceil((clock[0] - knots[0]) / spacing)) + 1 :] = elapsed[-1] / (clock[0] - clock[-1])
-    return pace
+    beyond = np.clip((knots - clock[0]) / spacing - 1, 0, 1)
+    return (1 - beyond) * pace + beyond * elapsed[-1] / (clock[0] - clock[-1])
 
 
 def _hat_integrals(position: Array, num: int) -> Array:
