@@ -138,7 +138,7 @@ def test_scores_and_curves_find_what_is_wrong_with_a_motion(engine):
     middle = task.paths[0][len(task.paths[0]) // 2]
     through, away = Union((Sphere(as_point(middle), 0.1),)), Union((Sphere((2.0, 2.0, 2.0), 0.1),))
     perfect = scored(task.paths, task, task.paths[0][-1], away)
-    assert perfect.frechet < 1e-3 and perfect.hand_depth == 0
+    assert perfect.frechet < 1e-3 and perfect.hand_depth == 0 and perfect.goal_error < 0.05
     assert scored(task.paths, task, task.paths[0][-1], through).hand_depth == pytest.approx(0.05, abs=2e-3)
     shifted = tuple(path + np.array([0, 0, 0.03]) for path in task.paths)
     assert scored(shifted, task, task.paths[0][-1], away).frechet == pytest.approx(0.03, abs=1e-3)

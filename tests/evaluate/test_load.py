@@ -4,6 +4,7 @@ import asyncio
 import json
 from contextlib import AsyncExitStack
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,8 @@ class Displacing:
 
 @pytest.fixture(scope="module")
 def poses():
-    return load.Poses(Displacing(), TASKS["draw_s"]())
+    engine: Any = Displacing()
+    return load.Poses(engine, TASKS["draw_s"]())
 
 
 def shown(poses, index, stage=Stage.ROLLOUTS):
@@ -70,7 +72,7 @@ def test_a_pose_is_found_by_its_first_rollouts_and_has_those_of_all_its_frames(p
 
 
 def test_the_latency_of_a_picture_is_the_time_since_the_edit_whose_pose_it_shows(poses):
-    client = SimpleNamespace(rollout=None)
+    client: Any = SimpleNamespace(rollout=None)
     visit = load.Visit(client, poses, first=10, edits=[5.0, 5.1, 5.2, 5.3])
     for pose, stage in ((11, Stage.ROLLOUTS), (1, Stage.ROLLOUTS), (1, Stage.FINE), (9, Stage.ROLLOUTS)):
         client.rollout = shown(poses, pose, stage)  # edits are of the poses 10, 11, 0 and 1; 9 was before all
