@@ -103,7 +103,7 @@ def pinocchio_configuration(q: np.ndarray) -> np.ndarray:
 
 
 class TestObstacle:
-    @pytest.mark.parametrize("seed", range(4))
+    @pytest.mark.parametrize("seed", range(2))
     @pytest.mark.parametrize("diameter", [0.02, 0.15, 0.6])
     def test_distances_are_those_of_the_nearest_triangle(self, model, seed, diameter):
         """Also where the ball cuts a link, swallows one, or lies within one."""
@@ -162,7 +162,7 @@ class TestObstacle:
             assert all(link.contains(point) for point in middles - 1e-4 * normals)
             assert not any(link.contains(point) for point in middles + 1e-4 * normals)
 
-    @settings(max_examples=20)
+    @settings(max_examples=10)
     @given(seed=seeds, turn=st.floats(-3, 3))
     def test_turning_the_arm_and_the_obstacle_changes_nothing(self, seed, turn):
         model, q = load_collision_model(), random_configurations(seed, 3)
@@ -174,7 +174,7 @@ class TestObstacle:
         np.testing.assert_allclose(after[moving], before[moving], atol=1e-9)
 
 
-PLACES = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.3), (0.12, 0.1, 0.1), (-0.2, 0.0, 0.1)]
+PLACES = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.3), (0.12, 0.1, 0.1)]
 SHAPES = [
     Box((0.0, 0.0, 0.0), (0.15, 0.15, 0.15), TILTED),
     Box((0.0, 0.0, 0.0), (0.2, 0.2, 0.03), TILTED),
@@ -238,7 +238,7 @@ class TestShapes:
 
     @pytest.mark.parametrize("shape", SHAPES, ids=["cube", "plate", "cylinder", "U"])
     def test_nothing_nearer_is_found_by_fine_sampling(self, model, robot, shape):
-        for seed in range(3):
+        for seed in range(2):
             q = random_path(seed)
             centre = robot.forward_kinematics(q[len(q) // 2])[1][seed] + np.array([0.1, 0.0, 0.05])
             obstacle = shape.moved(tuple(centre), shape.wxyz)
@@ -276,7 +276,7 @@ class TestBetweenSamples:
         assert found.distance <= at_home + TOLERANCE < -0.02
         assert 0.0 < found.at < 1.0
 
-    @settings(max_examples=20)
+    @settings(max_examples=10)
     @given(seed=seeds, diameter=st.floats(0.02, 0.4))
     def test_nothing_nearer_is_found_by_fine_sampling(self, seed, diameter):
         model, q = load_collision_model(), random_path(seed)
@@ -287,7 +287,7 @@ class TestBetweenSamples:
         assert found.distance <= fine + TOLERANCE
         assert found.distance >= fine - 0.01  # between two of the fine samples
 
-    @settings(max_examples=20)
+    @settings(max_examples=10)
     @given(seed=seeds)
     def test_what_is_found_is_there(self, seed):
         model, q = load_collision_model(), random_path(seed)
@@ -298,7 +298,7 @@ class TestBetweenSamples:
         np.testing.assert_allclose(distance[0], found.distance, atol=1e-9)
         assert found.links == (model.links[nearest[0]].name,)
 
-    @settings(max_examples=20)
+    @settings(max_examples=10)
     @given(seed=seeds, growth=st.floats(0.001, 0.2))
     def test_a_larger_ball_is_nearer_by_its_growth(self, seed, growth):
         model, q = load_collision_model(), random_path(seed)
@@ -351,12 +351,12 @@ class TestItself:
             assert found is None or found.distance > 0.02
         assert model.nearest_to_itself(ends).distance == 0.0
 
-    @settings(max_examples=15)
+    @settings(max_examples=8)
     @given(seed=seeds)
     def test_nothing_nearer_is_found_by_fine_sampling(self, seed):
         model, q = load_collision_model(), random_path(seed)
         found = model.nearest_to_itself(q)
-        for one in finely(q, 60):
+        for one in finely(q, 30):
             alone = model.nearest_to_itself(one[None])
             if alone:
                 assert found
@@ -368,7 +368,7 @@ class TestItself:
 
 
 class TestTable:
-    @settings(max_examples=20)
+    @settings(max_examples=10)
     @given(seed=seeds)
     def test_heights_are_those_of_the_vertices(self, seed):
         q = random_configurations(seed, 1)
@@ -395,7 +395,7 @@ class TestTable:
     def test_nothing_lower_is_found_by_fine_sampling(self, seed):
         model, q = load_collision_model(), random_path(seed)
         found = model.nearest_to_table(q).distance
-        assert found <= min(model.nearest_to_table(one[None]).distance for one in finely(q, 100)) + TOLERANCE
+        assert found <= min(model.nearest_to_table(one[None]).distance for one in finely(q, 40)) + TOLERANCE
 
 
 def test_the_report_says_what_is_wrong():

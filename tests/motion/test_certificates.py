@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scenes import changed, kinds
+from scenes import changed, frame_at, kinds
 
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.retiming import within_velocity_limits
@@ -20,6 +20,7 @@ from dt_viz.motion.certificates import MAX_OFF_POSTURE, Certificates, Shown, cer
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import FINE, Solution
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.scenario.scenario import View
 from dt_viz.warning import Kind, MotionWarning
 
 BASE = Attractor(np.array([0.5, 0.2, 0.0]), 0.2, 0.05)
@@ -204,8 +205,8 @@ class Certified:
 
 def computed(engine, scenario):
     """A motion of the scenario, refined."""
-    frame = next(frame for frame in engine.frames(scenario) if frame.stage is Stage.FINE)
-    return Certified(engine, frame, engine.solved(scenario, FINE))
+    scenario = replace(scenario, view=View(field=False))
+    return Certified(engine, frame_at(engine, scenario, Stage.FINE), engine.solved(scenario, FINE))
 
 
 @pytest.fixture(scope="module", name="hand")

@@ -11,7 +11,7 @@ from dt_viz.engine.frame import Stage
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_warnings
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import plane_of
 from dt_viz.transforms.avoidance import BESIDE, Avoidance
 from dt_viz.transforms.bias import BiasPoint
@@ -167,7 +167,7 @@ def test_the_last_frame_says_what_margin_the_meshes_keep(engine, new_engine, ini
     if not kept:  # the flow ends where the covering spheres are clear
         monkeypatch.setattr("dt_viz.arm.whole_arm.MESH_ROUNDING", np.inf)
         engine = new_engine()
-    margin, scenario = 0.01, changed(initial("draw_s"), space="cspace", margin=0.01)
+    margin, scenario = 0.01, changed(initial("draw_s"), space="cspace", margin=0.01, view=View(field=False))
     frame = stage(engine, scenario, Stage.CERTIFIED)
     model, arm = load_collision_model(), engine.solved(scenario, FINE).arm
     clearance = [
@@ -184,7 +184,8 @@ def test_the_arm_s_clearance_is_that_from_what_the_arm_avoids(engine):
     task = engine.task("draw_s")
     of_hand = Avoidance(Sphere(task.obstacle_position))
     of_arm = Avoidance(Sphere(as_point(task.mean_path[60]), 0.08), space="cspace")
-    scenario = Scenario("draw_s", (Layer(of_hand, name="Hand"), Layer(of_arm, name="Arm")))
+    stack = (Layer(of_hand, name="Hand"), Layer(of_arm, name="Arm"))
+    scenario = Scenario("draw_s", stack, view=View(field=False))
     frame = stage(engine, scenario, Stage.CERTIFIED)
     assert Kind.ARM_ENTERS in kinds(frame)
     assert not kinds(frame) & {Kind.OTHER_CLEARANCE, Kind.ROLLOUT_ENTERS}

@@ -116,6 +116,7 @@ def test_a_change_of_sides_is_complete_at_rest(drag, new_engine):
     assert rested.side @ alone.side > 0.999
 
 
+@pytest.mark.parametrize("drag", ONE_SLOW, indirect=True, ids=str)
 def test_where_nothing_was_dragged_nothing_is_remembered(drag, new_engine):
     engine, scenario = new_engine(), drag.at(0.0)
     drag.dragged(engine, [0.0])

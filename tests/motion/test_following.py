@@ -17,7 +17,7 @@ from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.base import ArmAvoidance
 from dt_viz.warning import Kind
@@ -31,7 +31,7 @@ def around(point, diameter=0.15):
 
 
 def placed(scenario, *obstacles, **changes):
-    return changed(scenario, obstacles=obstacles, space="cspace", **changes)
+    return changed(scenario, obstacles=obstacles, space="cspace", view=View(field=False), **changes)
 
 
 @pytest.fixture(scope="module", name="nominal")
@@ -366,6 +366,7 @@ class TestBlocked:
             raise UnwantedError
 
         engine, blocked = new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3))
+        blocked = replace(blocked, view=View())
         with pytest.raises(UnwantedError):
             next(engine.frames(blocked, checkpoint=refuse))
         assert next(engine.frames(blocked, checkpoint=refuse)).blocked  # what there is so far is shown at the next edit

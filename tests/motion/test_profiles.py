@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import changed
+from scenes import changed, frame_at
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.engine.frame import Stage
@@ -20,12 +20,12 @@ from dt_viz.motion.profiles import NUM_SAMPLES, body_profile
 from dt_viz.scenario.scenario import View
 from dt_viz.ui.panel.health_plots import HealthPlots, table_html
 
-SHOWN = View(health_plots=True)
+SHOWN = View(field=False, health_plots=True)
 
 
 def profiled(engine, scenario):
     """The frame of stage FINE with profiles, and these."""
-    frame = next(f for f in engine.frames(replace(scenario, view=SHOWN)) if f.stage is Stage.FINE)
+    frame = frame_at(engine, replace(scenario, view=SHOWN), Stage.FINE)
     assert frame.profiles is not None
     return frame, frame.profiles
 
@@ -105,10 +105,10 @@ def test_without_obstacles_the_clearance_is_infinite_and_nothing_is_entered(engi
 
 
 def test_profiles_are_computed_only_while_shown_and_not_while_dragging(engine, initial):
-    scenario = initial("draw_s")
-    assert all(frame.profiles is None for frame in engine.frames(scenario))
-    for frame in engine.frames(replace(scenario, view=SHOWN)):
-        assert (frame.profiles is not None) == (frame.stage >= Stage.FINE)
+    scenario = replace(initial("draw_s"), view=View(field=False))
+    assert frame_at(engine, scenario, Stage.FINE).profiles is None
+    assert frame_at(engine, replace(scenario, view=SHOWN), Stage.LIVE).profiles is None
+    assert frame_at(engine, replace(scenario, view=SHOWN), Stage.FINE).profiles is not None
     assert replace(scenario, view=SHOWN).computes_like(scenario) is False
     assert scenario.computes_like(replace(scenario, view=SHOWN))
 

@@ -107,8 +107,8 @@ def test_the_grid_covers_the_slice_also_where_it_is_tilted(engine, initial):
         turn = Rotation.from_rotvec([0.0, 0.1, 0.5]) * Rotation.from_quat(np.roll(home.pose.wxyz, -1))
         x, y, z = (float(c) for c in home.centre + 0.03)
         w, i, j, k = (float(c) for c in np.roll(turn.as_quat(), 1))
-        tilted = View(grid=True, slice=SlicePose((x, y, z), (w, i, j, k)))
-        frame, pictures = picture_at(engine, replace(scenario, view=tilted), Stage.LIVE)
+        tilted = View(field=False, grid=True, slice=SlicePose((x, y, z), (w, i, j, k)))
+        frame, pictures = picture_at(engine, replace(scenario, view=tilted))
         area = frame.slice
         points = np.concatenate(pictures.grid.lines)
         assert np.abs((points - area.centre) @ area.normal).max() < 3e-3
