@@ -72,7 +72,9 @@ async def visit_and_stop(process, url, number):
                 await client.wait_for(lambda: False, PATIENCE)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)], ids=["SIGTERM", "Ctrl-C"]
+)
 def test_a_signal_ends_it_cleanly_while_visitors_drag(cache, number):
     with started(cache) as process:
         asyncio.run(visit_and_stop(process, address(process), number))

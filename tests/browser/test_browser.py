@@ -287,19 +287,22 @@ def test_the_saved_png_has_the_chosen_size_and_is_not_blank(visit):
 
 def test_each_visitor_has_a_private_scene_and_a_full_house_says_so(browser, server, visit):
     _, first = visit
-    page, second = open_page(browser, server, (320, 240))
-    third = browser.new_page()
-    third.set_default_timeout(1000 * PATIENCE)
+    pages = [browser.new_page(viewport={"width": 320, "height": 240}) for _ in range(2)]
     try:
+        for page in pages:
+            page.set_default_timeout(1000 * PATIENCE)
+        pages[0].goto(f"http://127.0.0.1:{server.port}")
+        wait_until(lambda: len(server.visitors) == 2, "the second visitor")
+        (second,) = set(server.visitors) - {first}
         second.session.edit("test", **changing(second.session.scenario, avoids=False))
         assert second.session.wait_idle(PATIENCE)
         assert first.session.scenario.avoids
-        third.goto(f"http://127.0.0.1:{server.port}")
-        third.get_by_text("All 2 places are taken").wait_for()
+        pages[1].goto(f"http://127.0.0.1:{server.port}")
+        pages[1].get_by_text("All 2 places are taken").wait_for()
     finally:
-        third.close()
-        close_page(page, server, second)
-    assert len(server.visitors) == 1
+        for page in pages:
+            page.close()
+        wait_until(lambda: set(server.visitors) == {first}, "the second visitor to leave")
 
 
 def pixels(page):

@@ -13,6 +13,8 @@ from dt_viz.evaluate.crossings import crossings
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import learn
 from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.flow_chain import Layer
+from dt_viz.learning.timing import MIN_PACE, _fit_pace
 from dt_viz.scenario.tasks import TASKS
 
 STATES = ("plain", "augmented")
@@ -105,6 +107,26 @@ def test_exactly_even_demonstrations_decide_nothing_by_rounding(name, state):
 @pytest.mark.parametrize("name", ["crossing at equal phase", "left and right from one start", "reach and retreat"])
 def test_the_state_and_the_labels_do_not_hang_on_rounding_or_order(name):
     assert_repeated(list(crossings()[name].demonstrations), "auto")
+
+
+def test_inducing_points_on_the_edge_of_the_reach_are_in_use_however_they_are_rounded():
+    ends = np.array([[0.0, 0.0], [0.0, 5.0]])
+    inner = Layer.near(ends, 1.0, spacing=1.0, reach=1.25).grid.axes[1][2:-2]  # heights of inducing points
+    points = np.concatenate([ends, np.stack([np.zeros_like(inner), inner], axis=1)])
+    exact = Layer.near(points, 1.0, spacing=1.0, reach=1.25)
+    for seed in range(10):
+        noise = 1e-13 * np.random.default_rng(seed).normal(size=points.shape)
+        np.testing.assert_array_equal(Layer.near(points + noise, 1.0, spacing=1.0, reach=1.25).active, exact.active)
+
+
+def test_the_pace_is_solved_for_to_rounding():
+    rng, knots = np.random.default_rng(0), np.linspace(-2.0, 1.0, 24)
+    clock, elapsed = np.linspace(0.5, -2.0, 60), np.cumsum(rng.uniform(0, 0.1, 60))
+    pace = _fit_pace(knots, clock, elapsed, np.ones(60))
+    assert (pace >= MIN_PACE - 1e-12).all()
+    for seed in range(5):
+        noise = 1e-12 * np.random.default_rng(seed).normal(size=60)
+        np.testing.assert_allclose(_fit_pace(knots, clock, elapsed + noise, np.ones(60)), pace, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -219,18 +219,19 @@ def test_the_system_of_each_level_has_the_rollouts_of_that_level(engine, scenari
 
 def test_the_pictures_are_those_of_the_selected_level(engine, initial):
     scenario = with_bias(engine, initial("draw_s"))
-    names = levels(scenario)
-    for level, name in enumerate(names):
+    values = np.empty(0)
+    for level, name in enumerate(levels(scenario)):
         frame = shown(engine, scenario, Stage.FINE, level=name, colour="lyapunov")
         system = cut_off(*solved(engine, scenario), level)
         assert frame.level == level
         field, colour = frame.pictures.field, frame.pictures.colour
         np.testing.assert_allclose(field.velocities, system.velocity(field.points), rtol=1e-4, atol=1e-6)
-        known = ~np.isnan(colour.values)
+        values = colour.values
+        known = ~np.isnan(values)
         assert known.all() == (name != "Avoidance")  # only there the obstacle is in the way
     whole = shown(engine, scenario, Stage.FINE, level="", colour="lyapunov")
     assert whole.level is None
-    np.testing.assert_array_equal(whole.pictures.colour.values, colour.values)
+    np.testing.assert_array_equal(whole.pictures.colour.values, values)
 
 
 def test_the_grid_of_the_imitation_is_that_of_the_stack_without_the_obstacle(engine, scenario):

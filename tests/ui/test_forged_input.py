@@ -294,6 +294,8 @@ def test_a_ray_that_is_none_adds_no_start(page, ray):
 
 def test_reset_brings_the_camera_back(page):
     task = TASKS["draw_s"]()
+    page.busy()
+    page.session.edit("warp", warp=0.5)
     page.visitor._tripod.look(task)
     page.camera.position, page.camera.look_at = np.full(3, 9.0), np.ones(3)
     (history,) = (handle for handle in page.inputs if handle.label == "History")

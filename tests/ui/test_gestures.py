@@ -1,6 +1,7 @@
 """What a visitor does on the page, from the browser's message to what is drawn: clicks, drags, checkboxes."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
 
 PACE = Pace(0.02, 10.0, 0)
 AREA = TASKS["draw_s"]().slice
-EVERYTHING = View(**{name: True for name in VIEW_LABELS if name != "panels"}, panels=(BASE_PANEL,))
+SWITCHES: dict[str, Any] = dict.fromkeys(set(VIEW_LABELS) - {"panels"}, True)
+EVERYTHING = View(**SWITCHES, panels=(BASE_PANEL,))
 SCENARIO = avoiding("draw_s", Sphere(TASKS["draw_s"]().obstacle_position), view=EVERYTHING)
 
 
@@ -86,8 +88,7 @@ def drawn(page, at_rest):
     """The page with a frame that holds all that can be shown, of which nothing is."""
     begin(page, SCENARIO)
     page.visitor.draw(at_rest(SCENARIO, Stage.LIVE), PACE)
-    nothing = {name: False for name in VIEW_LABELS if name != "panels"}
-    page.session.edit("test", view=View(**nothing))
+    page.session.edit("test", view=View(**dict.fromkeys(SWITCHES, False)))
     return page
 
 
