@@ -14,7 +14,7 @@ OF_POOLS = re.compile(r"ThreadPoolExecutor|asyncio_\d|Thread-\d+ \(_do_work\)|py
 PROC = Path("/proc")
 WATCHED = (Path.cwd(), Path.cwd() / "assets", Path.cwd() / "dt_viz")
 """Folders in which no test may make a file."""
-HARMLESS = {".hypothesis", ".pytest_cache", ".ruff_cache", "__pycache__", "dconf"}
+HARMLESS = {".hypothesis", ".pytest_cache", ".ruff_cache", "__pycache__", "dconf", "matplotlib", "fontconfig"}
 
 
 def found() -> set[str]:
