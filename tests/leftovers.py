@@ -15,6 +15,8 @@ PROC = Path("/proc")
 WATCHED = (Path.cwd(), Path.cwd() / "assets", Path.cwd() / "dt_viz")
 """Folders in which no test may make a file."""
 HARMLESS = {".hypothesis", ".pytest_cache", ".ruff_cache", "__pycache__", "dconf", "matplotlib", "fontconfig"}
+OF_PYTEST = "pytest-of-"
+"""Beginning of the name of the folder in which pytest makes `tmp_path`."""
 
 
 def found() -> set[str]:
@@ -65,13 +67,8 @@ def _ports() -> set[str]:
 
 def _files() -> set[str]:
     folders = (*WATCHED, Path(tempfile.gettempdir()), Path(os.environ["XDG_CACHE_HOME"]))
-    return {
-        f"file {file}"
-        for folder in folders
-        if folder.is_dir()
-        for file in folder.iterdir()
-        if file.name not in HARMLESS
-    }
+    files = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
+    return {f"file {file}" for file in files if file.name not in HARMLESS and not file.name.startswith(OF_PYTEST)}
 
 
 def _read(file: Path) -> str:

@@ -224,7 +224,7 @@ def _fit_pace(knots: Array, clock: Array, elapsed: Array, speed: Array) -> Array
     b = np.concatenate([weight[:, 0] * elapsed, np.zeros(len(smooth))])
     pace = lsq_linear(A, b, bounds=(MIN_PACE, np.inf), method="bvls", tol=1e-12).x
     # A demonstration starts from rest. Motions that come from farther away must not be that slow all the way.
-    beyond = np.clip((knots - clock[0]) / spacing - 1, 0, 1)
+    beyond = np.clip(2 * (knots - clock[0]) / spacing - 1.5, 0, 1)
     return (1 - beyond) * pace + beyond * elapsed[-1] / (clock[0] - clock[-1])
 
 
