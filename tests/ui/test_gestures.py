@@ -20,6 +20,7 @@ from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
 PACE = Pace(0.02, 10.0, 0)
 AREA = TASKS["draw_s"]().slice
 SWITCHES: dict[str, Any] = dict.fromkeys(set(VIEW_LABELS) - {"panels"}, True)
+NOTHING: dict[str, Any] = dict.fromkeys(SWITCHES, False)
 EVERYTHING = View(**SWITCHES, panels=(BASE_PANEL,))
 SCENARIO = avoiding("draw_s", Sphere(TASKS["draw_s"]().obstacle_position), view=EVERYTHING)
 
@@ -75,21 +76,21 @@ def test_rollouts_pass_where_the_handles_of_a_bias_point_are_dragged_to(page, en
         assert np.linalg.norm(path - target, axis=1).min() < 0.01
 
 
-def test_the_slice_moves_along_the_arrow_that_is_dragged(page):
-    page.busy(move_slice=True)
-    page.move("/slice", tuple(AREA.centre + 0.1 * AREA.normal), AREA.pose.wxyz)
-    moved = AREA.posed(page.session.scenario.view.slice)
-    np.testing.assert_allclose(moved.centre - AREA.centre, 0.1 * AREA.normal, atol=1e-9)
-    np.testing.assert_allclose(moved.axes, AREA.axes, atol=1e-9)
-
-
 @pytest.fixture
 def drawn(page, at_rest):
     """The page with a frame that holds all that can be shown, of which nothing is."""
     begin(page, SCENARIO)
     page.visitor.draw(at_rest(SCENARIO, Stage.LIVE), PACE)
-    page.session.edit("test", view=View(**dict.fromkeys(SWITCHES, False)))
+    page.session.edit("test", view=View(**NOTHING))
     return page
+
+
+def test_the_slice_moves_along_the_arrow_that_is_dragged(drawn):
+    drawn.busy(move_slice=True)
+    drawn.move("/slice", tuple(AREA.centre + 0.1 * AREA.normal), AREA.pose.wxyz)
+    moved = AREA.posed(drawn.session.scenario.view.slice)
+    np.testing.assert_allclose(moved.centre - AREA.centre, 0.1 * AREA.normal, atol=1e-9)
+    np.testing.assert_allclose(moved.axes, AREA.axes, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", VIEW_LABELS)
