@@ -45,9 +45,9 @@ settings.load_profile("dt-viz")
 @pytest.fixture(autouse=True)
 def _leaves_nothing_behind():
     """A test that leaves a thread, a process, a port or a file behind fails."""
-    before = leftovers.found()
+    began, before = leftovers.now(), leftovers.found()
     yield
-    left = leftovers.left_behind(before)
+    left = leftovers.left_behind(before, began)
     assert not left, f"left behind: {', '.join(sorted(left))}"
 
 

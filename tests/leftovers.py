@@ -19,15 +19,24 @@ OF_PYTEST = "pytest-of-"
 """Beginning of the name of the folder in which pytest makes `tmp_path`."""
 
 
-def found() -> set[str]:
-    """Everything that would stay if the test ended now, described in words."""
-    return _threads() | _processes() | _ports() | _files()
+def now() -> float:
+    """Seconds since the machine was started, by which the kernel dates processes."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
-def left_behind(before: set[str]) -> set[str]:
-    """What was not there before and does not go by itself."""
+def found(since: float = 0.0) -> set[str]:
+    """Everything that would stay if the test ended now, described in words; of processes those begun `since` then."""
+    return _threads() | _processes(since) | _ports() | _files()
+
+
+def left_behind(before: set[str], since: float) -> set[str]:
+    """What was not there before and does not go by itself.
+
+    The kernel may leave a process out of a list of children that is read while another one ends: it counts only if it
+    was begun `since` the test was.
+    """
     deadline = time.monotonic() + PATIENCE
-    while (left := found() - before) and time.monotonic() < deadline:
+    while (left := found(since) - before) and time.monotonic() < deadline:
         time.sleep(0.02)
     return left
 
@@ -40,15 +49,21 @@ def _threads() -> set[str]:
     }
 
 
-def _processes() -> set[str]:
+def _processes(since: float) -> set[str]:
     """Child processes; only on Linux."""
     children = set()
     for file in PROC.glob("self/task/*/children"):
         for pid in _read(file).split():
             command = _read(PROC / pid / "cmdline").replace("\0", " ")
-            if "resource_tracker" not in command:
+            if "resource_tracker" not in command and _begun(pid) >= since:
                 children.add(f"process {pid}: {command[:100]}")
     return children
+
+
+def _begun(pid: str) -> float:
+    """When a process was begun, as `now` counts."""
+    fields = _read(PROC / pid / "stat").rpartition(")")[2].split()
+    return int(fields[19]) / os.sysconf("SC_CLK_TCK") if len(fields) > 19 else 0.0
 
 
 def _ports() -> set[str]:
