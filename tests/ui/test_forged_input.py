@@ -64,9 +64,12 @@ def page(server, robot):
 
 
 @pytest.fixture(autouse=True)
-def _without_presentation(page):
-    """Something forged may have begun it."""
+def _at_rest(page):
+    """No presentation, and a camera that stays where it is put: something forged may have begun others."""
     page.visitor._panel._presentation.on = False
+    for switch in page.inputs:
+        if switch.label in ("Orbit", "Lock camera") and switch.value:
+            page.claim(switch, False)
 
 
 def values_of(value: Any):
