@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,8 @@ from dt_viz.ui.origins import Origin, OriginError
 
 MAX_PORT = 65535
 PROG = "dt-viz"
+LOADED = 2.0
+"""Time, seconds, within which compiled code is loaded, so that nothing is said of it."""
 MEASURE = "evaluate"
 """Subcommand of the measurements; without it the demo starts."""
 
@@ -42,8 +45,9 @@ def _serve(options: argparse.Namespace) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # numerical libraries read these when they are first imported
     from dt_viz.errors import DataError  # noqa: PLC0415
+    from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
-    from dt_viz.learning.store import FitStore, default_cache_folder  # noqa: PLC0415
+    from dt_viz.learning.store import FitStore  # noqa: PLC0415
     from dt_viz.obstacles.shapes import unit_sphere_map  # noqa: PLC0415
     from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
     from dt_viz.ui.gate import GateError  # noqa: PLC0415
@@ -60,10 +64,12 @@ def _serve(options: argparse.Namespace) -> int:
         fits = FitStore(default_cache_folder())
         for name in tasks if options.prepare_all else (options.task,):
             task = tasks[name]()
-            fits.get(task.demonstrations, progress=_Bar(task.title))
+            fits.get(task.demonstrations, progress=_Bar(f"Learning {task.title}"))
             if options.prepare_all:
                 print(f"Ready: {task.title}", flush=True)
         unit_sphere_map()
+        if options.prepare_all:
+            _compile(threading.Event())
         server = Server(
             tasks,
             fits,
@@ -78,10 +84,15 @@ def _serve(options: argparse.Namespace) -> int:
         return 2
     host = f"[{server.host}]" if ":" in server.host else server.host
     print(f"DT-Viz is at http://{host}:{server.port} (Ctrl-C stops it)", flush=True)
+    leaving = threading.Event()
+    compiling = threading.Thread(target=_compile, args=(leaving,), name="compiling")
+    compiling.start()
     try:
         server.wait()
     finally:
+        leaving.set()
         server.close()
+        compiling.join()
 
 
 @contextmanager
@@ -157,12 +168,26 @@ def _positive(text: str) -> int:
 
 
 class _Bar:
-    """Progress of the first fit, on the terminal."""
+    """Progress of what takes long the first time, on the terminal."""
 
     def __init__(self, title: str) -> None:
         self._title = title
 
-    def __call__(self, fraction: float, message: str) -> None:
-        print(f"\rLearning {self._title}: {100 * fraction:3.0f} % {message:<40}", end="", flush=True)
+    def __call__(self, fraction: float, message: str = "") -> None:
+        print(f"\r{self._title}: {100 * fraction:3.0f} % {message:<40}", end="", flush=True)
         if fraction >= 1:
             print()
+
+
+def _compile(leaving: threading.Event) -> None:
+    """Compile what a drag repeats: once for a processor, for half a minute; later it is only loaded."""
+    from dt_viz.arm.body_points import load_body_points  # noqa: PLC0415
+    from dt_viz.arm.robot import load_jaco  # noqa: PLC0415
+    from dt_viz.arm.whole_arm import WholeArm  # noqa: PLC0415
+
+    began, bar = time.monotonic(), _Bar("Compiling for this processor, once")
+    for fraction in WholeArm(load_jaco(), load_body_points()).compiled():
+        if time.monotonic() - began > LOADED:
+            bar(fraction)
+        if leaving.is_set():
+            break

@@ -20,6 +20,7 @@ from dt_viz.arm.retiming import within_velocity_limits
 from dt_viz.arm.robot import Robot
 from dt_viz.arm.robot import load_jaco as load_robot
 from dt_viz.arm.tracking import inverse_kinematics, track
+from dt_viz.control import controller as control
 from dt_viz.errors import FormatError, check_between
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.phased import frozen
@@ -29,7 +30,6 @@ from dt_viz.learning.augmented import AugmentedImitation, unknown_label
 from dt_viz.learning.choice import State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
-from dt_viz.motion import control
 from dt_viz.motion.certificates import Certificates, Shown, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.following import Follower
@@ -409,7 +409,7 @@ class Arm:
 
 
 class Controller(control.Controller):
-    """The joint velocities of an arm in the loop, wherever it is: see `dt_viz.motion.control`.
+    """The joint velocities of an arm in the loop, wherever it is: see `dt_viz.control.controller`.
 
         controller = dt.Controller(motion, arm)
         q_velocity = controller.step(q, dt)

@@ -2,10 +2,10 @@
 
 import time
 from contextlib import suppress
-from dataclasses import fields
 
 import numpy as np
 import pytest
+from pages import all_of
 
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.ui.scene.camera import window
@@ -49,8 +49,8 @@ def until_drawn(visitor):
 
 page_errors: list[str] = []
 """What pages have complained of in their consoles."""
-OF_VISER = "Unable to preventDefault inside passive event listener"
-"""Said by viser's own page of any drag; nothing is lost."""
+OF_OTHERS = ("Unable to preventDefault inside passive event listener", "GPU stall due to ReadPixels")
+"""Said by viser's own page of any drag, and by Chromium where it draws by software; nothing is lost."""
 
 
 def close_notices(page):
@@ -87,7 +87,7 @@ def close_page(page, server, visitor):
 
 def begin(visitor: Visitor, scenario: Scenario) -> None:
     """Begin with a scenario, and wait until it is shown."""
-    visitor.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(Scenario)})
+    visitor.session.edit("test", **all_of(scenario))
     visitor.session.end_gesture()
     assert visitor.session.wait_idle(PATIENCE)
     assert visitor.shown is not None and visitor.shown.scenario.moves_like(scenario)
@@ -113,3 +113,17 @@ def project(visitor: Visitor, point) -> tuple[float, float]:
 def press(locator):
     """Click without waiting for two alike pictures of the page, which may be long in coming."""
     locator.click(force=True)
+
+
+def open_tab(page, name):
+    """A tab of the panel."""
+    press(page.get_by_role("tab", name=name, exact=True))
+
+
+def drag(page, start, end, steps=6):
+    page.mouse.move(*start)
+    page.mouse.down()
+    for k in range(1, steps + 1):
+        page.mouse.move(*(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)))
+        time.sleep(0.03)
+    page.mouse.up()

@@ -9,6 +9,11 @@ from pathlib import Path
 # Tests run beside each other, each on one core: read when numpy is imported, by its BLAS.
 os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"} | os.environ)
 
+# Compiled code is kept from one run to the next.
+os.environ.setdefault(
+    "NUMBA_CACHE_DIR", str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dt-viz/kernels")
+)
+
 # Temporary files and caches of this process lie where it is seen which of them a test leaves behind.
 OWN_FOLDER = Path(tempfile.mkdtemp(prefix="dt-viz-tests-", dir=os.environ.get("PYTEST_DEBUG_TEMPROOT")))
 atexit.register(shutil.rmtree, OWN_FOLDER, ignore_errors=True)

@@ -25,15 +25,17 @@ from queue import Queue
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("flows", "learning", "transforms", "obstacles", "arm", "motion", "engine", "ui")
+PACKAGES = ("kernels", "flows", "learning", "transforms", "obstacles", "arm", "motion", "control", "engine", "ui")
 """Packages that are corrupted."""
 ABOVE = {
+    "kernels": ("arm", "motion", "control", "engine"),
     "flows": ("learning", "obstacles", "transforms", "arm", "motion", "pictures", "engine", "baselines"),
     "learning": ("scenario", "motion", "engine", "baselines"),
     "transforms": ("arm", "scenario", "motion", "engine", "ui"),
     "obstacles": ("transforms", "arm", "scenario", "motion", "pictures", "engine", "baselines", "ui"),
-    "arm": ("motion", "pictures", "engine", "baselines", "ui"),
-    "motion": ("engine", "baselines", "ui"),
+    "arm": ("motion", "control", "pictures", "engine", "baselines", "ui"),
+    "motion": ("control", "engine", "baselines", "ui"),
+    "control": ("engine", "evaluate", "ui"),
     "engine": ("ui",),
     "ui": ("browser",),
 }
@@ -201,7 +203,6 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", type=int, nargs="*", help="numbers of the corruptions to try; default: all")
-    parser.add_argument("--list", action="store_true", help="print the corruptions, try none")
     parser.add_argument("--passing", action="store_true", help="the tests are known to pass without a corruption")
     arguments = parser.parse_args()
     numbered = [
@@ -209,9 +210,6 @@ def main() -> None:
         for number, corruption in enumerate(chosen(arguments.seed, arguments.count))
         if arguments.only is None or number in arguments.only
     ]
-    if arguments.list:
-        print(*(f"{number:3} {corruption}" for number, corruption in numbered), sep="\n")
-        return
     survivors: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         copies: Queue[Path] = Queue()
@@ -237,14 +235,8 @@ def main() -> None:
 
 def _copy(folder: Path) -> Path:
     """Copy the files of the checkout, those not committed yet, too."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    for name in filter(None, listed.stdout.split("\0")):
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    for name in filter(None, subprocess.check_output(command, cwd=ROOT, text=True).split("\0")):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(ROOT / name, folder / name)

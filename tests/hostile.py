@@ -15,7 +15,8 @@ import sys
 import time
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,7 +32,7 @@ from dt_viz.learning import demonstrations as demos
 from dt_viz.learning.imitation import ImitationSettings, fit
 from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles import files as shapes
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, _solid_map
 from dt_viz.saving import SavedMotion, save_motion
 from dt_viz.scenario.scenario import Layer
 from dt_viz.transforms.avoidance import Avoidance
@@ -325,14 +326,17 @@ def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
     )
 
 
-def hostile_file(number: int) -> tuple[str, str, bytes]:
-    """The kind of loader, a name and the content of the file of this number."""
-    rng = np.random.default_rng((11, number))
-    kind, name, content, own = seeds()[number % len(seeds())]
-    mutations = EVERYWHERE + own
+def mutated(content: bytes, mutations: tuple[Mutation, ...], rng: Rng) -> bytes:
+    """The content after one to three of the mutations."""
     for _ in range(rng.integers(1, 4)):
         content = mutations[int(rng.integers(len(mutations)))](content, rng)
-    return kind, name, content
+    return content
+
+
+def hostile_file(number: int) -> tuple[str, str, bytes]:
+    """The kind of loader, a name and the content of the file of this number."""
+    kind, name, content, own = seeds()[number % len(seeds())]
+    return kind, name, mutated(content, EVERYWHERE + own, np.random.default_rng((11, number)))
 
 
 def read(kind: str, name: str, content: bytes) -> None:
@@ -350,19 +354,40 @@ def read(kind: str, name: str, content: bytes) -> None:
     assert np.isfinite(solid.distances.values).all()
 
 
+def forget() -> None:
+    """Forget what was computed of meshes and clouds."""
+    for kept in (solids._surface, solids._distances, solids._balls, clouds._solid, _solid_map):
+        kept.cache_clear()
+
+
+@contextmanager
+def coarsely() -> Iterator[None]:
+    """Within this block the distances of meshes and clouds are coarse, and soon computed."""
+    fine = solids.NUM_NODES, solids.NUM_SAMPLES, solids.NUM_PROBES, clouds.NUM_NODES, clouds.NUM_SAMPLES
+    solids.NUM_NODES = clouds.NUM_NODES = 10**3
+    solids.NUM_SAMPLES = solids.NUM_PROBES = clouds.NUM_SAMPLES = 1000
+    forget()
+    try:
+        yield
+    finally:
+        solids.NUM_NODES, solids.NUM_SAMPLES, solids.NUM_PROBES, clouds.NUM_NODES, clouds.NUM_SAMPLES = fine
+        forget()
+
+
 def main() -> None:
     import resource  # not on every system
 
     resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESS_SPACE, MAX_ADDRESS_SPACE))
-    if "--coarse" in sys.argv:  # only reading is looked at
-        solids.NUM_NODES = clouds.NUM_NODES = 10**3
-        solids.NUM_SAMPLES = solids.NUM_PROBES = clouds.NUM_SAMPLES = 1000
+    with coarsely() if "--coarse" in sys.argv else nullcontext():
+        read_what_is_given()
+
+
+def read_what_is_given() -> None:
     while line := sys.stdin.buffer.readline():
         faulthandler.dump_traceback_later(MAX_SECONDS, exit=True)
         kind, name, size = json.loads(line)
         content = sys.stdin.buffer.read(size)
-        for kept in (solids._surface, solids._distances, clouds._solid):  # of files before
-            kept.cache_clear()
+        forget()  # what was computed of files before
         PROCESS.joinpath("clear_refs").write_text("5")  # forget the largest memory so far
         start, message = time.process_time(), ""
         try:

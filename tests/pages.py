@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import time
 from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -20,7 +21,7 @@ from dt_viz.engine.session import Session
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import Follower
-from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, rotation
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
@@ -31,7 +32,35 @@ from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.visitor import Visitor
 
 MIDDLE = (0.1, -0.5, 0.4)
+TITLES = {name: entry.title for name, entry in TASKS.items()}
 CLIENT = cast(Any, 0)
+PATIENCE = 30.0
+"""Seconds after which a test gives up; nothing on a page takes that long."""
+
+
+def ignored(*_what: Any) -> None:
+    """What is told of a thing that is clicked or dragged where nobody wants to know."""
+
+
+def wait_until(condition: Any, patience: float = PATIENCE) -> None:
+    deadline = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+def all_of(scenario: Scenario) -> dict[str, Any]:
+    """The fields of a scenario, for an edit after which it is the session's."""
+    return {field.name: getattr(scenario, field.name) for field in fields(scenario)}
+
+
+def painted_at(image: Any, half_size: Any, seen: Any) -> np.ndarray:
+    """Place in the world of the middle of those pixels of an image that are `seen` (rows, columns)."""
+    rows, columns = np.nonzero(seen)
+    height, width = seen.shape
+    across = 2 * (columns.mean() + 0.5) / width - 1, 2 * (rows.mean() + 0.5) / height - 1  # to the right and down
+    w, x, y, z = (float(component) for component in image.wxyz)
+    return image.position + rotation((w, x, y, z)) @ [*np.multiply(half_size, across), 0.0]
 
 
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:
@@ -73,11 +102,10 @@ class CameraClient:
         asyncio.run(self._reported(self.camera))
 
 
-def panel_of(server: viser.ViserServer, notify: Any = lambda *_: None) -> Panel:
+def panel_of(server: viser.ViserServer, notify: Any = ignored) -> Panel:
     """A panel without a page."""
-    titles = {name: entry.title for name, entry in TASKS.items()}
     tripod = Tripod(cast(Any, CameraClient()), lambda: None)
-    return Panel(server.gui, titles, load_jaco(), lambda *_: None, notify, tripod, lambda _dark: None)
+    return Panel(server.gui, TITLES, load_jaco(), ignored, notify, tripod, ignored)
 
 
 class NoFrames:
@@ -115,8 +143,7 @@ class Page:
         )
         self.gui._resolve_client = lambda _id: self.client  # type: ignore[method-assign]
         self.scene._get_client_handle = lambda _id: self.client  # type: ignore[method-assign]
-        titles = {name: entry.title for name, entry in TASKS.items()}
-        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, titles, "draw_s")
+        self.visitor = Visitor(cast(Any, self.client), cast(Engine, NoFrames()), robot, TITLES, "draw_s")
         self._loop = asyncio.new_event_loop()
         self.visitor._panel._chores.later(lambda: None)  # begins its thread now, not in the test that first needs it
         self.session = self.visitor.session
@@ -132,6 +159,10 @@ class Page:
         """All but those whose value nobody reads."""
         inputs = self.gui._gui_input_handle_from_uuid.values()
         return [handle for handle in inputs if not isinstance(handle, GuiProgressBarHandle)]
+
+    def __getitem__(self, label: str) -> Any:
+        """The first input that is shown with this label: of two it is the obstacle's."""
+        return next(handle for handle in self.inputs if handle.label == label and handle.visible)
 
     @property
     def commands(self) -> dict[str, Any]:
@@ -184,17 +215,25 @@ class Page:
         message = messages.SceneNodeClickMessage(name, None, (0.8, -1.6, 0.8), (0.0, 1.0, 0.0), (0.5, 0.5), None)
         self.run(self.scene._handle_node_click_updates(CLIENT, message))
 
+    def point(self, origin: Any, direction: Any) -> None:
+        """Click on the scene along a ray."""
+        message = messages.ScenePointerMessage("click", origin, direction, ((0.5, 0.5),), None)
+        self.run(self.scene._handle_scene_pointer_updates(CLIENT, message))
+
     def drag(self, name: str, start: Any, end: Any, phase: Any = "update") -> None:
-        at = {
-            "start_position": start,
-            "start_screen_pos": (0.5, 0.5),
-            "end_position": end,
-            "end_screen_pos": (0.5, 0.5),
-        }
+        at = {"start_position": start, "end_position": end}
+        at |= {"start_screen_pos": (0.5, 0.5), "end_screen_pos": (0.5, 0.5)}
         message = messages.SceneNodeDragMessage(
             phase=phase, name=name, instance_index=None, button="left", modifier=None, **at
         )
         self.run(self.scene._handle_node_drag(CLIENT, message))
+
+    def done(self) -> None:
+        """Wait until the work of buttons is done."""
+        self.visitor._panel._chores._executor.submit(lambda: None).result(PATIENCE)
+
+    def begin(self, scenario: Scenario) -> None:
+        self.session.edit("test", **all_of(scenario))
 
     def busy(self, **view: Any) -> Scenario:
         """A scenario in which most controls are shown, and most things stand in the scene; all else is as at first."""
@@ -206,7 +245,7 @@ class Page:
             starts=starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4)),
             view=View(generator=True, click_to_start=True, handles=True, **view),
         )
-        self.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(scenario)})
+        self.begin(scenario)
         return self.session.scenario
 
 

@@ -3,9 +3,11 @@
 from dataclasses import fields, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario, Start
+from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import avoidance_layer, with_avoidance
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
@@ -36,11 +38,8 @@ def changing(scenario, *, avoids=None, layers=None, level=None, **changes):
         others = list(beside(scenario) if layers is None else layers)
         others.insert(len(others) if level is None else level, avoidance)
         scenario = replace(scenario, stack=tuple(others))
-    return (
-        {"stack": scenario.stack, **changes}
-        if own or avoids is not None or layers is not None or level is not None
-        else changes
-    )
+    stack_changes = own or (avoids, layers, level) != (None, None, None)
+    return {"stack": scenario.stack, **changes} if stack_changes else changes
 
 
 def changed(scenario, **changes):
@@ -110,6 +109,15 @@ def random_scenario(engine, seed):
         level=int(rng.integers(len(layers) + 1)),
         temperature=float(rng.uniform(2, 12)),
     )
+
+
+def tilted(task, seed=0):
+    """A pose of the slice a little beside the task's, by random numbers."""
+    rng, home = np.random.default_rng(seed), task.slice.pose
+    turn = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)) * Rotation.from_quat(np.roll(home.wxyz, -1))
+    x, y, z = (np.asarray(home.position) + rng.uniform(-0.04, 0.04, 3)).tolist()
+    w, i, j, k = np.roll(turn.as_quat(), 1).tolist()
+    return SlicePose((x, y, z), (w, i, j, k))
 
 
 def frame_at(engine, scenario, stage):

@@ -53,6 +53,11 @@ def address(process):
     raise AssertionError(process.stderr.read())
 
 
+def assert_ends_cleanly(process):
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, errors) == (0, "")
+
+
 async def visit_and_stop(process, url, number):
     """Send the signal while two visitors drag."""
     async with AsyncExitStack() as stack:
@@ -62,7 +67,7 @@ async def visit_and_stop(process, url, number):
         for client in clients:
             assert await client.wait_for(lambda client=client: client.has_picture, PATIENCE)
             await client.grab()
-        for k in range(20):
+        for k in range(5):
             for client in clients:
                 await client.move([0.1, -0.5, 0.3 + 0.01 * k])
             await asyncio.sleep(0.02)
@@ -78,9 +83,7 @@ async def visit_and_stop(process, url, number):
 def test_a_signal_ends_it_cleanly_while_visitors_drag(cache, number):
     with started(cache) as process:
         asyncio.run(visit_and_stop(process, address(process), number))
-        _, printed = process.communicate(timeout=PATIENCE)
-        assert process.returncode == 0
-        assert printed == ""
+        assert_ends_cleanly(process)
 
 
 def test_a_signal_ends_it_cleanly_while_it_learns(tmp_path):
@@ -88,9 +91,7 @@ def test_a_signal_ends_it_cleanly_while_it_learns(tmp_path):
         assert process.stdout is not None
         assert "Learn" in process.stdout.read(8)
         process.terminate()
-        _, printed = process.communicate(timeout=PATIENCE)
-        assert process.returncode == 0
-        assert printed == ""
+        assert_ends_cleanly(process)
 
 
 def test_every_task_is_learned_before_it_is_ready_if_asked_with_a_line_for_each(monkeypatch, capsys):
@@ -123,22 +124,23 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
     assert "found 'nothing'" in capsys.readouterr().err
 
 
-def test_measurements_are_a_subcommand(capsys):
-    assert main(["evaluate", "starts", "--task", "nothing"]) == 2
-    assert capsys.readouterr().err.startswith("dt-viz evaluate starts: --task: found 'nothing'")
-    with pytest.raises(SystemExit) as ended:
-        main(["--help"])
-    assert ended.value.code == 0
-    assert "dt-viz evaluate --help" in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        ("--help", 0, "dt-viz evaluate --help"),
+        ("evaluate starts --task nothing", 2, "dt-viz evaluate starts: --task: found 'nothing'"),
+        ("--allow-origin demo.org", 2, "argument --allow-origin: found 'demo.org'; accepted: http://"),
+    ],
+)
+def test_it_explains_itself_and_what_is_wrong_and_measurements_are_a_subcommand(capsys, arguments, status, words):
+    try:
+        ended = main(arguments.split())
+    except SystemExit as exit:
+        ended = exit.code
+    assert ended == status
+    assert words in "".join(capsys.readouterr())
 
 
 def test_numpy_is_not_imported_before_its_threads_are_limited():
     program = "import sys, dt_viz.cli; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
-def test_what_is_no_origin_is_refused(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["--allow-origin", "demo.example.org"])
-    assert ended.value.code == 2
-    assert "argument --allow-origin: found 'demo.example.org'; accepted: http://" in capsys.readouterr().err

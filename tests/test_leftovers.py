@@ -17,12 +17,9 @@ def _soon(monkeypatch):
     monkeypatch.setattr(leftovers, "PATIENCE", 0.1)
 
 
-def test_nothing_is_found_where_nothing_is_left():
-    assert leftovers.left_behind(leftovers.found(), leftovers.now()) == set()
-
-
-def test_a_thread_is_found():
+def test_a_thread_is_found_and_nothing_where_nothing_is_left():
     began, before, end = leftovers.now(), leftovers.found(), threading.Event()
+    assert leftovers.left_behind(before, began) == set()
     thread = threading.Thread(target=end.wait, name="forgotten")
     thread.start()
     (left,) = leftovers.left_behind(before, began)

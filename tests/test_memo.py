@@ -11,18 +11,11 @@ from dt_viz.engine.session import Session
 from dt_viz.memo import Memo
 
 
-def test_a_result_is_computed_once_and_kinds_do_not_mix():
+def test_a_result_is_computed_once_kinds_do_not_mix_and_the_results_that_were_used_last_stay():
     memo, made = Memo(), []
-    for kind, key in (("a", 1), ("a", 1), ("b", 1), ("a", 2), ("b", 1)):
-        assert memo(kind, key, lambda k=(kind, key): made.append(k) or k) == (kind, key)
-    assert made == [("a", 1), ("b", 1), ("a", 2)]
-
-
-def test_the_results_that_were_used_last_stay():
-    memo, made = Memo(), []
-    for key in (1, 2, 1, 3, 1, 2):
-        memo("a", key, lambda key=key: made.append(key), newest=2)
-    assert made == [1, 2, 3, 2]
+    for kind, key in (("a", 1), ("a", 1), ("b", 1), ("a", 2), ("b", 1), ("a", 1), ("a", 3), ("a", 1), ("a", 2)):
+        assert memo(kind, key, lambda k=(kind, key): made.append(k) or k, newest=2) == (kind, key)
+    assert made == [("a", 1), ("b", 1), ("a", 2), ("a", 3), ("a", 2)]
     assert memo.count("a") == 2
 
 

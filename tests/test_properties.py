@@ -1,6 +1,7 @@
 """A property computed once: kept, and never waited for."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 from dt_viz.properties import cached_property
 
@@ -21,13 +22,10 @@ class Holder:
         return object()
 
 
-def test_it_is_computed_once_for_each_instance():
+def test_it_is_computed_once_for_each_instance_and_documented_on_the_class():
     one, other = Holder(), Holder()
     assert one.value is one.value
     assert one.value is not other.value
-
-
-def test_it_is_documented_on_the_class():
     assert Holder.value.__doc__ == "A new object."
 
 
@@ -41,20 +39,15 @@ def test_what_one_instance_computes_keeps_no_other_waiting():
     other = threading.Thread(target=lambda: Holder().value, daemon=True)
     other.start()
     other.join(PATIENCE / 2)
-    try:
-        assert not other.is_alive()
-    finally:
-        ready.set()
-        thread.join(PATIENCE)
+    waits = other.is_alive()
+    ready.set()
+    thread.join(PATIENCE)
+    assert not waits
 
 
 def test_threads_that_compute_it_at_the_same_time_get_the_same_value():
-    barrier, seen = threading.Barrier(4), []
+    barrier = threading.Barrier(4)
     holder = Holder(lambda: barrier.wait(PATIENCE))
-    threads = [threading.Thread(target=lambda: seen.append(holder.value), daemon=True) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(PATIENCE)
-    assert len(seen) == len(threads)
+    with ThreadPoolExecutor(4) as pool:
+        seen = list(pool.map(lambda _: holder.value, range(4)))
     assert len(set(map(id, seen))) == 1

@@ -1,6 +1,7 @@
 """Saved motions: read back to the last bit, written whole or not at all, and refused where they make no sense."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -16,7 +17,6 @@ from hypothesis import strategies as st
 from twirl import shown_in_the_readme
 
 import dt_viz as dt
-from dt_viz.examples import controller
 from dt_viz.files import npz
 from dt_viz.files.values import Codec
 from dt_viz.learning.demonstrations import Demonstration
@@ -37,6 +37,12 @@ def arcs(dim=2):
         yield Demonstration(2 * s, path[:, :dim], f"arc {k}")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _coarsely():
+    with hostile.coarsely():
+        yield
+
+
 @pytest.fixture(scope="module")
 def flat() -> dt.Motion:
     return dt.fit(list(arcs()))
@@ -55,14 +61,10 @@ def motions(flat) -> dict[str, dt.Motion]:
     near = SHAPED[3].moved((0.35, 0.03, 0.05), (0.9, 0.1, 0.3, -0.3))
     by_hand = dt.Avoidance(near, duration=0.5, generator="probability", integration=dt.Integration("rk4", 6))
     stack = dt.Avoidance((ball, *far), margin=0.02, temperature=4.0), bias, by_hand
-    space = dt.fit(list(arcs(3)))
     return {
-        "space": space.stack(*stack),
-        "space, velocities": dt.fit(list(arcs(3)), "velocity").stack(*stack),
+        "space": dt.fit(list(arcs(3))).stack(*stack),
         "plane": flat.stack(*stack),
-        "plane, velocities": dt.fit(list(arcs()), "velocity").stack(stack[1], stack[0]),
-        "plain": space,
-        "a drawing": dt.fit(dt.load_demonstrations(ASSETS / "draw_s.npz")),
+        "velocities": dt.fit(list(arcs()), "velocity").stack(stack[1], stack[0]),
     }
 
 
@@ -80,23 +82,13 @@ def assert_same(a: dt.Motion, b: dt.Motion):
     assert a.certificates() == b.certificates()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "space",
-        pytest.param("space, velocities", marks=pytest.mark.slow),
-        "plane",
-        "plane, velocities",
-        "plain",
-        "a drawing",
-    ],
-)
+@pytest.mark.parametrize("name", ["space", "plane", "velocities"])
 def test_a_motion_is_read_back_to_the_last_bit(motions, name, tmp_path):
     motions[name].save(tmp_path / "a.npz")
     again = dt.Motion.load(tmp_path / "a.npz")
     assert_same(motions[name], again)
     again.save(tmp_path / "b.npz")
-    assert_same(motions[name], dt.Motion.load(tmp_path / "b.npz"))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
 def test_all_kinds_of_transforms_and_obstacles_are_among_them(motions):
@@ -107,8 +99,9 @@ def test_all_kinds_of_transforms_and_obstacles_are_among_them(motions):
 
 DIGEST = """
 import hashlib, sys
-import numpy as np
 import dt_viz as dt
+from dt_viz.obstacles import clouds, solids
+solids.NUM_NODES = clouds.NUM_NODES = 1000  # soon computed
 motion = dt.Motion.load(sys.argv[1])
 digest = hashlib.sha256(repr(motion.certificates()).encode())
 for path in motion.rollouts():
@@ -118,16 +111,13 @@ print(digest.hexdigest())
 """
 
 
-@pytest.mark.parametrize("name", [pytest.param("space", marks=pytest.mark.slow), "plane"])
-def test_another_process_finds_the_same(motions, name, tmp_path, capsys, monkeypatch):
-    path = tmp_path / "a.npz"
-    motions[name].save(path)
-    found = subprocess.check_output([sys.executable, "-c", DIGEST, str(path)], text=True)
-    monkeypatch.setattr(sys, "argv", ["", str(path)])
-    with monkeypatch.context() as context:
-        context.setattr(dt.Motion, "load", lambda _: motions[name])
-        exec(DIGEST, {})
-    assert found == capsys.readouterr().out
+def test_other_processes_find_the_same(motions, tmp_path):
+    motions["plane"].save(tmp_path / "a.npz")
+    command = [sys.executable, "-c", DIGEST, str(tmp_path / "a.npz")]
+    environments = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
+    processes = [subprocess.Popen(command, env=seeded, stdout=subprocess.PIPE) for seeded in environments]
+    one, other = (process.communicate()[0] for process in processes)
+    assert one == other and one
 
 
 def test_layers_keep_their_names_and_whether_they_are_on(saved):
@@ -184,34 +174,36 @@ def test_a_new_transform_of_one_file_and_one_line_is_saved_without_code_of_its_o
         dt.Motion.load(path)
 
 
-def test_a_field_that_cannot_be_written_is_named(flat, tmp_path, monkeypatch):
-    @dataclass(frozen=True)
-    class Odd(Transform):
-        title: ClassVar[str] = "Odd"
-        table: dict[str, float]
+@dataclass(frozen=True)
+class Odd(Transform):
+    """A transform with a field that cannot be written."""
 
-        def build(self, motion: MotionBelow) -> Built:
-            raise NotImplementedError
+    title: ClassVar[str] = "Odd"
+    table: dict[str, float]
 
+    def build(self, motion: MotionBelow) -> Built:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (dt.Avoidance(dt.Sphere((0.0, 1e9, 0.0))), "distance of an obstacle: found 1e+09; accepted: 0 to 100"),
+        (dt.Avoidance(space=cast(Any, "tsk")), "'tsk'; accepted: 'task' or 'cspace'"),
+        (dt.BiasPoint((0.0, np.nan, 0.0)), "position[1]: found nan; accepted: a finite number"),
+        (Odd({}), "layers[0].transform.table: found a field of type dict"),
+    ],
+)
+def test_what_could_not_be_read_is_not_written(flat, tmp_path, monkeypatch, wrong, words):
     monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, Odd))
-    with pytest.raises(dt.DataError, match=re.escape("layers[0].transform.table: found a field of type dict")):
-        flat.stack(Odd({})).save(tmp_path / "a.npz")
-
-
-def test_what_could_not_be_read_is_not_written(flat, tmp_path):
-    path = tmp_path / "a.npz"
-    for wrong, words in (
-        (dt.Avoidance(dt.Sphere((0.0, 1e9, 0.0))), "distance of an obstacle: found 1e\\+09; accepted: 0 to 100"),
-        (dt.Avoidance(space="tsk"), "'tsk'; accepted: 'task' or 'cspace'"),  # pyright: ignore[reportArgumentType]
-        (dt.BiasPoint((0.0, np.nan, 0.0)), re.escape("position[1]: found nan; accepted: a finite number")),
-    ):
-        with pytest.raises(dt.DataError, match=words):
-            flat.stack(wrong).save(path)
+    with pytest.raises(dt.DataError, match=re.escape(words)):
+        flat.stack(wrong).save(tmp_path / "a.npz")
     assert not list(tmp_path.iterdir())
 
 
-def test_numbers_that_make_no_sense_are_refused_where_they_are_written():
-    for make, words in (
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
         (lambda: dt.Avoidance(margin=-0.01), "margin: found -0.01; accepted: 0 to 1"),
         (lambda: dt.Avoidance(temperature=0.0), "temperature"),
         (lambda: dt.Avoidance(duration=float("nan")), "duration"),
@@ -222,14 +214,15 @@ def test_numbers_that_make_no_sense_are_refused_where_they_are_written():
         (lambda: dt.Box((0.0, 0.0, 0.0), (0.1, 0.0, 0.1)), "sizes: found 0"),
         (lambda: dt.Cylinder((0.0, 0.0, 0.0), height=float("inf")), "height: found inf"),
         (lambda: cast(Any, SHAPED[3]).resized(-1.0), "scale"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            make()
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused_where_they_are_written(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a", "a.motion", "a.b.NPZ"])
-@pytest.mark.parametrize("kind", [str, Path])
-def test_the_file_has_the_name_that_is_given(flat, tmp_path, name, kind):
+@pytest.mark.parametrize(("kind", "name"), [(str, "a.npz"), (Path, "a"), (str, "a.motion"), (Path, "a.b.NPZ")])
+def test_the_file_has_the_name_that_is_given(flat, tmp_path, kind, name):
     path = kind(tmp_path / name)
     flat.save(path)
     assert [found.name for found in tmp_path.iterdir()] == [name]
@@ -383,33 +376,24 @@ def test_a_file_from_before_a_field_was_added_is_read(saved):
 
 
 def test_other_files_are_refused(saved, tmp_path):
-    for content in (
-        b"",
-        saved[:-1],
-        saved[: len(saved) // 2],
-        b"{}",
-        hostile.npz(points=np.zeros((9, 3))),
-    ):
+    for content in (b"", saved[:-1], saved[: len(saved) // 2], b"{}", hostile.npz(points=np.zeros((9, 3)))):
         refusal(content)
     assert "no text that describes a motion" in refusal((ASSETS / "push_box.npz").read_bytes())
     (tmp_path / "large").write_bytes(bytes(MAX_BYTES + 1))
     with pytest.raises(dt.DataError, match="at most 40 MB"):
         dt.Motion.load(tmp_path / "large")
-    for path in (tmp_path, tmp_path / "nothing.npz", str(tmp_path / "nothing")):
+    for path in (tmp_path, str(tmp_path / "nothing")):
         with pytest.raises(dt.DataError, match="found no such file; accepted: a readable file"):
             dt.Motion.load(path)
 
 
-def read_mutated(saved, numbers, monkeypatch):
-    """Read changed files: each is a motion or refused; some are read, and most are not."""
-    for module in (hostile.solids, hostile.clouds):
-        monkeypatch.setattr(module, "NUM_NODES", 10**3)
+@pytest.mark.parametrize("num", [60, pytest.param(3000, marks=pytest.mark.slow)])
+def test_mutated_files_are_read_or_refused(saved, num):
+    """Some are read, and most are not."""
     mutations = (*hostile.EVERYWHERE, hostile.with_changed_members, *(hostile.with_changed_text,) * 12)
     num_read = 0
-    for number in numbers:
-        rng, content = np.random.default_rng((12, number)), saved
-        for _ in range(rng.integers(1, 4)):
-            content = mutations[int(rng.integers(len(mutations)))](content, rng)
+    for number in range(num):
+        content = hostile.mutated(saved, mutations, np.random.default_rng((12, number)))
         try:
             motion, imitation = read_motion(content, "a.npz")
         except dt.DataError:
@@ -418,16 +402,7 @@ def read_mutated(saved, numbers, monkeypatch):
         num_read += 1
         assert all(isinstance(layer.transform, registry.KINDS) for layer in motion.layers)
         assert np.isfinite(imitation.starts).all() and len(imitation.starts)
-    assert 0.02 * len(numbers) < num_read < 0.7 * len(numbers)
-
-
-def test_mutated_files_are_read_or_refused(saved, monkeypatch):
-    read_mutated(saved, range(60), monkeypatch)
-
-
-@pytest.mark.slow
-def test_very_many_mutated_files_are_read_or_refused(saved, monkeypatch):
-    read_mutated(saved, range(3000), monkeypatch)
+    assert 0.02 * num < num_read < 0.7 * num
 
 
 def test_meshes_are_shared_by_content(flat, tmp_path):
@@ -436,13 +411,3 @@ def test_meshes_are_shared_by_content(flat, tmp_path):
     flat.stack(dt.Avoidance(mesh)).save(tmp_path / "a")
     (again,) = dt.Motion.load(tmp_path / "a").transforms[0].avoided.parts
     assert again == mesh and cast(MeshObstacle, again).mesh.distances is mesh.mesh.distances
-
-
-def test_the_controller_follows_a_saved_motion(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(controller, "PERIOD", 0.1)
-    path = tmp_path / "around.npz"
-    controller.main(str(path))
-    learned = capsys.readouterr().out
-    assert path.exists()
-    controller.main(str(path))
-    assert capsys.readouterr().out == learned and "distance from the goal" in learned

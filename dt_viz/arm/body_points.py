@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dt_viz.arm.robot import NUM_JOINTS, KinematicChain, Robot
 from dt_viz.flows.fields import Array, Mask
+from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.properties import cached_property
 from dt_viz.shipped import ASSETS
 
@@ -56,6 +57,13 @@ class BodyPoints:
                 turned = (offset @ chain.axes[joint].reshape(3, 3 * num)).reshape(len(offset), 3, num)
                 positions[points] = turned + chain.origins[joint]
         return positions
+
+    @cached_property
+    def records(self) -> NDArray[np.void]:
+        """(P,) the points for compiled loops; all are on joints."""
+        points = np.zeros(len(self.joint), BODY_POINT)
+        points["joint"], points["offset"], points["radius"] = self.joint, self.offset, self.radius
+        return points
 
     @cached_property
     def by_joint(self) -> list[tuple[int, slice]]:

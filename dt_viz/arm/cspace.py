@@ -7,17 +7,20 @@ complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from dt_viz.arm.body_points import BodyPoints
-from dt_viz.arm.robot import NUM_JOINTS, KinematicChain, Robot, cross
+from dt_viz.arm.robot import NUM_JOINTS, Robot, cross
 from dt_viz.arm.tracking import DIRECTION_WEIGHT
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Array
 from dt_viz.interruption import checkpoint
+from dt_viz.kernels import escape
+from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.properties import cached_property
 
@@ -30,8 +33,6 @@ REACH_PER_TEMPERATURE = 0.08 / 6
 CORE = 0.5
 """Depth at which the field has its full strength, as a part of the way from touching the obstacle to its middle; deeper
 inside the strength is constant, so the middle is not singular."""
-SHARPNESS = 2
-"""Exponent p of the smooth maximum over body points: stronger contacts count more."""
 FAN = 4.0
 """Distance of the source, from which escaping points fan out, behind the obstacle's middle, in the obstacle's radii."""
 BEHIND = 1.25
@@ -45,8 +46,8 @@ LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
 PIN = 0.03
 """Size of the region around a pinned posture in which the field fades out, metres of that distance."""
 
-BLOCK = 4096
-"""Size of one joint's angles in what is evaluated in one step, bytes: intermediate results stay in the cache."""
+BLOCK = 64
+"""Number of configurations that a flow carries along between two looks at whether they are still wanted."""
 
 SPEED = 0.2
 """Distance that a contact at full strength escapes in a unit of flow time, metres."""
@@ -59,21 +60,17 @@ NEAREST_TO_LIMIT = 0.9
 
 @dataclass(frozen=True, eq=False)
 class ArmField:
-    """Base of the generators V_q on R⁶ of an arm and an obstacle."""
+    """Base of the generators V_q on R⁶ of an arm and obstacles."""
 
     robot: Robot
     body: BodyPoints
     """Body points that can be moved away."""
-    obstacle: Obstacle
+    obstacles: tuple[Obstacle, ...]
 
     @property
     def dim(self) -> int:
         """Dimension of configuration space."""
         return NUM_JOINTS
-
-    @cached_property
-    def _core(self) -> Array:
-        return -CORE * (self.obstacle.depth + self.body.radius)[:, None]
 
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
@@ -86,93 +83,91 @@ class ArmField:
         values = self(shifted).reshape(d, num, d)
         return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
 
-    def _distances(self, points: Array) -> Array:
-        """Return the distances (P, N) of the body points' spheres, at `points` (P, 3, N), from the obstacle."""
-        return self.obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
-
 
 @dataclass(frozen=True, eq=False)
 class WholeArmField(ArmField):
-    """Generator V_q whose reverse flow takes the arm out of an obstacle along an escape direction.
+    """Generator V_q whose reverse flow takes the arm out of obstacles, each along an escape direction.
 
-    A body point x_b with sphere radius r_b has the occupancy w_b = S(d(x_b) − r_b), d the distance from the obstacle's
+    A body point x_b with sphere radius r_b has the occupancy w_b = S(d(x_b) − r_b), d the distance from an obstacle's
     surface and S a smooth step from 1 inside to 0 at `reach`. The arm's contact is the average of its body points with
-    weights ŵ_b = w_b^p / Σw^p, with the Jacobian J_c = Σ ŵ_b J_b, the direction n_c = Σ ŵ_b n_b and the strength
-    m = (Σ w_b^p)^(1/p). It escapes by the weighted pseudo-inverse
+    weights ŵ_b = w_b²/Σw², with the Jacobian J_c = Σ ŵ_b J_b, the direction n_c = Σ ŵ_b n_b and the strength
+    m = √Σw_b². It escapes by the weighted pseudo-inverse
 
         −V_q(q) = v · m · χ(q) · H⁻¹ J_cᵀ (J_c H⁻¹ J_cᵀ + λ²I)⁻¹ n_c,   H = I + w_d DᵀD + w_x JᵀJ,
 
     which moves the contact along n_c with as little motion of the joints, the hand's direction (D) and the end effector
-    (J) as possible. χ vanishes at pinned postures, so start and goal do not move.
+    (J) as possible. χ vanishes at pinned postures, so start and goal do not move. Those of several obstacles add up.
 
     The plain gradient ∇_q ΣU(x_b) of the paper (`GradientField`) follows the joints' mobility instead: it sweeps along
     the path with the first joint and turns sharply, see dt_viz/README.md.
     """
 
-    direction: Array
-    """n, (3,) unit vector in which the arm escapes."""
+    directions: Array
+    """(K, 3) unit vectors in which the arm escapes from the obstacles."""
     pins: Array
-    """(K, 6) postures that do not move, rad."""
+    """(M, 6) postures that do not move, rad."""
     reach: float = 6 * REACH_PER_TEMPERATURE
-    """Distance from the obstacle's surface at which the field ends, metres."""
+    """Distance from an obstacle's surface at which the field ends, metres."""
 
     @cached_property
-    def _source(self) -> Array:
-        end = self.obstacle.radius + self.reach + self.body.radius.max()
-        behind = max(FAN * self.obstacle.radius, BEHIND * end)
-        return (np.asarray(self.obstacle.position) - behind * self.direction)[:, None]
+    def _escape(self) -> escape.Escape:
+        radius = np.array([obstacle.radius for obstacle in self.obstacles])
+        depth = np.array([obstacle.depth for obstacle in self.obstacles])
+        behind = np.maximum(FAN * radius, BEHIND * (radius + self.reach + self.body.radius.max()))
+        places = np.array([obstacle.position for obstacle in self.obstacles])
+        shapes, values = records(self.obstacles)
+        return escape.Escape(
+            joints=self.robot.records,
+            points=self.body.records,
+            hand=np.array(self.robot.end_effector_offset),
+            shapes=shapes,
+            values=values,
+            sources=places - behind[:, None] * self.directions,
+            cores=-CORE * (depth[:, None] + self.body.radius),
+            reach=float(self.reach),
+            speed=SPEED,
+            damping=DAMPING,
+            direction_weight=DIRECTION_WEIGHT,
+            hand_weight=HAND_WEIGHT,
+            pins=np.array(self.pins, dtype=float),
+            levers=np.array(LEVERS),
+            pin=PIN,
+        )
 
     def __call__(self, q: Array) -> Array:
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
-        size = BLOCK // q.itemsize
-        if len(q) > size:
-            return np.concatenate([self(q[i : i + size]) for i in range(0, len(q), size)])
-        checkpoint()
-        chain = self.robot.chain(q.T)
-        points = self.body.of_chain(chain)
-        distance = self._distances(points)
-        close = (distance.real < self.reach).any(axis=1)  # points away from the obstacle have no weight
-        velocity = np.zeros_like(q)
-        if not close.any():
-            return velocity
-        u = (self.reach - distance[close]) / (self.reach - self._core[close])
-        powers, points = _fading(u) ** SHARPNESS, points[close]  # (P', N), (P', 3, N)
-        total = powers.sum(axis=0)
-        near = np.flatnonzero(total.real > 0)
-        if len(near) < len(q):
-            chain = KinematicChain(*(_columns(part, near) for part in chain))
-            points, powers, total = _columns(points, near), _columns(powers, near), total[near]
-        weights = powers / total
-        outward = points - self._source
-        outward = outward / np.sqrt((outward * outward).sum(axis=1, keepdims=True))
-        wanted = SPEED * total ** (1 / SHARPNESS) * (weights[:, None] * outward).sum(axis=0)  # (3, M)
-        # J_c = Σ ŵ_b J_b: each joint moves the points beyond it
-        beyond = self.body.is_beyond[:, close]
-        lever = (beyond @ (weights[:, None] * points).reshape(len(points), -1)).reshape(NUM_JOINTS, 3, -1)
-        lever -= (beyond @ weights)[:, None] * chain.origins
-        J = cross(chain.axes[:, 2], lever) / DAMPING  # (6, 3, M)
-        stays = [
-            np.sqrt(DIRECTION_WEIGHT) * chain.direction_jacobian(),
-            np.sqrt(HAND_WEIGHT) * chain.position_jacobian(),
-        ]
-        # H⁻¹Jᵀ(JH⁻¹Jᵀ + λ²I)⁻¹ = (H + JᵀJ/λ²)⁻¹Jᵀ/λ²: one system in place of two
-        A = np.concatenate([J, *stays], axis=1).transpose(2, 1, 0)  # (M, 9, 6)
-        resistance = np.eye(NUM_JOINTS) + A.transpose(0, 2, 1) @ A
-        pull = (J * (wanted / DAMPING)).sum(axis=1).T
-        turning = np.linalg.solve(resistance, pull[..., None])[..., 0]
-        velocity[near] = -turning * self._freedom(q[near])[:, None]
-        return velocity
+        return escape.velocities(self._escape, np.array(q, order="C"))
 
-    def _freedom(self, q: Array) -> Array:
-        """Compute χ, (N,): 0 at the pins, 1 away from them."""
-        return np.prod(1 - np.exp(-squared_lengths(q, self.pins) / (2 * PIN**2)), axis=1)
+    def rk4(self, s: Array, duration: float, steps: int) -> Array:
+        """See `CompiledField`."""
+        return self._in_blocks(s, lambda block: escape.flow(self._escape, block, float(duration), steps))
+
+    def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
+        """See `CompiledField`."""
+
+        def carried(block: Array) -> Array:
+            q, num_failed = escape.adaptive_flow(self._escape, block, float(duration), float(tolerance), max_steps)
+            if num_failed:
+                raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
+            return q
+
+        return self._in_blocks(s, carried)
+
+    def _in_blocks(self, s: Array, carried: Callable[[Array], Array]) -> Array:
+        """Carry points (N, 6) along block by block, so that what is not wanted any more ends soon."""
+        blocks = [np.array(s[i : i + BLOCK], order="C") for i in range(0, len(s), BLOCK)]
+        done = []
+        for block in blocks:
+            checkpoint()
+            done.append(carried(block))
+        return np.concatenate(done) if done else s.copy()
 
 
 @dataclass(frozen=True, eq=False)
 class GradientField(ArmField):
     """The paper's generator V_q = ∇_q Σ_b U(x_b), U the occupancy w_b of `WholeArmField` times the depth it grows over.
 
-    It moves start and goal, too, and ignores the motion of the hand.
+    It moves start and goal, too, and ignores the motion of the hand. Those of several obstacles add up.
     """
 
     reach: float = 6 * REACH_PER_TEMPERATURE
@@ -182,25 +177,20 @@ class GradientField(ArmField):
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
         chain = self.robot.chain(q.T)
         points = self.body.of_chain(chain)
-        distance = self._distances(points)
-        u = _unit_interval((self.reach - distance) / (self.reach - self._core))
-        force: Array = -30 * (u * u * (1 - u) * (1 - u))[:, None] * self._outward(points)  # the slope of `_fading`
+        force: Any = sum(self._force(obstacle, points) for obstacle in self.obstacles)
         moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
         return (chain.axes[:, 2] * moment).sum(axis=1).T
+
+    def _force(self, obstacle: Obstacle, points: Array) -> Array:
+        """Compute the forces (P, 3, N) of one obstacle on body points (P, 3, N): −30u²(1 − u)² times their way out."""
+        distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        core = -CORE * (obstacle.depth + self.body.radius)[:, None]
+        u = _unit_interval((self.reach - distance) / (self.reach - core))
+        return -30 * (u * u * (1 - u) * (1 - u))[:, None] * _outward(obstacle, points)
 
     def _beyond(self, values: Array) -> Array:
         """Sum `values` (P, 3, N), for each joint over the points that it moves, (6, 3, N)."""
         return (self.body.is_beyond @ values.reshape(len(values), -1)).reshape(NUM_JOINTS, *values.shape[1:])
-
-    def _outward(self, points: Array) -> Array:
-        """Compute the slope (P, 3, N) of the obstacle's distance at `points` (P, 3, N) by differences, analytic."""
-        shifts = DIFFERENCE * np.eye(3)[:, None, None]
-        s = points.transpose(0, 2, 1)
-        near, far = (self._change(s, k * shifts) for k in (1, 2))  # (3, P, N)
-        return ((8 * near - far) / (12 * DIFFERENCE)).transpose(1, 0, 2)
-
-    def _change(self, s: Array, shifts: Array) -> Array:
-        return self.obstacle.signed_distance(s + shifts) - self.obstacle.signed_distance(s - shifts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,12 +248,9 @@ def _unit_interval(u: Array) -> Array:
     return np.where(u.real <= 0, 0.0, np.where(u.real >= 1, 1.0, u))
 
 
-def _fading(u: Array) -> Array:
-    """Smooth step from 0 at u = 0 to 1 at u = 1, with two derivatives of 0 at both ends."""
-    u = _unit_interval(u)
-    return u * u * u * (10 - 15 * u + 6 * u * u)
-
-
-def _columns(values: Array, columns: Indices) -> Array:
-    """Select columns of the last axis and keep it innermost in memory, which indexing would not."""
-    return values.take(columns, axis=-1)
+def _outward(obstacle: Obstacle, points: Array) -> Array:
+    """Compute the slope (P, 3, N) of an obstacle's distance at `points` (P, 3, N) by differences, analytic."""
+    shifts = DIFFERENCE * np.eye(3)[:, None, None]
+    s = points.transpose(0, 2, 1)
+    near, far = (obstacle.signed_distance(s + k * shifts) - obstacle.signed_distance(s - k * shifts) for k in (1, 2))
+    return ((8 * near - far) / (12 * DIFFERENCE)).transpose(1, 0, 2)  # of (3, P, N)

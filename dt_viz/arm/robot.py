@@ -17,6 +17,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
+from dt_viz.kernels.arm import JOINT
+from dt_viz.properties import cached_property
+
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
@@ -96,6 +99,13 @@ class Robot:
         return np.clip(q, self.lower, self.upper)
 
     # --- Kinematics ---
+
+    @cached_property
+    def records(self) -> NDArray[np.void]:
+        """(6,) joints for compiled loops."""
+        joints = np.zeros(NUM_JOINTS, JOINT)
+        joints["rotation"], joints["translation"] = self.joint_rotations, self.joint_translations
+        return joints
 
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
         """Compute the poses of the six joint frames (each turns with the link after it).

@@ -8,7 +8,7 @@ drag costs p(t) = ψ_q⁻¹(q(t)) only, one batched flow in R⁶.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,11 +30,13 @@ from dt_viz.arm.escape import ALIKE, escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import JointPath, track
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
-from dt_viz.flows.fields import Array, Indices, Mask, Sum, VectorField
-from dt_viz.flows.integrators import rk4
+from dt_viz.flows.fields import Array, Indices, Mask, VectorField
+from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.interruption import checkpoint
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.kernels.arm import clearance
+from dt_viz.obstacles.arrays import records
+from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import Way, remembered
 from dt_viz.properties import cached_property
@@ -212,6 +214,23 @@ class WholeArm:
         """The same, and what the hand holds."""
         self.limits = JointLimits(robot.lower, robot.upper)
 
+    def compiled(self) -> Iterator[float]:
+        """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
+        q, field = (
+            self.robot.home[None],
+            WholeArmField(self.robot, self.body, (Sphere((0.0, 0.0, 0.0)),), np.eye(3)[:1], np.empty((0, NUM_JOINTS))),
+        )
+        calls: tuple[Callable[[], object], ...] = (
+            lambda: self.clearance(q, Union(field.obstacles)),
+            lambda: field(q),
+            lambda: field.rk4(q, 1.0, 1),
+            lambda: field.dormand_prince(q, 1.0, TOLERANCE, 1000),
+            lambda: field.with_jacobian(q),
+        )
+        for done, call in enumerate(calls, start=1):
+            call()
+            yield done / len(calls)
+
     def undisturbed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float) -> ArmSolution:
         """The motions as lifted, avoiding nothing."""
         return _Solver(self, lifted, avoidance, None, spacing, coarse=True).solution()
@@ -319,8 +338,8 @@ class WholeArm:
 
     def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
-        points = self.body.of_chain(self.robot.chain(q.T))
-        return (obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]).min(axis=0)
+        shapes, values = records(obstacle.parts if isinstance(obstacle, Union) else (obstacle,))
+        return clearance(self.robot.records, self.body.records, shapes, values, np.array(q, order="C"))
 
     def mesh_clearance(self, q: Array, obstacle: Union | Obstacle, enough: Array) -> Array:
         """Distance (N,), metres, of the arm's meshes at configurations q (N, 6) from the obstacle.
@@ -337,9 +356,11 @@ class WholeArm:
         """The field whose flow takes these ways, with these postures (K, 6) at rest, where the flow meets them."""
         reach = REACH_PER_TEMPERATURE * avoidance.temperature
         met = [way for way in ways if way is not None]
+        obstacles = tuple(way.obstacle for way in met)
         if avoidance.generator == "probability":
-            return Sum(tuple(GradientField(self.robot, self.body, way.obstacle, reach) for way in met))
-        return Sum(tuple(WholeArmField(self.robot, self.body, w.obstacle, w.direction, pins, reach) for w in met))
+            return GradientField(self.robot, self.body, obstacles, reach)
+        directions = np.stack([way.direction for way in met])
+        return WholeArmField(self.robot, self.body, obstacles, directions, pins, reach)
 
     def _sides(self, lifted: Lift, avoidance: ArmAvoidance, before: Sequence[Way | None]) -> list[list[Array]]:
         """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it.
@@ -483,7 +504,7 @@ class _Solver:
         if self._avoidance.integration.by_hand:
             flow = self._avoidance.integration.of(Flow(self._generator, duration))
         elif self._coarse:
-            flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP), sparse=True)
+            flow = Flow(self._generator, duration, math.ceil(duration / COARSE_STEP))
         else:
             flow = AdaptiveFlow(self._generator, duration, TOLERANCE)
         return Conjugated(flow, limits)
@@ -545,7 +566,7 @@ class _Solver:
             if duration >= MAX_DURATION:
                 return MAX_DURATION
             checkpoint()
-            state, _ = rk4(self._generator, state, None, -SNAPSHOT)
+            state, _ = integrate(rk4, self._generator, state, None, -SNAPSHOT, 1)
             before, lack = lack, self._lack(limits.inverse(state))
             if (lack <= 0).all():
                 return duration + SNAPSHOT * _crossing(before, lack)
@@ -562,7 +583,7 @@ class _Solver:
         state, lack = limits.forward(p), self._mesh_lack(p)
         for done in np.arange(0, MAX_EXTENSION, EXTENSION_STEP):
             checkpoint()
-            state, _ = rk4(self._generator, state, None, -EXTENSION_STEP)
+            state, _ = integrate(rk4, self._generator, state, None, -EXTENSION_STEP, 1)
             before, lack = lack, self._mesh_lack(limits.inverse(state), SPEED * EXTENSION_STEP)
             clear = lack <= 0
             if clear.any():

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from dt_viz.arm.tracking import track
+from dt_viz.control.controller import Controller, Phase
 from dt_viz.flows.fields import Array
-from dt_viz.motion.control import Controller, Phase
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.transforms.base import ArmAvoidance
@@ -200,11 +200,12 @@ class LiveArm:
         if self._let_go and (moves or len(controller.ahead) < 2):
             self._held, self._let_go = None, False
             controller.release()
-        if not moves and controller.phase is not Phase.HELD:
-            return
         seen, self._seen = self._seen, None
         if seen is not None:
             controller.see(*seen)
+        if not moves and controller.phase is not Phase.HELD:
+            controller.watch()
+            return
         self._due = min(self._due + seconds, LONGEST)
         ticks = int(self._due / TICK)
         self._due -= ticks * TICK

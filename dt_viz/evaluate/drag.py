@@ -47,7 +47,8 @@ from dt_viz.evaluate.options import (
     write_npz,
 )
 from dt_viz.flows.fields import Array, Mask
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.obstacles.shapes import Sphere, as_point

@@ -51,7 +51,8 @@ from dt_viz.evaluate.options import (
     write_json,
 )
 from dt_viz.evaluate.protocol_client import ROLLOUT, ProtocolClient
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.motion.nominal import NUM_SAMPLES
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario

@@ -55,7 +55,8 @@ from dt_viz.evaluate.options import (
     write_json,
 )
 from dt_viz.evaluate.protocol_client import ROLLOUT, LostError, ProtocolClient
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Point, Sphere, as_point
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance

@@ -51,7 +51,8 @@ from dt_viz.evaluate.options import (
     write_npz,
 )
 from dt_viz.flows.fields import Array
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point, golden_spiral
 from dt_viz.obstacles.union import Union

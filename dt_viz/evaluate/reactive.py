@@ -1,13 +1,10 @@
 """Let a sphere cross the motion of the robot in the loop, on random smooth paths, and measure how it dodges.
 
 The sphere's path has its middle at the hand of the undisturbed motion, and the sphere is there when the hand would be.
-Stacks take over as late as computing them took; the file holds these times, and `--delays` of it repeats a run.
 The npz file holds for run i:
 
 ``q_i`` (T, 6), ``t_i`` (T,), ``obstacle_i`` (T, 3)
     joint angles, rad, seconds, and the sphere's centre, metres, at each tick; NaN once it has gone.
-``delays_i`` (S,)
-    seconds that each stack took.
 
 and ``diameter``, metres. With `--beside`, ``potential_q_i`` and ``stepped_q_i`` with their ``_t_i`` and ``_obstacle_i``
 are those of the same arm with a repulsive potential field, and of its field stepped at the paper's 20 Hz.
@@ -18,7 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,6 +25,8 @@ from dt_viz.arm.arm_system import ArmSystem, Section
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import REACH_PER_TEMPERATURE
 from dt_viz.arm.robot import NUM_JOINTS, Robot, cross, load_jaco
+from dt_viz.control.controller import Controller, Phase
+from dt_viz.control.settings import ControllerSettings
 from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.options import (
     add_task,
@@ -40,19 +39,20 @@ from dt_viz.evaluate.options import (
     write_npz,
 )
 from dt_viz.flows.fields import Array
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.motion.control import ACCELERATION, Controller, Phase
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.base import ArmAvoidance
 
 TICK = 0.01
 """Time between two ticks, seconds."""
-STACK_PERIOD = 0.03
-"""Shortest time between the beginnings of two stacks, and time between two looks at the sphere, seconds."""
+LOOK_PERIOD = 0.03
+"""Time between two looks at the sphere, seconds."""
 HALF_LENGTH = 0.40
 """Half the length of a sphere's path, metres."""
 WIGGLE, WAVELENGTH = 0.04, 0.5
@@ -108,7 +108,6 @@ class Run:
     q: list[Array] = field(default_factory=list)
     t: list[float] = field(default_factory=list)
     obstacle: list[Array] = field(default_factory=list)
-    delays: list[float] = field(default_factory=list)
     ticks: list[float] = field(default_factory=list)
     """Processor times of the ticks, seconds."""
     phases: set[Phase] = field(default_factory=set)
@@ -128,38 +127,23 @@ class Arm(Protocol):
 
 
 class InTheLoop:
-    """The controller, with stacks that are late."""
+    """The controller, which looks at the sphere now and then."""
 
-    def __init__(self, bench: Bench, crossing: Crossing, delays: Array | None, *, anticipates: bool) -> None:
-        self._bench, self._delays = bench, delays
-        blind = {} if anticipates else {"lead": 0.0, "room": 0.0}
-        self.controller = Controller(bench.follower, bench.solved, **blind)
+    def __init__(self, bench: Bench, crossing: Crossing, settings: ControllerSettings) -> None:
+        self._bench, self.controller = bench, Controller(bench.follower, bench.solved, settings)
+        self.controller.begin(bench.starts[crossing.start], crossing.start)
         self.controller.home(crossing.start)
-        self._pending: Any = None
-        self._ready, self._next, self._looks, self._went, self._present = 0.0, 0.0, 0.0, False, True
+        self._looks, self._went, self._present = 0.0, False, True
 
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
         """See `Arm`."""
         if not self._went and t >= crossing.begins:
             self.controller.go()
             self._went = True
-        if self._pending is not None and t >= self._ready:
-            self.controller.take(self._pending)
-            self._pending = None
         present = t < crossing.gone
-        solved = self._bench.around(self._bench.sphere(crossing.at(t)) if present else ())
-        if t >= self._looks and run.q[1:]:
-            self.controller.see(solved.scenario.arm_avoidance)
-            self._looks = t + STACK_PERIOD
-        if self._pending is None and t >= self._next and run.q[1:] and (present or self._present):
-            self._present = present
-            began = time.thread_time()
-            self._pending = self.controller.prepared(solved)
-            delay = time.thread_time() - began
-            if self._delays is not None and len(run.delays) < len(self._delays):
-                delay = float(self._delays[len(run.delays)])
-            run.delays.append(delay)
-            self._ready, self._next = t + delay, t + STACK_PERIOD
+        if t >= self._looks and (present or self._present):
+            self._present, self._looks = present, t + LOOK_PERIOD
+            self.controller.see(self._bench.avoidance(self._bench.sphere(crossing.at(t)) if present else ()))
         began = time.thread_time()
         velocity = self.controller.step(q, TICK)
         run.ticks.append(time.thread_time() - began)
@@ -191,10 +175,9 @@ class Bench:
         """The sphere with its centre at a place (3,), metres."""
         return Sphere(as_point(place), self.diameter)
 
-    def around(self, obstacle: Sphere | tuple[()]) -> Solved:
-        """The stack with the sphere somewhere; that of the end effector is the same everywhere."""
-        avoidance = Avoidance(obstacle, space="cspace", margin=self.margin)
-        return replace(self.solved, scenario=avoiding(self._task, avoidance))
+    def avoidance(self, obstacle: Sphere | tuple[()]) -> ArmAvoidance | None:
+        """What the whole arm is to avoid."""
+        return avoiding(self._task, Avoidance(obstacle, space="cspace", margin=self.margin)).arm_avoidance
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
@@ -303,7 +286,7 @@ class _Field:
             self._next += self._period
         limits = self._bench.robot.velocity_limits
         wanted = self._wanted * min(1.0, float((limits / np.maximum(np.abs(self._wanted), 1e-9)).min()))
-        change = ACCELERATION * TICK
+        change = ControllerSettings().acceleration * TICK
         self._velocity = np.clip(wanted, self._velocity - change, self._velocity + change)
         room = self._bench.robot.lower - q, self._bench.robot.upper - q
         self._velocity, self._q = np.clip(self._velocity, room[0] / TICK, room[1] / TICK), q
@@ -361,7 +344,7 @@ class Stepped(_Field):
 
     def _at(self, q: Array, sphere: Sphere | None) -> Array:
         bench = self._bench
-        self._dodging.follow(bench.around(() if sphere is None else sphere))
+        self._dodging.see(bench.avoidance(() if sphere is None else sphere))
         self._dodging.step(q, self._period)
         system: ArmSystem = self._dodging.system
         return system.velocity(bench.follower.whole_arm.limits.inside(q))
@@ -375,9 +358,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the paths (default: %(default)s)")
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
-    parser.add_argument("--no-anticipation", action="store_true", help="stacks for where the sphere was seen")
+    parser.add_argument("--no-anticipation", action="store_true", help="the flow is made for where the sphere was seen")
     parser.add_argument("--beside", action="store_true", help="also a potential field, and stepping at 20 Hz")
-    parser.add_argument("--delays", type=Path, metavar="F.npz", help="of an earlier run, which this repeats")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
@@ -388,24 +370,19 @@ def run(options: argparse.Namespace) -> int:
     bench = Bench(
         Engine(tasks, FitStore(default_cache_folder()), load_jaco()), task.name, options.diameter, options.margin
     )
-    recorded = np.load(options.delays) if options.delays is not None else {}
-    kinds: dict[str, Callable[[Crossing, int], Arm]] = {
-        "": lambda crossing, i: InTheLoop(
-            bench, crossing, recorded.get(f"delays_{i}"), anticipates=not options.no_anticipation
-        )
-    }
+    settings = ControllerSettings(lead=0.0, room=0.0) if options.no_anticipation else ControllerSettings()
+    kinds: dict[str, Callable[[Crossing], Arm]] = {"": lambda crossing: InTheLoop(bench, crossing, settings)}
     if options.beside:
-        kinds |= {"potential_": lambda crossing, _: Potential(bench), "stepped_": lambda crossing, _: Stepped(bench)}
+        kinds |= {"potential_": lambda _: Potential(bench), "stepped_": lambda _: Stepped(bench)}
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: dict[str, list[Figures]] = {kind: [] for kind in kinds}
     rows = []
     for i, (crossing, seconds) in enumerate(crossings(bench, options.speed, options.runs, options.seed)):
         for kind, make in kinds.items():
-            found = simulated(bench, crossing, make(crossing, i))
+            found = simulated(bench, crossing, make(crossing))
             figures[kind].append(Figures.of(bench, crossing, found, seconds))
             arrays |= {f"{kind}q_{i}": found.q, f"{kind}t_{i}": found.t, f"{kind}obstacle_{i}": found.obstacle}
             if not kind:
-                arrays[f"delays_{i}"] = found.delays
                 rows.append((str(i), *figures[kind][-1].cells()))
                 print(*rows[-1], " ".join(sorted(p.value for p in found.phases)), flush=True)
     write_npz(out, **arrays)
@@ -417,7 +394,7 @@ def run(options: argparse.Namespace) -> int:
 
 HEADER = (
     "", "without contact", "clearance mm", "goal reached", "velocity", "acceleration",
-    "time lost s", "tick ms", "stack ms",
+    "time lost s", "tick ms",
 )  # fmt: skip
 
 
@@ -436,7 +413,6 @@ class Figures:
     lost: float
     """Time by which it arrived later than without a sphere, seconds."""
     ticks: Array
-    delays: Array
 
     @classmethod
     def of(cls, bench: Bench, crossing: Crossing, run: Run, seconds: float) -> Figures:
@@ -447,10 +423,9 @@ class Figures:
             smallest_distance(bench, run),
             float(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal)),
             float((np.abs(velocity) / bench.robot.velocity_limits).max()),
-            float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ACCELERATION),
+            float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ControllerSettings().acceleration),
             run.t[-1] - crossing.begins - seconds,
             np.array(run.ticks),
-            np.array(run.delays),
         )
 
     def cells(self) -> tuple[str, ...]:
@@ -465,10 +440,10 @@ def summary(found: list[Figures]) -> tuple[str, ...]:
     """The figures of all runs."""
     num = len(found)
     free, reached = sum(f.distance > 0 for f in found), sum(f.missed <= AT_GOAL for f in found)
-    ticks, delays = (np.concatenate([getattr(f, name) for f in found]) for name in ("ticks", "delays"))
-    timed = [f"{1e3 * np.median(t):.2f} ({1e3 * t.max():.0f})" if len(t) else "" for t in (ticks, delays)]
+    ticks = 1e3 * np.concatenate([f.ticks for f in found])
+    timed = f"{np.median(ticks):.2f} ({np.percentile(ticks, 95):.1f}, {ticks.max():.0f})" if len(ticks) else ""
     return (
         f"{free} of {num}", f"{1e3 * min(f.distance for f in found):.1f}", f"{reached} of {num}",
         f"{max(f.velocity for f in found):.3f}", f"{max(f.acceleration for f in found):.3f}",
-        f"{np.median([f.lost for f in found]):.1f} ({max(f.lost for f in found):.1f})", *timed,
+        f"{np.median([f.lost for f in found]):.1f} ({max(f.lost for f in found):.1f})", timed,
     )  # fmt: skip

@@ -44,7 +44,8 @@ from dt_viz.evaluate.options import (
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.transforms.avoidance import Avoidance
 

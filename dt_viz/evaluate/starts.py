@@ -22,7 +22,8 @@ from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to
 from dt_viz.flows.fields import Array
 from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 
 NUM_SAMPLES = 50
 """Number of samples of a rollout at which det J is computed."""

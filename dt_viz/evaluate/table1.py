@@ -51,7 +51,8 @@ from dt_viz.evaluate.avoidance import TURN_ARC
 from dt_viz.evaluate.figure6 import MATPLOTLIB, draw
 from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json, write_npz
 from dt_viz.flows.fields import Array
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.metrics import (
     dynamic_time_warping,
     frechet,

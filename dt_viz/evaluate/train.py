@@ -27,7 +27,8 @@ from dt_viz.baselines.registry import TRAINED, problem_of
 from dt_viz.baselines.weights import save_weights, weights_file
 from dt_viz.evaluate.held_out import folds_of, frechet
 from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union

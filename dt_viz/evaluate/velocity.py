@@ -23,7 +23,8 @@ import numpy as np
 from dt_viz.evaluate.options import add_task, chosen_task, print_table, ready_to_write, whole_number, write_json
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import CONTROLLER_TOLERANCE, DiffeomorphicSystem
-from dt_viz.learning.store import FitStore, default_cache_folder
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.stack import FINE, build_stack
 from dt_viz.obstacles.clouds import Cloud

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,19 @@ class VectorField(Protocol):
 
     def with_jacobian(self, s: Array, /) -> tuple[Array, Array]:
         """V (N, d) and its derivative DV (N, d, d), DV[:, i, j] = ∂V_i/∂s_j, at the points `s` (N, d)."""
+        ...
+
+
+@runtime_checkable
+class CompiledField(VectorField, Protocol):
+    """A field whose flow is a compiled loop over the points, without tangents."""
+
+    def rk4(self, s: Array, duration: float, steps: int) -> Array:
+        """Carry the points `s` (N, d) along in equal steps of the classical Runge–Kutta method."""
+        ...
+
+    def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
+        """Carry the points `s` (N, d) along as `integrate_adaptive` does. Raises ArithmeticError as it does."""
         ...
 
 

@@ -11,8 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dt_viz.flows.fields import Array, Mask, VectorField
+from dt_viz.flows.fields import Array, CompiledField, Mask, VectorField
 from dt_viz.interruption import checkpoint
+from dt_viz.kernels.dormand_prince import ERROR, LONGEST_TURN, ROUNDING, SHORT, STAGES, STRAIGHT, TURN_ERROR
 
 Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
 
@@ -71,6 +72,8 @@ def integrate(
     step: Step, field: VectorField, s: Array, U: Array | None, duration: float, steps: int
 ) -> tuple[Array, Array | None]:
     """Carry `s` (N, d) and `U` (N, d, k) along the flow of `field` for `duration` in equal `steps`."""
+    if U is None and step is rk4 and isinstance(field, CompiledField):
+        return field.rk4(s, duration, steps), None
     h = duration / steps
     for _ in range(steps):
         checkpoint()
@@ -95,6 +98,8 @@ def integrate_adaptive(
     total = np.abs(duration)
     if total == 0 or not len(s):
         return s, U
+    if U is None and isinstance(field, CompiledField):
+        return field.dormand_prince(s, duration, tolerance, max_rounds), None
     d = s.shape[1]
     state, rate = _augment(field, s, U)
     state = state.copy()
@@ -111,13 +116,13 @@ def integrate_adaptive(
             return _split(state, s, U)
         checkpoint()
         step = np.sign(duration) * h[:, None]
-        stages = np.empty((len(_DP_STAGES), *start.shape))
+        stages = np.empty((len(STAGES), *start.shape))
         end, stages[0] = start, first
-        for i, row in enumerate(_DP_STAGES[1:], start=1):
+        for i, row in enumerate(STAGES[1:], start=1):
             # the last stage point is the fifth-order result: first same as last
             end = start + step * _combined(row[:i], stages[:i])
             stages[i] = rate(end)
-        defect = step * _combined(_DP_ERROR, stages)
+        defect = step * _combined(ERROR, stages)
         # beside a rest point a small error is large relative to the motion, and grows with it
         allowed = _allowed(np.abs(end - start)[:, :d].max(axis=1), tolerance)
         error = np.abs(defect[:, :d]).max(axis=1) / allowed
@@ -136,32 +141,8 @@ def integrate_adaptive(
     raise ArithmeticError(f"{len(active)} points need more than {max_rounds} steps: the field is too steep for them")
 
 
-_DP_STAGES = np.array(
-    [
-        (0, 0, 0, 0, 0, 0),
-        (1 / 5, 0, 0, 0, 0, 0),
-        (3 / 40, 9 / 40, 0, 0, 0, 0),
-        (44 / 45, -56 / 15, 32 / 9, 0, 0, 0),
-        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0),
-        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0),
-        (35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-    ]
-)
-_DP_ERROR = np.array((71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40))
-
-
-SHORT = 1 / 15
-"""Motion of a step, in the unit of the points, from which on its error may be the whole tolerance. In the core of an
-obstacle space is squeezed ten thousand times; the inverse magnifies errors as much, so the relative error counts."""
 TANGENT_TOLERANCE = 3e-4
 """Largest estimated error of a step's tangents, relative to their largest entry."""
-ROUNDING = 1e-15
-"""Difference of coordinates, in their unit, below which rounding hides it."""
-STRAIGHT = 0.1
-"""Largest relative change of the velocity along a motion that counts as straight."""
-LONGEST_TURN, TURN_ERROR = 0.8, 3e-4
-"""Length of a first step, in units of the time in which the velocity changes by its own size, and the error of such a
-step relative to its motion, about."""
 
 
 def _combined(coefficients: Array, stages: Array) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -31,11 +30,6 @@ LONGEST_WRITE = 3600.0
 
 LONGEST_WITHOUT_REPORT = 0.2
 """Longest time between two progress reports to those who wait for a fit, seconds."""
-
-
-def default_cache_folder() -> Path:
-    """Return `$XDG_CACHE_HOME/dt-viz`, or `~/.cache/dt-viz`."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dt-viz"
 
 
 class _AbandonedError(Exception):

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pinocchio_arm import random_configurations
 from scipy.spatial import KDTree
 
 from dt_viz.arm.body_points import BodyPoints, load_body_points
 from dt_viz.arm.collision import load_collision_model
-from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes
+from dt_viz.arm.robot import LinkMesh, Robot, collision_meshes
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.shipped import ASSETS
 
@@ -26,11 +27,6 @@ each_joint = pytest.mark.parametrize("joint", OVERSHOOT)
 @pytest.fixture(scope="module")
 def body() -> BodyPoints:
     return load_body_points()
-
-
-def random_configurations(robot: Robot, seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, 2 * np.pi)
-    return np.random.default_rng(seed).uniform(lower, upper, (*shape, NUM_JOINTS))
 
 
 def on_surface(mesh: LinkMesh, num: int = 50_000) -> np.ndarray:
@@ -73,11 +69,8 @@ def clearance(body: BodyPoints, robot: Robot, q: np.ndarray, obstacle: Sphere) -
 
 class TestCover:
     @each_link
-    def test_no_point_of_a_link_sticks_out_of_its_joints_spheres(self, body, mesh):
+    def test_no_point_of_a_link_sticks_out_of_its_joints_spheres_and_each_triangle_lies_in_one(self, body, mesh):
         assert beyond_spheres(on_surface(mesh), body, mesh.joint).min(axis=1).max() <= 1e-6
-
-    @each_link
-    def test_each_triangle_lies_in_one_sphere(self, body, mesh):
         of_corners = beyond_spheres(mesh.vertices, body, mesh.joint)[mesh.faces]
         assert of_corners.max(axis=1).min(axis=1).max() <= 1e-6
 
@@ -141,27 +134,18 @@ class TestPositions:
                 expected = rotations[..., joint, :, :] @ offset + origins[..., joint, :]
             np.testing.assert_allclose(positions[..., i, :], np.broadcast_to(expected, (*shape, 3)), atol=1e-14)
 
-    def test_pedestal_and_moving_links_are_all_there_is(self, body, robot):
-        q = random_configurations(robot, 1, (3,))
-        parts = [body.on_pedestal, body.on_moving_links]
+    def test_pedestal_and_moving_links_are_all_there_is_and_the_end_effector_is_one_more(self, body, robot):
+        q, more = random_configurations(robot, 1, (3,)), body.with_end_effector(robot, 0.01)
+        positions, parts = more.positions(robot, q), [body.on_pedestal, body.on_moving_links]
         together = np.concatenate([part.positions(robot, q) for part in parts], axis=1)
         np.testing.assert_array_equal(together, body.positions(robot, q))
-        assert parts[0].joint.max() == 0
-        assert parts[1].joint.min() == 1
-
-    def test_the_end_effector_is_one_more(self, body, robot):
-        q, more = random_configurations(robot, 1, (3,)), body.with_end_effector(robot, 0.01)
-        positions = more.positions(robot, q)
-        np.testing.assert_array_equal(positions[:, :-1], body.positions(robot, q))
+        np.testing.assert_array_equal(together, positions[:, :-1])
         np.testing.assert_allclose(positions[:, -1], robot.end_effector(q), atol=1e-12)
-        assert more.radius[-1] == 0.01
-
-    def test_those_of_each_joint_are_together(self, body, robot):
-        for part in (body, body.on_moving_links, body.on_pedestal, body.with_end_effector(robot, 0.01)):
+        assert (parts[0].joint.max(), parts[1].joint.min(), more.radius[-1]) == (0, 1, 0.01)
+        for part in (body, more, *parts):
             covered = np.concatenate([np.arange(len(part.joint))[points] for _, points in part.by_joint])
             np.testing.assert_array_equal(covered, np.arange(len(part.joint)))
-            for joint, points in part.by_joint:
-                assert (part.joint[points] == joint).all()
+            assert all((part.joint[points] == joint).all() for joint, points in part.by_joint)
 
 
 @pytest.mark.parametrize("seed", range(5))

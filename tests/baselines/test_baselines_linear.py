@@ -10,7 +10,6 @@ from dt_viz.arm.robot import collision_meshes
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.postures import NUM_SAMPLES, Query, Surroundings, planned
-from dt_viz.interruption import interruptible
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 
@@ -38,17 +37,11 @@ def test_a_start_out_of_reach_is_refused(problem):
         Linear().fit(problem).plan(Union(), np.array([[2.0, 0.0, 0.5]]))
 
 
-def test_an_obstacle_changes_nothing_and_what_interrupts_it_ends_it(problem):
-    planner, starts = Linear().fit(problem), problem.task.starts
-    free = planner.plan(Union(), starts)
+def test_an_obstacle_changes_nothing(problem):
+    planner, start = Linear().fit(problem), problem.task.starts[:1]
+    free = planner.plan(Union(), start)
     ball = Union((Sphere(as_point(free.paths[0][100]), 0.15),))
-    np.testing.assert_array_equal(joints_of(free)[0], joints_of(planner.plan(ball, starts))[0])
-
-    def interrupted():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), interruptible(interrupted):
-        planner.plan(ball, starts)
+    np.testing.assert_array_equal(joints_of(free)[0], joints_of(planner.plan(ball, start))[0])
 
 
 def test_corners_are_kept_and_joints_stay_within_their_velocity_limits(problem):
@@ -99,13 +92,12 @@ class TestSurroundings:
         assert 3 < sum(verdicts) < 27
 
     def test_what_is_far_from_everything_is_free(self, problem, lines):
-        far = Surroundings.of(problem.robot, Union((Sphere((5.0, 0.0, 0.0), 0.1),)))
-        nothing, model = Surroundings.of(problem.robot, Union()), load_collision_model()
+        model = load_collision_model()
+        far, nothing = (Surroundings.of(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
         for line in lines[:15]:
             itself = model.nearest_to_itself(np.stack(line))
-            clear = self.depth(problem.robot, far.obstacle, *line) > 1e-3 and (itself is None or itself.distance > 0)
             assert far.is_free(*line) == nothing.is_free(*line)
-            if clear:
+            if self.depth(problem.robot, far.obstacle, *line) > 1e-3 and (itself is None or itself.distance > 0):
                 assert nothing.is_free(*line)
 
     def test_nothing_between_two_samples_is_passed_through(self, problem, lines):

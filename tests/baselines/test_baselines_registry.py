@@ -14,21 +14,12 @@ def in_the_way(problem):
     return Union((Sphere(problem.task.obstacle_position, 0.15),))
 
 
-def test_methods_are_known_by_their_name_and_say_what_they_promise():
-    for name, method in METHODS.items():
-        assert name == method.name
-        assert method.title and method.promise.endswith(".")
-        assert method.promise.startswith("Stable") == method.stable
+def test_methods_are_known_by_their_name_and_promise_stability_unless_they_plan_a_path_once():
     assert TRAINED.keys() <= METHODS.keys()
-
-
-def test_no_method_that_plans_a_path_once_is_stable():
-    assert {name for name, method in METHODS.items() if method.stable} == {
-        "ours",
-        "ours-no-avoidance",
-        "eflow",
-        "signed-distance",
-    }
+    assert [method.name for method in METHODS.values()] == list(METHODS)
+    assert all(method.promise.startswith("Stable") == method.stable for method in METHODS.values())
+    stable = {name for name, method in METHODS.items() if method.stable}
+    assert stable == {"ours", "ours-no-avoidance", "eflow", "signed-distance"}
 
 
 def test_the_arm_follows_each_demonstration(problem, robot):
@@ -59,9 +50,15 @@ def test_where_nothing_can_move_the_arm_stays_at_its_starts(problem, robot):
     assert np.linalg.norm(np.concatenate(plan.paths) - problem.task.starts[:2], axis=1).max() < 1e-4
 
 
-def test_what_interrupts_a_plan_ends_it(problem, in_the_way):
-    def interrupted():
-        raise TimeoutError
+@pytest.mark.parametrize(("name", "late"), [("ours", 5), ("linear", 2), ("mpnet", 5)])
+def test_what_interrupts_a_plan_ends_it(problem, in_the_way, name, late):
+    planner, calls = METHODS[name].fit(problem), []
 
-    with pytest.raises(TimeoutError), interruptible(interrupted):
-        METHODS["ours"].fit(problem).plan(in_the_way, problem.task.starts)
+    def interrupted():
+        calls.append(0)
+        if len(calls) == late:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), interruptible(interrupted):
+        planner.plan(in_the_way, problem.task.starts[:2])
+    assert len(calls) == late

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import central_differences
 from plans import eflow_weights as weights
 
 from dt_viz.baselines import repulsive
 from dt_viz.baselines.eflow import EFlowSystem
 from dt_viz.baselines.repulsive import RANGE, STRONGEST, repulsion
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import TASKS
 
@@ -21,29 +22,17 @@ def at_distances(distances):
     return np.array(SPHERE.parts[0].position) + np.outer(0.075 + np.array(distances), [1.0, 0.0, 0.0])
 
 
-def test_it_is_zero_outside_its_range_and_continuous_there():
-    y = at_distances([RANGE + 1e-9, 2 * RANGE, 1.0])
-    distance, velocity = repulsion(SPHERE, y)
-    assert np.allclose(distance, [RANGE, 2 * RANGE, 1.0])
+def test_it_is_the_gradient_of_its_potential_up_to_a_bound_ends_at_its_range_and_leads_away_inside():
+    def potential(y):
+        return 0.5 * repulsive.GAIN * (1 / SPHERE.signed_distance(y) - 1 / RANGE) ** 2
+
+    near = at_distances(np.array([0.9, 0.7, 0.5, 0.3]) * RANGE)
+    expected = -central_differences(potential, near, 1e-5)
+    np.testing.assert_allclose(repulsion(SPHERE, near)[1], expected, rtol=1e-4, atol=1e-9)
+    distance, velocity = repulsion(SPHERE, at_distances([RANGE + 1e-9, 2 * RANGE, 1.0]))
+    np.testing.assert_allclose(distance, [RANGE, 2 * RANGE, 1.0])
     assert not velocity.any()
-    assert 0 < np.linalg.norm(repulsion(SPHERE, at_distances([RANGE - 1e-6]))[1]) < 1e-4
-
-
-def test_it_leads_away_and_grows_towards_the_obstacle_up_to_a_bound():
-    distances = np.array([0.9, 0.7, 0.5, 0.3]) * RANGE
-    _, velocity = repulsion(SPHERE, at_distances(distances))
-    assert (np.diff(velocity[:, 0]) > 0).all()
-    assert np.abs(velocity[:, 1:]).max() < 1e-12
-    _, inside = repulsion(SPHERE, at_distances([-0.01, -0.05]))
-    assert np.allclose(inside, [[STRONGEST, 0, 0]] * 2)
-
-
-def test_it_is_the_gradient_of_the_potential():
-    y = at_distances([0.5 * RANGE])
-    potential = lambda y: 0.5 * repulsive.GAIN * (1 / SPHERE.signed_distance(y) - 1 / RANGE) ** 2  # noqa: E731
-    h = 1e-7
-    slope = [(potential(y + e) - potential(y - e)).item() / (2 * h) for e in h * np.eye(3)]
-    assert np.allclose(repulsion(SPHERE, y)[1][0], -np.array(slope), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(repulsion(SPHERE, at_distances([-0.01, -0.05]))[1], [[STRONGEST, 0, 0]] * 2)
 
 
 @pytest.fixture
@@ -66,36 +55,33 @@ def test_motions_that_stay_out_of_range_are_those_of_eflow(task, planner):
     assert all(np.array_equal(a, b) for a, b in zip((*plan.paths, *plan.times), (*paths, *times), strict=True))
 
 
-def passing(planner, task):
+@pytest.fixture
+def beside(planner, task):
     """An obstacle beside the first motion."""
     (path,), _ = planner.system.rollouts(task.starts[:1], 0.012)
-    return Union((Sphere(tuple(path[len(path) // 2] + [0.0, 0.03, 0.03]), 0.06),))
+    return Union((Sphere(as_point(path[len(path) // 2] + [0.0, 0.03, 0.03]), 0.06),))
 
 
-def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(task, planner):
-    obstacle = passing(planner, task)
-    plan = planner.plan(obstacle, task.starts[:1])
+def test_steps_follow_the_sum_of_both_velocities_and_eflow_goes_on_after_them(task, planner, beside):
+    plan = planner.plan(beside, task.starts[:1])
     path, times = plan.paths[0], plan.times[0]
     assert (np.diff(times) > 0).all()
     stepped = np.flatnonzero(np.isclose(np.diff(times), 0.05, rtol=0, atol=1e-12))
     assert len(stepped) > 10
-    v = planner.system.velocity(path[stepped]) + repulsion(obstacle, path[stepped])[1]
-    assert np.allclose(path[stepped + 1], path[stepped] + 0.05 * v, atol=1e-6)
-    assert not np.allclose(path[stepped + 1], path[stepped] + 0.05 * planner.system.velocity(path[stepped]), atol=1e-4)
+    alone, pushed = planner.system.velocity(path[stepped]), repulsion(beside, path[stepped])[1]
+    np.testing.assert_allclose(path[stepped + 1], path[stepped] + 0.05 * (alone + pushed), atol=1e-6)
+    assert np.abs(0.05 * pushed).max() > 1e-4
     assert np.linalg.norm(path[-1] - planner.system.goal) < 1e-6
 
 
-def test_finer_steps_converge(task, planner):
-    obstacle = passing(planner, task)
-    paths = [
-        replace(planner, interval=h).plan(obstacle, task.starts[:1]).paths[0] for h in (0.05, 0.005, 0.0025, 0.00125)
-    ]
-    off = [np.linalg.norm(a[:, None] - paths[-1], axis=2).min(axis=1).max() for a in paths[:3]]
+def test_finer_steps_converge(task, planner, beside):
+    intervals = (0.05, 0.005, 0.0025, 0.00125)
+    *paths, finest = (replace(planner, interval=h).plan(beside, task.starts[:1]).paths[0] for h in intervals)
+    off = [np.linalg.norm(path[:, None] - finest, axis=2).min(axis=1).max() for path in paths]
     assert off[0] > off[1] > off[2] > 0
 
 
 def test_before_an_obstacle_on_the_goal_a_motion_stops(task, planner):
-    x, y, z = planner.system.goal
-    plan = planner.plan(Union((Sphere((x, y, z), 0.1),)), task.starts[:2])
+    plan = planner.plan(Union((Sphere(as_point(planner.system.goal), 0.1),)), task.starts[:2])
     assert all(0.02 < np.linalg.norm(path[-1] - planner.system.goal) < 0.2 for path in plan.paths)
     assert max(t[-1] for t in plan.times) < repulsive.LONGEST + 60

@@ -41,11 +41,6 @@ def test_weights_of_another_version_method_or_task_are_refused(saved, method, ve
         load_weights(method, version, TASKS[task](), saved.parent)
 
 
-def test_missing_weights_are_refused_with_the_command_that_makes_them(tmp_path):
-    with pytest.raises(NotFittedError, match="train --method eflow --task draw_s"):
-        load_weights("eflow", 3, TASKS["draw_s"](), tmp_path)
-
-
 def flipped(content):
     """The content with one byte of the first array flipped."""
     at = content.index(b"W.npy") + 80

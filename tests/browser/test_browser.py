@@ -10,14 +10,14 @@ import pytest
 import trimesh
 from browsing import (
     LIGHT,
-    OF_VISER,
     PATIENCE,
     TRIES,
     begin,
     close_notices,
     close_page,
+    drag,
     open_page,
-    page_errors,
+    open_tab,
     press,
     project,
     until_drawn,
@@ -27,27 +27,19 @@ from chromium import needs_chromium
 from PIL import Image
 from scenes import changing
 
+from dt_viz.control.controller import Phase
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.motion.control import Phase
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene.camera import camera_for
 from dt_viz.ui.scene.slice_layers import VOLUME
-from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 
 WIDTH, HEIGHT = 720, 450
 CORNER = (5, 5)
 """CSS pixels where the mouse touches nothing."""
 pytestmark = [pytest.mark.browser, needs_chromium]
-
-
-@pytest.fixture(scope="module")
-def server(fits):
-    server = Server(TASKS, fits, task="draw_s", port=0, max_sessions=2)
-    yield server
-    server.close()
 
 
 class Tab:
@@ -85,7 +77,6 @@ def tab(browser, server):
 @pytest.fixture
 def visit(tab, initial, request):
     """The tab as it is when a visitor comes, but for the arm: the hand avoids, and nothing else is drawn or moves."""
-    page_errors.clear()
     failed = request.session.testsfailed
     page, visitor = tab.visit()
     begin(visitor, replace(initial("draw_s"), view=LIGHT))
@@ -97,7 +88,6 @@ def visit(tab, initial, request):
     wait_until(lambda: camera_rests(visitor), "the camera to stand where the task wants it")
     yield page, visitor
     tab.sound = request.session.testsfailed == failed
-    assert [error for error in page_errors if OF_VISER not in error] == []
 
 
 def look_home(visitor: Visitor) -> None:
@@ -114,15 +104,6 @@ def camera_rests(visitor: Visitor) -> bool:
 def seen_at(visitor: Visitor) -> tuple[float, float]:
     """CSS pixels of the obstacle."""
     return project(visitor, visitor.session.scenario.obstacles[0].position)
-
-
-def drag(page, start, end, steps=6):
-    page.mouse.move(*start)
-    page.mouse.down()
-    for k in range(1, steps + 1):
-        page.mouse.move(*(a + (b - a) * k / steps for a, b in zip(start, end, strict=True)))
-        time.sleep(0.03)
-    page.mouse.up()
 
 
 def drag_until(page, visitor, done, reset, ends):
@@ -166,10 +147,8 @@ def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
 
     assert_shows_the_obstacle_where_it_is(visitor)
     after = visitor.shown
-    assert (
-        max(np.abs(a[len(a) // 2] - b[len(b) // 2]).max() for a, b in zip(after.rollouts, before.rollouts, strict=True))
-        > 0.01
-    )
+    earlier, later = ([path[len(path) // 2] for path in shown.rollouts] for shown in (before, after))
+    assert np.abs(np.subtract(later, earlier)).max() > 0.01
     obstacle = after.scenario.obstacle
     assert max(maximum_collision_distance(path, obstacle.signed_distance) for path in after.rollouts) == 0
     assert after.certificates.clearance > 0
@@ -198,11 +177,6 @@ def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_p
     assert session.wait_idle(PATIENCE)
     assert abs(session.scenario.obstacles[0].position[1] - centre[1]) < 1e-6
     assert_shows_the_obstacle_where_it_is(visitor)
-
-
-def open_tab(page, name):
-    """A tab of the panel."""
-    press(page.get_by_role("tab", name=name, exact=True))
 
 
 def press_unseen(locator):
@@ -250,13 +224,10 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
         turns = [np.array([np.cos(angle), 0.0, np.sin(angle)]) for angle in (grabbed, grabbed - 0.7)]
         return [project(visitor, mesh.position + arc * turn) for turn in turns]
 
-    drag_until(
-        page,
-        visitor,
-        turned,
-        lambda: session.edit("test", **changing(session.scenario, obstacles=(mesh,))),
-        along_the_arc,
-    )
+    def turn_back():
+        session.edit("test", **changing(session.scenario, obstacles=(mesh,)))
+
+    drag_until(page, visitor, turned, turn_back, along_the_arc)
     assert session.wait_idle(PATIENCE)
     (after,) = session.scenario.obstacles
     axis = np.abs(after.wxyz[1:]) / np.linalg.norm(after.wxyz[1:])
@@ -341,9 +312,8 @@ def test_the_layers_of_the_whole_arm_are_seen_once_they_are_switched_on(visit, m
         box = page.get_by_label(label, exact=True).first
         press_unseen(box)
         wait_until(lambda name=name: getattr(session.scenario.view, name), f"the checkbox of {name}")
-        wait_until(
-            lambda coloured=coloured: coloured(pixels(page)).sum() > coloured(before).sum() + 1000, f"{name} to be seen"
-        )
+        least = coloured(before).sum() + 1000
+        wait_until(lambda coloured=coloured, least=least: coloured(pixels(page)).sum() > least, f"{name} to be seen")
         session.edit("test", view=plain)
 
     press_unseen(page.get_by_label("Joint plots").first)
@@ -380,14 +350,8 @@ def test_keys_do_what_the_panel_does(visit):
 def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_go(visit):
     page, visitor = visit
     session = visitor.session
-    session.edit(
-        "test",
-        **changing(session.scenario, obstacles=()),
-        view=replace(LIGHT, arm=True),
-    )
-    wait_until(
-        lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion without obstacle"
-    )
+    session.edit("test", **changing(session.scenario, obstacles=()), view=replace(LIGHT, arm=True))
+    wait_until(lambda: session.wait_idle(0.3) and visitor.shown.scenario == session.scenario, "a motion")
     assert visitor.grip.ball.visible
     before = visitor._hand()
 

@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawings import frechet
+from oracles import central_differences
 from scenes import avoiding, biases, changed, kinds, starts_at
 
 import dt_viz as dt
+from dt_viz.control.controller import Controller, Phase
 from dt_viz.engine.frame import Stage
 from dt_viz.errors import DataError, FormatError
 from dt_viz.evaluate.crossings import crossings
@@ -19,9 +22,8 @@ from dt_viz.learning.choice import MOST_CONFLICTING, MOST_MISSED, conflicts, lea
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.learning.preparation import ImitationError, prepare
-from dt_viz.metrics import discrete_frechet, resample_by_arc_length
+from dt_viz.metrics import distance_from_path
 from dt_viz.motion.certificates import Certificates, Shown, certified
-from dt_viz.motion.control import Controller, Phase
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.panels import Panel
@@ -40,10 +42,6 @@ CASES = crossings()
 
 def last(engine, scenario):
     return list(engine.frames(scenario))[-1]
-
-
-def frechet(a, b):
-    return float(discrete_frechet(resample_by_arc_length(a, 150), resample_by_arc_length(b, 150)))
 
 
 def in_the_way(engine, fraction=0.3, diameter=0.08, **settings):
@@ -77,9 +75,11 @@ def test_settings_of_the_plain_fit_do_not_change_the_state(fits, poor):
     assert isinstance(fits.learned(TASKS[EIGHT]().demonstrations, poor), AugmentedImitation)
 
 
-@pytest.mark.parametrize("name", ["loop", "eight", "wide eight", "double loop", "reach and retreat"])
-def test_what_crosses_or_comes_back_is_in_conflict(name):
-    assert conflicts(prepare(CASES[name].demonstrations)).phase > MOST_CONFLICTING
+def test_what_crosses_or_comes_back_is_in_conflict_and_gets_no_labels():
+    for name in ("loop", "eight", "wide eight", "double loop", "reach and retreat"):
+        assert conflicts(prepare(CASES[name].demonstrations)).phase > MOST_CONFLICTING
+        assert found_labels(CASES[name].demonstrations) == ()
+    assert found_labels(CASES["helix, 4 turns"].demonstrations) == ()
 
 
 def test_what_differs_at_one_phase_is_in_conflict_by_its_label_alone():
@@ -191,11 +191,6 @@ def test_one_pattern_gets_no_labels(fits, task):
     assert isinstance(imitation, AugmentedImitation) and imitation.known_labels == ()
 
 
-def test_what_crosses_itself_gets_no_labels():
-    for name in ("loop", "wide eight", "reach and retreat", "helix, 4 turns"):
-        assert found_labels(CASES[name].demonstrations) == ()
-
-
 def test_ways_that_begin_far_apart_are_told_by_their_starts():
     """Each has demonstrations that begin nearest to its own."""
     left = ways((0.1,))
@@ -296,20 +291,18 @@ def test_wrong_choices_are_named():
 
 @pytest.mark.parametrize("name", ["wide eight", "left and right from one start", "helix, 2 turns"])
 def test_the_learned_shear_changes_with_the_condition_as_it_says(name):
-    case = CASES[name]
+    case, rng = CASES[name], np.random.default_rng(0)
     imitation = fit_augmented(case.demonstrations, case.labels)
-    psi, rng = imitation.system.transform, np.random.default_rng(0)
-    states = imitation.demonstrated(np.stack([d.positions[0] for d in case.demonstrations]))
+    psi, states = (
+        imitation.system.transform,
+        imitation.demonstrated(np.stack([d.positions[0] for d in case.demonstrations])),
+    )
     states[:, imitation.dim] *= rng.uniform(0.1, 0.9, len(states))
     states += 0.01 * rng.normal(size=states.shape)
     image, J = psi.jacobian(states)
     np.testing.assert_allclose(np.linalg.det(J), 1.0, atol=1e-9)
     np.testing.assert_allclose(psi.inverse(image), states, atol=1e-14)
-    h = 1e-6
-    for k in range(psi.dim):
-        step = h * np.eye(psi.dim)[k]
-        slope = (psi.forward(states + step) - psi.forward(states - step)) / (2 * h)
-        np.testing.assert_allclose(J[..., k], slope, atol=2e-5)
+    np.testing.assert_allclose(J, central_differences(psi.forward, states, 1e-6), atol=2e-5)
 
 
 def test_in_the_world_motions_are_those_of_the_drawing_placed_there():
@@ -357,25 +350,13 @@ def test_the_8_is_drawn_as_demonstrated(engine):
     assert max(frechet(a, b) for a, b in zip(plain.rollouts, plain.task.paths, strict=True)) > 0.08
 
 
-def test_certificates_recognise_another_motion(engine):
-    scenario = in_the_way(engine)
-    solved = engine.solved(scenario, FINE)
+def test_certificates_recognise_motions_of_other_conditions(engine):
+    solved = engine.solved(in_the_way(engine), FINE)
     stack, bundle = solved.stack, solved.stack.bundle
-    times = stack.rays.times(bundle.index, bundle.fraction)
-    known = Certificates(0.01)
-    good = Shown(bundle.index, bundle.fraction, times, bundle.positions)
-    assert not certified(known, stack, solved.ends, good).warnings
-    late = replace(good, times=1.05 * times)
-    assert Kind.OTHER_TIMES in kinds(certified(known, stack, solved.ends, late).warnings)
-    beside = replace(good, positions=bundle.positions + 1e-4 * np.sin(40 * bundle.fraction)[:, None])
-    assert Kind.OFF_MOTION in kinds(certified(known, stack, solved.ends, beside).warnings)
-    another = replace(stack, rays=replace(stack.rays, z0=np.roll(stack.rays.z0, 1, axis=0)))  # others' conditions
-    assert Kind.OFF_MOTION in kinds(certified(known, another, solved.ends, good).warnings)
-    back = np.concatenate(
-        [rows[::-1] for rows in np.split(np.arange(len(times)), np.flatnonzero(np.diff(bundle.index)) + 1)]
-    )
-    reversed_ = replace(good, positions=bundle.positions[back])
-    assert Kind.OFF_MOTION in kinds(certified(known, stack, solved.ends, reversed_).warnings)
+    shown = Shown(bundle.index, bundle.fraction, stack.rays.times(bundle.index, bundle.fraction), bundle.positions)
+    assert not certified(Certificates(0.01), stack, solved.ends, shown).warnings
+    another = replace(stack, rays=replace(stack.rays, z0=np.roll(stack.rays.z0, 1, axis=0)))
+    assert Kind.OFF_MOTION in kinds(certified(Certificates(0.01), another, solved.ends, shown).warnings)
 
 
 def test_an_added_start_draws_the_8_from_there(engine):
@@ -388,16 +369,12 @@ def test_an_added_start_draws_the_8_from_there(engine):
 
 
 def test_half_warped_it_is_between_a_straight_line_and_the_8(engine):
-    frame = last(engine, Scenario(EIGHT, (), warp=0.5))
-    assert not frame.certificates.warnings
-    straight, whole = (last(engine, Scenario(EIGHT, (), warp=warp)) for warp in (0.0, 1.0))
-    for line, half, figure in zip(straight.rollouts, frame.rollouts, whole.rollouts, strict=True):
-        apart = frechet(line, figure)
-        assert 0.2 * apart < min(frechet(half, line), frechet(half, figure))
-        assert max(frechet(half, line), frechet(half, figure)) < 0.9 * apart
-    for path in straight.rollouts:
-        along = (path - path[0]) @ (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
-        assert np.linalg.norm(path - path[0], axis=1) == pytest.approx(along, abs=1e-9)
+    straight, halfway, whole = (last(engine, Scenario(EIGHT, (), warp=warp)) for warp in (0.0, 0.5, 1.0))
+    assert not halfway.certificates.warnings
+    for line, half, figure in zip(straight.rollouts, halfway.rollouts, whole.rollouts, strict=True):
+        apart, from_both = frechet(line, figure), [frechet(half, line), frechet(half, figure)]
+        assert 0.2 * apart < min(from_both) and max(from_both) < 0.9 * apart
+        assert distance_from_path(line, line[[0, -1]]).max() < 1e-9
 
 
 def test_the_whole_arm_gives_way(engine):
@@ -462,27 +439,36 @@ def run(controller, q, seconds, passed):
     return q
 
 
+def drawn(robot, controller, q):
+    """The path of the hand (T, 3), metres, from a posture until it rests, and its last posture."""
+    passed: list[np.ndarray] = []
+    q = run(controller, q, 30, passed)
+    return robot.end_effector(np.array(passed)), q
+
+
+def farthest_from(hand, path):
+    """Distance of the point of a path that a hand passes farthest from, metres."""
+    return np.linalg.norm(path[:, None] - hand, axis=2).min(axis=1).max()
+
+
 def test_the_arm_draws_the_8(engine, loop):
     solved, joints = loop
-    controller, passed = Controller(engine.follower, solved), []
-    q = run(controller, joints[0], 30, passed)
-    hand = engine.follower.robot.end_effector(np.array(passed))
+    controller, robot = Controller(engine.follower, solved), engine.follower.robot
+    hand, q = drawn(robot, controller, joints[0])
     assert controller.phase is Phase.RESTING and controller.left < 1e-3
     assert np.linalg.norm(hand[-1] - solved.nominal.goal) < 1e-3
     assert frechet(hand, solved.stack.bundle.paths[0]) < 0.015
     controller.home(0)
-    q = run(controller, q, 30, passed)
+    _, q = drawn(robot, controller, q)
     controller.go()
-    again: list[np.ndarray] = []
-    run(controller, q, 30, again)
-    assert frechet(engine.follower.robot.end_effector(np.array(again)), solved.stack.bundle.paths[0]) < 0.02
+    assert frechet(drawn(robot, controller, q)[0], solved.stack.bundle.paths[0]) < 0.02
 
 
 @pytest.mark.parametrize("way", ["pushed", "held"])
 def test_after_a_disturbance_it_draws_the_rest(engine, loop, way):
     solved, joints = loop
-    robot, controller, passed = engine.follower.robot, Controller(engine.follower, solved), []
-    q = run(controller, joints[0], 2.5, passed)
+    robot, controller = engine.follower.robot, Controller(engine.follower, solved)
+    q = run(controller, joints[0], 2.5, [])
     path = solved.stack.bundle.paths[0]
     assert 0.2 < controller.left < 0.9
     reached = np.linalg.norm(path - robot.end_effector(q), axis=1).argmin()
@@ -490,12 +476,10 @@ def test_after_a_disturbance_it_draws_the_rest(engine, loop, way):
         q = engine.follower.whole_arm.limits.inside(q + np.array([0.08, 0.0, 0.05, 0.0, 0.0, 0.0]))
     else:
         controller.hold(robot.end_effector(q) + np.array([0.05, 0.0, 0.03]))
-        q = run(controller, q, 1.5, passed)
+        q = run(controller, q, 1.5, [])
         controller.release()
-    after: list[np.ndarray] = []
-    run(controller, q, 30, after)
-    hand, rest = robot.end_effector(np.array(after)), path[reached:]
-    near = np.linalg.norm(rest[:, None] - hand, axis=2).min(axis=1) < 0.05 * 0.40
+    hand, _ = drawn(robot, controller, q)
+    near = np.linalg.norm(path[reached:][:, None] - hand, axis=2).min(axis=1) < 0.05 * 0.40
     assert near.mean() > 0.7
     assert np.linalg.norm(hand[-1] - solved.nominal.goal) < 1e-3
 
@@ -519,21 +503,19 @@ def test_its_velocity_is_that_of_the_system_at_its_phase(engine, loop):
 @pytest.mark.parametrize("rollout", [0, 1])
 def test_the_arm_draws_the_pattern_of_the_rollout_that_it_begins(new_engine, rollout):
     engine = with_ways(new_engine)
-    solved = engine.solved(Scenario("ways", (), state="augmented"), LIVE)
+    solved, robot = engine.solved(Scenario("ways", (), state="augmented"), LIVE), engine.follower.robot
     q = engine.follower.undisturbed(solved.nominal).tracked.q[rollout][0]
     path, other = (solved.nominal.paths[k] for k in (rollout, 1 - rollout))
     for aim in ("begin", "home"):
-        controller, passed = Controller(engine.follower, solved), []
+        controller = Controller(engine.follower, solved)
         if aim == "begin":
             controller.begin(q, rollout)
         else:
             controller.home(rollout)
-            q = run(controller, q, 30, [])
+            _, q = drawn(robot, controller, q)
             controller.go()
-        run(controller, q, 30, passed)
-        hand = engine.follower.robot.end_effector(np.array(passed))
-        near, far = (np.linalg.norm(p[:, None] - hand, axis=2).min(axis=1).max() for p in (path, other))
-        assert near < 0.01 and far > 0.05
+        hand, _ = drawn(robot, controller, q)
+        assert farthest_from(hand, path) < 0.01 and farthest_from(hand, other) > 0.05
 
 
 # --- The library ---
@@ -548,12 +530,10 @@ def test_the_arm_in_the_loop_draws_the_pattern_of_its_label(label):
     ]
     motion, arm = dt.fit(turned, state="augmented"), dt.load_jaco()
     (path, *_), (other, *_) = motion.rollouts(label=label), motion.rollouts(label=-label)
-    controller, passed = dt.Controller(motion, arm, label), []
-    controller.begin(arm.follow(path).q[0])
-    run(controller, arm.follow(path).q[0], 30, passed)
-    hand = arm.robot.end_effector(np.array(passed))
-    near, far = (np.linalg.norm(p.positions[:, None] - hand, axis=2).min(axis=1).max() for p in (path, other))
-    assert near < 0.01 and far > 0.05
+    controller, q = dt.Controller(motion, arm, label), arm.follow(path).q[0]
+    controller.begin(q)
+    hand, _ = drawn(arm.robot, controller, q)
+    assert farthest_from(hand, path.positions) < 0.01 and farthest_from(hand, other.positions) > 0.05
     with pytest.raises(FormatError, match="label: found 3"):
         dt.Controller(motion, arm, 3.0)
 
@@ -662,17 +642,11 @@ def test_wrong_values_are_named(wrong, found):
         wrong(dt.fit(ways((-0.1, 0.1)), state="augmented"))
 
 
-def test_a_saved_motion_warns_as_before(tmp_path):
+def test_a_saved_motion_warns_as_before_and_one_whose_labels_do_not_fit_is_refused(tmp_path):
     motion = dt.fit(ways((-0.1, 0.1)), labels=6 * (0.0,))
     motion.save(tmp_path / "motion.npz")
     found = [m.certificates().found for m in (motion, dt.Motion.load(tmp_path / "motion.npz"))]
     assert found[0] == found[1] and "misses its demonstration" in found[0][0].text
-
-
-def test_a_saved_motion_whose_labels_do_not_fit_is_refused(tmp_path):
-    motion = dt.fit(CASES["wide eight"].demonstrations)
-    learned = motion._learned
-    forged = replace(learned.imitation, labels=(1.0,))
-    motion._learned = replace(learned, imitation=forged)
+    motion._learned = replace(motion._learned, imitation=replace(motion._learned.imitation, labels=(1.0,)))
     with pytest.raises(DataError, match="labels"):
         motion.save(tmp_path / "motion.npz")

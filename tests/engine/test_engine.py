@@ -15,9 +15,9 @@ from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
 from dt_viz.engine.turns import Turns
 from dt_viz.flows import rollouts
-from dt_viz.interruption import interruptible
+from dt_viz.interruption import UnwantedError, interruptible
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.metrics import maximum_collision_distance
+from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.motion import diagnostics
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
@@ -70,6 +70,11 @@ def assert_finite(frame):
         assert np.isfinite(frame.arm.q).all()
 
 
+def refuse():
+    """A checkpoint of what is not wanted any more."""
+    raise UnwantedError
+
+
 def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(engine, scenario):
     frames = list(engine.frames(scenario))
     assert [frame.stage for frame in frames] == list(Stage)
@@ -82,22 +87,13 @@ def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(eng
         assert (frame.arm is not None) == (frame.stage >= Stage.FINE)
         assert (frame.certificates.min_det_jacobian is not None) == (frame.stage >= Stage.CERTIFIED)
         assert_finite(frame)
+        assert depth(frame) == 0 or frame.stage is Stage.ROLLOUTS
         for path, times in zip(frame.rollouts, frame.times, strict=True):
             assert len(path) == len(times)
             assert (np.diff(times) > 0).all() and times[0] == pytest.approx(0, abs=1e-9)
-
-
-def test_the_first_picture_is_clear_and_certified_without_warnings(engine, scenario):
-    live = frame_at(engine, scenario, Stage.LIVE)
-    assert depth(live) == 0
-    assert live.certificates.clearance > MARGIN_KEPT * scenario.avoidance.margin
-    certified = frame_at(engine, scenario, Stage.CERTIFIED)
-    certificates = certified.certificates
-    assert depth(certified) == 0
-    assert certificates.min_det_jacobian is not None and certificates.min_det_jacobian > 0
-    assert certificates.round_trip_error is not None and certificates.round_trip_error < 1e-6
-    assert certificates.lyapunov_falls is True
-    assert certificates.collision is not None
+    assert frames[Stage.LIVE].certificates.clearance > MARGIN_KEPT * scenario.avoidance.margin
+    certificates = frames[-1].certificates
+    assert certificates.min_det_jacobian > 0 and certificates.round_trip_error < 1e-6 and certificates.lyapunov_falls
     assert set(certificates.warnings) <= set(certificates.collision.warnings)  # only the hand gives way
 
 
@@ -136,23 +132,16 @@ def beside_goal(engine, scenario, diameter, clearance):
     return placed(scenario, goal + (diameter / 2 + clearance) * away / np.linalg.norm(away), diameter)
 
 
-@pytest.mark.parametrize(("diameter", "clearance"), [(0.15, 0.05), (0.08, 0.03), (0.10, 0.15)])
-def test_motions_end_exactly_at_a_free_goal(engine, scenario, diameter, clearance):
+@pytest.mark.parametrize(
+    ("diameter", "clearance"), [(0.15, 0.05), (0.08, 0.03), (0.10, 0.15), (0.15, 0.0005), (0.15, 0.005), (0.15, 0.015)]
+)
+def test_motions_end_exactly_at_a_free_goal_or_it_is_said_that_they_miss_it(engine, scenario, diameter, clearance):
     frame = frame_at(engine, beside_goal(engine, scenario, diameter, clearance), Stage.FINE)
-    np.testing.assert_allclose(ends_of(frame), np.broadcast_to(frame.goal, ends_of(frame).shape), rtol=0, atol=1e-4)
-    np.testing.assert_allclose(frame.reached, frame.goal, rtol=0, atol=1e-4)
-    assert depth(frame) == 0
-
-
-@pytest.mark.parametrize("clearance", [0.0005, 0.005, 0.015])
-def test_an_obstacle_that_nearly_touches_the_goal_is_cleared_and_a_missed_goal_is_said(engine, scenario, clearance):
-    frame = frame_at(engine, beside_goal(engine, scenario, 0.15, clearance), Stage.FINE)
     assert depth(frame) < 1e-5
+    np.testing.assert_allclose(ends_of(frame), np.broadcast_to(frame.reached, ends_of(frame).shape), rtol=0, atol=1e-4)
     missed = np.linalg.norm(frame.reached - frame.goal)
-    assert missed < 1e-4 or Kind.GOAL_MISSED in kinds(frame.certificates.warnings), (
-        missed,
-        frame.certificates.warnings,
-    )
+    said = Kind.GOAL_MISSED in kinds(frame.certificates.warnings)
+    assert missed < 1e-4 or (said and clearance < 0.02), (missed, frame.certificates.warnings)
 
 
 @pytest.mark.parametrize("offset", [(0.02, 0.0, 0.03), (-0.03, 0.01, -0.02), (0.0, 0.0, 0.07), (0.001, 0.0, 0.0)])
@@ -167,14 +156,12 @@ def test_motions_to_a_covered_goal_stay_outside_and_end_beside_the_obstacle(engi
 
 
 def test_without_avoidance_the_rollouts_are_the_ghost(engine, scenario):
-    without = changed(scenario, avoids=False)
-    for frame in engine.frames(without):
+    for frame in engine.frames(changed(scenario, avoids=False)):
         assert frame.durations == (None,)
         for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
             if frame.stage <= Stage.LIVE:
                 np.testing.assert_allclose(path, ghost, rtol=0, atol=1e-12)
-            distance = np.linalg.norm(path[:, None] - ghost, axis=-1)
-            assert distance.min(axis=0).max() < 1e-12  # every ghost point is on it
+            assert distance_from_path(ghost, path).max() < 1e-12
 
 
 def test_with_an_obstacle_far_away_nothing_changes(engine, scenario):
@@ -255,11 +242,8 @@ def test_the_arm_follows_the_chosen_rollout(engine, robot, scenario):
     for chosen in (0, 3):
         frame = frame_at(engine, replace(scenario, arm_rollout=chosen), Stage.LIVE)
         assert frame.arm is not None
-        hand = robot.end_effector(frame.arm.q)
-        path = frame.rollouts[chosen]
-        nearest = np.linalg.norm(hand[:, None] - path, axis=-1).min(axis=1)
-        said = Kind.PATH_MISSED in kinds(frame.certificates.warnings)
-        assert said or nearest.max() < 1e-3
+        beside = distance_from_path(robot.end_effector(frame.arm.q), frame.rollouts[chosen]).max()
+        assert beside < 1e-3 or Kind.PATH_MISSED in kinds(frame.certificates.warnings)
         assert frame.arm.times[0] == frame.times[chosen][0]
         assert frame.arm.times[-1] >= frame.times[chosen][-1]  # later where the joints cannot keep up
         assert used_fraction(frame.arm.times, frame.arm.q, robot.velocity_limits) <= 1 + 1e-9
@@ -279,34 +263,14 @@ def test_times_increase_where_a_strong_bias_stretches_space_at_the_goal(engine, 
             assert used_fraction(frame.arm.times, frame.arm.q, robot.velocity_limits) <= 1 + 1e-9
 
 
-def test_refining_ends_where_a_checkpoint_says_so(engine, scenario):
-    class UnwantedError(Exception):
-        pass
-
-    def refuse():
-        raise UnwantedError
-
-    frames = engine.frames(scenario, checkpoint=refuse)
-    assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
-    with pytest.raises(UnwantedError):
-        next(frames)
-    assert frame_at(engine, scenario, Stage.CERTIFIED).certificates.lyapunov_falls  # nothing is left locked
-
-
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_what_follows_a_hand_ends_where_the_thread_is_interrupted(new_engine, initial, space):
-    class ClosedError(Exception):
-        pass
-
-    def refuse():
-        raise ClosedError
-
     engine, scenario, passed = new_engine(), changed(initial("draw_s"), space=space), []
     with interruptible(lambda: passed.append(None)):
         frames = engine.frames(changed(scenario, margin=0.012))
         assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     assert len(passed) > 20
-    with pytest.raises(ClosedError), interruptible(refuse):
+    with pytest.raises(UnwantedError), interruptible(refuse):
         next(engine.frames(scenario))
     assert frame_at(engine, scenario, Stage.LIVE).rollouts  # nothing is left locked
 
@@ -325,24 +289,23 @@ def test_a_motion_that_would_take_too_many_samples_says_so(new_engine, initial, 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
 def test_wherever_refining_is_interrupted_it_leaves_nothing_half_done(fits, robot, space):
-    class UnwantedError(Exception):
-        pass
-
     (demonstration, *_), passed = TASKS["draw_s"]().demonstrations, []
     one = TaskEntry("One", lambda: drawing_task("one", "One", "", (demonstration,)))
     undisturbed, engine = (Engine({"one": one}, fits, robot) for _ in range(2))
     scenario = avoiding("one", Sphere(one().obstacle_position), space=space)
     *_, expected = undisturbed.frames(scenario, checkpoint=lambda: passed.append(None))
     assert len(passed) > 50  # all along, not between a few long parts
-    for moment, margin in ((0.05, 0.01), (0.5, 0.005), (0.3, 0.01)):
-        left = iter(range(int(moment * len(passed))))
+    for moment in (0, 0.05, 0.4):
+        left, stages = iter(range(int(moment * len(passed)))), []
 
-        def refuse(left=left):
+        def refuse_then(left=left):
             if next(left, None) is None:
                 raise UnwantedError
 
         with pytest.raises(UnwantedError):
-            list(engine.frames(changed(scenario, margin=margin), checkpoint=refuse))
+            for frame in engine.frames(scenario, checkpoint=refuse_then):
+                stages.append(frame.stage)
+        assert stages[:2] == [Stage.ROLLOUTS, Stage.LIVE]  # what follows a hand comes first, and whole
     *_, found = engine.frames(scenario)
     for path, times, same, at in zip(found.rollouts, found.times, expected.rollouts, expected.times, strict=True):
         np.testing.assert_allclose(path, same, rtol=0, atol=1e-9)
@@ -373,27 +336,18 @@ def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
 
 def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_turn(new_engine, initial, monkeypatch):
     """Else a hand that moves again would wait for all others to rest."""
-
-    class UnwantedError(Exception):
-        pass
-
-    turns, unwanted, ended = Turns(), threading.Event(), threading.Event()
+    turns, ended = Turns(), threading.Event()
     monkeypatch.setattr(engine_module, "_turns", turns)
-
-    def refuse():
-        if unwanted.is_set():
-            raise UnwantedError
+    frames = new_engine().frames(initial("draw_s"), checkpoint=refuse)
 
     def refine():
         with pytest.raises(UnwantedError):
             list(frames)
         ended.set()
 
-    frames = new_engine().frames(initial("draw_s"), checkpoint=refuse)
     assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     with turns.taken():  # somebody who drags on and on
         threading.Thread(target=refine, daemon=True).start()
-        unwanted.set()
         assert ended.wait(PATIENCE)
 
 
@@ -450,8 +404,9 @@ def test_the_same_scenario_gives_the_same_frame_whatever_was_shown_before(new_en
     assert (a.arm is None) == (b.arm is None)
 
 
-def reach_of_random_starts(engine, fits, task, num):
-    """Largest miss of the goal, metres, and smallest det J along the motions of random starts."""
+@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("num", [500, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_random_starts_around_the_demonstrations_all_reach_the_goal(engine, fits, task, num):
     task = engine.task(task)
     imitation = fits.get(task.demonstrations)
     points = np.concatenate([d.positions for d in task.demonstrations])
@@ -463,18 +418,9 @@ def reach_of_random_starts(engine, fits, task, num):
     np.testing.assert_allclose(motion[:, 0], starts, rtol=0, atol=1e-9)
     values = imitation.system.lyapunov(motion[:, :5])
     arrived = values[:, :-1] < 1e-12 * values.max()  # what is below is rounding
-    falls = bool((arrived | (np.diff(values, axis=-1) < 0)).all())
-    miss = task.scale * np.linalg.norm(motion[:, -1] - imitation.goal, axis=1).max()
-    return miss, np.linalg.det(imitation.transform.jacobian(motion)[1]).min(), falls
-
-
-@pytest.mark.parametrize("task", TASK_NAMES)
-@pytest.mark.parametrize("num", [500, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_random_starts_around_the_demonstrations_all_reach_the_goal(engine, fits, task, num):
-    miss, det, falls = reach_of_random_starts(engine, fits, task, num)
-    assert miss < 1e-4
-    assert det > 0
-    assert falls
+    assert (arrived | (np.diff(values, axis=-1) < 0)).all()
+    assert task.scale * np.linalg.norm(motion[:, -1] - imitation.goal, axis=1).max() < 1e-4
+    assert np.linalg.det(imitation.transform.jacobian(motion)[1]).min() > 0
 
 
 def test_a_task_is_loaded_once(engine):

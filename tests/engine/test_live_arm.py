@@ -7,9 +7,11 @@ import pytest
 from scenes import changed
 
 from dt_viz.arm.collision import load_collision_model
+from dt_viz.control.controller import Phase
+from dt_viz.control.settings import ControllerSettings
 from dt_viz.engine.frame import Stage
 from dt_viz.engine.live_arm import DISTANCES, REST, LiveArm
-from dt_viz.motion.control import ACCELERATION, Phase
+from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Sphere, as_point
 
 PICTURE = 0.04
@@ -53,8 +55,22 @@ class Loop:
         q = np.array(self.passed)
         speeds = np.abs(np.diff(q, axis=0)) / PICTURE
         assert (speeds <= self.robot.velocity_limits * (1 + 1e-9)).all()
-        assert np.abs(np.diff(speeds, axis=0)).max() <= ACCELERATION * PICTURE * 1.3  # between means over pictures
+        assert (
+            np.abs(np.diff(speeds, axis=0)).max() <= ControllerSettings().acceleration * PICTURE * 1.3
+        )  # between means over pictures
         assert (q >= self.robot.lower).all() and (q <= self.robot.upper).all() and np.isfinite(q).all()
+
+    def assert_arrives_without_a_jump(self):
+        self.run(30, lambda: self.arm.arrived > 0)
+        assert self.missed() < 1e-3
+        self.assert_no_jump()
+
+    def assert_free(self, obstacle=None, since=0):
+        """The arm has touched nothing since it was in the posture of that number."""
+        near = load_collision_model().nearest_to_obstacle(
+            np.array(self.passed[since:]), obstacle or self.scenario.obstacle
+        )
+        assert near.distance > 0
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +105,7 @@ def test_it_goes_from_start_to_goal_and_home_to_the_next_start(begin, initial, t
     loop = begin(changed(initial(task), space=space))
     arm, starts = loop.arm, loop.engine.nominal(loop.scenario).starts
     np.testing.assert_allclose(loop.hand, loop.frame.rollouts[0][0], atol=5e-3)
-    loop.run(30, lambda: arm.arrived > 0)
-    assert loop.missed() < 1e-3
+    loop.assert_arrives_without_a_jump()
     loop.run(3, lambda: arm.phase is Phase.HOMING)
     assert REST <= arm.arrived < REST + 0.1
     loop.run(30, lambda: arm.phase is Phase.RESTING)
@@ -98,28 +113,21 @@ def test_it_goes_from_start_to_goal_and_home_to_the_next_start(begin, initial, t
     assert arm.arrived > REST  # what it carried stays where it fell
     loop.run(1, lambda: arm.phase is Phase.MOVING)
     assert arm.arrived == 0
-    loop.run(30, lambda: arm.arrived > 0)
-    assert loop.missed() < 1e-3
-    loop.assert_no_jump()
+    loop.assert_arrives_without_a_jump()
     if space == "cspace":
-        nearest = load_collision_model().nearest_to_obstacle(np.array(loop.passed)[::3], loop.scenario.obstacle)
-        assert nearest.distance > 0
+        loop.assert_free()
         assert {Phase.MOVING, Phase.HOMING, Phase.RESTING} >= set(loop.phases)
 
 
 def test_the_sphere_is_thrown_in_its_way_and_it_flows_around_it(whole):
     whole.run(1.5)
-    before = whole.arm.q
-    ahead = whole.arm.ahead
+    before, ahead = whole.arm.q, whole.arm.ahead
     near = ahead[np.linalg.norm(ahead - whole.hand, axis=1) > 0.2][0]
     whole.show(changed(whole.scenario, obstacles=(sphere_at(near),)))
     np.testing.assert_array_equal(whole.arm.q, before)
     begun = len(whole.passed)
-    whole.run(30, lambda: whole.arm.arrived > 0)
-    assert whole.missed() < 1e-3
-    whole.assert_no_jump()
-    passed = np.array(whole.passed)[begun:]
-    assert load_collision_model().nearest_to_obstacle(passed, sphere_at(near)).distance > 0
+    whole.assert_arrives_without_a_jump()
+    whole.assert_free(since=begun)
 
 
 def test_another_task_does_not_move_it_at_once(begin, initial):
@@ -128,9 +136,7 @@ def test_another_task_does_not_move_it_at_once(begin, initial):
     assert loop.arm.phase is Phase.MOVING
     loop.run(30, lambda: loop.phases[-2:] == [Phase.RESTING] * 2)
     np.testing.assert_allclose(loop.hand, loop.frame.rollouts[0][0], atol=5e-3)
-    loop.run(30, lambda: loop.arm.arrived > 0)
-    assert loop.missed() < 1e-3
-    loop.assert_no_jump()
+    loop.assert_arrives_without_a_jump()
 
 
 def test_another_rollout_is_begun_at_its_start(whole):
@@ -141,42 +147,38 @@ def test_another_rollout_is_begun_at_its_start(whole):
     whole.assert_no_jump()
 
 
-class TestPush:
-    def test_it_is_pushed_aside_and_still_reaches_the_goal(self, whole):
-        whole.run(2.0)
-        free = whole.arm.ahead
-        for _ in range(3):
-            whole.arm.push()
-            hand = whole.hand
-            whole.run(0.6)
-            away = np.linalg.norm(free - whole.hand, axis=1).min()
-            assert 0.2 * DISTANCES[-1] < away < 2 * DISTANCES[0]
-            assert np.linalg.norm(whole.hand - hand) > DISTANCES[-1] / 2
-        whole.run(30, lambda: whole.arm.arrived > 0)
-        assert whole.missed() < 1e-3 and Phase.HELD in whole.phases
-        whole.assert_no_jump()
-        q = np.array(whole.passed)
-        assert load_collision_model().nearest_to_obstacle(q, whole.scenario.obstacle).distance > 0
-        assert whole.robot.end_effector(q)[:, 2].min() > 0
+def test_pushed_aside_again_and_again_it_still_reaches_the_goal(whole):
+    whole.run(2.0)
+    free, aside = whole.arm.ahead, []
+    for _ in range(3):
+        whole.arm.push()
+        whole.run(0.6)
+        aside.append(distance_from_path(whole.hand[None], free)[0])
+    assert DISTANCES[-1] < max(aside) < 3 * DISTANCES[0]
+    whole.assert_arrives_without_a_jump()
+    assert Phase.HELD in whole.phases
+    whole.assert_free()
+    assert whole.robot.end_effector(np.array(whole.passed))[:, 2].min() > 0
 
-    def test_directions_differ_and_are_the_same_every_time(self, begin, initial):
-        def pushed(times):
-            loop = begin(changed(initial("draw_s"), space="task")).run(2.0)
-            for _ in range(times):
-                loop.arm.push()
-                loop.run(0.4)
-            return loop.hand
 
-        np.testing.assert_array_equal(pushed(1), pushed(1))
-        assert np.linalg.norm(pushed(2) - pushed(1)) > 0.01
+def test_pushes_differ_and_are_the_same_every_time(begin, initial):
+    def pushed(times):
+        loop = begin(changed(initial("draw_s"), space="task")).run(2.0)
+        for _ in range(times):
+            loop.arm.push()
+            loop.run(0.4)
+        return loop.hand
+
+    np.testing.assert_array_equal(pushed(1), pushed(1))
+    assert np.linalg.norm(pushed(2) - pushed(1)) > 0.01
 
 
 class TestHolding:
-    def held(self, loop, place, **how):
+    def held(self, loop, place):
         for u in np.linspace(0, 1, 12):
             loop.arm.hold((1 - u) * loop.hand + u * place)
-            loop.run(PICTURE, **how)
-        loop.run(5.0, **how)
+            loop.run(PICTURE)
+        loop.run(5.0)
 
     def test_the_hand_follows_stays_and_goes_on_when_it_is_let_go(self, whole):
         whole.run(1.5)
@@ -184,9 +186,7 @@ class TestHolding:
         self.held(whole, place)
         assert np.linalg.norm(whole.hand - place) < 5e-3 and whole.arm.phase is Phase.HELD and not whole.arm.note
         whole.arm.release()
-        whole.run(30, lambda: whole.arm.arrived > 0)
-        assert whole.missed() < 1e-3
-        whole.assert_no_jump()
+        whole.assert_arrives_without_a_jump()
 
     @pytest.mark.parametrize("seconds", [0.0, 1.5])
     def test_it_is_held_also_in_a_pause_and_stays_where_it_is_let_go(self, whole, seconds):
@@ -195,9 +195,8 @@ class TestHolding:
         whole.arm.hold(place)
         whole.run(0.1, moves=False)
         whole.arm.release()
-        whole.run(3.0, moves=False)
+        stays = whole.run(3.0, moves=False).arm.q
         assert np.linalg.norm(whole.hand - place) < 5e-3
-        stays = whole.arm.q
         np.testing.assert_array_equal(whole.run(1.0, moves=False).arm.q, stays)
         whole.run(30, lambda: whole.arm.arrived > 0)
         assert whole.missed() < 1e-3
@@ -212,95 +211,81 @@ class TestHolding:
         self.held(whole, np.array(whole.scenario.obstacles[0].position if place is None else place))
         assert whole.arm.note == note
         whole.assert_no_jump()
-        nearest = load_collision_model().nearest_to_obstacle(np.array(whole.passed), whole.scenario.obstacle)
-        assert nearest.distance > 0
+        whole.assert_free()
 
 
-class TestPause:
-    def test_it_stops_the_robot_and_not_the_world(self, whole):
-        stays = whole.run(1.0).arm.q
-        whole.run(1.0, moves=False)
-        np.testing.assert_array_equal(whole.arm.q, stays)
-        ahead = whole.arm.ahead
-        whole.show(changed(whole.scenario, obstacles=(sphere_at(ahead[len(ahead) // 2] + np.array([0, 0, 0.05])),)))
-        whole.run(1.0, moves=False)
-        np.testing.assert_array_equal(whole.arm.q, stays)
-        assert len(ahead) != len(whole.arm.ahead) or np.abs(ahead - whole.arm.ahead).max() > 0.02
-        whole.run(30, lambda: whole.arm.arrived > 0)
-        assert whole.missed() < 1e-3
+def test_a_pause_stops_the_robot_and_not_the_world(whole):
+    stays = whole.run(1.0).arm.q
+    np.testing.assert_array_equal(whole.run(1.0, moves=False).arm.q, stays)
+    ahead = whole.arm.ahead
+    whole.show(changed(whole.scenario, obstacles=(sphere_at(ahead[len(ahead) // 2] + np.array([0, 0, 0.05])),)))
+    np.testing.assert_array_equal(whole.run(1.0, moves=False).arm.q, stays)
+    assert len(ahead) != len(whole.arm.ahead) or np.abs(ahead - whole.arm.ahead).max() > 0.02
+    whole.run(30, lambda: whole.arm.arrived > 0)
+    assert whole.missed() < 1e-3
 
-    def test_a_thread_that_was_held_up_does_not_make_it_rush(self, whole):
-        whole.run(0.5)
-        before = whole.arm.q
-        whole.arm.advance(60.0, moves=True)
-        assert np.abs(whole.arm.q - before).max() < 0.26 * whole.robot.velocity_limits.max()
+
+def test_a_thread_that_was_held_up_does_not_make_it_rush(whole):
+    before = whole.run(0.5).arm.q
+    whole.arm.advance(60.0, moves=True)
+    assert np.abs(whole.arm.q - before).max() < 0.26 * whole.robot.velocity_limits.max()
 
 
 def test_what_is_seen_is_not_touched_before_there_is_a_motion_around_it(whole):
     """However long that takes: the sphere comes to rest in the way, and no stack takes over. It may slide along it."""
-    whole.run(1.0)
-    model, ahead = load_collision_model(), whole.arm.ahead
+    ahead = whole.run(1.0).arm.ahead
     place = ahead[np.linalg.norm(ahead - whole.hand, axis=1) > 0.25][0]
     seen = changed(whole.scenario, obstacles=(sphere_at(place),))
     whole.engine.see(seen)
     begun = len(whole.passed)
     whole.run(6.0)
-    passed = np.array(whole.passed[begun:])
-    assert model.nearest_to_obstacle(passed, seen.obstacle).distance > 0
+    whole.assert_free(seen.obstacle, since=begun)
     whole.show(seen)
     whole.run(30, lambda: whole.missed() < 1e-3)
+    whole.assert_arrives_without_a_jump()
+    whole.assert_free(since=begun)
+
+
+def test_it_says_that_it_is_touched_gives_way_and_goes_on(whole):
+    whole.run(2.0)
+    before, sphere = whole.scenario, sphere_at(whole.hand + np.array([0, 0, 0.1]), 0.6)
+    whole.show(changed(before, obstacles=(sphere,)), until=Stage.CERTIFIED)
+    whole.run(0.2)
+    assert whole.arm.phase is Phase.TOUCHED and whole.arm.note == "touched"
+    whole.run(3.0)
+    whole.assert_free(since=-2)
+    whole.show(before)
+    whole.assert_arrives_without_a_jump()
+
+
+@pytest.mark.parametrize("where", ["base", "start", "goal"])
+def test_nothing_jumps_where_there_is_no_motion(whole, where):
+    whole.run(1.0)
+    places = {"base": np.array([0.0, 0.0, 0.2]), "start": whole.frame.ghost[0][0], "goal": whole.frame.goal}
+    free = whole.scenario
+    whole.show(changed(free, obstacles=(sphere_at(places[where], 0.3),)), until=Stage.CERTIFIED)
+    assert whole.frame.blocked
+    whole.run(8.0)
+    whole.show(free)
+    whole.run(40, lambda: whole.missed() < 1e-3)
     assert whole.missed() < 1e-3
     whole.assert_no_jump()
-    assert model.nearest_to_obstacle(np.array(whole.passed[begun:]), seen.obstacle).distance > 0
 
 
-class TestBadInput:
-    def test_it_says_that_it_is_touched_gives_way_and_goes_on(self, whole):
-        whole.run(2.0)
-        before = whole.scenario
-        whole.show(
-            changed(before, obstacles=(sphere_at(whole.hand + np.array([0, 0, 0.1]), 0.6),)), until=Stage.CERTIFIED
-        )
-        whole.run(0.2)
-        assert whole.arm.phase is Phase.TOUCHED and whole.arm.note == "touched"
-        whole.run(3.0)
-        q = np.array(whole.passed[-2:])
-        assert load_collision_model().nearest_to_obstacle(q, whole.scenario.obstacle).distance > 0
-        whole.show(before)
-        whole.run(30, lambda: whole.arm.arrived > 0)
-        assert whole.missed() < 1e-3
-        whole.assert_no_jump()
-
-    @pytest.mark.parametrize("where", ["base", "start", "goal"])
-    def test_nothing_jumps_where_there_is_no_motion(self, whole, where):
-        whole.run(1.0)
-        places = {"base": np.array([0.0, 0.0, 0.2]), "start": whole.frame.ghost[0][0], "goal": whole.frame.goal}
-        free = whole.scenario
-        whole.show(changed(free, obstacles=(sphere_at(places[where], 0.3),)), until=Stage.CERTIFIED)
-        assert whole.frame.blocked
-        whole.run(8.0)
-        whole.show(free)
-        whole.run(40, lambda: whole.missed() < 1e-3)
-        assert whole.missed() < 1e-3
-        whole.assert_no_jump()
-
-    def test_it_waits_for_its_first_motion(self, engine):
-        arm = LiveArm(engine.follower)
-        arm.push()
-        arm.advance(1.0, moves=True)
-        assert arm.q is None and arm.undisturbed is None and len(arm.ahead) == 0 and arm.note == ""
+def test_it_waits_for_its_first_motion(engine):
+    arm = LiveArm(engine.follower)
+    arm.push()
+    arm.advance(1.0, moves=True)
+    assert arm.q is None and arm.undisturbed is None and len(arm.ahead) == 0 and arm.note == ""
 
 
 def test_it_is_put_elsewhere_and_goes_on_from_there(whole):
-    whole.run(1.0)
-    elsewhere = whole.arm.q + np.array([0.2, 0.1, -0.1, 0.0, 0.1, 0.0])
+    elsewhere = whole.run(1.0).arm.q + np.array([0.2, 0.1, -0.1, 0.0, 0.1, 0.0])
     whole.arm.put(elsewhere)
     whole.passed.clear()
     whole.run(PICTURE)
     assert np.abs(whole.arm.q - elsewhere).max() < 0.03
-    whole.run(30, lambda: whole.arm.arrived > 0)
-    assert whole.missed() < 1e-3
-    whole.assert_no_jump()
+    whole.assert_arrives_without_a_jump()
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])

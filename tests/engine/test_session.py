@@ -114,6 +114,8 @@ class Opened:
     engine: FakeEngine
     page: Page
     clock: list
+    before: Scenario | None = None
+    scene: Scenario | None = None
 
     def edit(self, gesture, **changes):
         self.session.edit(gesture, **changing(self.session.scenario, **changes))
@@ -140,23 +142,33 @@ def opened(monkeypatch):
     session.close()
 
 
+@pytest.fixture
+def in_scene(opened):
+    """The same, after a scene was loaded."""
+    task = TASKS["draw_s"]()
+    opened.engine.task = lambda name: task
+    opened.session.edit("view", view=View(grid=True, speed=2.0, colour="det"))
+    opened.before = opened.session.scenario
+    opened.scene = SCENES["cloud"].scenario(task)
+    opened.session.load("draw_s", SCENES["cloud"].scenario)
+    return opened
+
+
 def at(x):
     return Sphere((x, 0.0, 0.0))
 
 
-def test_a_session_begins_with_its_task(opened):
-    assert opened.session.scenario == fresh("draw_s")
-    assert opened.page.adopted == [fresh("draw_s")]
-    assert [frame.stage for frame in opened.page.frames] == list(Stage)
-    assert opened.shown == fresh("draw_s")
-
-
-def test_an_edit_is_adopted_computed_and_shown(opened):
+def test_a_session_begins_with_its_task_and_an_edit_is_adopted_computed_and_shown(opened):
+    assert opened.page.adopted == [fresh("draw_s")] == [opened.session.scenario]
+    assert opened.page.frames == [Sketch(fresh("draw_s"), stage) for stage in Stage]
     opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
-    assert opened.session.scenario.obstacles[0] == at(1.0)
-    assert opened.page.adopted[-1] == opened.shown == opened.session.scenario
+    edited = changed(fresh("draw_s"), obstacles=(at(1.0),))
+    assert opened.session.scenario == opened.page.adopted[-1] == opened.shown == edited
     assert opened.page.frames[-1].stage is max(Stage)
+    assert all(pace.latency >= 0 for pace in opened.page.paces)
+    shown = zip(opened.page.frames, opened.page.paces, strict=True)
+    assert min(pace.rate for frame, pace in shown if frame.stage is Stage.LIVE) >= 1
 
 
 def test_an_edit_that_changes_nothing_does_nothing(opened):
@@ -184,10 +196,17 @@ def test_a_view_is_no_step_of_undo_and_stays_when_others_are_taken_back(opened):
     assert opened.session.scenario == replace(fresh("draw_s"), view=View(ghost=False))
 
 
-def test_one_gesture_is_one_step_of_undo(opened):
+@pytest.mark.parametrize("held", [False, True], ids=["a slider", "a drag, however slow"])
+def test_one_gesture_is_one_step_of_undo(opened, held):
+    if held:
+        opened.session.begin_gesture()
     for x in np.linspace(0, 1, 20):
-        opened.clock[0] += 0.05
+        opened.clock[0] += 10 * GESTURE_PAUSE if held else 0.05
         opened.edit("obstacle", obstacles=(at(x),))
+    opened.session.end_gesture()
+    opened.edit("obstacle", obstacles=(at(9.0),))
+    opened.session.undo()
+    assert opened.session.scenario.obstacles[0] == at(1.0)
     opened.session.undo()
     assert opened.session.scenario == fresh("draw_s")
     opened.session.redo()
@@ -209,33 +228,25 @@ def test_the_next_gesture_is_a_step_of_its_own(opened, ending):
     assert opened.session.scenario == middle
 
 
-def test_undo_and_redo_are_inverse_and_shown(opened):
+def test_undo_and_redo_are_inverse_and_shown_until_a_new_edit(opened):
     states = [opened.session.scenario]
     for step in range(5):
         opened.edit(f"control {step}", temperature=2.0 + step)
         states.append(opened.session.scenario)
-    for state in reversed(states[:-1]):
-        opened.session.undo()
+    for move, expected in (
+        *((opened.session.undo, state) for state in (*reversed(states[:-1]), states[0])),
+        *((opened.session.redo, state) for state in (*states[1:], states[-1])),
+    ):
+        move()
         opened.settle()
-        assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == state
+        assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == expected
     opened.session.undo()
-    assert opened.session.scenario == states[0]
-    for state in states[1:]:
-        opened.session.redo()
-        opened.settle()
-        assert opened.session.scenario == opened.shown == state
+    opened.edit("another", temperature=1.5)
+    edited = opened.session.scenario
     opened.session.redo()
-    assert opened.session.scenario == states[-1]
-
-
-def test_a_new_edit_ends_what_could_be_redone(opened):
-    opened.edit("a", temperature=2.0)
+    assert opened.session.scenario == edited
     opened.session.undo()
-    opened.edit("b", temperature=3.0)
-    opened.session.redo()
-    assert opened.session.scenario.avoidance.temperature == 3.0
-    opened.session.undo()
-    assert opened.session.scenario == fresh("draw_s")
+    assert opened.session.scenario == states[-2]
 
 
 def test_history_does_not_grow_without_end(opened):
@@ -257,29 +268,23 @@ def test_reset_goes_back_to_the_beginning_and_how_it_was_seen_and_the_motion_can
     assert opened.session.scenario == replace(changed, view=View())
 
 
-def test_another_task_brings_its_place_and_keeps_other_choices(opened):
+def test_another_task_brings_its_place_and_its_slice_and_keeps_other_choices(opened):
+    session, pose = opened.session, SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
     opened.edit("size", obstacles=(Sphere((0.0, 0.0, 0.0), 0.22),), temperature=3.0)
-    opened.session.choose_task("lift_box")
+    session.edit("slice", view=replace(session.scenario.view, slice=pose))
+    before = session.scenario
+    session.choose_task("lift_box")
     opened.settle()
-    scenario = opened.session.scenario
-    assert (scenario.task, scenario.avoidance.temperature) == ("lift_box", 3.0)
+    scenario = session.scenario
+    assert (scenario.task, scenario.avoidance.temperature, scenario.view.slice) == ("lift_box", 3.0, None)
     assert scenario.obstacles == (Sphere(fresh("lift_box").obstacles[0].position, 0.22),)
     assert opened.shown == scenario
-    opened.session.undo()
-    assert opened.session.scenario.task == "draw_s"
-    assert opened.session.scenario.obstacles[0] == Sphere((0.0, 0.0, 0.0), 0.22)
-
-
-def test_another_task_has_its_own_slice_and_undo_brings_the_moved_one_back(opened):
-    session = opened.session
-    pose = SlicePose((0.1, -0.4, 0.5), (0.6, 0.8, 0.0, 0.0))
-    session.edit("slice", view=replace(session.scenario.view, slice=pose))
-    session.choose_task("lift_box")
-    assert session.scenario.view.slice is None
     session.undo()
-    assert session.scenario.view.slice == pose
+    assert session.scenario == before
     session.redo()
-    assert session.scenario.view.slice is None
+    assert session.scenario == scenario
+    session.choose_task("lift_box")
+    assert session.scenario == scenario  # the same one changes nothing
 
 
 def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first(opened):
@@ -295,12 +300,6 @@ def test_another_task_begins_with_its_own_obstacle_in_the_shape_of_the_first(ope
     assert opened.session.scenario.obstacles == ()
 
 
-def test_choosing_the_same_task_changes_nothing(opened):
-    opened.edit("obstacle", obstacles=(at(1.0),))
-    opened.session.choose_task("draw_s")
-    assert opened.session.scenario.obstacles[0] == at(1.0)
-
-
 def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
     with pytest.raises(DemonstrationError, match=r"broken\.csv"):
         opened.session.choose_task("broken")
@@ -308,19 +307,6 @@ def test_a_task_that_cannot_be_read_is_refused_and_the_session_stays(opened):
     opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     assert opened.shown.obstacles[0] == at(1.0)
-
-
-def test_a_drag_is_one_step_for_undo_however_slow(opened):
-    opened.session.begin_gesture()
-    for x in range(1, 5):
-        opened.edit("obstacle", obstacles=(at(float(x)),))
-        opened.clock[0] += 10 * GESTURE_PAUSE
-    opened.session.end_gesture()
-    opened.edit("obstacle", obstacles=(at(9.0),))
-    opened.session.undo()
-    assert opened.session.scenario.obstacles[0] == at(4.0)
-    opened.session.undo()
-    assert opened.session.scenario == fresh("draw_s")
 
 
 def test_a_drag_whose_end_is_lost_ends_with_the_next_control(opened):
@@ -346,39 +332,34 @@ def test_an_error_is_shown_once_and_the_session_goes_on(opened, caplog):
     assert len(opened.page.errors) == 1
 
 
+UNDRAWABLE = View(generator=True, generator_layer=-9, health_plots=True)
+
+
 def test_a_view_that_cannot_be_drawn_is_left_by_reset(opened, caplog):
-    bad = View(generator=True, generator_layer=-9, health_plots=True)
     with caplog.at_level(logging.CRITICAL):
-        opened.edit("view", view=bad)
+        opened.edit("view", view=UNDRAWABLE)
         opened.settle()
     assert [str(error) for error in opened.page.errors] == ["no such flow"]
     opened.session.reset()
     opened.settle()
-    assert opened.session.scenario == fresh("draw_s")
     assert opened.page.frames[-1] == Sketch(fresh("draw_s"), Stage.CERTIFIED)
-    assert len(opened.page.errors) == 1
+    assert opened.session.scenario == fresh("draw_s") and len(opened.page.errors) == 1
 
 
-def test_after_a_picture_that_failed_any_choice_that_can_be_drawn_is(opened, caplog):
+@pytest.mark.parametrize("meanwhile", [False, True])
+def test_after_a_picture_that_failed_or_is_failing_any_choice_that_can_be_drawn_is(opened, caplog, meanwhile):
     """Also one that needs nothing but what was asked for before, and did not come."""
-    with caplog.at_level(logging.CRITICAL):
-        opened.edit("view", view=View(generator=True, generator_layer=-9))
-        opened.settle()
-    opened.page.frames.clear()
-    opened.edit("view", view=View())
-    opened.settle()
-    assert opened.page.frames[-1] == Sketch(opened.session.scenario, Stage.CERTIFIED)
-
-
-def test_a_view_that_is_left_while_it_fails_is_drawn_without_another_edit(opened, caplog):
-    gate = opened.engine.gate = threading.Event()
+    opened.engine.gate = threading.Event()
     opened.engine.begun.clear()
     with caplog.at_level(logging.CRITICAL):
-        opened.edit("view", view=View(generator=True, generator_layer=-9))
+        opened.edit("view", view=UNDRAWABLE)
         assert opened.engine.begun.wait(PATIENCE)
+        if not meanwhile:
+            opened.engine.gate.set()
+            opened.settle()
         opened.page.frames.clear()
         opened.edit("view", view=View())
-        gate.set()
+        opened.engine.gate.set()
         opened.settle()
     assert opened.page.frames[-1] == Sketch(opened.session.scenario, Stage.CERTIFIED)
 
@@ -410,12 +391,6 @@ def test_edits_during_a_computation_are_overtaken_by_the_last(opened):
     # something is shown while dragging, field and arm unless they were drawn a moment ago; refined is only what rests
     assert stages in ([Stage.ROLLOUTS], [Stage.ROLLOUTS, Stage.LIVE])
     assert opened.page.paces[-1].num_skipped == 6
-
-
-def test_paces_are_those_of_the_edits(opened):
-    assert all(pace.latency >= 0 for pace in opened.page.paces)
-    shown = zip(opened.page.frames, opened.page.paces, strict=True)
-    assert min(pace.rate for frame, pace in shown if frame.stage is Stage.LIVE) >= 1
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -490,18 +465,24 @@ def begin_learning(opened, task="lift_box"):
     assert opened.engine.learning.wait(PATIENCE)
 
 
-def test_cancelling_goes_back_to_the_task_that_was_shown_and_says_so(opened):
+def test_cancelling_goes_back_to_what_was_shown_and_the_task_can_be_chosen_again(opened):
     opened.edit("obstacle", obstacles=(at(1.0),))
     opened.settle()
     before = opened.session.scenario
+    opened.session.cancel()  # nothing is learned: there is nothing to cancel
+    opened.settle()
+    assert opened.session.scenario == before and opened.page.cancellations == []
     begin_learning(opened)
     opened.session.cancel()
     opened.settle()
     assert opened.session.scenario == opened.shown == opened.page.adopted[-1] == before
-    assert opened.page.cancellations == ["lift_box"]
-    assert opened.page.errors == []
+    assert (opened.page.cancellations, opened.page.errors) == (["lift_box"], [])
     opened.session.undo()  # as if the other task had never been chosen
     assert opened.session.scenario == fresh("draw_s")
+    opened.engine.unlearned = set()
+    opened.session.choose_task("lift_box")
+    opened.settle()
+    assert opened.shown.task == "lift_box"
 
 
 def test_cancelling_keeps_the_view_and_forgets_what_was_edited_meanwhile(opened):
@@ -513,16 +494,6 @@ def test_cancelling_keeps_the_view_and_forgets_what_was_edited_meanwhile(opened)
     assert opened.session.scenario == opened.shown == replace(fresh("draw_s"), view=View(ghost=False))
     opened.session.undo()
     assert opened.session.scenario.task == "draw_s"
-
-
-def test_what_was_cancelled_can_be_chosen_again(opened):
-    begin_learning(opened)
-    opened.session.cancel()
-    opened.settle()
-    opened.engine.unlearned = set()
-    opened.session.choose_task("lift_box")
-    opened.settle()
-    assert opened.shown.task == "lift_box"
 
 
 @pytest.mark.parametrize("how", ["another task", "undo"])
@@ -548,15 +519,6 @@ def test_moving_the_obstacle_does_not_begin_learning_anew(opened):
     opened.engine.unlearned = set()
     opened.settle()
     assert opened.shown.obstacles[0] == at(4.0)
-
-
-def test_there_is_nothing_to_cancel_when_nothing_is_learned(opened):
-    opened.edit("obstacle", obstacles=(at(1.0),))
-    opened.settle()
-    opened.session.cancel()
-    opened.settle()
-    assert opened.session.scenario.obstacles[0] == at(1.0)
-    assert opened.page.cancellations == []
 
 
 def test_the_first_task_can_be_cancelled_too_and_any_edit_begins_again():
@@ -604,50 +566,40 @@ def test_a_picture_that_is_computed_on_demand_is_asked_for_once_it_is_shown(open
     assert opened.session.scenario == replace(fresh("draw_s"), view=View(generator_layer=2))
 
 
-def test_a_scene_is_seen_as_it_wants_to_be_and_undo_brings_back_what_was_seen_before(opened):
-    session, task = opened.session, TASKS["draw_s"]()
-    opened.engine.task = lambda name: task
-    session.edit("view", view=View(grid=True, speed=2.0, colour="det"))
-    before, scene = session.scenario, SCENES["cloud"].scenario(task)
-    session.load("draw_s", SCENES["cloud"].scenario)
-    opened.settle()
-    assert opened.shown == replace(scene, view=replace(scene.view, speed=2.0))
+def test_a_scene_is_seen_as_it_wants_to_be_and_undo_brings_back_what_was_seen_before(in_scene):
+    session, scene = in_scene.session, in_scene.scene
+    in_scene.settle()
+    assert in_scene.shown == replace(scene, view=replace(scene.view, speed=2.0))
     assert not scene.view.grid and scene.view.colour == "occupancy"
     session.undo()
-    assert session.scenario == before
+    assert session.scenario == in_scene.before
     session.redo()
     assert session.scenario.view == replace(scene.view, speed=2.0)
 
 
 @pytest.mark.parametrize("leave", ["leave_scene", "choose_task"])
-def test_a_scene_that_is_left_leaves_nothing_of_what_it_shows(opened, leave):
-    session, task = opened.session, TASKS["draw_s"]()
-    opened.engine.task = lambda name: task
-    session.load("draw_s", SCENES["cloud"].scenario)
-    if leave == "leave_scene":
-        session.leave_scene()
-        assert session.scenario == fresh("draw_s")
-        session.leave_scene()
-        assert session.scenario == fresh("draw_s")
-    else:
-        session.choose_task("lift_box")
-        assert session.scenario == fresh("lift_box")
+def test_a_scene_that_is_left_leaves_nothing_of_what_it_shows(in_scene, leave):
+    session = in_scene.session
+    for _ in range(2):  # left already, it stays left
+        if leave == "leave_scene":
+            session.leave_scene()
+        else:
+            session.choose_task("lift_box")
+        left = fresh("draw_s" if leave == "leave_scene" else "lift_box")
+        assert session.scenario == replace(left, view=replace(left.view, speed=2.0))
     session.undo()
     assert session.scenario.view.colour == "occupancy"
 
 
-def test_reset_in_a_scene_brings_the_scene_back_as_it_was(opened):
-    session, task = opened.session, TASKS["draw_s"]()
-    opened.engine.task = lambda name: task
-    session.load("draw_s", SCENES["cloud"].scenario)
-    loaded = session.scenario
-    opened.edit("size", obstacles=(at(1.0),), temperature=2.0)
+def test_reset_in_a_scene_brings_the_scene_back_as_it_was(in_scene):
+    session, loaded = in_scene.session, in_scene.session.scenario
+    in_scene.edit("size", obstacles=(at(1.0),), temperature=2.0)
     session.edit("view", view=View(grid=True))
-    changed = session.scenario
+    edited = session.scenario
     session.reset()
-    assert session.scenario == loaded
+    assert session.scenario == replace(loaded, view=replace(loaded.view, speed=1.0))
     session.undo()
-    assert session.scenario.moves_like(changed)
+    assert session.scenario.moves_like(edited)
 
 
 def test_moving_the_slice_is_a_step_for_undo(opened):

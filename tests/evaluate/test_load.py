@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 from contextlib import AsyncExitStack
 from types import SimpleNamespace
 from typing import Any
@@ -130,15 +131,10 @@ def test_visitors_of_a_started_server_who_look_on_cost_something(tmp_path, monke
     monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
     monkeypatch.setattr(load, "SETTLED", 0.0)
     out = tmp_path / "rest.json"
-    assert main(["load", "--rest", "--clients", "1", "--seconds", "1.5", "--out", str(out)]) == 0
+    assert main(["load", "--rest", "--clients", "1", "--seconds", "0.8", "--out", str(out)]) == 0
     figures = json.loads(out.read_text())
     assert 0 < figures["core_percent"] < 400 and figures["messages_per_s"] > 1 and figures["peak_memory_mb"] > 50
     assert f"{figures['core_percent']:.1f} % of a core" in capsys.readouterr().out
-
-
-def test_the_cost_of_a_server_that_runs_elsewhere_is_unknown(capsys, url):
-    assert main(["load", "--rest", "--url", url]) == 2
-    assert "--rest" in capsys.readouterr().err
 
 
 def test_who_gets_no_picture_fails_the_measurement(monkeypatch, capsys, url):
@@ -156,14 +152,14 @@ def test_a_server_that_is_not_there_fails_the_measurement(monkeypatch, capsys, u
 
 @pytest.fixture
 def unused_port():
-    import socket
-
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
-def test_what_is_no_address_is_refused(capsys):
+def test_what_is_no_address_or_has_no_known_cost_is_refused(capsys):
     with pytest.raises(SystemExit):
         main(["load", "--url", "127.0.0.1:8080"])
     assert "found '127.0.0.1:8080'; accepted: ws:// or wss://" in capsys.readouterr().err
+    assert main(["load", "--rest", "--url", "ws://127.0.0.1:8080"]) == 2  # of a server that runs elsewhere
+    assert "--rest" in capsys.readouterr().err

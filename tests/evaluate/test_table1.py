@@ -126,24 +126,14 @@ def test_a_motion_that_stays_at_its_start_is_measured(problem):
 
 
 class TestMissing:
-    @pytest.fixture
-    def without_extras(self, monkeypatch):
-        monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda module: None)
-        monkeypatch.setattr("dt_viz.evaluate.figure6.find_spec", lambda module: None)
-
-    def test_what_is_not_installed_is_said(self, without_extras, tmp_path, capsys):
+    def test_what_is_not_installed_is_said(self, monkeypatch, tmp_path, capsys):
+        for module in ("dt_viz.baselines.base", "dt_viz.evaluate.figure6"):
+            monkeypatch.setattr(f"{module}.find_spec", lambda module: None)
         assert main([*ARGUMENTS, "mpnet-rrt", "linear", "--out", str(tmp_path)]) == 1
         said = capsys.readouterr().err
         assert "MPNet-RRT needs ompl: pip install" in said
         assert "figure 6 needs matplotlib" in said
         assert not (tmp_path / "table1.json").exists()
-
-    def test_what_is_left_out_is_not_missed(self, without_extras, tmp_path):
-        assert (
-            main([*ARGUMENTS, "linear", "--count", "1", "--perturbed", "0", "--no-figures", "--out", str(tmp_path)])
-            == 0
-        )
-        assert not list(tmp_path.glob("figure6*"))
 
     def test_a_method_that_was_not_trained_is_said(self, monkeypatch, tmp_path, capsys):
         monkeypatch.setitem(METHODS, "mpnet", MPNet(tmp_path))
@@ -152,9 +142,13 @@ class TestMissing:
 
 
 class TestFigure6:
-    def test_is_drawn_in_both_formats(self, folder):
+    def test_is_drawn_in_both_formats_unless_it_is_left_out(self, folder, monkeypatch, tmp_path):
         assert (folder / "figure6_push_box.svg").read_text().startswith("<?xml")
         assert (folder / "figure6_push_box.png").read_bytes().startswith(b"\x89PNG")
+        monkeypatch.setattr("dt_viz.evaluate.figure6.find_spec", lambda module: None)  # then it is not missed
+        few = ["linear", "--count", "1", "--perturbed", "0", "--no-figures"]
+        assert main([*ARGUMENTS, *few, "--out", str(tmp_path)]) == 0
+        assert not list(tmp_path.glob("figure6*"))
 
     def test_curves_are_distance_and_depth_along_the_path(self):
         x = np.stack([np.linspace(0, 1, 7), np.full(7, 0.25), np.zeros(7)], axis=1)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from laws.registry import bent
 from scipy.linalg import expm
 
 from dt_viz.flows.collocation import collocated, implicit_euler_path
-from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import implicit_euler, integrate, rk4
 from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.obstacles.union import Union
@@ -23,11 +23,6 @@ class Linear:
 
     def with_jacobian(self, s):
         return self(s), np.broadcast_to(self.A, (len(s), *self.A.shape))
-
-
-def smooth_field(rng, dim, size):
-    grid = GaussianGrid(tuple(np.linspace(-1, 1, 4) for _ in range(dim)), 2.0)
-    return GridRBF(grid, size * rng.normal(size=(grid.num_points, dim)))
 
 
 FIELDS = {
@@ -71,7 +66,7 @@ def test_a_field_that_is_too_steep_is_told():
 @pytest.mark.parametrize("steps", [1, 4, 9])
 def test_implicit_euler_as_a_whole_is_that_step_by_step(dim, steps):
     rng = np.random.default_rng(steps)
-    field = smooth_field(rng, dim, 0.1)
+    field = bent(dim, steps, 0.1)
     for point in rng.uniform(-1, 1, (10, dim)):
         end, tangents = integrate(implicit_euler, field, point[None], np.eye(dim)[None], 1.0, steps)
         mapped = implicit_euler_path(field, point, 1.0, steps, 1e-8)

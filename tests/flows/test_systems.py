@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from laws.registry import bent
+from oracles import central_differences
 
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow
 from dt_viz.flows.fields import GaussianGrid, GridRBF
@@ -23,10 +24,14 @@ ROUNDING = 10 * np.finfo(float).eps * ATTRACTOR.speed * ATTRACTOR.smoothing
 SYSTEM = DiffeomorphicSystem(Flow(bent(2, strength=0.25), 1.0, 20), ATTRACTOR)
 
 
-def test_the_velocity_is_the_falling_gradient_of_the_potential():
-    z, h = np.random.default_rng(1).uniform(-1, 1, (20, 2)), 1e-6
-    gradient = [(ATTRACTOR.potential(z + e) - ATTRACTOR.potential(z - e)) / (2 * h) for e in h * np.eye(2)]
-    np.testing.assert_allclose(ATTRACTOR.velocity(z), -np.stack(gradient, axis=-1), rtol=0, atol=1e-8)
+def test_the_velocity_is_the_falling_gradient_of_the_potential_which_is_a_parabola_close_to_the_goal():
+    z = np.random.default_rng(1).uniform(-1, 1, (20, 2))
+    gradient = central_differences(ATTRACTOR.potential, z, 1e-4)
+    np.testing.assert_allclose(ATTRACTOR.velocity(z), -gradient, rtol=0, atol=1e-8)
+    r = np.array([1e-3, 1e-5, 1e-7])
+    parabola = ATTRACTOR.speed * r**2 / (2 * ATTRACTOR.smoothing)
+    near = ATTRACTOR.goal + r[:, None] * np.array([1.0, 0.0])
+    np.testing.assert_allclose(ATTRACTOR.potential(near), parabola, rtol=1e-4, atol=ROUNDING)
 
 
 def test_far_from_the_goal_nothing_overflows_and_the_speed_is_the_chosen_one():
@@ -39,13 +44,6 @@ def test_far_from_the_goal_nothing_overflows_and_the_speed_is_the_chosen_one():
     assert (radius[:, 3] < 1e-12).all()
     np.testing.assert_allclose(np.linalg.norm(far.velocity(z0), axis=-1), 0.1, rtol=1e-14)
     np.testing.assert_allclose(far.potential(z0), 0.1 * (10 - 1e-3 * np.log(2)), rtol=1e-12)
-
-
-def test_close_to_the_goal_the_potential_is_its_parabola():
-    r = np.array([1e-3, 1e-5, 1e-7])
-    z = ATTRACTOR.goal + r[:, None] * np.array([1.0, 0.0])
-    parabola = ATTRACTOR.speed * r**2 / (2 * ATTRACTOR.smoothing)
-    np.testing.assert_allclose(ATTRACTOR.potential(z), parabola, rtol=1e-4, atol=ROUNDING)
 
 
 @given(seeds, st.floats(1e-4, 0.5))
@@ -63,12 +61,8 @@ def test_arrival_times_are_when_the_flow_is_there(seed, distance):
 def test_logarithmic_hyperbolic_functions_are_inverse(a):
     assert log_sinh(np.array(a)) == pytest.approx(np.log(np.sinh(a)), abs=1e-12, rel=1e-12)
     assert asinh_exp(log_sinh(np.array(a))) == pytest.approx(a, rel=1e-12)
-
-
-def test_logarithmic_hyperbolic_functions_do_not_overflow():
-    assert asinh_exp(log_sinh(np.array(1e6))) == pytest.approx(1e6, rel=1e-14)
-    assert log_sinh(np.array(0.0)) == -np.inf
-    assert asinh_exp(np.array(-np.inf)) == 0
+    assert asinh_exp(log_sinh(np.array(3e3 * a))) == pytest.approx(3e3 * a, rel=1e-12)  # where sinh overflows, too
+    assert (log_sinh(np.array(0.0)), asinh_exp(np.array(-np.inf))) == (-np.inf, 0)
 
 
 def around_a_sphere(tolerance=2e-9):
@@ -109,19 +103,14 @@ def test_the_velocity_at_one_point_is_that_in_a_batch():
     np.testing.assert_allclose(alone, system.velocity(y), rtol=0, atol=1e-9)
 
 
-def test_the_velocity_approaches_the_exact_one_with_the_tolerance():
+def test_the_velocity_approaches_the_exact_one_with_the_tolerance_and_a_controllers_is_exact_to_a_thousandth():
     system, y = around_a_sphere(1e-10)
     exact = system.velocity(y)
     speed = np.linalg.norm(exact, axis=1, keepdims=True)
     errors = [np.abs((system.at_tolerance(h).velocity(y) - exact) / speed).max() for h in (1e-4, 1e-6, 1e-8)]
     assert errors[0] > 10 * errors[1] > 100 * errors[2]
-
-
-def test_a_controllers_velocity_at_one_point_is_exact_to_a_thousandth():
-    system, y = around_a_sphere(1e-10)
-    exact, controlled = system.velocity(y), system.at_tolerance(1e-6)
+    controlled = system.at_tolerance(1e-6)
     velocity = np.stack([controlled.velocity(point) for point in y])
-    speed = np.linalg.norm(exact, axis=1, keepdims=True)
     assert 0 < np.abs((velocity - exact) / speed).max() < 1e-3
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from laws.registry import bent
 
 from dt_viz.flows import tabulated as module
 from dt_viz.flows.diffeomorphisms import Flow, Placed
-from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.tabulated import Tabulated, tabulated
 from dt_viz.interruption import interruptible
 
@@ -14,9 +14,7 @@ MARGIN = 0.2
 
 def some_flow(dim):
     """A flow that bends the unit box by about a tenth."""
-    grid = GaussianGrid((np.linspace(0, 1, 4),) * dim, 4.0)
-    weights = 0.1 * np.random.default_rng(dim).normal(size=(grid.num_points, dim))
-    return Flow(GridRBF(grid, weights), 1.0, 6)
+    return Flow(bent(dim, dim, 0.1), 1.0, 6)
 
 
 @pytest.fixture(params=[2, 3])

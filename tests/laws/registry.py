@@ -296,13 +296,15 @@ FIELDS: dict[str, Generator] = {
     ),
     "sideways": Generator(sideways(), uniform(3, 0.5)),
     "signed distance": Generator(SignedDistanceField(Union((HAND,))), around_hand, 1e-5, 1e-4),
-    "escape of the hand": Generator(WholeArmField(ROBOT, BODY, HAND, UP, PINS, REACH), near_ready, 1e-5, 1e-5),
-    "escape of the elbow": Generator(WholeArmField(ROBOT, BODY, ELBOW, UP, PINS, REACH), near_ready, 1e-5, 1e-5),
-    "escape from a small ball": Generator(
-        WholeArmField(ROBOT, BODY, beside_hand(0.01, diameter=0.04), UP, PINS, REACH), near_ready, 1e-5, 1e-5
+    "escape of the hand": Generator(WholeArmField(ROBOT, BODY, (HAND,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5),
+    "escape of the elbow": Generator(
+        WholeArmField(ROBOT, BODY, (ELBOW,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5
     ),
-    "gradient at the hand": Generator(GradientField(ROBOT, BODY, HAND, REACH), near_ready, 1e-5, 1e-5),
-    "gradient at the elbow": Generator(GradientField(ROBOT, BODY, ELBOW, REACH), near_ready, 1e-5, 1e-5),
+    "escape from a small ball": Generator(
+        WholeArmField(ROBOT, BODY, (beside_hand(0.01, diameter=0.04),), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5
+    ),
+    "gradient at the hand": Generator(GradientField(ROBOT, BODY, (HAND,), REACH), near_ready, 1e-5, 1e-5),
+    "gradient at the elbow": Generator(GradientField(ROBOT, BODY, (ELBOW,), REACH), near_ready, 1e-5, 1e-5),
 }
 WITHOUT_DERIVATIVE = {"_Clocked"}
 """Fields that no tangents are carried along."""

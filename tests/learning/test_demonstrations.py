@@ -3,6 +3,7 @@
 import io
 import pickle
 import zipfile
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -67,17 +68,17 @@ def refusal(content, source):
 
 
 class TestChecks:
-    def test_times_are_shifted_to_zero_and_arrays_are_read_only_floats(self):
-        (checked,) = check_demonstrations([Demonstration(np.array([5, 6, 8]), np.eye(3, dtype=int), "a")], "memory")
+    def test_times_are_shifted_to_zero_and_arrays_are_read_only_floats_but_those_of_the_caller(self):
+        given = Demonstration(np.array([5, 6, 8]), np.eye(3, dtype=int), "a")
+        (checked,) = check_demonstrations([given], "memory")
         np.testing.assert_array_equal(checked.times, [0, 1, 3])
         assert checked.times.dtype == checked.positions.dtype == np.float64
         assert not checked.times.flags.writeable and not checked.positions.flags.writeable
         assert (checked.dimension, checked.duration) == (3, 3.0)
-
-    def test_the_arrays_of_the_caller_stay_as_they_were(self):
-        times, positions = np.array([1.0, 2.0]), np.eye(2)
-        check_demonstrations([Demonstration(times, positions, "a")], "memory")
-        assert times.flags.writeable and positions.flags.writeable and times[0] == 1.0
+        assert given.times.flags.writeable and given.positions.flags.writeable and given.times[0] == 5
+        (again,) = check_demonstrations([checked], "memory")
+        np.testing.assert_array_equal(again.positions, checked.positions)
+        np.testing.assert_array_equal(again.times, checked.times)
 
     @pytest.mark.parametrize(
         ("times", "positions", "words"),
@@ -107,19 +108,11 @@ class TestChecks:
             check_demonstrations([Demonstration(np.array(times), positions, "a")], "memory")
         assert all(word in str(caught.value) for word in ["memory: ", "accepted: ", *words]), str(caught.value)
 
-    def test_no_demonstration_is_refused(self):
+    def test_none_and_mixed_dimensions_are_refused(self):
         with pytest.raises(DemonstrationError, match="none; accepted: at least one"):
             check_demonstrations([], "memory")
-
-    def test_mixed_dimensions_are_refused(self):
         with pytest.raises(DemonstrationError, match="2 in 'flat' but 3 in 'deep'"):
             check_demonstrations([motion("flat"), motion("deep", dimension=3)], "memory")
-
-    def test_checking_twice_changes_nothing(self):
-        once = check_demonstrations([motion()], "memory")
-        twice = check_demonstrations(once, "memory")
-        np.testing.assert_array_equal(once[0].positions, twice[0].positions)
-        np.testing.assert_array_equal(once[0].times, twice[0].times)
 
     def test_the_error_survives_pickling(self):
         error = DemonstrationError("a.csv", "header line", "nothing", "a header")
@@ -135,7 +128,7 @@ class TestNpz:
         ),
         st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])),
     )
-    @settings(deadline=None, max_examples=50)
+    @settings(max_examples=50)
     def test_round_trip(self, tmp_path_factory, tables, name):
         for table in tables:
             table[0, 0] = -100  # so that none stays at one point
@@ -170,24 +163,19 @@ class TestNpz:
         assert not trap.exists()
 
     def test_missing_unknown_and_wrong_arrays_are_named(self):
+        assert "demonstrations: found none" in refusal(npz_bytes(), "a.npz")
         assert "no 'positions_0'" in refusal(npz_bytes(times_0=np.arange(2)), "a.npz")
         named = {"times_0": np.arange(2), "positions_0": np.eye(2), "name_0": np.arange(3)}
         assert "name_0: found int64 of shape (3,)" in refusal(npz_bytes(**named), "a.npz")
         assert "'velocity_0'" in refusal(npz_bytes(velocity_0=np.arange(2)), "a.npz")
 
-    def test_an_archive_without_arrays_is_refused(self):
-        assert "demonstrations: found none" in refusal(npz_bytes(), "a.npz")
-
-    def test_an_archive_that_unpacks_to_more_than_the_limit_is_not_unpacked(self):
-        file = io.BytesIO()
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+    def test_an_archive_that_unpacks_to_more_than_the_limit_and_a_single_array_are_refused(self):
+        bomb, single = io.BytesIO(), io.BytesIO()
+        with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("times_0.npy", npy_header(MAX_BYTES // 8 + 1) + bytes(MAX_BYTES + 8))
-        assert "when unpacked" in refusal(file.getvalue(), "bomb.npz")
-
-    def test_a_single_array_with_the_suffix_of_an_archive_is_refused(self):
-        file = io.BytesIO()
-        np.save(file, np.eye(2))
-        refusal(file.getvalue(), "a.npz")
+        assert "when unpacked" in refusal(bomb.getvalue(), "bomb.npz")
+        np.save(single, np.eye(2))
+        refusal(single.getvalue(), "a.npz")
 
     def test_other_suffixes_are_not_written(self, tmp_path):
         with pytest.raises(DemonstrationError, match=r"accepted: \.npz"):
@@ -216,32 +204,22 @@ class TestCsv:
         ("text", "words"),
         [
             ("x,y\n0,1\n", ["header line", "'x,y'", "'t,x,y'"]),
-            ("0,1,2\n1,2,3\n", ["header line", "'0,1,2'"]),
             ("t,x,y\n", ["demonstrations: found none"]),
             ("t,x,y\n0,1,2\n", ["1 sample"]),
-            ("t,x,y\n0,1,2\n1,2\n", ["line 3", "2 columns", "accepted: 3"]),
             ("t,x,y\n0,1,2\n1,two,2\n", ["line 3", "'1,two,2'"]),
             ("t,x,y\n0,1,2\n1,nan,2\n", ["nan at line 3"]),
             ("demo,t,x,y\na,0,1,2\na,1,2,2\nb,0,1,2\n\nb,0,2,2\n", ["times of 'b'", "0 s at line 6, after 0 s"]),
-            ('t,x,y\n0,1,"2\n', ["line 2", "comma-separated"]),
-            ("\n\n", ["header line"]),
         ],
     )
     def test_refusals_name_the_line(self, text, words):
         message = refusal(text.encode(), "bad.csv")
         assert all(word in message for word in words), message
 
-    def test_text_in_another_encoding_is_refused(self):
-        assert "UTF-8" in refusal("t,x,y\n0,1,2\n".encode("utf-16"), "wide.csv")
-
-    def test_a_folder_of_mixed_dimensions_is_refused(self, tmp_path):
+    def test_a_folder_of_mixed_dimensions_or_with_other_files_is_refused_rather_than_read_in_part(self, tmp_path):
         (tmp_path / "a.csv").write_text("t,x,y\n0,0,0\n1,1,0\n")
         (tmp_path / "b.csv").write_text("t,x,y,z\n0,0,0,0\n1,1,0,0\n")
         with pytest.raises(DemonstrationError, match="2 in 'a' but 3 in 'b'"):
             load_demonstrations(tmp_path)
-
-    def test_a_folder_with_other_demonstration_files_is_refused_rather_than_read_in_part(self, tmp_path):
-        (tmp_path / "a.csv").write_text("t,x,y\n0,0,0\n1,1,0\n")
         save_demonstrations(tmp_path / "b.npz", [motion()])
         with pytest.raises(DemonstrationError, match=r"'b\.npz'"):
             load_demonstrations(tmp_path)
@@ -271,18 +249,18 @@ class TestLasa:
         message = refusal(lasa_bytes(demos), "odd.mat")
         assert all(word in message for word in words), message
 
-    def test_files_without_demos_are_refused(self):
+    @pytest.mark.parametrize(
+        ("variables", "version", "words"),
+        [
+            ({"x": 1.0}, "5", "variable 'demos': found no such"),
+            ({"demos": np.eye(3)}, "5", "no cells"),
+            ({"demos": np.eye(3)}, "4", "accepted: a MATLAB file of version 5 to 7"),
+        ],
+    )
+    def test_files_without_demos_and_of_other_versions_are_refused(self, variables, version, words):
         file = io.BytesIO()
-        scipy.io.savemat(file, {"x": 1.0})
-        assert "variable 'demos': found no such" in refusal(file.getvalue(), "x.mat")
-        file = io.BytesIO()
-        scipy.io.savemat(file, {"demos": np.eye(3)})
-        assert "no cells" in refusal(file.getvalue(), "x.mat")
-
-    def test_other_matlab_versions_are_refused(self):
-        file = io.BytesIO()
-        scipy.io.savemat(file, {"demos": np.eye(3)}, format="4")
-        assert "accepted: a MATLAB file of version 5 to 7" in refusal(file.getvalue(), "old.mat")
+        scipy.io.savemat(file, variables, format=version)
+        assert words in refusal(file.getvalue(), "x.mat")
 
     def test_a_folder_is_listed_by_shape_and_loaded(self, tmp_path):
         for name in ("Zig", "Arc"):
@@ -294,12 +272,9 @@ class TestLasa:
 
 class TestPaths:
     @pytest.mark.parametrize("load", [load_demonstrations, lasa_files])
-    def test_what_is_missing_is_named(self, tmp_path, load):
+    def test_what_is_missing_and_an_empty_folder_are_named(self, tmp_path, load):
         with pytest.raises(DemonstrationError, match="nowhere"):
             load(tmp_path / "nowhere")
-
-    @pytest.mark.parametrize("load", [load_demonstrations, lasa_files])
-    def test_an_empty_folder_is_refused(self, tmp_path, load):
         with pytest.raises(DemonstrationError, match=r"no \.(csv|mat) file"):
             load(tmp_path)
 
@@ -308,10 +283,8 @@ class TestPaths:
         assert all(suffix in refusal(b"t,x,y\n", name) for suffix in SUFFIXES)
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
-    def test_an_empty_file_is_refused(self, tmp_path, suffix):
-        (tmp_path / f"a{suffix}").touch()
-        with pytest.raises(DemonstrationError, match="an empty file"):
-            load_demonstrations(tmp_path / f"a{suffix}")
+    def test_an_empty_file_is_refused(self, suffix):
+        assert "an empty file" in refusal(b"", f"a{suffix}")
 
     def test_a_file_beyond_the_limit_is_not_read(self, tmp_path):
         with (tmp_path / "a.csv").open("wb") as file:
@@ -327,41 +300,26 @@ class TestPaths:
 
 def read_or_refuse(content, source):
     """Read; the only exception let through is one that is not a DemonstrationError."""
-    try:
-        demonstrations = read_demonstrations(content, source)
-    except DemonstrationError as error:
-        assert str(error)
-        return
-    for demonstration in demonstrations:
-        assert np.isfinite(demonstration.positions).all()
-        assert demonstration.times[0] == 0 and (np.diff(demonstration.times) > 0).all()
+    with suppress(DemonstrationError):
+        for demonstration in read_demonstrations(content, source):
+            assert np.isfinite(demonstration.positions).all()
+            assert demonstration.times[0] == 0 and (np.diff(demonstration.times) > 0).all()
 
 
 class TestHostileFiles:
+    """Beside damaged files (tests/files/test_hostile_files.py)."""
+
     @pytest.mark.parametrize("suffix", SUFFIXES)
     @given(content=st.binary(max_size=2000))
     @example(content=b"\x80\x04")
     @example(content=b"PK\x05\x06" + bytes(18))
-    @settings(deadline=None)
     def test_random_bytes(self, suffix, content):
         read_or_refuse(content, f"a{suffix}")
 
     @given(st.binary(min_size=8, max_size=500))
-    @settings(deadline=None)
     def test_random_bytes_behind_a_matlab_header(self, content):
         read_or_refuse(lasa_bytes()[:128] + content, "a.mat")
 
     @given(st.text(st.sampled_from("0123456789.,-eainfxyt\n\"' \0\r"), max_size=300))
-    @settings(deadline=None)
     def test_random_tables(self, text):
         read_or_refuse(b"demo,t,x,y\n" + text.encode(), "a.csv")
-
-    @pytest.mark.parametrize("suffix", [".npz", ".mat"])
-    @given(data=st.data())
-    @settings(deadline=None, max_examples=200)
-    def test_good_files_with_damaged_bytes(self, suffix, data):
-        good = lasa_bytes() if suffix == ".mat" else npz_bytes(times_0=motion().times, positions_0=motion().positions)
-        content = bytearray(good[: data.draw(st.integers(1, len(good)))])
-        for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=8)):
-            content[place] = data.draw(st.integers(0, 255))
-        read_or_refuse(bytes(content), f"a{suffix}")

@@ -37,7 +37,6 @@ def nested(levels):
     st.sampled_from(NUMBERS).flatmap(lambda dtype: arrays(dtype, array_shapes(min_dims=2, min_side=0, max_side=4))),
     st.booleans(),
 )
-@settings(deadline=None)
 def test_numbers_come_back_as_they_were_written(array, compressed):
     value = read_variable(written(compressed, before=1.0, x=array), "x")
     assert isinstance(value, np.ndarray)
@@ -111,7 +110,7 @@ def test_depth_is_limited():
 
 
 @given(data=st.data(), compressed=st.booleans())
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 def test_damaged_files_are_refused_or_read(data, compressed):
     cells = np.empty((1, 2), dtype=object)
     cells[0, 0], cells[0, 1] = {"t": np.eye(2), "pos": np.ones((1, 3), dtype=np.uint8)}, "text"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drawings import extent, from_one_start
 
 from dt_viz.evaluate.crossings import crossings
 from dt_viz.learning.augmented import AugmentedImitation
@@ -26,10 +27,6 @@ fit that turns far, with room to spare."""
 BESIDE = 0.02
 """Deviation of starts beside the demonstrated ones, relative to the extent."""
 FITTED_ELSEWHERE = ("draw_s", "draw_g", "push_box")
-
-
-def extent(demonstrations):
-    return float(np.ptp(np.concatenate([d.positions for d in demonstrations]), axis=0).max())
 
 
 def motions(demonstrations, state, order=None):
@@ -73,15 +70,6 @@ def test_motions_and_their_timing_do_not_hang_on_rounding_or_order(task, state):
     assert_repeated(TASKS[task]().demonstrations[:5], state)
 
 
-def from_one_start(demonstrations):
-    """They begin where the first one does."""
-    start = demonstrations[0].positions[0]
-    return [
-        replace(d, positions=d.positions + np.linspace(1, 0, len(d.positions))[:, None] * (start - d.positions[0]))
-        for d in demonstrations
-    ]
-
-
 def arcs(*heights):
     """Arcs over one straight line, of which starts, ends and durations agree exactly."""
     s = np.linspace(0, 1, 120)
@@ -119,14 +107,17 @@ def test_inducing_points_on_the_edge_of_the_reach_are_in_use_however_they_are_ro
         np.testing.assert_array_equal(Layer.near(points + noise, 1.0, spacing=1.0, reach=1.25).active, exact.active)
 
 
-def test_the_pace_is_solved_for_to_rounding():
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_pace_is_solved_for_to_rounding_also_at_its_limit(quick):
     rng, knots = np.random.default_rng(0), np.linspace(-2.0, 1.0, 24)
-    clock, elapsed = np.linspace(0.5, -2.0, 60), np.cumsum(rng.uniform(0, 0.1, 60))
-    pace = _fit_pace(knots, clock, elapsed, np.ones(60))
-    assert (pace >= MIN_PACE - 1e-12).all()
+    clock, steps = np.linspace(0.5, -2.0, 60), rng.uniform(0, 0.1, 60)
+    steps[20:40] *= 0.02 if quick else 1.0
+    pace = _fit_pace(knots, clock, np.cumsum(steps), np.ones(60))
+    assert (pace.min() == MIN_PACE) == quick and (pace >= MIN_PACE).all()
     for seed in range(5):
         noise = 1e-12 * np.random.default_rng(seed).normal(size=60)
-        np.testing.assert_allclose(_fit_pace(knots, clock, elapsed + noise, np.ones(60)), pace, rtol=0, atol=1e-9)
+        found = _fit_pace(knots, clock, np.cumsum(steps) + noise, np.ones(60))
+        np.testing.assert_allclose(found, pace, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -1,9 +1,11 @@
 """Style: what leads from one hand to another, taken off and put on, keeps ends, stability and det J = 1."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
+from drawings import frechet, path_from
 from scenes import kinds
 
 from dt_viz.evaluate.crossings import crossings
@@ -12,7 +14,6 @@ from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.learning.style import Style
-from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Layer, Scenario
@@ -21,6 +22,7 @@ from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.warning import Kind
 
 
+@lru_cache
 def learned(task):
     return fit_augmented(TASKS[task]().demonstrations)
 
@@ -30,21 +32,10 @@ def _style():
     return Style.between(*(learned(task) for task in STYLES["wavy"]))
 
 
-def path_of(imitation, start, num=300):
-    """Places of the motion from a start, evenly in the phase."""
-    system = imitation.system
-    z = system.base.at_fraction(system.transform.forward(imitation.states(start)), np.linspace(1, 0, num))
-    return system.transform.inverse(z)[:, : imitation.dim]
-
-
-def frechet(a, b):
-    return float(discrete_frechet(resample_by_arc_length(a, 150), resample_by_arc_length(b, 150)))
-
-
 def test_put_on_the_usual_motion_it_gives_the_styled_one(style):
     usual, styled = (learned(task) for task in STYLES["wavy"])
     given, without = (
-        np.mean([frechet(path_of(one, start), path_of(styled, start)) for start in styled.starts])
+        np.mean([frechet(path_from(one, start), path_from(styled, start)) for start in styled.starts])
         for one in (style.on(usual, 1.0), usual)
     )
     assert given < 0.6 * without  # the rest is how the demonstrations of one hand differ
@@ -62,11 +53,8 @@ def test_it_is_the_composition_of_the_two_shears(style):
         mean = (imitation.patterns[0].mean - imitation.goal) / imitation.top
         mean = mean - np.linspace(1, 0, len(mean))[:, None] * mean[0]
         pattern = replace(imitation.patterns[0], mean=mean * imitation.top + imitation.goal)
-        at_one.append(
-            replace(imitation, patterns=(pattern,)).placed(
-                -imitation.goal / imitation.top, np.eye(2), 1 / imitation.top
-            )
-        )
+        moved = replace(imitation, patterns=(pattern,))
+        at_one.append(moved.placed(-imitation.goal / imitation.top, np.eye(2), 1 / imitation.top))
     phases = np.linspace(0.02, 0.98, 20)
     condition = np.zeros(2)
     own = [imitation.patterns[0].shapes.at(condition) for imitation in at_one]  # what the starts add, which is no style
@@ -85,10 +73,10 @@ def test_taken_off_again_nothing_is_left_and_ends_stay(style, task):
     own = learned(task)
     on = style.on(own, 0.7)
     start = own.starts[1]
-    np.testing.assert_allclose(path_of(on, start)[[0, -1]], np.stack([start, own.goal]), atol=1e-12)
-    np.testing.assert_allclose(path_of(style.on(on, -0.7), start), path_of(own, start), atol=1e-12)
-    size = float(np.ptp(path_of(own, start), axis=0).max())
-    assert frechet(path_of(on, start), path_of(own, start)) > 0.02 * size
+    np.testing.assert_allclose(path_from(on, start)[[0, -1]], np.stack([start, own.goal]), atol=1e-12)
+    np.testing.assert_allclose(path_from(style.on(on, -0.7), start), path_from(own, start), atol=1e-12)
+    size = float(np.ptp(path_from(own, start), axis=0).max())
+    assert frechet(path_from(on, start), path_from(own, start)) > 0.02 * size
     states = on.states(on.starts)
     states[:, on.dim] *= 0.4
     np.testing.assert_allclose(np.linalg.det(on.system.transform.jacobian(states)[1]), 1.0, atol=1e-9)
@@ -97,21 +85,18 @@ def test_taken_off_again_nothing_is_left_and_ends_stay(style, task):
 def test_hands_of_other_detail_give_a_style_too(style, monkeypatch):
     usual = learned("draw_s")
     monkeypatch.setattr(augmented, "FEWEST_KNOTS", 60)
-    finer = learned(STYLES["wavy"][1])
+    finer = fit_augmented(TASKS[STYLES["wavy"][1]]().demonstrations)
     mixed, own = Style.between(usual, finer), learned("draw_c")
     assert len(mixed.offsets) == 60 and len(style.offsets) == 30
     for on in (style, mixed):
-        path, wanted = (path_of(one.on(own, 1.0), own.starts[0]) for one in (on, style))
+        path, wanted = (path_from(one.on(own, 1.0), own.starts[0]) for one in (on, style))
         assert np.linalg.norm(path - wanted, axis=1).max() < 0.05 * own.top
 
 
-def test_a_hand_of_several_patterns_is_no_style():
+def test_a_hand_of_several_patterns_is_no_style_and_it_fits_motions_of_as_many_coordinates(style):
     usual, case = learned("draw_s"), crossings()["left and right from one start"]
     with pytest.raises(ImitationError, match="found a hand of 2 patterns; accepted: 1"):
         Style.between(usual, fit_augmented(case.demonstrations, case.labels))
-
-
-def test_it_fits_motions_of_as_many_coordinates(style):
     with pytest.raises(ImitationError, match="style: found a motion of 3 coordinates; accepted: 2"):
         style.on(learned("push_box"), 1.0)
 

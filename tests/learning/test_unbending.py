@@ -4,13 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from drawings import extent, frechet
 
 from dt_viz.learning import unbending as module
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import fit
 from dt_viz.learning.preparation import prepare
 from dt_viz.learning.unbending import unbending
-from dt_viz.metrics import discrete_frechet, resample_by_arc_length
+from dt_viz.metrics import resample_by_arc_length
 from dt_viz.scenario.tasks import TASKS
 
 
@@ -54,25 +55,23 @@ def same(one, other):
 def test_what_winds_is_followed_on_a_map_that_does_not_fold(turns):
     demonstrations = helix(turns)
     imitation = fit(demonstrations)
-    extent = float(np.ptp(np.concatenate([d.positions for d in demonstrations]), axis=0).max())
     assert imitation.min_det_jacobian > 0 and imitation.round_trip_error < 1e-12
     for d in demonstrations:
         path = imitation.system.rollout(d.positions[0], np.linspace(0, 8, 1000))
-        off = discrete_frechet(*(resample_by_arc_length(p, 150) for p in (path, d.positions)))
-        assert off < 0.04 * extent
+        assert frechet(path, d.positions) < 0.04 * extent(demonstrations)
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_shipped_demonstrations_are_unbent(task, monkeypatch):
-    demonstrations = TASKS[task]().demonstrations
-    assert same(guess(demonstrations), without_shear(demonstrations, monkeypatch))
+MANY = {
+    "shipped": lambda: [make().demonstrations for make in TASKS.values()],
+    "drawings in the plane": lambda: [drawing(seed, 2) for seed in range(30)],
+    "drawings in space": lambda: [drawing(seed, 3) for seed in range(30)],
+}
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_drawings_are_unbent(dim, monkeypatch):
-    for seed in range(30):
-        demonstrations = drawing(seed, dim)
-        assert same(guess(demonstrations), without_shear(demonstrations, monkeypatch))
+@pytest.mark.parametrize("many", MANY)
+def test_shipped_demonstrations_and_drawings_are_unbent(many, monkeypatch):
+    for demonstrations in MANY[many]():
+        assert same(guess(demonstrations), without_shear(demonstrations, monkeypatch)), demonstrations[0].name
 
 
 def test_nothing_in_the_plane_is_sheared():

@@ -1,4 +1,7 @@
-"""Certificates must recognise what they certify against: folds, bad inverses, and motions other than the stack's."""
+"""Certificates must recognise what they certify against: folds, bad inverses, and motions other than the stack's.
+
+What is just within a limit is certified, what is just beyond it is said.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -14,9 +17,18 @@ from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
-from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
+from dt_viz.flows.rollouts import ARRIVED, Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor
-from dt_viz.motion.certificates import MAX_OFF_POSTURE, Certificates, Shown, certified
+from dt_viz.motion.certificates import (
+    MAX_OFF,
+    MAX_OFF_POSTURE,
+    Certificates,
+    Shown,
+    certified,
+    clearance_warnings,
+    delay_warnings,
+    hand_warnings,
+)
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import FINE, Solution
 from dt_viz.obstacles.shapes import Sphere
@@ -25,8 +37,11 @@ from dt_viz.warning import Kind, MotionWarning
 
 BASE = Attractor(np.array([0.5, 0.2, 0.0]), 0.2, 0.05)
 RAYS = Rays(np.array([[-0.8, -0.3, 0.1], [-0.6, 0.7, -0.2]]), BASE)
+ENDS = np.concatenate([RAYS.z0, BASE.goal[None]])
+IDENTITY = Identity(3)
+AWAY = np.eye(3)[2]
 BEFORE = MotionWarning(Kind.IMITATION, "said before")
-CLEAR = Certificates(clearance=0.05, found=(BEFORE,))
+KNOWN = Certificates(clearance=0.05, found=(BEFORE,))
 
 
 def field(strength):
@@ -38,90 +53,85 @@ def bundle_of(transform):
     return evenly_sampled(lambda i, u: transform.inverse(RAYS.at(i, u))[:, None], 2, 300)
 
 
-def certificates_of(transform, bundle=None):
-    """Certificates of a bundle, said to be a motion of the transform between the ends of its rays."""
-    bundle = bundle or bundle_of(transform)
-    stack = Solution(transform, RAYS, bundle, ())
-    shown = Shown(bundle.index, bundle.fraction, RAYS.times(bundle.index, bundle.fraction), bundle.positions)
-    return certified(CLEAR, stack, transform.inverse(np.concatenate([RAYS.z0, BASE.goal[None]])), shown)
-
-
-def both(*fractions):
-    """Rollouts of the identity at these fractions of their rays, each the same for both rays."""
+def straight(*fractions):
+    """Straight motions from sample to sample at these fractions of their rays, the same for both rays."""
     fraction = np.concatenate([np.concatenate(fractions)] * 2)
     index = np.repeat([0, 1], len(fraction) // 2)
     return Bundle(index, fraction, RAYS.at(index, fraction)[:, None])
 
 
+def as_shown(bundle):
+    return Shown(bundle.index, bundle.fraction, RAYS.times(bundle.index, bundle.fraction), bundle.positions)
+
+
+SHOWN = as_shown(bundle_of(IDENTITY))
+
+
+def certificates_of(
+    shown: Shown | Bundle = SHOWN, ends=None, transform: Diffeomorphism = IDENTITY, known=KNOWN, **options
+):
+    """Certificates of what is shown, said to be motions of the transform."""
+    if isinstance(shown, Bundle):
+        shown = as_shown(shown)
+    ends = transform.inverse(ENDS) if ends is None else ends
+    return certified(known, Solution(transform, RAYS, bundle_of(transform), ()), ends, shown, **options)
+
+
+# --- the map ---
+
+
 @pytest.mark.parametrize(
-    "transform", [Identity(3), Flow(field(0.3), 0.5, 20), Flow(field(0.3), 0.5, 6, implicit_euler, euler)]
+    "transform", [IDENTITY, Flow(field(0.3), 0.5, 20), Flow(field(0.3), 0.5, 6, implicit_euler, euler)]
 )
 def test_a_sound_stack_gets_its_certificates_and_no_warning(transform):
-    known = certificates_of(transform)
-    assert known.min_det_jacobian is not None and known.min_det_jacobian > 0
+    bundle = bundle_of(transform)
+    known = certificates_of(bundle, transform=transform)
+    expected = np.linalg.det(transform.jacobian(bundle.positions)[1]).min()
+    assert known.min_det_jacobian == pytest.approx(expected, rel=1e-4) and expected > 0
     assert known.round_trip_error is not None and known.round_trip_error < 1e-6
     assert known.lyapunov_falls is True
     assert (known.clearance, known.warnings) == (0.05, (BEFORE,))
 
 
-def test_the_smallest_determinant_is_that_of_the_forward_map():
-    transform = Flow(field(0.5), 0.8, 6, implicit_euler, euler)
-    bundle = bundle_of(transform)
-    expected = np.linalg.det(transform.jacobian(bundle.positions)[1]).min()
-    assert certificates_of(transform, bundle).min_det_jacobian == pytest.approx(expected, rel=1e-8)
-
-
 def test_a_folding_euler_map_is_recognised():
-    folding = Flow(field(6.0), 1.0, 1, euler)
-    bundle = bundle_of(Identity(3))  # straight through where it folds
-    known = certificates_of(folding, bundle)
+    known = certificates_of(transform=Flow(field(6.0), 1.0, 1, euler))  # straight through where it folds
     assert known.min_det_jacobian is not None and known.min_det_jacobian < 0
     assert Kind.NO_DIFFEOMORPHISM in kinds(known.warnings)
 
 
-def test_a_bad_round_trip_is_recognised_and_measured():
-    coarse = Flow(field(0.4), 1.0, 10, euler)  # Euler back is not the inverse of Euler there
-    bundle = bundle_of(coarse)
-    known = certificates_of(coarse, bundle)
-    error = np.linalg.norm(coarse.inverse(coarse.forward(bundle.positions)) - bundle.positions, axis=1).max()
-    assert known.round_trip_error is not None
-    assert known.round_trip_error == pytest.approx(error, rel=0.05)
-    assert known.warnings[0] == BEFORE
-    (warning,) = (warning for warning in known.warnings if warning.kind is Kind.ROUND_TRIP)
-    assert f"misses by {1e3 * known.round_trip_error:.3g} mm" in warning.text
+around_the_limit = pytest.mark.parametrize(("part", "said"), [(0.9, False), (1.1, True)])
 
 
-def test_a_motion_that_turns_back_is_recognised():
-    there = np.linspace(0, 1, 100)
-    bundle = both(there[:60], there[40:])
-    known = certificates_of(Identity(3), bundle)
-    assert known.lyapunov_falls is False
-    assert [warning.kind for warning in known.warnings] == [BEFORE.kind, Kind.NOT_FALLING]
+@dataclass(frozen=True)
+class Missing(Diffeomorphism):
+    """The identity, there; back it misses by a distance in metres."""
+
+    missed: float
+
+    @property
+    def dim(self) -> int:
+        return 3
+
+    def scaled(self, fraction: float) -> Diffeomorphism:
+        return self
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        return s + self.missed * AWAY * inverse, U
 
 
-@pytest.mark.parametrize(("rise", "falls"), [(1e-6, True), (1e-4, False)])
-def test_samples_nearer_than_rounding_need_not_fall(rise, falls):
-    bundle = both(np.linspace(0, 1, 50))
-    index, fraction = np.insert(bundle.index, 20, 0), np.insert(bundle.fraction, 20, bundle.fraction[20])
-    levels = np.insert(bundle.levels, 20, bundle.levels[20], axis=0)
-    fraction[20] -= 1e-9
-    levels[21, 0] += rise * (RAYS.z0[0] - BASE.goal) / np.linalg.norm(RAYS.z0[0] - BASE.goal)
-    assert certificates_of(Identity(3), Bundle(index, fraction, levels)).lyapunov_falls is falls
+@around_the_limit
+def test_a_round_trip_that_misses_is_said_with_its_length(part, said):
+    known = certificates_of(transform=Missing(part * 1e-6))
+    assert known.round_trip_error == pytest.approx(part * 1e-6)
+    assert (Kind.ROUND_TRIP in kinds(known.warnings)) == said
+    assert not said or any("misses by 0.0011 mm" in warning.text for warning in known.warnings)
 
 
-def test_a_motion_that_stands_still_does_not_fall_strictly():
-    assert certificates_of(Identity(3), both([0.0, 0.3, 0.3, 1.0])).lyapunov_falls is False
-
-
-@pytest.mark.parametrize(("first", "last"), [(0.0, 0.9), (0.1, 1.0)])
-def test_a_motion_that_is_not_shown_as_a_whole_is_recognised(first, last):
-    warnings = certificates_of(Identity(3), both(np.linspace(first, last, 50))).warnings[1:]
-    assert warnings == (MotionWarning(Kind.OTHER_ENDS, "a motion is not shown from its start to its goal"),)
-
-
-def test_the_rise_from_the_end_of_one_rollout_to_the_start_of_the_next_is_none():
-    assert certificates_of(Identity(3)).lyapunov_falls is True
-    assert len(bundle_of(Identity(3)).paths) == 2
+def test_of_two_maps_the_worse_is_certified():
+    known = certificates_of(known=replace(KNOWN, min_det_jacobian=0.2, round_trip_error=3e-7))
+    assert (known.min_det_jacobian, known.round_trip_error) == (0.2, 3e-7)
+    known = certificates_of(known=replace(KNOWN, min_det_jacobian=1.7, round_trip_error=1e-9), transform=Missing(2e-7))
+    assert (known.min_det_jacobian, known.round_trip_error) == (1.0, pytest.approx(2e-7))
 
 
 class Broken(Diffeomorphism):
@@ -140,25 +150,120 @@ class Broken(Diffeomorphism):
 
 def test_no_number_is_no_certificate():
     with np.errstate(invalid="ignore"):
-        known = certificates_of(Broken(), both(np.linspace(0, 1, 5)))
+        known = certificates_of(straight(np.linspace(0, 1, 5)), transform=Broken())
     assert known.lyapunov_falls is False
     failed = {Kind.NO_DIFFEOMORPHISM, Kind.ROUND_TRIP, Kind.NOT_FALLING, Kind.OFF_MOTION, Kind.OTHER_ENDS}
     assert kinds(known.warnings) == {BEFORE.kind, *failed}
 
 
+# --- straight motions of the base system, and others ---
+
+
+@around_the_limit
+@pytest.mark.parametrize("row", [0, 17, -1])
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-3])
+def test_a_sample_beside_the_motion_of_the_base_system(row, tolerance, part, said):
+    positions = SHOWN.positions.copy()
+    positions[row] += part * tolerance * AWAY
+    known = certificates_of(replace(SHOWN, positions=positions), tolerance=tolerance)
+    assert (Kind.OFF_MOTION in kinds(known.warnings)) == said
+
+
+@around_the_limit
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sample_at_another_time(sign, part, said):
+    row, times = 40, SHOWN.times.copy()
+    times[row] += sign * part * 1e-6 / np.linalg.norm(BASE.velocity(SHOWN.positions[row]))
+    assert (Kind.OTHER_TIMES in kinds(certificates_of(replace(SHOWN, times=times)).warnings)) == said
+
+
+@around_the_limit
+def test_a_motion_that_is_said_to_be_at_its_goal_too_early(part, said):
+    """It counts as there a tenth of a millimetre before."""
+    last, times = np.flatnonzero(SHOWN.index == 0)[-1], SHOWN.times.copy()
+    times[last] = BASE.arrival_time(RAYS.z0[:1], ARRIVED + part * 1e-6)[0]
+    assert (Kind.OTHER_TIMES in kinds(certificates_of(replace(SHOWN, times=times)).warnings)) == said
+
+
+@around_the_limit
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_start_or_goal_beside_those_of_the_base_system(which, part, said):
+    known = certificates_of(ends=ENDS + part * 1e-6 * np.outer(np.eye(3)[which], AWAY))
+    assert (Kind.OTHER_ENDS in kinds(known.warnings)) == said
+
+
+def test_motions_in_another_order_are_recognised():
+    assert Kind.OTHER_ENDS in kinds(certificates_of(ends=ENDS[[1, 0, 2]]).warnings)
+    only_one = replace(SHOWN, index=np.zeros_like(SHOWN.index))
+    assert Kind.OTHER_ENDS in kinds(certificates_of(only_one).warnings)
+
+
+@pytest.mark.parametrize(
+    "fractions",
+    [(np.linspace(0, 0.6, 60), np.linspace(0.4, 1, 60)), ([0.0, 0.3, 0.3, 1.0],)],
+    ids=["turns back", "stands still"],
+)
+def test_a_motion_that_does_not_go_on_is_recognised(fractions):
+    known = certificates_of(straight(*fractions))
+    assert known.lyapunov_falls is False
+    assert [warning.kind for warning in known.warnings] == [BEFORE.kind, Kind.NOT_FALLING]
+
+
+@pytest.mark.parametrize(("rise", "falls"), [(1e-6, True), (1e-4, False)])
+def test_samples_nearer_than_rounding_need_not_fall(rise, falls):
+    bundle = straight(np.linspace(0, 1, 50))
+    index, fraction = np.insert(bundle.index, 20, 0), np.insert(bundle.fraction, 20, bundle.fraction[20])
+    levels = np.insert(bundle.levels, 20, bundle.levels[20], axis=0)
+    fraction[20] -= 1e-9
+    levels[21, 0] += rise * (RAYS.z0[0] - BASE.goal) / np.linalg.norm(RAYS.z0[0] - BASE.goal)
+    assert certificates_of(Bundle(index, fraction, levels)).lyapunov_falls is falls
+
+
+@pytest.mark.parametrize(("first", "last"), [(0.0, 0.9), (0.1, 1.0)])
+def test_a_motion_that_is_not_shown_as_a_whole_is_recognised(first, last):
+    warnings = certificates_of(straight(np.linspace(first, last, 50))).warnings[1:]
+    assert warnings == (MotionWarning(Kind.OTHER_ENDS, "a motion is not shown from its start to its goal"),)
+
+
+@around_the_limit
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_clearance_other_than_the_one_that_is_said(sign, part, said):
+    warnings = clearance_warnings(0.0532, 0.0532 + sign * part * 1e-6)
+    assert kinds(warnings) == ({Kind.OTHER_CLEARANCE} if said else set())
+    assert clearance_warnings(np.inf, np.inf) == ()
+    (warning,) = clearance_warnings(0.0532, -0.004)
+    assert warning.text == "the motions shown keep -4.0 mm from the obstacle, not 53.2 mm"
+
+
+@around_the_limit
+@pytest.mark.parametrize("options", [{}, {"tolerance": 1e-6}])
+def test_a_hand_beside_its_rollout(robot, options, part, said):
+    path = robot.end_effector(robot.home)[None].repeat(5, axis=0)
+    path[3] += part * options.get("tolerance", 1e-3) * AWAY
+    warnings = hand_warnings(robot, robot.home[None].repeat(5, axis=0), path, source="it", **options)
+    assert [(warning.kind, warning.source) for warning in warnings] == [(Kind.HAND_BESIDE, "it")] * said
+
+
+@around_the_limit
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_arm_at_other_times_than_its_limits_ask_for(robot, sign, part, said):
+    q, due = robot.home + np.linspace(0, 1, 20)[:, None] * np.eye(6)[0], np.linspace(0.0, 1.0, 20)
+    times = within_velocity_limits(due, q, robot.velocity_limits)
+    assert times[-1] > 1.5  # they have something to ask for
+    times[7] += sign * part * 1e-9
+    assert kinds(delay_warnings(robot, q, times, due)) == ({Kind.OTHER_DELAY} if said else set())
+
+
+# --- what is told ---
+
+
 def test_what_follows_from_a_cause_that_is_said_is_not_told_beside_it_but_known():
     cause = MotionWarning(Kind.FOLDS, "a step folds", "Bias 1")
     follows = MotionWarning(Kind.NOT_FALLING, "it rises")
-    known = CLEAR.warning(follows, cause, cause)
+    known = KNOWN.warning(follows, cause, cause)
     assert known.found == (BEFORE, follows, cause, cause)
     assert known.warnings == (BEFORE, cause)
-    assert CLEAR.warning(follows).warnings == (BEFORE, follows)
-
-
-def test_a_cause_in_one_transform_leaves_what_fails_in_another_told():
-    cause = MotionWarning(Kind.STAYS_INSIDE, "it does not leave", "Avoidance")
-    its_own, other = (MotionWarning(Kind.ENTERS, "it enters", name) for name in ("Avoidance", "Avoidance 2"))
-    assert CLEAR.warning(cause, its_own, other).warnings == (BEFORE, cause, other)
+    assert KNOWN.warning(follows).warnings == (BEFORE, follows)
 
 
 # --- motions other than those that were computed ---
@@ -219,8 +324,11 @@ def _arm(engine, initial):
     return computed(engine, changed(initial("push_box"), space="cspace"))
 
 
-def noise(path, size):
-    return path + np.random.default_rng(0).normal(0, size, path.shape)
+def of_elbow(postures, robot):
+    """Turns of the joints (6,) that move an elbow of the middle posture by 5 mm, by their levers, and not the hand."""
+    middle = postures[[len(postures) // 2]]
+    null = np.linalg.svd(robot.chain(middle.T).position_jacobian()[..., 0].T)[2][-1]
+    return 5e-3 * null / np.linalg.norm(null * LEVERS)
 
 
 def displaced(path, rows, offset):
@@ -237,24 +345,14 @@ def sideways(postures, robot):
     return turn * 1e-3 * 5e-3 / moved
 
 
-def bent_to(path, offset):
-    """The same path, ending elsewhere."""
-    return path + np.linspace(0, 1, len(path))[:, None] * offset
-
-
 HAND = {
     "no avoidance": lambda y, x: x,
-    "reversed": lambda y, x: y[::-1],
-    "noise": lambda y, x: noise(y, 1e-3),
     "one sample off by 5 mm": lambda y, x: displaced(y, len(y) // 2, [0.0, 0.005, 0.0]),
-    "goal shifted": lambda y, x: bent_to(y, [0.005, 0.0, 0.0]),
 }
 ARM = {
     "no avoidance": lambda p, q, robot: q,
-    "reversed": lambda p, q, robot: p[::-1],
-    "noise": lambda p, q, robot: noise(p, 0.2),
     "one sample off by 5 mm": lambda p, q, robot: displaced(p, len(p) // 2, sideways(p, robot)),
-    "goal shifted": lambda p, q, robot: bent_to(p, sideways(p, robot)),
+    "5 mm of an elbow where the hand stays": lambda p, q, robot: displaced(p, len(p) // 2, of_elbow(p, robot)),
 }
 
 
@@ -273,41 +371,19 @@ def test_postures_of_another_motion_are_recognised(arm, robot, corruption):
     assert Kind.OFF_MOTION in arm.failed(frame, solved)
 
 
-def test_each_displaced_sample_is_recognised_where_the_stack_squeezes_space_most(hand):
-    transform, y = hand.solved.stack.transform, hand.solved.stack.bundle.positions
-    _, s, Vt = np.linalg.svd(transform.jacobian(y)[1])
-    row = int(s[:, -1].argmin())  # and the direction in which least is left of a displacement
-    before = np.flatnonzero(np.diff(hand.solved.stack.bundle.index, prepend=-1))
-    rollout = int(np.searchsorted(before, row, side="right")) - 1
-    for sign in (1, -1):
-        paths = list(hand.frame.rollouts)
-        paths[rollout] = displaced(paths[rollout], row - before[rollout], sign * 5e-3 * Vt[row, -1])
-        frame = replace(hand.frame, rollouts=tuple(paths), arm=None)
-        assert Kind.OFF_MOTION in hand.failed(frame)
+def test_tolerances_are_far_from_what_the_computation_leaves_and_from_5_mm_where_space_is_squeezed_most(hand, arm):
+    of_hand, of_arm = hand.solved.stack, arm.solved.arm
+    hand_base = of_hand.rays.at(of_hand.bundle.index, of_hand.bundle.fraction)
+    for transform, y, base, units, tolerance in (
+        (of_hand.transform, of_hand.bundle.positions, hand_base, np.ones(3), MAX_OFF),
+        (of_arm.transform, of_arm.p, of_arm.q, LEVERS, MAX_OFF_POSTURE),
+    ):
+        left = np.linalg.norm((transform.forward(y) - base) * units, axis=1).max()
+        stretches = np.linalg.svd(units[:, None] * transform.jacobian(y[::20])[1] / units, compute_uv=False)
+        assert 10 * left < tolerance < 0.1 * 5e-3 * stretches.min()
 
 
-def test_postures_displaced_where_the_hand_stays_are_recognised(arm, robot):
-    """What the hand does not show, the joints' motion does: 5 mm of an elbow, by their levers."""
-
-    def elbow(p, q):
-        middle = len(p) // 2
-        null = np.linalg.svd(robot.chain(p[[middle]].T).position_jacobian()[..., 0].T)[2][-1]
-        return displaced(p, middle, 5e-3 * null / np.linalg.norm(null * LEVERS))
-
-    assert Kind.OFF_MOTION in arm.failed(*arm.with_postures(elbow))
-
-
-def test_the_tolerance_of_postures_is_far_from_what_the_computation_leaves_and_from_what_is_seen(arm):
-    transform, p = arm.solved.arm.transform, arm.solved.arm.p
-    left = np.linalg.norm((transform.forward(p) - arm.solved.arm.q) * LEVERS, axis=1).max()
-    s = np.linalg.svd(LEVERS[:, None] * transform.jacobian(p[::20])[1] / LEVERS, compute_uv=False)
-    assert 10 * left < MAX_OFF_POSTURE < 0.1 * 5e-3 * s.min()
-
-
-@pytest.mark.parametrize(
-    ("whose", "factor"),
-    [("hand", 0.98), ("hand", 1.02), ("arm", 0.98), pytest.param("arm", 1.02, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("whose", "factor"), [("hand", 1.02), ("arm", 0.98)])
 def test_scaled_times_are_recognised(request, whose, factor):
     motion = request.getfixturevalue(whose)
     frame = motion.frame

@@ -171,28 +171,3 @@ def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, init
     assert kept_stance(moved, solved) == other.stance is not None
     assert kept_stance(away, solved) is None
     assert kept_stance(scenario, replace(solved, arm=None)) is None
-
-
-def test_a_start_without_a_way_is_not_tried_again_in_a_drag(engine, robot, initial, monkeypatch):
-    nominal, follower = engine.nominal(initial("lift_box")), Follower(robot)
-    x, y, z = (float(c) for c in np.mean(nominal.paths, axis=0)[90])
-    first, second = (
-        changed(initial("lift_box"), obstacles=Sphere((x, y, z + dz)), space="cspace") for dz in (0, 0.003)
-    )
-    avoiding, num, tried = follower.whole_arm.avoiding, len(nominal.strands), []
-
-    def never_from_the_third(lifted, *arguments, **options):
-        tried.append(lifted.num_hosts)
-        found = avoiding(lifted, *arguments, **options)
-        return replace(found, stuck=np.array([2])) if lifted.num_hosts == num else found
-
-    monkeypatch.setattr(follower.whole_arm, "avoiding", never_from_the_third)
-    before = solve(first, nominal, LIVE, follower)
-    assert before.nominal.left_out == (2,) and tried[0] == num
-    tried.clear()
-    after = solve(second, nominal, LIVE, follower, before)
-    assert after.nominal.left_out == (2,) and tried == [num - 1]
-    assert after.nominal.warnings == before.nominal.warnings
-    tried.clear()
-    solve(second, nominal, FINE, follower, before)
-    assert tried[0] == num

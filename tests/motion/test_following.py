@@ -76,13 +76,20 @@ class TestAdmission:
         assert (away[list(admission.nominal.left_out)] < 0.15).all()
         assert len(admission.nominal.strands) + len(admission.nominal.left_out) == 7
 
-    def test_it_is_blocked_where_no_start_is_left(self, follower, nominal):
-        (reason,) = self.reasons(follower, nominal, around(nominal.task.starts.mean(axis=0), 0.4))
-        assert reason.kind is Kind.START_COVERED and "1, 2, 3, 4, 5, 6, 7" in reason.text
-
-    def test_a_covered_goal_is_named(self, follower, nominal):
-        (reason,) = self.reasons(follower, nominal, around(nominal.goal, 0.15))
-        assert reason.kind is Kind.GOAL_COVERED and "the arm there touches it" in reason.text
+    @pytest.mark.parametrize(
+        ("place", "diameter", "kind", "says"),
+        [
+            ("the starts", 0.4, Kind.START_COVERED, "1, 2, 3, 4, 5, 6, 7"),
+            ("the goal", 0.15, Kind.GOAL_COVERED, "the arm there touches it"),
+            ((0.0, 0.08, 0.05), 0.1, Kind.ARM_BLOCKED, "base"),
+            ((0.0, 0.08, 0.2), 0.1, Kind.ARM_BLOCKED, "link 1"),
+        ],
+    )
+    def test_what_blocks_the_arm_is_named(self, follower, nominal, place, diameter, kind, says):
+        known = {"the starts": nominal.task.starts.mean(axis=0), "the goal": nominal.goal}
+        (reason,) = self.reasons(follower, nominal, around(known.get(place, place), diameter))
+        assert reason.kind is kind and says in reason.text
+        assert ("cannot move away" in reason.text) == (kind is Kind.ARM_BLOCKED)
 
     def test_what_fits_between_the_fingers_covers_the_goal_only_where_it_is_there(self, follower, nominal, robot):
         """The end effector is a point of the arm, too: its way may not begin or end in an obstacle."""
@@ -98,11 +105,6 @@ class TestAdmission:
         ball = around(nominal.task.starts[2], 0.02)
         assert load_collision_model().obstacle_distance(follower.undisturbed(nominal).pins[2:3], ball)[0][0] > 0
         assert 2 in self.admission(follower, nominal, ball).nominal.left_out
-
-    @pytest.mark.parametrize(("height", "name"), [(0.05, "base"), (0.2, "link 1")])
-    def test_what_touches_the_pedestal_is_said_to(self, follower, nominal, height, name):
-        (reason,) = self.reasons(follower, nominal, around((0.0, 0.08, height), 0.1))
-        assert name in reason.text and "cannot move away" in reason.text
 
     def test_demonstrations_out_of_reach_are_named(self, too_far, initial, robot):
         nominal = too_far.nominal(initial("push_box"))
@@ -130,35 +132,25 @@ class TestStance:
         (part,) = avoidance.obstacle.parts
         return load_collision_model().obstacle_distance(q, part)[0]
 
-    def test_the_arm_rests_elsewhere_with_the_hand_where_it_was(self, follower, beside, robot):
+    def test_the_arm_rests_elsewhere_with_the_hand_where_it_was_and_can_be_taken_there(self, follower, beside, robot):
         nominal, avoidance = beside
         assert self.truth(follower.undisturbed(nominal).pins, avoidance).min() < 0  # so there is something to do
         found = follower.admission(nominal, avoidance)
         assert not found.blocked and not found.nominal.left_out and found.nominal.stance is not None
+        assert Follower(robot).admission(nominal, avoidance).nominal.stance == found.nominal.stance
         lifted = follower.undisturbed(found.nominal)
         assert self.truth(lifted.pins, avoidance).min() >= avoidance.margin - 1e-3
         np.testing.assert_allclose(robot.end_effector(lifted.pins), nominal.ends, rtol=0, atol=1e-5)
-
-    def test_it_can_be_taken_along_all_motions(self, follower, beside, robot):
-        nominal, avoidance = beside
-        lifted = follower.undisturbed(follower.admission(nominal, avoidance).nominal)
+        # along all motions
         assert lifted.tracked.error.max() < MAX_TRACKING_ERROR
         assert not lifted.tracked.limits_hit.any() and not lifted.tracked.damped.any()
         assert (lifted.tracked.q > robot.lower).all() and (lifted.tracked.q < robot.upper).all()
         itself = load_collision_model().nearest_to_itself(lifted.tracked.q[0])
         assert itself is None or itself.distance >= SELF_MARGIN
-
-    def test_one_section_leads_to_it_from_every_start(self, follower, beside, robot):
-        nominal, avoidance = beside
-        lifted = follower.undisturbed(follower.admission(nominal, avoidance).nominal)
+        # by one section from every start
         q = lifted.tracked.q[:, ::20]
         again = Section(robot, lifted.reference).postures(robot.end_effector(q))
         np.testing.assert_allclose(again, q, rtol=0, atol=1e-3)
-
-    def test_it_does_not_depend_on_what_was_asked_before(self, follower, beside, robot):
-        nominal, avoidance = beside
-        stance = follower.admission(nominal, avoidance).nominal.stance
-        assert Follower(robot).admission(nominal, avoidance).nominal.stance == stance
 
     def test_the_motion_ends_at_the_goal_around_the_obstacle(self, engine, beside, robot):
         nominal, avoidance = beside
@@ -179,110 +171,106 @@ class TestStance:
         after = follower.behaving(standing, solution, exact=False, before=before)
         np.testing.assert_array_equal(after.tracked.q, fresh.tracked.q)
 
-    def test_where_the_arm_finds_no_way_other_stances_are_tried(self, engine, follower, initial, monkeypatch):
-        nominal = engine.nominal(initial("lift_box"))
-        middle = np.mean(nominal.paths, axis=0)[90]
-        scenario = placed(initial("lift_box"), around(middle))
-        usual = solve(scenario, nominal, LIVE, follower)
-        assert usual.nominal is nominal and usual.cleared
-        avoiding = follower.whole_arm.avoiding
 
-        def only_elsewhere(lifted, *arguments, **options):
-            found = avoiding(lifted, *arguments, **options)
-            same = np.array_equal(lifted.reference, follower.reference(nominal))
-            return replace(found, stuck=np.arange(1)) if same else found
+class Lift:
+    """A box that is lifted around a ball, with a whole arm that finds no ways of a kind."""
 
-        monkeypatch.setattr(follower.whole_arm, "avoiding", only_elsewhere)
-        other = solve(scenario, nominal, LIVE, follower)
+    def __init__(self, engine, follower, scenario, monkeypatch):
+        self.engine, self.follower, self.monkeypatch = engine, follower, monkeypatch
+        self.nominal, self.avoiding = engine.nominal(scenario), follower.whole_arm.avoiding
+        self.scenario = placed(scenario, around(np.mean(self.nominal.paths, axis=0)[90]))
+
+    def spoil(self, when, **changes):
+        """Change what the arm finds for motions for which that is so."""
+
+        def avoiding(lifted, *arguments, **options):
+            found = self.avoiding(lifted, *arguments, **options)
+            return replace(found, **changes) if when(lifted) else found
+
+        self.monkeypatch.setattr(self.follower.whole_arm, "avoiding", avoiding)
+
+    def go_straight_through(self):
+        """The arm avoids nothing."""
+        arm = self.follower.whole_arm
+        through = lambda lifted, avoidance, spacing, **_: arm.undisturbed(lifted, avoidance, spacing)  # noqa: E731
+        self.monkeypatch.setattr(arm, "avoiding", through)
+
+    def is_usual(self, lifted):
+        """Whether the arm keeps the stance that it has without obstacles."""
+        return np.array_equal(lifted.reference, self.follower.reference(self.nominal))
+
+    def solved(self, scenario=None, precision=LIVE, before=None):
+        return solve(scenario or self.scenario, self.nominal, precision, self.follower, before)
+
+
+@pytest.fixture(name="lift")
+def _lift(engine, follower, initial, monkeypatch):
+    return Lift(engine, follower, initial("lift_box"), monkeypatch)
+
+
+class TestNoWay:
+    def test_other_stances_are_tried_where_the_usual_one_has_no_way(self, lift):
+        usual = lift.solved()
+        assert usual.nominal is lift.nominal and usual.cleared
+        lift.spoil(lift.is_usual, stuck=np.arange(1))
+        other = lift.solved()
         assert other.cleared and other.nominal.stance is not None
-        manual = changed(scenario, duration=0.3)  # what is asked for by hand is done as it is asked for
-        assert solve(manual, nominal, LIVE, follower).nominal is nominal
+        # what is asked for by hand is done as it is asked for
+        assert lift.solved(changed(lift.scenario, duration=0.3)).nominal is lift.nominal
 
-    def test_starts_from_which_there_is_no_way_are_left_out_and_named(self, engine, follower, initial, monkeypatch):
-        nominal = engine.nominal(initial("lift_box"))
-        scenario = placed(initial("lift_box"), around(np.mean(nominal.paths, axis=0)[90]))
-        avoiding, num = follower.whole_arm.avoiding, len(nominal.strands)
+    def test_other_stances_are_tried_where_the_way_is_long_but_not_in_a_drag(self, lift):
+        lift.spoil(lift.is_usual, duration=1.01 * LONG)
+        other = lift.solved()
+        assert other.cleared and other.nominal.stance is not None
+        arm = lift.avoiding(other.lifted, lift.scenario.arm_avoidance, LIVE.spacing, coarse=True)
+        x, y, z = lift.scenario.obstacle.parts[0].position
+        moved = changed(lift.scenario, obstacles=Sphere((x, y, z + 0.003)))
+        assert lift.solved(moved, before=replace(other, arm=arm)).nominal is lift.nominal
 
-        def never_from_the_third(lifted, *arguments, **options):
-            found = avoiding(lifted, *arguments, **options)
-            return replace(found, stuck=np.array([2])) if lifted.num_hosts == num else found
-
-        monkeypatch.setattr(follower.whole_arm, "avoiding", never_from_the_third)
-        solved = solve(scenario, nominal, LIVE, follower)
-        assert solved.arm is not None and solved.cleared and solved.nominal.left_out == (2,)
+    def test_starts_from_which_there_is_no_way_are_left_out_and_named_and_not_tried_again_in_a_drag(self, lift):
+        num, tried = len(lift.nominal.strands), []
+        lift.spoil(lambda lifted: tried.append(lifted.num_hosts) or lifted.num_hosts == num, stuck=np.array([2]))
+        solved = lift.solved()
+        assert solved.arm is not None and solved.cleared and solved.nominal.left_out == (2,) and tried[0] == num
         assert len(np.unique(solved.arm.index)) == len(solved.stack.bundle.paths) == num - 1
         (warning,) = solved.nominal.warnings
         assert warning.text == "start 3 is without a way around the obstacle for the arm"
-
-    def test_other_stances_are_tried_where_the_way_is_long_but_not_in_a_drag(
-        self, engine, follower, initial, monkeypatch
-    ):
-        nominal = engine.nominal(initial("lift_box"))
-        scenario = placed(initial("lift_box"), around(np.mean(nominal.paths, axis=0)[90]))
-        avoiding, long = follower.whole_arm.avoiding, 1.01 * LONG
-
-        def long_here(lifted, *arguments, **options):
-            found = avoiding(lifted, *arguments, **options)
-            same = np.array_equal(lifted.reference, follower.reference(nominal))
-            return replace(found, duration=long) if same else found
-
-        monkeypatch.setattr(follower.whole_arm, "avoiding", long_here)
-        other = solve(scenario, nominal, LIVE, follower)
-        assert other.cleared and other.nominal.stance is not None
-        x, y, z = scenario.obstacle.parts[0].position
-        shown = replace(other, arm=avoiding(other.lifted, scenario.arm_avoidance, LIVE.spacing, coarse=True))
-        moved = changed(scenario, obstacles=Sphere((x, y, z + 0.003)))
-        assert solve(moved, nominal, LIVE, follower, shown).nominal is nominal
+        x, y, z = lift.scenario.obstacle.parts[0].position
+        moved = changed(lift.scenario, obstacles=Sphere((x, y, z + 0.003)))
+        tried.clear()
+        after = lift.solved(moved, before=solved)
+        assert (after.nominal.left_out, after.nominal.warnings) == ((2,), (warning,)) and tried == [num - 1]
+        tried.clear()
+        lift.solved(moved, FINE, solved)
+        assert tried[0] == num
 
     @pytest.mark.parametrize("precision", [LIVE, pytest.param(FINE, marks=pytest.mark.slow)], ids=["live", "fine"])
-    def test_no_way_is_said_instead_of_shown_where_the_arm_would_touch(
-        self, engine, follower, initial, monkeypatch, precision
-    ):
-        nominal = engine.nominal(initial("lift_box"))
-        scenario = placed(initial("lift_box"), around(np.mean(nominal.paths, axis=0)[90]))
-        arm, avoiding = follower.whole_arm, follower.whole_arm.avoiding
-
-        def never(lifted, *arguments, **options):
-            return replace(avoiding(lifted, *arguments, **options), stuck=np.arange(lifted.num_hosts))
-
-        monkeypatch.setattr(arm, "avoiding", never)
-        assert solve(scenario, nominal, precision, follower).blocked == ()  # it comes near, but does not touch
-
-        def through(lifted, avoidance, spacing, **_):
-            return arm.undisturbed(lifted, avoidance, spacing)
-
-        monkeypatch.setattr(arm, "avoiding", through)
-        (warning,) = solve(scenario, nominal, precision, follower).blocked
+    def test_no_way_is_said_instead_of_shown_where_the_arm_would_touch(self, lift, precision):
+        lift.spoil(lambda lifted: True, stuck=np.arange(len(lift.nominal.strands)))
+        assert lift.solved(precision=precision).blocked == ()  # it comes near, but does not touch
+        lift.go_straight_through()
+        (warning,) = lift.solved(precision=precision).blocked
         assert warning.kind is Kind.NO_WAY
-        manual = changed(scenario, duration=0.0)  # what is asked for by hand is shown as it is
-        assert solve(manual, nominal, precision, follower).blocked == ()
+        # what is asked for by hand is shown as it is
+        assert lift.solved(changed(lift.scenario, duration=0.0), precision).blocked == ()
 
     def test_a_frame_is_blocked_where_there_is_no_way(self, new_engine, initial, monkeypatch):
         engine = new_engine()
-        scenario = placed(initial("lift_box"), around(engine.task("lift_box").mean_path[50]))
-        arm = engine.follower.whole_arm
-
-        def through(lifted, avoidance, spacing, **_):
-            return arm.undisturbed(lifted, avoidance, spacing)
-
-        monkeypatch.setattr(arm, "avoiding", through)
-        frame, motions = engine.arm_motions(scenario)
+        lift = Lift(engine, engine.follower, initial("lift_box"), monkeypatch)
+        lift.go_straight_through()
+        frame, motions = engine.arm_motions(lift.scenario)
         assert kinds(frame.blocked) == {Kind.NO_WAY} and motions == ()
-        assert all(kinds(shown.blocked) == {Kind.NO_WAY} for shown in engine.frames(scenario))
+        assert all(kinds(shown.blocked) == {Kind.NO_WAY} for shown in engine.frames(lift.scenario))
 
-    def test_a_start_left_out_leaves_the_arm_with_another(self, new_engine, initial):
-        scenario = placed(initial("push_box"), around(new_engine().task("push_box").starts[0], 0.1))
-        frame, motions = new_engine().arm_motions(scenario)
+    def test_a_start_left_out_leaves_the_arm_with_another_and_added_starts_the_last_ones(self, new_engine, initial):
+        engine, added = new_engine(), ((0.1, -0.45, 0.3), (0.0, -0.45, 0.35))
+        scenario = placed(initial("push_box"), around(engine.task("push_box").starts[0], 0.1))
+        frame, motions = engine.arm_motions(scenario)
         assert 0 < len(motions) < 7 and Kind.START_COVERED in kinds(frame.certificates.found)
         assert frame.chosen == 0 and len(frame.rollouts) == len(motions)
-
-    def test_added_starts_stay_the_last_ones_where_one_of_the_task_s_is_left_out(self, engine, initial):
-        scenario = placed(initial("push_box"), around(engine.task("push_box").starts[0], 0.1))
-        added = (0.1, -0.45, 0.3), (0.0, -0.45, 0.35)
-        scenario = replace(scenario, starts=starts_at(*added))
-        frame = next(engine.frames(scenario))
+        frame = next(engine.frames(replace(scenario, starts=starts_at(*added))))
         assert Kind.START_COVERED in kinds(frame.certificates.found)
-        assert frame.num_added == len(added) < len(frame.rollouts) < 7 + len(added)
+        assert frame.num_added == len(added) and len(frame.rollouts) == len(motions) + len(added)
         for path, start in zip(frame.rollouts[-2:], added, strict=True):
             np.testing.assert_allclose(path[0], start, atol=5e-3)
 
@@ -292,28 +280,23 @@ class TestFollowing:
         assert follower.undisturbed(nominal) is follower.undisturbed(nominal)
         assert follower.undisturbed(nominal).tracked.error.max() < MAX_TRACKING_ERROR
 
-    @pytest.mark.parametrize(("exact", "tolerance"), [(False, 1e-3), (True, 1e-8)])
-    def test_behaviours_of_the_hand_are_followed(self, follower, nominal, initial, robot, exact, tolerance):
-        solution = build_stack(nominal, changed(initial("push_box"), space="task").active, LIVE)
+    @pytest.mark.parametrize(("exact", "tolerance", "kept"), [(False, 1e-3, 2e-3), (True, 1e-8, 0)])
+    def test_behaviours_of_the_hand_are_followed_whatever_was_before(
+        self, follower, nominal, initial, robot, exact, tolerance, kept
+    ):
+        scenario = changed(initial("push_box"), space="task")
+        solution = build_stack(nominal, scenario.active, LIVE)
         lifted = follower.behaving(nominal, solution, exact=exact)
         assert lifted.fractions.shape == (7, NUM_CONFIGURATIONS)
         assert (np.diff(lifted.fractions, axis=1) > 0).all()
-        index = np.repeat(np.arange(7), 60)
-        fraction = np.tile(np.linspace(0, 1, 60), 7)
+        index, fraction = np.repeat(np.arange(7), 60), np.tile(np.linspace(0, 1, 60), 7)
         miss = robot.end_effector(lifted.at(index, fraction)) - solution.positions_at(index, fraction)
         assert np.linalg.norm(miss, axis=1).max() < tolerance
-
-    @pytest.mark.parametrize(("exact", "tolerance"), [(False, 2e-3), (True, 0)])
-    def test_what_was_followed_before_changes_nothing_that_is_seen(
-        self, follower, nominal, initial, robot, exact, tolerance
-    ):
-        wanted = build_stack(nominal, changed(initial("push_box"), space="task").active, LIVE)
-        x, y, z = initial("push_box").obstacles[0].position
-        other = changed(initial("push_box"), space="task", obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
+        x, y, z = scenario.obstacles[0].position
+        other = changed(scenario, obstacles=(Sphere((x + 0.05, y, z + 0.02), 0.2),))
         before = follower.behaving(nominal, build_stack(nominal, other.active, LIVE), exact=False)
-        again = follower.behaving(nominal, wanted, exact=exact, before=before).tracked.q
-        fresh = follower.behaving(nominal, wanted, exact=exact).tracked.q
-        np.testing.assert_allclose(again, fresh, rtol=0, atol=tolerance)
+        again = follower.behaving(nominal, solution, exact=exact, before=before).tracked.q
+        np.testing.assert_allclose(again, lifted.tracked.q, rtol=0, atol=kept)
 
     def test_warnings_say_what_misses_its_path(self, follower, nominal):
         path = np.linspace([0.0, -0.5, 0.2], [0.0, -1.2, 0.2], NUM_ARM_SAMPLES)

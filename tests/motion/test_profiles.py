@@ -18,7 +18,7 @@ from dt_viz.metrics import (
 )
 from dt_viz.motion.profiles import NUM_SAMPLES, body_profile
 from dt_viz.scenario.scenario import View
-from dt_viz.ui.panel.health_plots import HealthPlots, table_html
+from dt_viz.ui.panel.health_plots import HealthPlots
 
 SHOWN = View(field=False, health_plots=True)
 
@@ -36,12 +36,6 @@ def shown(request, engine, initial):
 
 
 # --- Distance from a polyline ---
-
-
-def test_the_distance_from_a_path_is_that_from_its_nearest_place_also_between_its_points():
-    path = np.array([[0.0, 0], [0, 0], [4, 0], [4, 3]])
-    points = np.array([[1.0, 2], [-3, 4], [4, 3], [5, 1.5], [7, 7]])
-    np.testing.assert_allclose(distance_from_path(points, path), [2, 5, 0, 1, 5])
 
 
 @given(st.integers(0, 10**6))
@@ -127,7 +121,7 @@ def test_a_motion_that_rests_on_its_way_has_a_profile():
 # --- In the panel ---
 
 
-def test_the_plots_show_what_the_profiles_hold(shown, server):
+def test_the_plots_and_the_table_show_what_the_profiles_hold(shown, server):
     _, profiles = shown
     plots = HealthPlots(server.gui)
     assert not plots.visible
@@ -136,6 +130,9 @@ def test_the_plots_show_what_the_profiles_hold(shown, server):
         assert len(plot.data) == len(plot.series) and all(len(column) == NUM_SAMPLES for column in plot.data)
     np.testing.assert_allclose(plots.clearance.data[1], 1e3 * profiles.shown.clearance)
     np.testing.assert_allclose(plots.distance.data[2], 1e3 * profiles.undisturbed.distance)
+    for profile in (profiles.shown, profiles.undisturbed):
+        assert f"{1e3 * profile.frechet:.1f} mm" in plots.table.content
+        assert f"{1e3 * profile.depth:.1f} mm" in plots.table.content
     before = plots.lyapunov.data
     plots.draw(None)
     assert plots.lyapunov.data is before and plots.clearance.visible
@@ -143,10 +140,3 @@ def test_the_plots_show_what_the_profiles_hold(shown, server):
     plots.draw(replace(profiles, shown=nowhere, undisturbed=nowhere))
     assert not plots.clearance.visible
     assert plots.table.content.count("–") == 2
-
-
-def test_the_table_has_both_motions_side_by_side(shown):
-    _, profiles = shown
-    said = table_html(profiles)
-    for profile in (profiles.shown, profiles.undisturbed):
-        assert f"{1e3 * profile.frechet:.1f} mm" in said and f"{1e3 * profile.depth:.1f} mm" in said

@@ -41,13 +41,10 @@ def random_starts(engine, scenario, num=NUM, seed=0, room=0.02):
     return starts_at(*found)
 
 
-def test_added_rollouts_are_motions_of_the_system_and_end_at_the_goal(engine, initial, task):
-    scenario = initial(task)
-    scenario = replace(scenario, starts=random_starts(engine, scenario))
-    frame, num = (
-        frame_at(engine, replace(scenario, view=View(field=False)), Stage.FINE),
-        len(engine.task(task).demonstrations),
-    )
+def test_added_rollouts_are_motions_of_the_system_that_avoid_the_obstacle_and_end_at_the_goal(engine, initial, task):
+    scenario, num = replace(initial(task), view=View(field=False)), len(engine.task(task).demonstrations)
+    scenario = replace(scenario, starts=random_starts(engine, scenario, seed=1))
+    frame = frame_at(engine, scenario, Stage.FINE)
     system = build_stack(engine.nominal(scenario), scenario.active, FINE).system
     assert len(frame.rollouts) == num + NUM
     for start, path, times in zip(scenario.starts, frame.rollouts[num:], frame.times[num:], strict=True):
@@ -56,19 +53,12 @@ def test_added_rollouts_are_motions_of_the_system_and_end_at_the_goal(engine, in
         there = system.rollout(np.array([start.place]), times)[0]
         np.testing.assert_allclose(there[:-1], path[:-1], atol=1e-5)
         assert (np.diff(system.lyapunov(path)) < 0).all()
-
-
-def test_the_obstacle_is_avoided_by_added_rollouts_too(engine, initial, task):
-    scenario = initial(task)
-    scenario = replace(scenario, starts=random_starts(engine, scenario, seed=1))
-    without = changed(scenario, avoids=False)
-    num = len(engine.task(task).demonstrations)
-
-    def clearance(scenario):
-        paths = frame_at(engine, scenario, Stage.ROLLOUTS).rollouts[num:]
-        return min(scenario.obstacle.signed_distance(path).min() for path in paths)
-
-    assert clearance(without) < 0 < clearance(scenario)
+    without = frame_at(engine, changed(scenario, avoids=False), Stage.ROLLOUTS)
+    before, after = (
+        min(scenario.obstacle.signed_distance(path).min() for path in shown.rollouts[num:])
+        for shown in (without, frame)
+    )
+    assert before < 0 < after
 
 
 def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(engine, initial, task):
@@ -85,17 +75,6 @@ def test_a_bias_and_the_demonstrated_rollouts_are_those_without_added_starts(eng
     for path, other in zip(solutions[0].bundle.paths, solutions[1].bundle.paths, strict=False):
         np.testing.assert_allclose(path[[0, -1]], other[[0, -1]], atol=1e-6)
         assert max(np.linalg.norm(other - point, axis=1).min() for point in path) < 0.006
-
-
-def test_the_whole_arm_begins_at_added_starts_and_keeps_clear(engine, initial, robot):
-    scenario = changed(initial("push_box"), space="cspace")
-    scenario = replace(scenario, starts=random_starts(engine, scenario, seed=3, room=0.12))
-    frame, num = frame_at(engine, scenario, Stage.ROLLOUTS), 7
-    assert len(frame.rollouts) == num + NUM and frame.certificates.clearance > 0
-    for start, path in zip(scenario.starts, frame.rollouts[num:], strict=True):
-        np.testing.assert_allclose(path[0], start.place, atol=2e-3)
-        np.testing.assert_allclose(path[-1], frame.goal, atol=2e-3)
-        assert scenario.obstacle.signed_distance(path).min() > 0
 
 
 def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it_does_not_suit(engine, initial):
@@ -120,16 +99,18 @@ def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
-def test_the_arm_follows_an_added_rollout(engine, initial, robot, space):
-    scenario = changed(
-        initial("push_box"), space=space, view=replace(initial("push_box").view, field=False, health_plots=True)
-    )
+def test_the_arm_follows_an_added_rollout_clear_of_the_obstacle(engine, initial, robot, space):
+    scenario = changed(initial("push_box"), space=space, view=View(field=False, health_plots=True))
     scenario = replace(scenario, starts=random_starts(engine, scenario, seed=3, room=0.12), arm_rollout=7 + 2)
     frame = frame_at(engine, scenario, Stage.FINE)
+    assert len(frame.rollouts) == 7 + NUM and frame.certificates.clearance > 0
+    for start, path in zip(scenario.starts, frame.rollouts[7:], strict=True):
+        np.testing.assert_allclose(path[0], start.place, atol=2e-3)
+        np.testing.assert_allclose(path[-1], frame.goal, atol=2e-3)
+        assert scenario.obstacle.signed_distance(path).min() > 0
     assert frame.chosen == 9 and frame.arm is not None
     hand = robot.end_effector(frame.arm.q)
-    np.testing.assert_allclose(hand[0], scenario.starts[2].place, atol=2e-3)
-    np.testing.assert_allclose(hand[-1], frame.goal, atol=2e-3)
+    np.testing.assert_allclose(hand[[0, -1]], [scenario.starts[2].place, frame.goal], atol=2e-3)
     assert frame.profiles is not None and frame.profiles.of_mean
     assert not frame_at(engine, replace(scenario, arm_rollout=3), Stage.FINE).profiles.of_mean
 
@@ -158,8 +139,7 @@ def test_a_start_out_of_reach_is_said_to_be_and_blocks_nothing(engine, initial, 
 def test_a_start_inside_the_obstacle_is_said_to_be(engine, initial, space):
     scenario = changed(initial("push_box"), space=space)
     frame = frame_at(engine, replace(scenario, starts=starts_at(scenario.obstacles[0].position)), Stage.ROLLOUTS)
-    assert not frame.blocked
-    assert says(frame, "added start 1 is inside the obstacle")
+    assert not frame.blocked and says(frame, "added start 1 is inside the obstacle")
 
 
 def test_an_added_start_at_the_goal_stays_there(engine, initial):

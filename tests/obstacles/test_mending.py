@@ -80,6 +80,16 @@ def test_seams_are_closed(shift):
     assert volume(mesh) == pytest.approx(BALL.volume, rel=1e-3)
 
 
+def test_the_inside_of_a_hollow_ball_stays_its_inside_stray_vertices_and_doubled_triangles_do_not_count():
+    inner = trimesh.creation.icosphere(3, 0.05)
+    inner.invert()
+    assert volume(trimesh.util.concatenate([BALL, inner])) == pytest.approx(BALL.volume + inner.volume)
+    stray = trimesh.Trimesh(np.concatenate([BALL.vertices, [[1e30, 0, 0]]]), BALL.faces, process=False)
+    assert volume(stray) == pytest.approx(BALL.volume)
+    doubled = trimesh.Trimesh(BALL.vertices, np.concatenate([BALL.faces, BALL.faces[::2, ::-1]]), process=False)
+    assert volume(doubled) == pytest.approx(BALL.volume)
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_triangles_that_face_the_other_way_are_turned(seed):
     faces = BALL.faces.copy()
@@ -90,32 +100,18 @@ def test_triangles_that_face_the_other_way_are_turned(seed):
     assert found.volume == pytest.approx(BALL.volume)
 
 
-def test_the_inside_of_a_hollow_ball_stays_its_inside():
-    inner = trimesh.creation.icosphere(3, 0.05)
-    outside_in = trimesh.Trimesh(inner.vertices, inner.faces[:, ::-1], process=False)
-    assert volume(trimesh.util.concatenate([BALL, outside_in])) == pytest.approx(BALL.volume - inner.volume)
+FIN = np.concatenate([BOX.vertices, [[0.0, 0.0, 0.3]]]), np.concatenate([BOX.faces, [[*BOX.faces[0, :2], 8]]])
+LOOSE = np.random.default_rng(0).uniform(0, 0.2, (30_000, 3)), np.arange(30_000).reshape(-1, 3)
 
 
-def test_vertices_that_no_triangle_uses_do_not_count():
-    far = trimesh.Trimesh(np.concatenate([BALL.vertices, [[1e30, 0, 0]]]), BALL.faces, process=False)
-    assert volume(far) == pytest.approx(BALL.volume)
-
-
-def test_doubled_triangles_are_taken_once():
-    both = trimesh.Trimesh(BALL.vertices, np.concatenate([BALL.faces, BALL.faces[::2, ::-1]]), process=False)
-    assert volume(both) == pytest.approx(BALL.volume)
-
-
-def test_more_than_two_triangles_at_an_edge_are_refused():
-    fin = np.concatenate([BOX.faces, [[BOX.faces[0, 0], BOX.faces[0, 1], 8]]])
-    with pytest.raises(FormatError, match="1 of them more than two"):
-        closed(np.concatenate([BOX.vertices, [[0.0, 0.0, 0.3]]]), fin)
-
-
-def test_loose_triangles_are_refused_soon():
-    corners = np.random.default_rng(0).uniform(0, 0.2, (30_000, 3))
-    with pytest.raises(FormatError, match="30000 edges that do not join two triangles"):
-        closed(corners, np.arange(30_000).reshape(-1, 3))
+@pytest.mark.parametrize(
+    ("surface", "words"),
+    [(FIN, "1 of them more than two"), (LOOSE, "30000 edges that do not join two triangles")],
+    ids=["a fin", "loose triangles"],
+)
+def test_edges_that_do_not_join_two_triangles_are_refused_soon(surface, words):
+    with pytest.raises(FormatError, match=words):
+        closed(*surface)
 
 
 def test_a_surface_with_one_side_is_refused():

@@ -2,14 +2,13 @@
 
 import io
 import json
+import re
 import struct
 import time
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles.files import MAX_BYTES, MAX_FACES, ShapeError, read_cloud, read_mesh
@@ -54,18 +53,15 @@ def refusal(read, content: bytes, name: str, **options) -> str:
 
 
 class TestMeshes:
-    @pytest.mark.parametrize("kind", FORMATS)
+    @pytest.mark.parametrize("kind", [*FORMATS, "stl_ascii"])
     def test_every_format_gives_the_same_solid(self, kind):
-        loaded = read_mesh(exported(BOX, kind), f"crate.{kind.upper()}")
+        loaded = read_mesh(exported(BOX, kind), f"crate.{kind[:3].upper()}")
         assert loaded.name == "crate"
         assert loaded.notes == ()
         np.testing.assert_allclose(np.ptp(loaded.solid.vertices, axis=0), (0.15, 0.1, 0.05), atol=1e-6)
         np.testing.assert_allclose(loaded.solid.bounds.mean(axis=0), 0, atol=1e-6)
         obstacle = MeshObstacle((0.3, 0.0, 0.0), loaded.solid)
         np.testing.assert_allclose(obstacle.signed_distance(np.array([0.3, 0.0, 0.2])), 0.175, atol=2e-3)
-
-    def test_text_stl(self):
-        assert len(read_mesh(exported(BOX, "stl_ascii"), "a.stl").solid.faces) == 12
 
     def test_parts_of_a_scene_are_placed(self):
         scene = trimesh.Scene()
@@ -83,11 +79,8 @@ class TestMeshes:
         assert "150 × 100 × 50 m; is the file in millimetres (scale=0.001)? then that is 0.15 × 0.1 × 0.05 m" in message
         solid = read_mesh(content, "big.stl", scale=1e-3).solid
         np.testing.assert_allclose(np.ptp(solid.vertices, axis=0), (0.15, 0.1, 0.05), atol=1e-9)
-
-    def test_too_small(self):
-        assert "0.0015 × 0.001 × 0.0005 m" in refusal(
-            read_mesh, exported(trimesh.creation.box((0.0015, 0.001, 0.0005)), "stl"), "a.stl"
-        )
+        assert "0.0015 × 0.001 × 0.0005 m" in refusal(read_mesh, content, "small.stl", scale=1e-5)
+        assert "scale" in refusal(read_mesh, content, "a.stl", scale=0.0)
 
     def test_a_small_hole_is_filled_and_said(self):
         ball = trimesh.creation.icosphere(3, 0.07)
@@ -98,30 +91,19 @@ class TestMeshes:
             trimesh.Trimesh(loaded.solid.vertices, loaded.solid.faces).volume, ball.volume, rtol=1e-3
         )
 
-    def test_open_seams_are_closed_and_said(self):
-        loose = BOX.triangles.reshape(-1, 3) + np.random.default_rng(0).normal(scale=1e-8, size=(36, 3))
-        loaded = read_mesh(
-            exported(trimesh.Trimesh(loose, np.arange(36).reshape(-1, 3), process=False), "ply"), "a.ply"
-        )
-        assert loaded.notes in ((), ("open seams were closed",))
-        assert len(loaded.solid.vertices) == 8
-
-    def test_an_inside_out_mesh_is_turned(self):
-        turned = BOX.copy()
-        turned.invert()
-        solid = read_mesh(exported(turned, "ply"), "a.ply").solid
+    def test_open_seams_are_closed_and_an_inside_out_mesh_is_turned(self):
+        corners = BOX.triangles.reshape(-1, 3) + np.random.default_rng(0).normal(scale=1e-8, size=(36, 3))
+        loose = trimesh.Trimesh(corners, np.arange(36).reshape(-1, 3)[:, ::-1], process=False)
+        solid = read_mesh(exported(loose, "ply"), "a.ply").solid
+        assert len(solid.vertices) == 8
         assert trimesh.Trimesh(solid.vertices, solid.faces).volume > 0
 
-    def test_an_open_mesh_is_refused(self):
-        ball = trimesh.creation.icosphere(3, 0.07)
-        half = ball.slice_plane([0, 0, 0], [0, 0, 1])
+    def test_an_open_and_a_flat_mesh_are_refused(self):
+        half = trimesh.creation.icosphere(3, 0.07).slice_plane([0, 0, 0], [0, 0, 1])
         several = trimesh.Trimesh(half.vertices, half.faces[::2], process=False)
         assert "of its closed surface" in refusal(read_mesh, exported(several, "ply"), "open.ply")
-
-    def test_a_flat_mesh_is_refused(self):
         flat = trimesh.creation.box((0.1, 0.1, 1e-9))
-        message = refusal(read_mesh, exported(flat, "ply"), "flat.ply")
-        assert "volume" in message or "thickness" in message or "edges" in message
+        assert re.search("volume|thickness|edges", refusal(read_mesh, exported(flat, "ply"), "flat.ply"))
 
     def test_a_thin_wall_is_said(self):
         wall, post = trimesh.creation.box((0.3, 0.3, 0.004)), trimesh.creation.box((0.05, 0.05, 0.1))
@@ -149,9 +131,6 @@ class TestMeshes:
         assert "an empty file" in refusal(read_mesh, b"", f"a.{kind}")
         refusal(read_mesh, b"\n", f"a.{kind}")
 
-    def test_a_scale_that_is_none(self):
-        assert "scale" in refusal(read_mesh, exported(BOX, "stl"), "a.stl", scale=0.0)
-
     def test_a_cloud_is_no_mesh(self):
         assert "cloud" in refusal(read_mesh, exported(trimesh.PointCloud(POINTS), "ply"), "a.ply")  # pyright: ignore[reportArgumentType]
 
@@ -177,18 +156,6 @@ class TestMeshes:
         body = text.encode().ljust((len(text) + 3) // 4 * 4)
         glb = b"glTF" + struct.pack("<III", 2, 20 + len(body), len(body)) + b"JSON" + body
         assert "faces: found none" in refusal(read_mesh, glb, "a.glb")
-
-    @settings(max_examples=25)
-    @given(kind=st.sampled_from(FORMATS), seed=st.integers(0, 2**32 - 1))
-    def test_corrupt_files_are_read_or_refused(self, kind, seed):
-        rng = np.random.default_rng(seed)
-        content = bytearray(exported(BOX, kind))
-        for place in rng.integers(0, len(content), rng.integers(1, 8)):
-            content[place] = rng.integers(256)
-        try:
-            assert read_mesh(bytes(content), f"a.{kind}").solid.distances.depth > 0
-        except ShapeError as error:
-            assert str(error).startswith(f"a.{kind}: ")
 
     def test_many_faces_are_ready_soon(self):
         content = exported(trimesh.creation.icosphere(6, 0.07), "stl")
@@ -265,10 +232,8 @@ class TestClouds:
             (b"PK not a zip", "a.npz", "a .npz file of points"),
             (npz(points=np.zeros((2_000_000, 3))), "a.npz", "when unpacked"),
             (b"a,b,c\n1,2,3\n", "a.csv", "'a,b,c'"),
-            (b"x,y,z\n1,2\n", "a.csv", "line 2: found 2 columns"),
             (b"x,y,z\n1,2,one\n", "a.csv", "line 2: found '1,2,one'"),
             (b"x,y,z\n", "a.csv", "points: found 0"),
-            (b"\xff\xfe", "a.csv", "UTF-8"),
             (b"", "a.csv", "an empty file"),
             (b"ply\n", "a.ply", "end_header"),
             (b"x", "a.xyz", ".ply, .npz, .csv"),

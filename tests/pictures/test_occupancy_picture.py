@@ -46,10 +46,9 @@ def test_what_any_obstacle_is_believed_to_occupy_is_occupied():
 
 
 def test_the_points_beside_the_slice_are_shown_on_it_with_their_labels():
-    rng = np.random.default_rng(4)
-    own = rng.uniform(-0.1, 0.1, (20_000, 3))
-    labels = np.linalg.norm(own, axis=1) < 0.06
-    cloud = CloudObstacle((0.05, -0.5, 0.42), Cloud(own, labels), (0.9, 0.1, 0.3, -0.3))
+    own = np.random.default_rng(4).uniform(-0.1, 0.1, (20_000, 3))
+    cloud = Cloud(own, (np.linalg.norm(own, axis=1) < 0.06).astype(float))
+    cloud = CloudObstacle((0.05, -0.5, 0.42), cloud, (0.9, 0.1, 0.3, -0.3))
     picture = occupancy_picture(AREA, (SHAPES[0], cloud), coarse=True)
     normal = np.cross(*AREA.axes.T)
     assert MAX_POINTS / 2 < len(picture.points) <= MAX_POINTS

@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import biases, changed, frame_at
-from scipy.spatial.transform import Rotation
+from scenes import biases, changed, frame_at, tilted
 
 from dt_viz.engine.frame import Stage
 from dt_viz.motion.stack import FINE, LIVE, build_stack, cut_off
 from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
 from dt_viz.scenario.scenario import SLICE_COLOURS, View
-from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import levels, surroundings
 from dt_viz.transforms.bias import BiasPoint
 
@@ -23,30 +21,17 @@ def _scenario(request, initial):
     return initial(request.param)
 
 
-def tilted(task, seed=0):
-    """A pose a little beside the task's, by random numbers."""
-    rng, home = np.random.default_rng(seed), task.slice.pose
-    turn = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)) * Rotation.from_quat(np.roll(home.wxyz, -1))
-    x, y, z = (np.asarray(home.position) + rng.uniform(-0.04, 0.04, 3)).tolist()
-    w, i, j, k = np.roll(turn.as_quat(), 1).tolist()
-    return SlicePose((x, y, z), (w, i, j, k))
-
-
 def shown(engine, scenario, wanted=Stage.FINE, **view):
-    scenario = replace(scenario, view=View(**view))
-    return frame_at(engine, scenario, wanted)
+    return frame_at(engine, replace(scenario, view=View(**view)), wanted)
 
 
-def solved(engine, scenario, precision=FINE):
+def solved(engine, scenario, wanted=Stage.FINE):
     nominal = engine.nominal(scenario)
-    return nominal, build_stack(nominal, scenario.active, precision)
+    return nominal, build_stack(nominal, scenario.active, LIVE if wanted is Stage.LIVE else FINE)
 
 
 def with_bias(engine, scenario):
     return changed(scenario, layers=biases(BiasPoint.beside(surroundings(engine.task(scenario.task), scenario))))
-
-
-# --- The slice ---
 
 
 @pytest.mark.parametrize("colour", ["det", "lyapunov", "occupancy"])
@@ -55,19 +40,15 @@ def test_everything_lies_on_the_slice_wherever_it_is(engine, scenario, colour):
     frame = shown(engine, scenario, Stage.LIVE, slice=pose, colour=colour)
     area, pictures = frame.slice, frame.pictures
     assert area.pose.position == pytest.approx(pose.position)
-    lying = [pictures.field.points]
-    if colour == "occupancy":
-        lying += [pictures.occupancy.level.reshape(-1, 3), pictures.occupancy.outline.reshape(-1, 3)]
-    else:
-        lying.append(pictures.colour.lines.reshape(-1, 3))
-    for points in lying:
+    made = pictures.occupancy if colour == "occupancy" else pictures.colour
+    lines = (made.level, made.outline) if colour == "occupancy" else (made.lines,)
+    assert made.area.lies_like(area)
+    for points in (pictures.field.points, *(line.reshape(-1, 3) for line in lines)):
         np.testing.assert_allclose((points - area.centre) @ area.normal, 0, atol=1e-12)
         assert (np.abs(area.across(points)) <= np.array(area.half_size) + 1e-9).all()
-    made = pictures.occupancy if colour == "occupancy" else pictures.colour
-    assert made.area.lies_like(area)
 
 
-def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, initial, monkeypatch):
+def test_neither_another_slice_nor_another_rollout_for_the_arm_solves_anything_again(new_engine, initial, monkeypatch):
     engine, scenario = new_engine(), initial("lift_box")
     before = list(engine.frames(scenario))
     monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
@@ -78,23 +59,17 @@ def test_moving_the_slice_moves_no_motion_and_solves_nothing_again(new_engine, i
         assert (new.certificates, new.durations) == (old.certificates, old.durations)
         for a, b in zip(old.rollouts, new.rollouts, strict=True):
             np.testing.assert_array_equal(a, b)
+    other = frame_at(engine, replace(moved, arm_rollout=3), Stage.FINE)
+    assert (before[-1].chosen, other.chosen) == (0, 3)
+    assert not np.array_equal(before[-1].arm.q[0], other.arm.q[0])
     x, y, z = scenario.obstacles[0].position
     with pytest.raises(BaseException, match="solved again"):
         next(engine.frames(changed(moved, obstacles=(scenario.obstacles[0].moved((x, y, z + 0.01)),))))
 
 
-def test_another_rollout_for_the_arm_solves_nothing_again(new_engine, initial, monkeypatch):
-    engine, scenario = new_engine(), initial("draw_s")
-    frame_at(engine, scenario, Stage.FINE)
-    monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
-    first, other = (frame_at(engine, replace(scenario, arm_rollout=number), Stage.FINE) for number in (0, 3))
-    assert (first.chosen, other.chosen) == (0, 3)
-    assert not np.array_equal(first.arm.q[0], other.arm.q[0])
-
-
 def test_frames_of_a_changed_view_are_those_of_a_fresh_start(engine, new_engine, initial):
     scenario = initial("draw_s")
-    view = {"slice": tilted(engine.task(scenario.task), 1), "colour": "lyapunov", "streamlines": True}
+    view = {"slice": tilted(engine.task("draw_s"), 1), "colour": "lyapunov", "streamlines": True}
     frame_at(engine, scenario, Stage.FINE)
     again, fresh = (shown(e, scenario, **view).pictures for e in (engine, new_engine()))
     np.testing.assert_array_equal(again.field.velocities, fresh.field.velocities)
@@ -112,23 +87,12 @@ def test_what_is_not_shown_is_not_computed(engine, scenario):
         assert plain.computes_like(replace(scenario, view=View(colour=colour)))
 
 
-# --- Streamlines ---
-
-
-@pytest.mark.parametrize(
-    ("task", "wanted", "moved"),
-    [
-        ("draw_s", Stage.FINE, False),
-        ("lift_box", Stage.LIVE, True),
-        pytest.param("draw_s", Stage.LIVE, True, marks=pytest.mark.slow),
-        pytest.param("lift_box", Stage.FINE, False, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("task", "wanted", "moved"), [("draw_s", Stage.FINE, False), ("lift_box", Stage.LIVE, True)])
 def test_streamlines_follow_the_velocity_and_the_lyapunov_value_falls_along_them(engine, initial, task, wanted, moved):
     scenario = initial(task)
     view = {"slice": tilted(engine.task(scenario.task))} if moved else {}
     frame = shown(engine, scenario, wanted, streamlines=True, **view)
-    system = solved(engine, scenario, LIVE if wanted is Stage.LIVE else FINE)[1].system
+    system = solved(engine, scenario, wanted)[1].system
     lines, obstacle = frame.pictures.streamlines, scenario.obstacle
     assert len(lines) > 30
     cosines = []
@@ -161,13 +125,10 @@ def test_streamlines_keep_apart_fill_the_slice_and_stay_over_it(engine, scenario
     assert np.quantile(empty, 0.9) < 1.2 * SEPARATION
 
 
-# --- Colours ---
-
-
 @pytest.mark.parametrize("wanted", [Stage.LIVE, Stage.FINE])
 def test_colours_are_the_functions_that_they_say(engine, scenario, wanted):
     pose = tilted(engine.task(scenario.task), 2)
-    system = solved(engine, scenario, LIVE if wanted is Stage.LIVE else FINE)[1].system
+    system = solved(engine, scenario, wanted)[1].system
     rng = np.random.default_rng(3)
     for colour, direct in (
         ("det", lambda y: np.linalg.det(system.transform.jacobian(y)[1])),
@@ -199,9 +160,6 @@ def test_det_j_of_the_identity_is_one_and_its_level_lines_are_circles(engine, sc
     assert off.max() < 5e-4 and len(np.unique(np.round(radii / 0.04))) > 5
 
 
-# --- Levels ---
-
-
 def test_the_system_of_each_level_has_the_rollouts_of_that_level(engine, scenario):
     scenario = with_bias(engine, scenario)
     frame = shown(engine, scenario)
@@ -217,7 +175,7 @@ def test_the_system_of_each_level_has_the_rollouts_of_that_level(engine, scenari
             np.testing.assert_allclose(path[:-1], again, atol=2e-6)
 
 
-def test_the_pictures_are_those_of_the_selected_level(engine, initial):
+def test_the_pictures_are_those_of_the_selected_level_if_it_is_in_the_stack(engine, initial):
     scenario = with_bias(engine, initial("draw_s"))
     values = np.empty(0)
     for level, name in enumerate(levels(scenario)):
@@ -229,9 +187,12 @@ def test_the_pictures_are_those_of_the_selected_level(engine, initial):
         values = colour.values
         known = ~np.isnan(values)
         assert known.all() == (name != "Avoidance")  # only there the obstacle is in the way
-    whole = shown(engine, scenario, Stage.FINE, level="", colour="lyapunov")
-    assert whole.level is None
-    np.testing.assert_array_equal(whole.pictures.colour.values, values)
+    for name in ("", "Bias 7"):
+        whole = shown(engine, scenario, Stage.FINE, level=name, colour="lyapunov")
+        assert whole.level is None
+        np.testing.assert_array_equal(whole.pictures.colour.values, values)
+    without = changed(scenario, avoids=False)
+    assert shown(engine, without, Stage.ROLLOUTS, level="Avoidance").level is None
 
 
 def test_the_grid_of_the_imitation_is_that_of_the_stack_without_the_obstacle(engine, scenario):
@@ -240,11 +201,6 @@ def test_the_grid_of_the_imitation_is_that_of_the_stack_without_the_obstacle(eng
     assert len(below) == len(without)
     for a, b in zip(below, without, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_a_level_that_is_not_in_the_stack_is_no_level(engine, scenario):
-    assert shown(engine, scenario, Stage.ROLLOUTS, level="Bias 7").level is None
-    assert shown(engine, changed(scenario, avoids=False), Stage.ROLLOUTS, level="Avoidance").level is None
 
 
 def test_the_slice_can_be_moved_while_there_is_no_motion(new_engine, initial):

@@ -109,16 +109,13 @@ class TestLiftedBox:
         places = followed(self.BOX, path)
         assert places[:98, 2].max() == 0
         np.testing.assert_allclose(places[-1], [0, -0.5, 0.3], atol=0.01)
-        home = between(path[-1], path[0])
         place = places[-1]
-        for now in home:
+        for now in between(path[-1], path[0]):
             place = self.BOX.moved(place, Hand(now, now, path[-1], 1.0))
         np.testing.assert_array_equal(place, places[-1])
 
-    def test_a_hand_that_never_reached_in_leaves_it(self):
+    def test_a_hand_that_never_reached_in_leaves_it_and_it_is_never_taken_below_the_table(self):
         path = between([0.3, -0.3, 0.4], [0.0, -0.5, 0.2], [0.0, -0.5, 0.4])
         np.testing.assert_array_equal(followed(self.BOX, path) - self.BOX.start, 0)
-
-    def test_it_is_never_taken_below_the_table(self):
         path = between([0.0, -0.5, 0.1], [0.0, -0.5, 0.15], [0.0, -0.5, 0.02])
         assert followed(self.BOX, path)[:, 2].min() >= 0

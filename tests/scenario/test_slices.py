@@ -40,7 +40,7 @@ def test_the_tasks_own_pose_leaves_the_slice_where_it_is(task):
     assert home.lies_like(replace(home)) and not home.lies_like(replace(home, half_size=(0.1, 0.1)))
 
 
-def test_the_level_line_of_a_plane_is_where_the_plane_is_zero():
+def test_level_lines_lie_where_the_function_has_that_value_and_not_where_it_has_none():
     rng = np.random.default_rng(1)
     normal, offset = rng.normal(size=3), 0.1
     points = np.stack([*np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 7), indexing="ij")], axis=-1)
@@ -48,11 +48,7 @@ def test_the_level_line_of_a_plane_is_where_the_plane_is_zero():
     segments = level_line(points, points @ normal - offset)
     assert len(segments) > 5
     np.testing.assert_allclose(segments @ normal, offset, atol=1e-12)
-
-
-def test_a_level_line_leaves_out_where_the_function_has_no_value():
     points = Slice(np.zeros(3), np.eye(3)[:, :2], (1.0, 1.0)).grid(0.1)
-    values = np.where(points[..., 0] < 0.05, points[..., 1] - 0.03, np.nan)
-    segments = level_line(points, values)
+    segments = level_line(points, np.where(points[..., 0] < 0.05, points[..., 1] - 0.03, np.nan))
     np.testing.assert_allclose(segments[..., 1], 0.03, atol=1e-12)
     assert np.ptp(segments[..., 0]) == pytest.approx(1.0) and segments[..., 0].max() < 0.05

@@ -36,17 +36,13 @@ def test_a_file_in_space_is_refused_and_named(tmp_path):
         lasa_tasks(tmp_path)["Solid"]()
 
 
-def test_the_arm_reaches_above_and_into_every_pot():
+def test_the_arm_reaches_above_and_into_every_pot_which_catches_what_is_let_go_over_its_opening_only():
     robot, height = load_jaco(), TASKS["drop_pots"]().paths[0][-1, 2]
     for pot in POTS:
         for z in (pot.height + 0.05, height):
             q = inverse_kinematics(robot, np.array([pot.x, pot.y, z]))
             assert robot.hand_direction(q)[2] < -0.2
-
-
-def test_a_pot_catches_what_is_let_go_over_its_opening_only():
-    pot = POTS[0]
-    over = np.array(pot.opening) + np.array([0.9 * pot.radius, 0.0, 0.1])
-    assert pot.catches(over)
-    assert not pot.catches(over + np.array([0.2 * pot.radius, 0.0, 0.0]))
-    assert not pot.catches(over - np.array([0.0, 0.0, 0.11]))
+        over = np.array(pot.opening) + np.array([0.9 * pot.radius, 0.0, 0.1])
+        assert pot.catches(over)
+        assert not pot.catches(over + np.array([0.2 * pot.radius, 0.0, 0.0]))
+        assert not pot.catches(over - np.array([0.0, 0.0, 0.11]))

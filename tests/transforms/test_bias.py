@@ -1,6 +1,7 @@
 """Bias points: the field that pulls, motions that pass their targets, and what is said of targets out of reach."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -8,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import avoiding, biases
 
-from dt_viz.flows.diffeomorphisms import Flow, round_trip_error
+from dt_viz.flows.diffeomorphisms import Flow, min_det_jacobian, round_trip_error
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
-from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import FINE, LIVE, Solution, build_stack
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
@@ -26,13 +26,13 @@ from dt_viz.transforms.bias import (
     closest_points,
     unit_field,
 )
-from dt_viz.warning import Kind, MotionWarning
+from dt_viz.warning import Kind
 
 seeds = st.integers(0, 2**32 - 1)
 
 
+SWEPT = ("draw_s", "push_box")
 PLANE = as_point(DRAWING_AXES[:, 0]), as_point(DRAWING_AXES[:, 1])
-MAX_OFF = 0.15
 
 
 def plane_of(task):
@@ -40,16 +40,9 @@ def plane_of(task):
 
 
 @pytest.fixture(scope="session")
-def nominal(fits, engine):
+def nominal(engine):
     """The undisturbed motion of a task."""
-    made = {}
-
-    def nominal(task) -> Nominal:
-        if task not in made:
-            made[task] = engine.nominal(Scenario(task))
-        return made[task]
-
-    return nominal
+    return lru_cache(lambda task: engine.nominal(Scenario(task)))
 
 
 def biased(nominal, *points, precision=FINE, **changes) -> Solution:
@@ -77,20 +70,17 @@ def beside(nominal, rng, plane=None):
     if plane is not None:
         aside = np.array(plane).T @ (np.array(plane) @ aside)
     aside = aside - (aside @ tangent) / (tangent @ tangent) * tangent
-    x, y, z = path[k] + rng.uniform(0.0, MAX_OFF) * aside / np.linalg.norm(aside)
-    if z < 0:
-        return beside(nominal, rng, plane)
-    return float(x), float(y), float(z)
+    place = path[k] + rng.uniform(0.0, 0.15) * aside / np.linalg.norm(aside)
+    return as_point(place) if place[2] >= 0 else beside(nominal, rng, plane)
 
 
 def assert_sound(nominal, solution, goal=None):
     """Ends kept, a diffeomorphism along the rollouts, there and back again exact."""
     paths, y = solution.bundle.paths, solution.bundle.positions
-    np.testing.assert_allclose([path[0] for path in paths], nominal.task.starts, atol=1e-6)
-    np.testing.assert_allclose(
-        [path[-1] for path in paths], [nominal.goal if goal is None else goal] * len(paths), atol=1e-6
-    )
-    assert np.linalg.det(solution.transform.jacobian(y)[1]).min() > 0
+    goal = nominal.goal if goal is None else goal
+    for path, start in zip(paths, nominal.task.starts, strict=True):
+        np.testing.assert_allclose(path[[0, -1]], [start, goal], atol=1e-6)
+    assert min_det_jacobian(solution.transform.jacobian, y) > 0
     assert round_trip_error(solution.transform, y) < 1e-6
 
 
@@ -109,23 +99,18 @@ def test_the_field_leads_away_from_the_centre_nearly_alike_everywhere_outside_it
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_field_is_at_rest_at_the_centre_and_outside_its_region(dim):
-    field = unit_field(dim)
+def test_the_field_is_at_rest_at_the_centre_and_ends_smoothly(dim):
+    """Value and derivative fade out together: near the border of its region both are small, however near."""
+    field, direction = unit_field(dim), np.array([0.6, 0.8, 0.0])
     assert np.abs(field(np.zeros((1, 3)))).max() < 1e-12
+    for gap, bound in ((1e-2, 1e-3), (1e-3, 1e-6)):
+        V, DV = field.with_jacobian((1 - gap) * direction[None])
+        assert 0 < np.abs(V).max() < bound
+        assert np.abs(DV).max() < 10 * bound / gap
     outside = np.random.default_rng(0).normal(size=(100, 3))
     outside *= 1.001 / np.linalg.norm(outside[:, :dim], axis=1, keepdims=True)
     V, DV = field.with_jacobian(outside)
     assert not V.any() and not DV.any() and not field(outside).any()
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_the_field_ends_smoothly(dim):
-    """Value and derivative fade out together: near the border both are small, however near."""
-    direction = np.array([0.6, 0.8, 0.0])
-    for gap, bound in ((1e-2, 1e-3), (1e-3, 1e-6)):
-        V, DV = unit_field(dim).with_jacobian((1 - gap) * direction[None])
-        assert 0 < np.abs(V).max() < bound
-        assert np.abs(DV).max() < 10 * bound / gap
 
 
 def test_a_dragged_or_resized_bias_point_learns_nothing_again():
@@ -149,15 +134,11 @@ def test_every_rollout_passes_within_a_centimetre_of_targets_up_to_15_cm_off(nom
         turns.append(max(sharpest_turn(path, 0.02) for path in solution.bundle.paths))
         if number % 5 == 0:
             assert_sound(g, solution)
+        if plane_of(task):
+            assert np.ptp(solution.bundle.positions[:, 1]) < 1e-12  # a drawing stays in its plane
     assert max(off) > (0.12 if num > 6 else 0.07)  # the targets were not all on the path
     before = max(sharpest_turn(path, 0.02) for path in g.bundle.paths)
     assert np.median(turns) < before + 65  # on two centimetres, degrees
-
-
-def test_a_drawing_stays_in_its_plane(nominal):
-    g = nominal("draw_s")
-    solution = biased(g, BiasPoint(beside(g, np.random.default_rng(1), PLANE), plane=PLANE))
-    assert np.ptp(solution.bundle.positions[:, 1]) < 1e-12
 
 
 def straight(distance, num=401, **changes):
@@ -176,10 +157,8 @@ def test_the_auto_duration_is_the_shortest(distance, radius):
     field = built.transform.field
 
     def after(duration):
-        return float(closest_distances(point, replace(motion, positions=flow(duration).inverse(motion.positions)))[0])
-
-    def flow(duration):
-        return Flow(field, duration, 60)
+        moved = Flow(field, duration, 60).inverse(motion.positions)
+        return float(closest_distances(point, replace(motion, positions=moved))[0])
 
     assert after(built.duration) == pytest.approx(AIM, rel=0.03)
     assert after(0.97 * built.duration) > AIM
@@ -222,15 +201,9 @@ def test_a_chosen_strength_is_taken_as_it_is():
 # several
 
 
+@pytest.mark.parametrize("order", [1, pytest.param(-1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    ("task", "order"),
-    [
-        *(("draw_s", 1), ("draw_s", -1), ("lift_box", 1)),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("lift_box", -1), ("draw_j", 1), ("draw_j", -1), ("push_box", 1), ("push_box", -1))
-        ),
-    ],
+    "task", ["lift_box", *(pytest.param(t, marks=pytest.mark.slow) for t in ("draw_s", "push_box"))]
 )
 def test_two_bias_points_in_either_order(nominal, task, order):
     g, plane = nominal(task), plane_of(task)
@@ -239,19 +212,19 @@ def test_two_bias_points_in_either_order(nominal, task, order):
     points = [BiasPoint(as_point(path[k] + aside), plane=plane) for k in (35, 75)][::order]
     solution = biased(g, *points)
     assert satisfied(solution)
-    for point in points:
-        assert missed(g, solution, point) <= ACCEPTED
+    assert max(missed(g, solution, point) for point in points) <= ACCEPTED
     assert_sound(g, solution)
 
 
-def test_fig_4_a_letter_biased_to_two_points(nominal):
+@pytest.mark.parametrize("order", [1, -1])
+def test_fig_4_a_letter_biased_to_two_points_in_either_order(nominal, order):
     g = nominal("draw_j")
     path = resample_by_arc_length(np.mean([resample_by_arc_length(p, 201) for p in g.bundle.paths], axis=0), 101)
-    first = as_point(path[30] + [-0.10, 0.0, 0.0])  # into the letter
-    second = as_point(path[70] + [0.0, 0.0, -0.08])  # below its bow
-    points = [BiasPoint(first, plane=PLANE), BiasPoint(second, plane=PLANE)]
+    places = (path[30] + [-0.10, 0.0, 0.0], path[70] + [0.0, 0.0, -0.08])  # into the letter, below its bow
+    points = [BiasPoint(as_point(place), plane=PLANE) for place in places][::order]
     solution = biased(g, *points)
-    assert [missed(g, solution, point) <= ACCEPTED for point in points] == [True, True]
+    assert satisfied(solution)
+    assert max(missed(g, solution, point) for point in points) <= ACCEPTED
     assert_sound(g, solution)
 
 
@@ -283,16 +256,18 @@ def test_bias_and_avoidance_in_either_order(nominal, level):
 # what cannot be
 
 
-def test_a_region_that_does_not_reach_the_motion_is_said_to_be_too_small():
-    built = BiasPoint((0.0, 0.0, 0.0), radius=0.08).build(straight(0.12))
+@pytest.mark.parametrize(
+    ("radius", "words"),
+    [
+        (0.08, "Bias 1: the region of 8 cm is too small: a motion is 12 cm from the target"),
+        (0.123, "fades out"),
+    ],
+)
+def test_a_region_that_does_not_reach_the_motion_or_hardly_is_said_to(radius, words):
+    built = BiasPoint((0.0, 0.0, 0.0), radius).build(straight(0.12))
     assert built.hopeless and built.duration == MAX_DURATION
-    text = "Bias 1: the region of 8 cm is too small: a motion is 12 cm from the target"
-    assert built.warnings == (MotionWarning(Kind.UNREACHED, text, "Bias 1"),)
-
-
-def test_a_region_that_hardly_reaches_the_motion_is_said_to_fade_out():
-    built = BiasPoint((0.0, 0.0, 0.0), radius=0.123).build(straight(0.12))
-    assert built.hopeless and "fades out" in built.warnings[0].text
+    (warning,) = built.warnings
+    assert warning.kind is Kind.UNREACHED and warning.source == "Bias 1" and words in warning.text
 
 
 def misplaced(warnings):
@@ -300,12 +275,17 @@ def misplaced(warnings):
 
 
 @pytest.mark.parametrize(
-    ("place", "words"), [((0.6, 0.1, 0.0), "the point is on the goal"), ((-0.6, 0.1, 0.0), "the point is on a start")]
+    ("place", "radius", "targets", "words"),
+    [
+        ((0.6, 0.1, 0.0), 0.2, (), "Bias 1: the point is on the goal"),
+        ((-0.6, 0.1, 0.0), 0.2, (), "Bias 1: the point is on a start"),
+        ((0.0, 0.0, 0.0), 0.3, ((0.1, 0.1, 0.0),), "covers a bias point below it"),
+        ((0.0, 0.0, 0.0), 0.3, (), None),
+    ],
 )
-def test_a_misplaced_bias_point_is_warned_of(place, words):
-    built = BiasPoint(place, radius=0.2).build(straight(0.1, tolerance=1e-6))
-    (text,) = misplaced(built.warnings)
-    assert text.startswith(f"Bias 1: {words}")
+def test_a_misplaced_bias_point_is_warned_of(place, radius, targets, words):
+    texts = misplaced(BiasPoint(place, radius).build(straight(0.1, tolerance=1e-6, targets=targets)).warnings)
+    assert [words in text for text in texts] == ([] if words is None else [True])
 
 
 @pytest.mark.parametrize(
@@ -340,15 +320,8 @@ def test_a_target_behind_the_goal_is_warned_of_and_the_goal_stays(nominal):
         np.testing.assert_allclose(path[-1], g.goal, atol=1e-3)
 
 
-def test_a_region_over_another_target_is_warned_of():
-    point, other = BiasPoint((0.0, 0.0, 0.0), radius=0.3), (0.1, 0.1, 0.0)
-    assert not misplaced(point.build(straight(0.1)).warnings)
-    (text,) = misplaced(point.build(straight(0.1, targets=(other,))).warnings)
-    assert "covers a bias point below it" in text
-
-
 def test_a_bias_point_is_told_the_targets_below_it(nominal):
-    path = resample_by_arc_length(nominal("lift_box").bundle.paths[0], 101)
-    points = [BiasPoint(as_point(path[50]), radius=0.3), BiasPoint(as_point(path[55]), radius=0.3)]
-    solution = biased(nominal("lift_box"), *points, precision=LIVE)
+    g = nominal("lift_box")
+    path = resample_by_arc_length(g.bundle.paths[0], 101)
+    solution = biased(g, *(BiasPoint(as_point(path[k]), radius=0.3) for k in (50, 55)), precision=LIVE)
     assert [bool(misplaced(applied.made.warnings)) for applied in solution.built] == [False, True]

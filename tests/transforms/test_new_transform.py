@@ -34,8 +34,7 @@ def scenario(request, engine, initial, monkeypatch):
 def test_a_new_transform_needs_a_file_and_a_line(engine, scenario):
     assert set(listed(scenario)) < set(tunable(scenario))
     assert not anchored(scenario)  # it has no handles
-    *_, frame = engine.frames(scenario)
-    assert frame.stage is Stage.CERTIFIED
+    frame = frame_at(engine, scenario, Stage.CERTIFIED)
     for path, before in zip(frame.rollouts, frame.ghost, strict=True):
         assert np.isfinite(path).all()
         np.testing.assert_allclose(path[0], before[0], atol=1e-6)

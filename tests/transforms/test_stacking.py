@@ -83,28 +83,28 @@ def test_what_is_moved_out_and_in_again_is_where_it_was(name, steps):
     assert [n for n in listed(after) if n != name] == [n for n in order if n != name]
 
 
-def test_layers_are_added_below_avoidance_only_while_that_is_outermost():
+def test_layers_are_added_below_avoidance_only_while_that_is_outermost_and_move_past_it_at_once_where_it_does_nothing():
     inner, point = moved(stack(2), AVOIDANCE, -1), BiasPoint(PLACES[2])
     assert listed(added(inner, point)) == ("Bias 1", AVOIDANCE, "Bias 2", "Bias 3")
     assert listed(added(moved(inner, AVOIDANCE, 1), point)) == ("Bias 1", "Bias 2", "Bias 3", AVOIDANCE)
-
-
-def test_what_is_below_avoidance_that_does_nothing_moves_past_it_at_once():
-    for scenario in (stack(space="cspace", level=2), changed(stack(level=2), obstacles=())):
-        assert listed(moved(scenario, "Bias 3", 1)) == ("Bias 1", "Bias 2", "Bias 3")
-        assert listed(moved(scenario, "Bias 3", -1)) == ("Bias 1", "Bias 3", "Bias 2")
+    for idle in (stack(space="cspace", level=2), changed(stack(level=2), obstacles=())):
+        assert listed(moved(idle, "Bias 3", 1)) == ("Bias 1", "Bias 2", "Bias 3")
+        assert listed(moved(idle, "Bias 3", -1)) == ("Bias 1", "Bias 3", "Bias 2")
 
 
 def test_each_transform_is_told_the_targets_below_it_that_are_on(engine, monkeypatch):
     told, build = {}, BiasPoint.build
-    monkeypatch.setattr(
-        BiasPoint, "build", lambda self, motion: told.update({motion.name: motion}) or build(self, motion)
-    )
+
+    def listening(self, motion):
+        told[motion.name] = motion.targets
+        return build(self, motion)
 
     def targets(scenario):
         told.clear()
         build_stack(engine.nominal(scenario), scenario.active, LIVE)
-        return {name: motion.targets for name, motion in told.items()}
+        return dict(told)
+
+    monkeypatch.setattr(BiasPoint, "build", listening)
 
     first = (0.5, 0.0, 0.0)
     points = [BiasPoint(place, strength=0.0) for place in (first, *PLACES[1:])]
@@ -171,15 +171,14 @@ def placed_beside(task, scenario):
     return BiasPoint.beside(surroundings(task, scenario))
 
 
-@pytest.mark.parametrize("task", [name for name in TASKS])
+@pytest.mark.parametrize("task", TASKS)
 def test_new_bias_points_lie_beside_the_motion_apart_from_each_other_and_in_the_plane_of_a_drawing(task, initial):
     task, scenario = TASKS[task](), initial(task)
     for _ in range(BiasPoint.most):
         point = placed_beside(task, scenario)
         assert (point.plane is None) == (task.demonstrations[0].dimension == 3)
-        assert (
-            0.02 < min(np.linalg.norm(path - point.position, axis=1).min() for path in task.paths) < 2 * PLACED_BESIDE
-        )
+        nearest = min(np.linalg.norm(path - point.position, axis=1).min() for path in task.paths)
+        assert 0.02 < nearest < 2 * PLACED_BESIDE
         for other in anchored(scenario).values():
             assert isinstance(other, BiasPoint)
             assert np.linalg.norm(np.subtract(point.position, other.position)) > 0.5 * PLACED_BESIDE
@@ -211,13 +210,10 @@ def test_two_new_bias_points_do_not_pull_against_each_other(task, engine, initia
 TUNED = stack(2, space="cspace", duration=0.4)
 
 
-def test_transforms_are_listed_from_the_outermost_inwards_where_they_have_something_to_do():
+def test_transforms_are_listed_from_the_outermost_inwards_and_the_chosen_one_is_tuned_while_it_is_there():
     assert tunable(TUNED) == (WHOLE_ARM, "Bias 2", "Bias 1", IMITATION)
     assert tunable(changed(TUNED, space="task", level=0)) == ("Bias 2", "Bias 1", AVOIDANCE, IMITATION)
     assert tunable(changed(TUNED, obstacles=())) == ("Bias 2", "Bias 1", IMITATION)
-
-
-def test_the_chosen_transform_is_tuned_or_the_outermost_if_it_is_gone():
     chosen = replace(TUNED, view=View(tuned="Bias 2"))
     assert tuned(TUNED) == WHOLE_ARM
     assert tuned(chosen) == "Bias 2"
@@ -249,9 +245,8 @@ def test_settings_are_of_fields_and_show_what_a_new_transform_has(kind, initial)
         value = getattr(transform, setting.field)
         match setting:
             case Number():
-                assert setting.automatic == (value is None)
                 shown = setting.initial if value is None else setting.scale * value
-                assert setting.low <= shown <= setting.high
+                assert setting.automatic == (value is None) and setting.low <= shown <= setting.high
             case Choice():
                 assert value in setting.options
             case Switch():

@@ -99,19 +99,31 @@ def passes_of(motion, obstacle=None, margin=0.01, **changes):
 def blocks(seed):
     """A ball, a box and a cylinder, turned somehow, around the origin."""
     rng = np.random.default_rng(seed)
-    a, b, c, d = (float(part) for part in rng.normal(size=4))
-    sizes = [float(size) for size in rng.uniform(0.08, 0.2, 5)]
+    wxyz = tuple(rng.normal(size=4).tolist())
+    sizes = rng.uniform(0.08, 0.2, 5).tolist()
     nowhere = (0.0, 0.0, 0.0)
     yield Sphere(nowhere, sizes[0])
-    yield Box(nowhere, (sizes[0], sizes[1], sizes[2]), (a, b, c, d))
-    yield Cylinder(nowhere, sizes[3], sizes[4], (a, b, c, d))
+    yield Box(nowhere, tuple(sizes[:3]), wxyz)
+    yield Cylinder(nowhere, sizes[3], sizes[4], wxyz)
 
 
-def test_without_a_way_before_it_is_the_nearest_one_across_the_motions():
-    passes = passes_of(motion_past(0.02 * Z, 0.01 * Z))
-    way = passes.way(None, gradually=True)
+def test_without_a_way_before_it_is_the_nearest_one_across_the_motions_and_in_their_plane():
+    way = passes_of(motion_past(0.02 * Z, 0.01 * Z)).way(None, gradually=True)
     assert not way.kept
     assert way.direction @ Z > 0.9 and abs(way.direction @ X) < 0.1
+    in_plane = passes_of(motion_past(0.001 * Z), plane=np.stack([X, Y], axis=1))
+    assert abs(in_plane.way(None, gradually=False).direction @ Y) > 0.99
+
+
+@pytest.mark.parametrize("corner", [False, True])
+def test_a_single_sample_is_led_out_however_far_out_it_is(corner):
+    cube = Box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    motion = motion_past((0.0499 if corner else 0.02) * (Y + Z))
+    counts = np.zeros(len(motion.positions), dtype=bool)
+    counts[np.abs(motion.positions[:, 0] - (0.045 if corner else 0.0)).argmin()] = True
+    passes = Passes.of(motion, counts, cube, 0.01)
+    assert passes is not None
+    assert np.linalg.norm(passes.way(None, gradually=False).direction) == pytest.approx(1)
 
 
 def test_what_does_not_count_or_is_clear_does_not_pass():
@@ -126,19 +138,16 @@ def test_what_does_not_count_or_is_clear_does_not_pass():
 def test_all_motions_are_carried_clear_on_one_side(seed):
     offsets = np.random.default_rng(seed).uniform(-0.03, 0.03, (4, 3)) * [0, 1, 1]
     motion = motion_past(*offsets)
-    for obstacle, least in zip(
-        blocks(seed), (0.009, -1e-3, 0.006), strict=True
-    ):  # beside a box's corners, samples lack
+    least = (0.009, -1e-3, 0.006)  # beside a box's corners, samples lack
+    for obstacle, clearance in zip(blocks(seed), least, strict=True):
         passes = passes_of(motion, obstacle)
         direction = passes.way(None, gradually=False).direction
         flow = passes.flow(direction, 1e-9)
         moved = flow.inverse(motion.positions)
-        assert obstacle.signed_distance(moved).min() > least
+        assert obstacle.signed_distance(moved).min() > clearance
         across = (moved - motion.positions) @ direction
         np.testing.assert_allclose(moved - motion.positions, across[:, None] * direction, atol=1e-9)
         assert (across > -1e-9).all()
-        np.testing.assert_allclose(flow.forward(moved), motion.positions, atol=1e-6)
-        assert np.linalg.det(flow.jacobian(moved)[1]).min() > 0
 
 
 @given(seeds)
@@ -159,12 +168,6 @@ def test_starts_and_goal_stay_where_they_are(seed):
     flow = passes.flow(some_directions(seed, 1)[0], 1e-9)
     ends = np.concatenate([motion.starts, motion.goal[None]])
     np.testing.assert_allclose(flow.inverse(ends), ends, atol=1e-9)
-
-
-def test_in_a_plane_motions_stay_there():
-    plane = np.stack([X, Y], axis=1)
-    passes = passes_of(motion_past(0.001 * Z), plane=plane)
-    assert abs(passes.way(None, gradually=False).direction @ Y) > 0.99
 
 
 def test_the_way_out_does_not_end_in_an_obstacle_that_is_passed_already():

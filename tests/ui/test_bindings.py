@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import viser  # noqa: TID251 - looks at the messages to a browser
-from pages import MIDDLE, Bound, Page, frame_of
+from pages import MIDDLE, Bound, frame_of
 from scenes import avoiding
 from viser import _messages as messages  # noqa: TID251
 
@@ -16,12 +16,10 @@ from dt_viz.ui.scene.handles import Handles
 SCENARIO = avoiding("draw_s", ())
 
 
-@pytest.fixture(scope="module")
-def page(server, robot):
-    page = Page(server, robot)
+@pytest.fixture(scope="module", name="page")
+def _page(page):
     page.visitor.pictures.slice.draw(frame_of(page.busy(), task=page.session.task))
-    yield page
-    page.close()
+    return page
 
 
 @pytest.fixture
@@ -38,6 +36,11 @@ def sent(server, monkeypatch):
     return sent
 
 
+def updates(sent, handle):
+    """Of this handle: a page of another test may not be done with its own."""
+    return [m.updates for m in sent if isinstance(m, messages.GuiUpdateMessage) and m.uuid == handle._impl.uuid]
+
+
 @pytest.fixture(params=[False, True], ids=["", "echoing"])
 def echoes(request, monkeypatch):
     """Whether the page is one that echoes: what stands somewhere is put there again, and so is what has a value."""
@@ -49,12 +52,8 @@ def echoes(request, monkeypatch):
 
 @pytest.mark.parametrize("name", ["/obstacles/2", "/bias/0", "/slice"])
 def test_a_gizmo_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, sent, echoes, name):
-    page.session.edit(
-        "select",
-        view=replace(
-            page.session.scenario.view, selected=2, handles=True, bias_handles=True, move_slice=name == "/slice"
-        ),
-    )
+    shown = {"selected": 2, "handles": True, "bias_handles": True, "move_slice": name == "/slice"}
+    page.session.edit("select", view=replace(page.session.scenario.view, **shown))
     page.move(name, MIDDLE)
     before = page.session.scenario
     sent.clear()
@@ -63,27 +62,23 @@ def test_a_gizmo_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, 
     assert bool(sent) == echoes
 
 
-def is_enabled(handle):
-    return handle.visible and not handle.disabled
-
-
 def test_an_input_that_is_moved_is_not_echoed_to_the_browser_that_moves_it(page, sent, echoes):
     page.session.edit("select", view=replace(page.session.scenario.view, selected=0))
     moved = []
     for handle in page.inputs:
-        if isinstance(handle, viser.GuiSliderHandle) and is_enabled(handle):
-            value = handle.min if handle.value != handle.min else handle.min + handle.step
-        elif isinstance(handle, viser.GuiCheckboxHandle) and is_enabled(handle):
-            value = not handle.value
-        else:
+        is_slider = isinstance(handle, viser.GuiSliderHandle)
+        if handle.disabled or not (handle.visible and (is_slider or isinstance(handle, viser.GuiCheckboxHandle))):
             continue
+        if is_slider:
+            value = handle.min if handle.value != handle.min else handle.min + handle.step
+        else:
+            value = not handle.value
         before = page.session.scenario
         sent.clear()
         page.claim(handle, value)
-        told = [m for m in sent if isinstance(m, messages.GuiUpdateMessage) and m.uuid == handle._impl.uuid]
         if page.session.scenario != before:
             moved.append(handle.label)
-            assert bool([m for m in told if "value" in m.updates]) == echoes, handle.label
+            assert bool([update for update in updates(sent, handle) if "value" in update]) == echoes, handle.label
     assert len(moved) > 20
 
 
@@ -94,15 +89,14 @@ def test_an_edit_leaves_alone_what_a_browser_has_moved_meanwhile(server, sent):
     slider._impl.value = 0.3  # by a browser, whose edit comes next
     sent.clear()
 
-    def told():  # a page of another test may not be done with its own
-        return [m for m in sent if isinstance(m, messages.GuiUpdateMessage) and m.uuid == slider._impl.uuid]
-
-    bound.edited.edit("view", view=View(grid=True))
-    assert slider.value == 0.3 and not told()
-    bound.edited.edit("Warp", warp=0.3)
-    assert slider.value == 0.3 and not told()
-    bound.edited.edit("Warp", warp=0.5)
-    assert slider.value == 0.5 and len(told()) == 1
+    for changes, value, num_told in (
+        ({"view": View(grid=True)}, 0.3, 0),
+        ({"warp": 0.3}, 0.3, 0),
+        ({"warp": 0.5}, 0.5, 1),
+    ):
+        bound.edited.edit("test", **changes)
+        assert slider.value == value
+        assert len(updates(sent, slider)) == num_told
     slider._impl.value = 0.9  # in vain
     bound.restore()
     assert slider.value == 0.5

@@ -5,10 +5,9 @@ import threading
 import time
 
 import pytest
+from pages import PATIENCE
 
 from dt_viz.ui.scene.export import PictureSaver
-
-PATIENCE = 30.0
 
 
 class Browser:

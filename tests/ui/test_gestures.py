@@ -1,11 +1,11 @@
 """What a visitor does on the page, from the browser's message to what is drawn: clicks, drags, checkboxes."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from pages import MIDDLE, Page
+from pages import MIDDLE
 from scenes import avoiding, beside, biases, frame_at
 
 from dt_viz.engine.frame import Stage
@@ -25,27 +25,6 @@ EVERYTHING = View(**SWITCHES, panels=(BASE_PANEL,))
 SCENARIO = avoiding("draw_s", Sphere(TASKS["draw_s"]().obstacle_position), view=EVERYTHING)
 
 
-@pytest.fixture(scope="module")
-def page(server, robot):
-    page = Page(server, robot)
-    yield page
-    page.close()
-
-
-def begin(page, scenario):
-    page.session.edit("test", **{field.name: getattr(scenario, field.name) for field in fields(scenario)})
-
-
-def handle(page, label):
-    """The first that is shown with this label: of two it is the obstacle's."""
-    return next(handle for handle in page.inputs if handle.label == label and handle.visible)
-
-
-def done(page):
-    """Wait until the work of buttons is done."""
-    page.visitor._panel._chores._executor.submit(lambda: None).result(30)
-
-
 def test_a_click_on_an_obstacle_selects_it_and_shows_its_handles_and_another_hides_them(page):
     page.busy(selected=0)
     items = page.visitor.pictures.obstacles.items
@@ -53,13 +32,13 @@ def test_a_click_on_an_obstacle_selects_it_and_shows_its_handles_and_another_hid
         page.click(f"{name or '/obstacles/1'}/surface")
         assert page.session.scenario.selected == index
         assert [item.handles.shown for item in items] == expected
-    assert handle(page, "Handles").value is False
+    assert page["Handles"].value is False
 
 
 def test_delete_removes_the_selected_obstacle_and_its_handles(page):
     before = page.busy(selected=1).obstacles
-    page.claim(handle(page, "Change"), "Delete")
-    done(page)
+    page.claim(page["Change"], "Delete")
+    page.done()
     assert page.session.scenario.obstacles == (before[0], before[2])
     items = page.visitor.pictures.obstacles.items
     np.testing.assert_allclose([item.gizmo.position for item in items], [before[0].position, before[2].position])
@@ -67,7 +46,7 @@ def test_delete_removes_the_selected_obstacle_and_its_handles(page):
 
 
 def test_rollouts_pass_where_the_handles_of_a_bias_point_are_dragged_to(page, engine):
-    begin(page, replace(avoiding("draw_s", (), layers=biases(BiasPoint(MIDDLE))), view=View(bias_handles=True)))
+    page.begin(replace(avoiding("draw_s", (), layers=biases(BiasPoint(MIDDLE))), view=View(bias_handles=True)))
     target = engine.task("draw_s").mean_path[50] + 0.05 * AREA.axes[:, 0]
     page.move("/bias/0", tuple(target))
     (layer,) = beside(page.session.scenario)
@@ -79,7 +58,7 @@ def test_rollouts_pass_where_the_handles_of_a_bias_point_are_dragged_to(page, en
 @pytest.fixture
 def drawn(page, at_rest):
     """The page with a frame that holds all that can be shown, of which nothing is."""
-    begin(page, SCENARIO)
+    page.begin(SCENARIO)
     page.visitor.draw(at_rest(SCENARIO, Stage.LIVE), PACE)
     page.session.edit("test", view=View(**NOTHING))
     return page
@@ -96,22 +75,17 @@ def test_the_slice_moves_along_the_arrow_that_is_dragged(drawn):
 @pytest.mark.parametrize("name", VIEW_LABELS)
 def test_each_layer_is_shown_while_its_checkbox_is_on(drawn, name):
     arms, panel = drawn.visitor.arms, drawn.visitor._panel
-    beside_layers = {
-        "arm": arms.arm,
-        "ghost_arm": arms.ghost,
-        "body_points": arms.body,
-        "joint_plots": panel.joints,
-        "health_plots": panel.health,
-    }
+    beside_layers = {"arm": arms.arm, "ghost_arm": arms.ghost, "body_points": arms.body}
+    beside_layers |= {"joint_plots": panel.joints, "health_plots": panel.health}
     picture = beside_layers[name] if name in beside_layers else drawn.visitor.pictures.layer(name)
     assert not picture.visible
-    drawn.claim(handle(drawn, VIEW_LABELS[name]), True)
+    drawn.claim(drawn[VIEW_LABELS[name]], True)
     assert picture.visible
     if name not in PLOTS | {"arm"}:
         arrays = shown_in(drawn, picture.node.name)
         assert all(np.isfinite(array.astype(float)).all() for array in arrays)
         assert name in {"ghost_arm", "table"} or max(np.ptp(array, axis=0).max() for array in arrays) > 0.05
-    drawn.claim(handle(drawn, VIEW_LABELS[name]), False)
+    drawn.claim(drawn[VIEW_LABELS[name]], False)
     assert not picture.visible
 
 

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from pages import PATIENCE
 
 from dt_viz.engine.engine import ArmMotion
 from dt_viz.engine.live_arm import REST
@@ -12,8 +13,6 @@ from dt_viz.ui import playback as playback_module
 from dt_viz.ui.playback import Playback, at_moment
 
 PICTURE = 0.02
-PATIENCE = 30.0
-"""Seconds after which a test gives up; nothing takes that long."""
 
 
 class Arm:

@@ -3,13 +3,11 @@
 import threading
 
 import pytest
+from pages import PATIENCE, wait_until
 
 from dt_viz.engine import engine
 from dt_viz.interruption import UnwantedError, checkpoint
 from dt_viz.ui.reading import Reader
-
-PATIENCE = 30
-"""Seconds after which a test gives up; nothing takes that long."""
 
 
 class Visitor:
@@ -36,54 +34,60 @@ class Visitor:
     def begin(self) -> bool:
         return self.reader.begin(self.read)
 
-
-@pytest.fixture(name="visitors")
-def _visitors():
-    visitors = Visitor(), Visitor()
-    yield visitors
-    for visitor in visitors:
-        visitor.reader.close()
-        visitor.let_go.set()
+    def begin_next(self, read) -> None:
+        """Begin once what is under way has ended."""
+        wait_until(lambda: self.reader.begin(read))
 
 
-def test_a_second_visitor_is_told_to_wait_and_comes_next(visitors):
-    first, second = visitors
+@pytest.fixture(name="first")
+def _first():
+    first = Visitor()
+    yield first
+    first.reader.close()
+    first.let_go.set()
+
+
+@pytest.fixture(name="both")
+def _both(first):
+    """One who has a file read and one who waits."""
+    second = Visitor()
     assert first.begin() and first.reads.wait(PATIENCE) and not first.waits.is_set()
     assert second.begin() and second.waits.wait(PATIENCE)
+    yield first, second
+    second.reader.close()
+    second.let_go.set()
+
+
+def test_a_second_visitor_is_told_to_wait_and_comes_next(both):
+    first, second = both
     assert not second.reads.wait(0.3)
     first.let_go.set()
     assert second.reads.wait(PATIENCE)
     assert first.end == "read"
 
 
-def test_who_leaves_while_reading_makes_room(visitors):
-    first, second = visitors
-    assert first.begin() and first.reads.wait(PATIENCE)
-    assert second.begin() and second.waits.wait(PATIENCE)
+def test_who_leaves_while_reading_makes_room(both):
+    first, second = both
     first.reader.close()
     assert first.done.wait(PATIENCE) and first.end == "left"
     assert second.reads.wait(PATIENCE)
 
 
-def test_who_leaves_while_waiting_is_not_waited_for(visitors):
-    first, second = visitors
-    assert first.begin() and first.reads.wait(PATIENCE)
-    assert second.begin() and second.waits.wait(PATIENCE)
+def test_who_leaves_while_waiting_is_not_waited_for(both):
+    _, second = both
     second.reader.close()
     assert second.done.wait(PATIENCE) and second.end == "left" and not second.reads.is_set()
 
 
-def test_each_visitor_has_one_file_under_way(visitors):
-    first, _ = visitors
+def test_each_visitor_has_one_file_under_way(first):
     assert first.begin() and first.reads.wait(PATIENCE)
     assert not first.begin()
     first.let_go.set()
     assert first.done.wait(PATIENCE)
-    assert any(first.begin() for _ in iter(lambda: threading.Event().wait(0.01), True))
+    first.begin_next(first.read)
 
 
-def test_reading_pauses_at_its_checkpoints_while_others_drag(visitors, monkeypatch):
-    first, _ = visitors
+def test_reading_pauses_at_its_checkpoints_while_others_drag(first, monkeypatch):
     monkeypatch.setattr("dt_viz.ui.reading.LONGEST_PAUSE", PATIENCE)
     passed = threading.Event()
 
@@ -99,9 +103,7 @@ def test_reading_pauses_at_its_checkpoints_while_others_drag(visitors, monkeypat
     assert passed.wait(PATIENCE)
 
 
-def test_reading_does_not_pause_for_who_is_patient_nor_for_ever(visitors, monkeypatch):
-    first, _ = visitors
-
+def test_reading_does_not_pause_for_who_is_patient_nor_for_ever(first, monkeypatch):
     def read() -> None:
         with first.reader.turn():
             checkpoint()
@@ -113,12 +115,11 @@ def test_reading_does_not_pause_for_who_is_patient_nor_for_ever(visitors, monkey
     first.done.clear()
     with engine._turns.taken():
         monkeypatch.setattr("dt_viz.ui.reading.LONGEST_PAUSE", 0.01)
-        assert any(first.reader.begin(read) for _ in iter(lambda: threading.Event().wait(0.01), True))
+        first.begin_next(read)
         assert first.done.wait(PATIENCE)
 
 
-def test_what_nobody_expects_is_logged_and_the_next_file_is_read(visitors, caplog):
-    first, _ = visitors
+def test_what_nobody_expects_is_logged_and_the_next_file_is_read(first, caplog):
     assert first.reader.begin(lambda: 1 / 0)  # pyright: ignore[reportArgumentType]
-    assert any(first.begin() for _ in iter(lambda: threading.Event().wait(0.01), True))
+    first.begin_next(first.read)
     assert "ZeroDivisionError" in caplog.text

@@ -74,10 +74,9 @@ def test_another_task_or_a_reset_begins_with_its_own_view(client, tripod):
 def test_a_locked_camera_is_put_back_and_still_takes_its_views(client, tripod):
     client.moves(ELSEWHERE)
     tripod.locked = True
-    client.moves((0.9, -1.0, 1.0))
-    assert is_at(client, (ELSEWHERE, np.zeros(3)))
-    client.moves(ELSEWHERE, (0.0, 0.0, 0.1))  # turned on the spot
-    assert is_at(client, (ELSEWHERE, np.zeros(3)))
+    for move in (((0.9, -1.0, 1.0),), (ELSEWHERE, (0.0, 0.0, 0.1))):  # or turned on the spot
+        client.moves(*move)
+        assert is_at(client, (ELSEWHERE, np.zeros(3)))
     tripod.view("Front")
     front = camera_for(TASK, client.camera, "Front")
     assert is_at(client, front)

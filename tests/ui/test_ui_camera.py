@@ -29,6 +29,10 @@ from dt_viz.ui.scene.camera import (
 )
 
 
+def screen(size):
+    return SimpleNamespace(image_width=size[0], image_height=size[1])
+
+
 def pixels(points, position, look_at, size):
     """(N, 2) columns and rows, as three.js projects them, and the depth (N,)."""
     ahead = (look_at - position) / np.linalg.norm(look_at - position)
@@ -44,7 +48,7 @@ def pixels(points, position, look_at, size):
 @pytest.mark.parametrize("task", TASKS)
 def test_a_task_is_seen_beside_the_panel_and_as_large_as_can_be(task, view, size):
     task = TASKS[task]()
-    camera = SimpleNamespace(image_width=size[0], image_height=size[1])
+    camera = screen(size)
     at, depth = pixels(shown(task), *camera_for(task, camera, view), size)
     narrow = size[0] < NARROW
     low, high = np.zeros(2), np.array([size[0] - (0 if narrow else PANEL), size[1] * (1 - UNDER * narrow)])
@@ -57,7 +61,7 @@ def test_a_task_is_seen_beside_the_panel_and_as_large_as_can_be(task, view, size
 
 @pytest.mark.parametrize("size", [(1600, 900), (390, 844), (844, 390)], ids=str)
 def test_a_presentation_shows_the_task_above_the_caption_in_all_of_the_width(size):
-    task, camera = TASKS["draw_s"](), SimpleNamespace(image_width=size[0], image_height=size[1])
+    task, camera = TASKS["draw_s"](), screen(size)
     at, _ = pixels(shown(task), *camera_for(task, camera, alone=True), size)
     high = np.array([size[0], size[1] * (1 - CAPTION)])
     room = MARGIN * high
@@ -68,7 +72,7 @@ def test_a_presentation_shows_the_task_above_the_caption_in_all_of_the_width(siz
 @pytest.mark.parametrize("task", TASKS)
 def test_the_hand_is_seen_from_near_in_the_middle_of_the_free_part_and_from_the_side_of_the_task(task):
     size = 1280, 720
-    task, camera, hand = TASKS[task](), SimpleNamespace(image_width=size[0], image_height=size[1]), (0.1, -0.4, 0.3)
+    task, camera, hand = TASKS[task](), screen(size), (0.1, -0.4, 0.3)
     near, home = (camera_for(task, camera, view, hand=np.array(hand)) for view in (HAND, HOME))
     assert np.linalg.norm(near[0] - hand) < 0.8 * np.linalg.norm(home[0] - home[1])
     assert np.cross(near[1] - near[0], home[1] - home[0]) == pytest.approx(np.zeros(3), abs=1e-9)
@@ -115,4 +119,4 @@ def test_no_camera_nearer_by_sees_all_points(seed):
 
 @pytest.mark.parametrize("size", [(0, 0), (10, 720), (np.nan, 720), ("wide", 720), (10**9, 720), (None, None)])
 def test_a_size_that_no_window_has_is_not_believed(size):
-    assert window(SimpleNamespace(image_width=size[0], image_height=size[1])) == USUAL
+    assert window(screen(size)) == USUAL

@@ -30,19 +30,12 @@ def test_pots_are_drawn_for_tasks_that_have_some(objects):
     assert objects.pots == ()
 
 
-def test_pots_are_open_above_and_hold_what_falls_in():
+def test_pots_are_open_above():
     for pot in POTS:
         vertices, faces = pot.surface()
-        radius = np.linalg.norm(vertices[:, :2], axis=1)
-        assert vertices[:, 2].min() == 0 and vertices[:, 2].max() == pot.height
-        rim = vertices[:, 2] == pot.height
-        assert radius[rim].min() == pytest.approx(pot.radius)
-        corners = vertices[faces]
-        volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-        outer, inner = radius.max(), pot.radius
-        floor = np.unique(vertices[:, 2])[1]
-        expected = np.pi * (outer**2 * pot.height - inner**2 * (pot.height - floor))
-        assert volume == pytest.approx(expected, rel=0.01)  # positive: faces look outward
+        middles = vertices[faces].mean(axis=1)
+        over_the_opening = np.linalg.norm(middles[:, :2], axis=1) < 0.9 * pot.radius
+        assert over_the_opening.any() and middles[over_the_opening, 2].max() < 0.2 * pot.height
 
 
 def test_the_ball_is_shown_with_the_arm_once_the_hand_is_known(objects):
@@ -52,18 +45,17 @@ def test_the_ball_is_shown_with_the_arm_once_the_hand_is_known(objects):
     objects.pose(LEFT, 0.0)
     assert ball.visible
     np.testing.assert_allclose(ball.position, LEFT)
-    objects.show(arm=False)
-    assert not ball.visible
-    objects.show(arm=True)
-    assert ball.visible
+    for shown in (False, True):
+        objects.show(arm=shown)
+        assert ball.visible == shown
 
 
 def test_the_ball_stays_where_it_was_dropped_until_the_hand_sets_out_again(objects):
     objects.stand(DROP)
     ((thing, ball),) = objects.items
     objects.pose(LEFT, 0.0)
-    for seconds in (0.5, 3.0):
-        objects.pose(LEFT + np.array([0.0, 0.0, 0.0]) if seconds == 0.5 else RIGHT, seconds)  # the hand goes home
+    for hand, seconds in ((LEFT, 0.5), (RIGHT, 3.0)):  # the hand goes home
+        objects.pose(hand, seconds)
         np.testing.assert_allclose(ball.position, thing.fallen(LEFT, seconds))
     objects.pose(RIGHT, 0.0)
     np.testing.assert_allclose(ball.position, RIGHT)

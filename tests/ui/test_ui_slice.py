@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from pages import Bound, frame_of
+from pages import Bound, frame_of, ignored, painted_at
 from PIL import Image
 from scenes import avoiding, changed
 
@@ -19,7 +19,6 @@ from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.panel.slice import WHOLE_ARM_NOTE, SlicePanel
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.anchors import Anchors
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp
 from dt_viz.ui.scene.export import as_png
 from dt_viz.ui.scene.legend import OCCUPANCY, legend_of
@@ -57,7 +56,7 @@ def seen(**view):
 
 
 def test_the_frame_lies_where_the_slice_does_and_only_while_it_is_of_use(scene):
-    picture = MovableSlice(scene, lambda *_: None)
+    picture = MovableSlice(scene, ignored)
     picture.adopt(seen(move_slice=True))  # before the task is known
     assert not picture.visible
     picture.draw(frame())
@@ -73,14 +72,10 @@ def test_the_frame_lies_where_the_slice_does_and_only_while_it_is_of_use(scene):
 
 
 def test_one_thing_at_a_time_has_handles_and_none_in_a_picture(scene):
-    picture, obstacles = (
-        MovableSlice(scene, lambda *_: None),
-        Obstacles(scene, lambda *_: None, lambda _: None, lambda _: None),
-    )
-    biases = Anchors(scene, lambda *_: None, lambda _: None, lambda _: None)
+    picture, obstacles = MovableSlice(scene, ignored), Obstacles(scene, ignored, ignored, ignored)
     picture.draw(frame())
     for moving in (True, False):
-        for each in (picture, obstacles, biases):
+        for each in (picture, obstacles):
             each.adopt(seen(move_slice=moving, handles=True))
         assert obstacles.items[0].handles.shown is not moving
     picture.adopt(seen(move_slice=True))
@@ -162,12 +157,8 @@ def test_the_image_follows_the_slice(scene):
         shown.draw(frame(pictures=Pictures(colour=replace(picture_of(corner), area=area))))
         handle = shown.image.handle
         assert handle is not None
-        rows, columns = np.nonzero((np.abs(on_white(handle.image) - palette.VOLUME[-1]) < 2).all(axis=-1))
-        height, width = handle.image.shape[:2]
-        across = (columns.mean() + 0.5) / width - 0.5, (rows.mean() + 0.5) / height - 0.5
-        w, x, y, z = (float(c) for c in handle.wxyz)
-        right, down = 2 * np.multiply(area.half_size, across)  # the image's own axes
-        place = handle.position + rotation((w, x, y, z)) @ [right, down, 0.0]
+        dark = (np.abs(on_white(handle.image) - palette.VOLUME[-1]) < 2).all(axis=-1)
+        place = painted_at(handle, area.half_size, dark)
         assert (area.across(place) > 0.8 * np.array(area.half_size)).all()
         assert abs((place - area.centre) @ area.normal) < 1e-9
 
@@ -217,7 +208,7 @@ def test_the_legend_has_round_numbers_with_a_unit_that_reach_the_largest_value(l
 
 
 def test_the_legend_of_det_j_names_the_colour_of_folds():
-    said = legend_of(picture_of(np.ones((4, 5)))).html
+    said = LEGENDS["det"].html
     assert all(f">{number}<" in said for number in ("0.01", "0.1", "1", "10", "100"))
     assert "0 or less" in said and palette.css(palette.FOLDED) in said
 

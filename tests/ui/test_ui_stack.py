@@ -6,15 +6,16 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from pages import Bound, Edited, frame_of
+from pages import Bound, Edited, frame_of, ignored
 from scenes import avoiding, beside, biases, changed
 
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, selected
+from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, avoiding_with, selected
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
+from dt_viz.ui.panel.avoid import add_avoid_and_imitate, avoids_with
 from dt_viz.ui.panel.stack import (
     BASE,
     DOWN,
@@ -82,13 +83,6 @@ def test_each_row_tells_the_duration_that_was_chosen_and_offers_what_can_be_done
 
 
 @pytest.fixture
-def panel(server):
-    bound = Bound(SCENARIO)
-    yield StackPanel(server.gui, bound), bound
-    server.gui.reset()
-
-
-@pytest.fixture
 def session():
     return cast(Any, Edited(SCENARIO))
 
@@ -125,8 +119,9 @@ def test_one_level_is_looked_at_at_a_time_and_the_legend_names_it(session):
     assert session.scenario.view == View(panels=(BASE_PANEL,), tuned="Bias 1")  # and its settings stay in sight
 
 
-def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
-    panel, bound = panel
+def test_rows_are_reused_and_hidden_when_the_stack_shrinks(server):
+    bound = Bound(SCENARIO)
+    panel = StackPanel(server.gui, bound)
     bound.adopt(SCENARIO)
     bound.report(frame())
     shown = [handle.label for handle in panel.rows if handle.visible]
@@ -135,6 +130,7 @@ def test_rows_are_reused_and_hidden_when_the_stack_shrinks(panel):
     assert [handle.label for handle in panel.rows if handle.visible] == [IMITATION, BASE]
     bound.adopt(SCENARIO)
     assert len(panel.rows) == 5
+    server.gui.reset()
 
 
 def test_the_selected_level_is_drawn_and_named(scene):
@@ -168,7 +164,7 @@ def test_the_end_of_a_level_is_marked_where_it_is_not_the_goal(scene):
 
 
 def test_bias_points_stand_where_they_are_and_the_one_that_was_clicked_has_handles(scene):
-    picture = Anchors(scene, lambda *_: None, lambda _: None, lambda _: None)
+    picture = Anchors(scene, ignored, ignored, ignored)
     picture.adopt(SCENARIO)
     picture.draw(frame())
     first, second, *others = picture.items
@@ -237,3 +233,42 @@ def test_the_formula_follows_the_stack_and_names_its_parts_in_their_colours(scen
     named = parts[len(parts) // 2 :]
     assert parts[: len(parts) // 2] == named and below.count(" · ") == len(named)
     assert len({part.split("'")[1] for part in named}) == len(named)  # each has a colour of its own
+
+
+# --- What avoids, and the imitation ---
+
+
+@pytest.fixture
+def bound(server):
+    bound = Bound(SCENARIO)
+    add_avoid_and_imitate(server.gui, bound)
+    bound.adopt(SCENARIO)
+    yield bound
+    server.gui.reset()
+
+
+@pytest.mark.parametrize("name", ["Off", "Hand", "Arm"])
+def test_what_avoids_is_chosen_and_shown(bound, name):
+    bound.set("Avoid", name)
+    scenario = bound.edited.scenario
+    assert avoids_with(Scenario("draw_s")) == "Arm"  # at first
+    assert avoids_with(scenario) == name == bound["Avoid"].control.value
+    assert scenario.avoids == (name != "Off")
+    assert (scenario.arm_avoidance is not None) == (name == "Arm")
+    assert (AVOIDANCE in [layer.name for _, layer in scenario.active]) == (name == "Hand")
+    assert scenario.obstacles == SCENARIO.obstacles
+    bound.set("Avoid", "Hand")
+    assert bound.edited.scenario == SCENARIO
+
+
+def test_what_is_off_comes_back_as_it_was_in_all_but_its_space():
+    tuned = changed(SCENARIO, temperature=3.0, margin=0.02)
+    off = replace(tuned, stack=avoiding_with(tuned, None))
+    assert replace(off, stack=avoiding_with(off, "cspace")) == changed(tuned, space="cspace")
+
+
+def test_imitation_is_switched_where_it_is_seen_first(bound):
+    for on in (False, True):
+        bound.set("Imitate", on)
+        assert bound.edited.scenario == replace(SCENARIO, imitation=on)
+        assert bound["Imitate"].control.value is on

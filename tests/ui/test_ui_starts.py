@@ -1,24 +1,19 @@
 """Added starts in the page: clicks on the slice, grids, and the balls in the scene."""
 
-import asyncio
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 from pages import Bound, frame_of
 from scenes import avoiding, changed, places_of, starts_at
 
-from dt_viz.engine.frame import Frame
 from dt_viz.motion.following import room_at_rest
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.scenario.scenario import MAX_STARTS, Start
+from dt_viz.scenario.scenario import MAX_STARTS, Start, View
 from dt_viz.scenario.starts import APART, INNER, followed, struck, with_grid, with_moved_start, with_start
 from dt_viz.ui.panel.starts import StartsPanel
 from dt_viz.ui.scene import palette
-from dt_viz.ui.scene.starts import Starts
 
 
 def test_a_ray_meets_the_slice_where_it_is_seen(engine):
@@ -88,103 +83,46 @@ def test_the_arm_follows_the_same_rollout_when_starts_are_added(engine, initial,
     assert followed(after, 7) == before
 
 
-class Scene:
-    """Stands in for viser's: remembers nodes and the callbacks of clicks anywhere."""
-
-    def __init__(self):
-        self.clicks, self.labels = [], {}
-
-    def add_frame(self, _name, **_look):
-        return SimpleNamespace(visible=True)
-
-    def add_label(self, name, text, **_look):
-        self.labels[name] = text
-
-    def add_icosphere(self, name, **_look):
-        node = SimpleNamespace(name=name, position=np.zeros(3), removed=False, color=palette.ADDED, visible=True)
-
-        def keep(callback, what):
-            setattr(node, what, callback)
-            return callback
-
-        node.on_drag = lambda callback: keep(callback, "dragged")
-        node.on_click = lambda callback: keep(callback, "clicked")
-        node.remove = lambda: setattr(node, "removed", True)
-        return node
-
-    def on_click(self):
-        return self.clicks.append
-
-    def remove_click_callback(self, callback):
-        self.clicks.remove(callback)
-
-
 @pytest.fixture
-def opened(engine):
-    told = SimpleNamespace(moved=[], chosen=[], clicked=[])
-    scene: Any = Scene()
-    starts = Starts(scene, lambda *what: told.moved.append(what), told.chosen.append, told.clicked.append)
-    starts.draw(cast(Frame, SimpleNamespace(slice=engine.task("draw_s").slice, blocked=())))
-    return scene, starts, told
+def area(page):
+    """The slice, of which the page knows."""
+    task = page.session.task
+    page.visitor.pictures.starts.draw(frame_of(page.session.scenario, task=task))
+    return task.slice
 
 
-def looking_at(place, eye=(0.8, -1.6, 0.8)):
-    return SimpleNamespace(ray_origin=eye, ray_direction=tuple(np.asarray(place) - eye))
+def test_a_click_adds_a_start_only_while_it_is_asked_for_and_not_on_a_ball_or_beside_the_slice(page, area):
+    eye = np.array([0.8, -1.6, 0.8])
+    behind, place = (area.at(np.array(across)) for across in ((0.05, 0.1), (-0.1, -0.05)))
+    ball = behind + 0.1 * (eye - behind)
+    for asked, expected in ((False, [ball]), (True, [ball, place])):
+        page.begin(avoiding("draw_s", starts=starts_at(ball), view=View(click_to_start=asked)))
+        for seen in (place, ball, area.centre + np.array([2.0, 0.0, 0.0])):
+            page.point(tuple(eye), tuple(seen - eye))
+        np.testing.assert_allclose(places_of(page.session.scenario.starts), expected, atol=1e-9)
 
 
-def test_a_click_adds_a_start_only_while_it_is_asked_for_and_not_on_a_ball(opened, initial, engine):
-    scene, starts, told = opened
-    scenario, area = initial("draw_s"), engine.task("draw_s").slice
-    starts.adopt(scenario)
-    assert scene.clicks == []
-    first = area.at(np.array([0.05, 0.1]))
-    asked = replace(scenario, starts=starts_at(first), view=replace(scenario.view, click_to_start=True))
-    starts.adopt(asked)
-    starts.adopt(asked)
-    (click,) = scene.clicks
-    place = area.at(np.array([-0.1, -0.05]))
-    asyncio.run(click(looking_at(place)))
-    asyncio.run(click(looking_at(first)))
-    asyncio.run(click(looking_at(area.centre + np.array([2.0, 0.0, 0.0]))))
-    (added,) = told.clicked
-    np.testing.assert_allclose(added, place, atol=1e-9)
-    starts.adopt(scenario)
-    assert scene.clicks == []
-
-
-def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(opened, initial, engine):
-    scene, starts, told = opened
-    area = engine.task("draw_s").slice
+def test_balls_stand_where_the_starts_are_and_are_dragged_parallel_to_the_slice(page, area):
     places = [area.at(np.array(across)) for across in ((0.0, 0.1), (0.1, 0.0))]
-    scenario = replace(initial("draw_s"), starts=starts_at(*places))
-    starts.adopt(scenario)
-    for item, place in zip(starts.items, places, strict=True):
-        np.testing.assert_allclose(item.ball.position, place)
-    assert scene.labels == {"/starts/0/label": "1", "/starts/1/label": "2"}
-    ball, eye = starts.items[1].ball, np.array([0.8, -1.6, 0.8])
-    camera = SimpleNamespace(camera=SimpleNamespace(position=eye))
-    target = area.at(np.array([0.02, -0.12]))
+    page.begin(avoiding("draw_s", starts=starts_at(*places)))
+    for number, place in enumerate(places):
+        np.testing.assert_allclose(page.nodes[f"/starts/{number}"].position, place)
+        assert page.nodes[f"/starts/{number}/label"].text == str(number + 1)
+    eye, target = np.array(page.camera.position), area.at(np.array([0.02, -0.12]))
     for phase, pointer in (("start", places[1]), ("update", target), ("end", eye + 0.7 * (target - eye))):
-        event = SimpleNamespace(
-            phase=phase, client=camera, start_position=tuple(places[1]), end_position=tuple(pointer)
-        )
-        asyncio.run(ball.dragged(event))
-    assert [(index, phase) for index, _, phase in told.moved] == [(1, "start"), (1, "update"), (1, "end")]
-    np.testing.assert_allclose(told.moved[1][1], target, atol=1e-9)
-    np.testing.assert_allclose(told.moved[2][1], target, atol=1e-9)  # whatever the depth of the pointer
-    asyncio.run(ball.clicked(None))
-    assert told.chosen == [1]
-    second = starts.items[1].ball
-    starts.adopt(replace(scenario, starts=scenario.starts[:1]))
-    assert len(starts.items) == 1 and second.removed
+        page.drag("/starts/1", tuple(places[1]), tuple(pointer), phase)  # whatever the depth of the pointer
+    np.testing.assert_allclose(places_of(page.session.scenario.starts), [places[0], target], atol=1e-9)
+    page.click("/starts/1")
+    assert page.session.scenario.arm_rollout == len(page.session.task.demonstrations) + 1
+    page.session.edit("test", starts=page.session.scenario.starts[:1])
+    assert [name for name in page.nodes if name in ("/starts/0", "/starts/1")] == ["/starts/0"]
 
 
-def test_balls_are_grey_while_nothing_moves_from_them(opened, initial, engine):
-    _, starts, _ = opened
-    starts.adopt(replace(initial("draw_s"), starts=starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))))
-    area = engine.task("draw_s").slice
+def test_balls_are_grey_while_nothing_moves_from_them(page):
+    page.begin(avoiding("draw_s", starts=starts_at((0.1, -0.5, 0.4), (0.2, -0.5, 0.4))))
+    starts, task = page.visitor.pictures.starts, page.session.task
     for blocked, colour in ((("no way",), palette.STALE), ((), palette.ADDED)):
-        starts.draw(cast(Frame, SimpleNamespace(slice=area, blocked=blocked)))
+        starts.draw(frame_of(page.session.scenario, task=task, blocked=blocked))
         assert [item.ball.color for item in starts.items] == [colour] * 2
 
 

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from pages import Page
 
 from dt_viz.ui.scene import palette
 
 LINES = ("DEMONSTRATION", "ROLLOUT", "ADDED", "GHOST", "WAY", "GOAL", "OBSTACLE", "BIAS", "STREAMLINE", "ARROW_FAST")
-"""What must be seen from far."""
 SEEN = 2.7
 """Smallest contrast with table and sky (WCAG 2.1 measures it so)."""
 
@@ -29,14 +27,6 @@ def test_lines_are_seen_on_the_dark_background(name):
         assert contrast(colour, palette.shade(ground, dark=True)) >= SEEN
 
 
-@pytest.fixture(scope="module")
-def page(server, robot):
-    page = Page(server, robot)
-    page.busy()
-    yield page
-    page.close()
-
-
 def colours(page):
     """Those of all nodes, by name and property."""
     found = {}
@@ -48,12 +38,12 @@ def colours(page):
 
 
 def choose(page, dark):
-    (switch,) = (handle for handle in page.inputs if handle.label == "Dark theme")
-    page.claim(switch, dark)
-    page.visitor._panel._chores._executor.submit(lambda: None).result(10)
+    page.claim(page["Dark theme"], dark)
+    page.done()
 
 
 def test_the_light_theme_comes_back_as_it_was(page, monkeypatch):
+    page.busy()
     themes, before = [], colours(page)
     monkeypatch.setattr(page.gui, "configure_theme", lambda **theme: themes.append(theme["dark_mode"]))
     choose(page, True)

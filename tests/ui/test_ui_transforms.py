@@ -1,22 +1,18 @@
 """The warp and the settings of the transforms in the page, without a browser."""
 
 import itertools
-import time
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from pages import Bound, frame_of
+from pages import Bound, frame_of, wait_until
 from scenes import avoiding, biases, changing
 
-from dt_viz.arm.collision import CollisionReport, Nearest
 from dt_viz.engine import player as player_module
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.player import Player
-from dt_viz.engine.session import Pace, Session
+from dt_viz.engine.session import Session
 from dt_viz.flows.diffeomorphisms import Integration
-from dt_viz.motion.certificates import Certificates
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, anchored
@@ -24,13 +20,10 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel import warp as warp_module
 from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
-from dt_viz.ui.panel.verdict import Level, concerns, verdict
 from dt_viz.ui.panel.warp import grown
-from dt_viz.warning import Kind
 
 AVOIDANCE = "Avoidance"
 SCENARIO = avoiding("draw_s", Sphere((0.0, -0.5, 0.4)), layers=biases(BiasPoint((0.2, -0.5, 0.4))))
-PACE = Pace(0.02, 30.0, 0)
 
 
 def frame(scenario=SCENARIO, **changes):
@@ -123,22 +116,6 @@ def test_the_imitation_says_what_it_is_made_of_and_why_there_is_nothing_to_choos
 # --- The warp ---
 
 
-def report(obstacle):
-    return CollisionReport(
-        obstacle=Nearest(obstacle, ("finger 1",), 0), itself=None, table=Nearest(-0.02, ("link 5",), 0)
-    )
-
-
-def test_a_warp_is_a_hint_and_what_it_enters_no_alarm():
-    entered = report(-0.04)
-    apart = tuple(warning for warning in entered.warnings if warning.kind is not Kind.ARM_ENTERS)
-    half = frame(replace(SCENARIO, warp=0.5), certificates=Certificates(-0.03, entered, found=apart))  # of a warp
-    assert verdict(half, PACE, half.scenario).level is Level.NOTE
-    assert [warning.kind for warning in concerns(half, half.scenario.view)] == [Kind.ARM_BELOW_TABLE]
-    full = frame(certificates=Certificates(-0.03, entered, found=entered.warnings))
-    assert "finger 1 enters" in verdict(full, PACE, full.scenario).reason
-
-
 class Sketches:
     """Stands in for an engine."""
 
@@ -164,13 +141,6 @@ def session():
     session = Session(cast(Engine, Sketches()), lambda _: SCENARIO, "draw_s", cast(Any, Quiet()))
     yield session
     session.close()
-
-
-def wait_until(condition):
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def play_warp(session, told, seconds, monkeypatch):
@@ -228,11 +198,3 @@ def test_closing_ends_playing(session, monkeypatch):
     player = play_warp(session, [], 1000.0, monkeypatch)
     player.close()
     assert not player.playing
-
-
-def test_a_reset_and_another_task_begin_with_the_full_stack(session):
-    session.edit("Warp", warp=0.4)
-    session.reset()
-    assert session.scenario.warp == 1.0
-    session.undo()
-    assert session.scenario.warp == 0.4

@@ -8,8 +8,9 @@ from scenes import changed
 
 from dt_viz.arm.arm_system import ArmSystem
 from dt_viz.arm.collision import load_collision_model
+from dt_viz.control.controller import Controller, Phase
+from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.diffeomorphisms import Identity
-from dt_viz.motion.control import ACCELERATION, FORESEEN, Controller, Phase
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 
@@ -43,7 +44,9 @@ class Robot:
         """Largest velocity and acceleration of a joint, in limits."""
         velocities = np.array([np.zeros(6), *self.velocities])
         changes = np.abs(np.diff(velocities, axis=0)).max() / TICK
-        return (np.abs(velocities) / self.controller.robot.velocity_limits).max(), changes / ACCELERATION
+        return (
+            np.abs(velocities) / self.controller.robot.velocity_limits
+        ).max(), changes / ControllerSettings().acceleration
 
 
 @pytest.fixture(scope="module", name="scene")
@@ -69,8 +72,18 @@ class Scene:
     def controller(self, solved=None):
         return Controller(self.engine.follower, solved or self.solved)
 
+    def begun(self, seconds, solved=None):
+        """A robot that has moved for some seconds from the start."""
+        return Robot(self.controller(solved), self.start).run(seconds)
+
     def missed(self, q):
         return np.linalg.norm(self.robot.end_effector(q) - self.goal)
+
+    def assert_arrives(self, robot, seconds=15.0):
+        """The robot comes to rest at the goal, within its limits all the way."""
+        robot.run(seconds, until=Phase.RESTING)
+        assert robot.phases[-1] is Phase.RESTING and self.missed(robot.q) < 1e-3
+        assert max(robot.excess()) < 1 + 1e-9
 
 
 class TestExactness:
@@ -110,21 +123,20 @@ class TestExactness:
 
 class TestArrival:
     def test_from_the_start(self, scene):
-        robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)
-        assert robot.phases[-1] is Phase.RESTING and scene.missed(robot.q) < 1e-4
-        assert max(robot.excess()) < 1 + 1e-9
+        robot = Robot(scene.controller(), scene.start)
+        scene.assert_arrives(robot, 12)
+        assert scene.missed(robot.q) < 1e-4
 
     @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 12))])
     def test_from_postures_beside_the_section(self, scene, seed):
         """Each converges to the posture that the section has for the goal."""
         rng = np.random.default_rng(seed)
         q = scene.engine.follower.whole_arm.limits.inside(scene.start + rng.normal(scale=0.5, size=6))
-        robot = Robot(scene.controller(), q).run(30, until=Phase.RESTING)
-        assert robot.phases[-1] is Phase.RESTING and scene.missed(robot.q) < 1e-3
+        robot = Robot(scene.controller(), q)
+        scene.assert_arrives(robot, 30)
         turned = (robot.q - scene.lifted.tracked.q[0, -1]) / (2 * np.pi)
         turned -= np.where(np.isinf(scene.robot.lower), np.round(turned), 0)
         np.testing.assert_allclose(turned, 0, atol=2e-3)
-        assert max(robot.excess()) < 1 + 1e-9
         passed = np.array(robot.passed)
         assert (passed >= scene.robot.lower).all() and (passed <= scene.robot.upper).all()
 
@@ -143,58 +155,7 @@ class TestArrival:
         start = scene.solved.nominal.starts[1]
         assert np.linalg.norm(scene.robot.end_effector(robot.q) - start) < 1e-3
         robot.controller.go()
-        robot.run(12, until=Phase.RESTING)
-        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
-
-
-class TestSeveralSteps:
-    @pytest.mark.parametrize("seed", range(3))
-    def test_at_once_they_are_those_of_one_after_the_other(self, scene, seed):
-        """Also after pushes, with other stacks, with obstacles that are seen ahead, and at the goal."""
-        rng, singly = np.random.default_rng(seed), 0
-        alone, together = (Robot(scene.controller(), scene.start) for _ in range(2))
-        step = together.controller.step
-
-        def counted(q, dt):
-            nonlocal singly
-            singly += 1
-            return step(q, dt)
-
-        together.controller.step = counted
-        for k in range(280):
-            alone.run(5 * TICK)
-            velocities = together.controller.steps(together.q, TICK, 5)
-            together.q = together.q + TICK * velocities.sum(axis=0)
-            np.testing.assert_allclose(velocities, alone.velocities[-5:], atol=1e-7)
-            np.testing.assert_allclose(together.q, alone.q, atol=1e-9)
-            assert together.controller.phase is alone.phases[-1]
-            if k % 20 == 19 and k < 160:
-                ahead = scene.robot.end_effector(alone.controller.ahead)
-                place = ahead[min(12, len(ahead) - 1)] + rng.normal(scale=0.03, size=3)
-                beside, q = scene.around(place, rng.uniform(0.04, 0.1)), alone.q + rng.normal(scale=0.1, size=6)
-                for controller in (alone.controller, together.controller):
-                    match (k // 20) % 4:
-                        case 0:
-                            controller.see(beside.scenario.arm_avoidance)
-                        case 1:
-                            controller.follow(beside)
-                        case 2:
-                            controller.displace(q)
-                        case 3:
-                            controller.follow(scene.solved)
-        assert singly < 700 and scene.missed(alone.q) < 1e-3 and alone.phases[-1] is Phase.RESTING
-
-    def test_they_are_foreseen_for_a_while_where_nothing_changes(self, scene, monkeypatch):
-        controller, q, nums = scene.controller(scene.around(scene.middle)), scene.start, []
-        foreseen = controller._foreseen
-        monkeypatch.setattr(controller, "_foreseen", lambda q, dt, num: nums.append(num) or foreseen(q, dt, num))
-        for _ in range(50):
-            q = q + TICK * controller.steps(q, TICK, 5).sum(axis=0)
-        assert nums.count(FORESEEN) > 5 and len(nums) < 25
-
-    def test_a_posture_has_to_be_one(self, scene):
-        with pytest.raises(ValueError, match="6 finite angles"):
-            scene.controller().steps(np.full(6, np.nan), TICK, 3)
+        scene.assert_arrives(robot)
 
 
 class TestDisturbances:
@@ -218,18 +179,15 @@ class TestDisturbances:
         assert max(robot.excess()) < 1 + 1e-9
         robot.controller.follow(scene.solved)
         robot.controller.go()
-        robot.run(30, until=Phase.RESTING)
-        assert scene.missed(robot.q) < 1e-3
+        scene.assert_arrives(robot, 30)
 
     def test_it_goes_on_from_where_somebody_else_has_moved_it(self, scene):
-        robot = Robot(scene.controller(), scene.start).run(1.5)
+        robot = scene.begun(1.5)
         robot.q = robot.q + np.array([0.1, -0.1, 0.05, 0.2, -0.1, 0.3])
         place = robot.q
         robot.run(0.05)
         assert np.abs(robot.q - place).max() < 0.05  # no way back to where it was
-        robot.run(15, until=Phase.RESTING)
-        assert scene.missed(robot.q) < 1e-3
-        assert max(robot.excess()) < 1 + 1e-9
+        scene.assert_arrives(robot)
 
     def test_at_rest_it_steps_aside_and_comes_back(self, scene):
         robot = Robot(scene.controller(), scene.start).run(12, until=Phase.RESTING)
@@ -248,36 +206,33 @@ class TestDisturbances:
         assert max(robot.excess()) < 1 + 1e-9
 
     def test_a_sphere_dropped_over_the_base_stops_it_and_it_goes_on_when_it_can(self, scene):
-        robot = Robot(scene.controller(), scene.start).run(1.0)
+        robot = scene.begun(1.0)
         robot.controller.follow(scene.around((0, 0, 0.25), 0.3))
         robot.run(3)
         assert robot.phases[-1] is Phase.TOUCHED
         assert np.abs(robot.velocities[-1]).max() < 0.05
         robot.controller.follow(scene.solved)
-        robot.run(15, until=Phase.RESTING)
-        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+        scene.assert_arrives(robot)
 
     def test_the_hand_is_held_and_let_go(self, scene):
-        robot = Robot(scene.controller(), scene.start).run(1.0)
+        robot = scene.begun(1.0)
         place = scene.middle + np.array([0.0, 0.0, 0.08])
         robot.controller.hold(place)
         robot.run(3)
         assert robot.phases[-1] is Phase.HELD
         np.testing.assert_allclose(scene.robot.end_effector(robot.q), place, atol=1e-3)
         robot.controller.release()
-        robot.run(12, until=Phase.RESTING)
-        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+        scene.assert_arrives(robot)
 
     def test_a_shove_takes_it_aside_and_it_goes_on_by_itself(self, scene):
-        robot = Robot(scene.controller(), scene.start).run(1.0)
+        robot = scene.begun(1.0)
         free = np.array(Robot(scene.controller(), scene.start).run(4.0).passed)
         aside = np.array([0.1, 0.1, -0.1, 0.0, 0.1, 0.0])
         robot.controller.displace(robot.q + aside)
         robot.run(1.0)
         beside = min(np.abs(q - free - aside).max(axis=1).min() for q in robot.passed)
         assert beside < 0.03  # so far beside the motion that goes on meanwhile
-        robot.run(12, until=Phase.RESTING)
-        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+        scene.assert_arrives(robot)
 
     @pytest.mark.parametrize("turns", [0, 1])
     def test_a_stack_of_the_hand_takes_over_where_the_motion_is(self, scene, engine, turns):
@@ -286,14 +241,13 @@ class TestDisturbances:
         turned = scene.start + 2 * np.pi * turns * np.isinf(scene.robot.lower)
         robot = Robot(scene.controller(), turned).run(1.5)
         robot.controller.follow(engine.solved(scenario, LIVE))
-        course, section = robot.controller._ahead.course, robot.controller.system.section
+        course, section = robot.controller._course, robot.controller.system.section
         ahead = course.q[course.times > 2]  # by then it has nearly converged to the section
         exact = section.postures(scene.robot.end_effector(ahead)[::-1])[::-1]
         assert len(ahead) > 10 and np.abs(np.sin((ahead - exact) / 2)).max() < 5e-3
-        robot.run(15, until=Phase.RESTING)
+        scene.assert_arrives(robot)
         hand = scene.robot.end_effector(np.array(robot.passed))
         assert scenario.obstacle.signed_distance(hand).min() > 0.01
-        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
 
     def test_another_posture_to_stay_near_is_taken_gradually(self, scene):
         class Leaning:
@@ -308,18 +262,22 @@ class TestDisturbances:
         robot = Robot(Controller(Leaning(), scene.solved), scene.start).run(1.0)  # pyright: ignore[reportArgumentType]
         offset = np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
         robot.controller.follow(scene.solved)
-        robot.run(12, until=Phase.RESTING)
-        assert scene.missed(robot.q) < 1e-3 and max(robot.excess()) < 1 + 1e-9
+        scene.assert_arrives(robot)
         assert np.abs(robot.q - scene.lifted.tracked.q[0, -1]).max() > 0.1
 
 
-class TestInput:
-    @pytest.mark.parametrize("q", [np.zeros(5), np.full(6, np.nan)])
-    def test_a_posture_has_to_be_one(self, scene, q):
-        with pytest.raises(ValueError, match="6 finite angles"):
-            scene.controller().step(q, TICK)
-
-    @pytest.mark.parametrize("dt", [0.0, -1.0, np.nan])
-    def test_time_has_to_pass(self, scene, dt):
-        with pytest.raises(ValueError, match="more than 0"):
-            scene.controller().step(scene.start, dt)
+@pytest.mark.parametrize(
+    ("q", "dt", "accepted"),
+    [
+        (np.zeros(5), TICK, "6 finite angles"),
+        (np.full(6, np.nan), TICK, "6 finite angles"),
+        (np.zeros(6), 0.0, "more than 0"),
+        (np.zeros(6), -1.0, "more than 0"),
+        (np.zeros(6), np.nan, "more than 0"),
+    ],
+)
+def test_postures_have_to_be_such_and_time_has_to_pass(scene, q, dt, accepted):
+    with pytest.raises(ValueError, match=accepted):
+        scene.controller().step(q, dt)
+    with pytest.raises(ValueError, match=accepted):
+        scene.controller().steps(q, dt, 3)

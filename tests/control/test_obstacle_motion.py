@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dt_viz.motion.anticipation import NOTHING_SEEN, STALE, Sighting
+from dt_viz.control.obstacle_motion import NOTHING_SEEN, STALE, Sighting
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import ArmAvoidance

@@ -14,7 +14,7 @@ from dt_viz.transforms.base import ArmAvoidance
 
 SMOOTHING = 0.08
 """Time constant of the measured velocity, seconds."""
-FASTEST = 0.6
+FASTEST = 1.5
 """Speed, m/s, from which on an obstacle counts as put elsewhere, not as moving."""
 STALE = 0.25
 """Time without news, seconds, after which an obstacle counts as at rest."""
@@ -46,6 +46,10 @@ class Sighting:
             for part, velocity in zip(parts, self.velocities, strict=True)
         )
         return replace(self.avoidance, obstacle=Union(moved), margin=self.avoidance.margin + room * self.speed)
+
+    def where(self, avoidance: ArmAvoidance | None) -> Sighting:
+        """What is seen, with the obstacles where they are expected."""
+        return replace(self, avoidance=avoidance)
 
     def then(self, avoidance: ArmAvoidance | None, time: float) -> Sighting:
         """What is seen at a later time."""

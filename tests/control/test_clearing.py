@@ -1,4 +1,4 @@
-"""The dodge of the robot's own motion: it clears what is ahead, and changes gradually."""
+"""The flow around obstacles of the robot's own motion: it clears what is ahead, and changes gradually."""
 
 from dataclasses import replace
 
@@ -7,8 +7,8 @@ import pytest
 
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.whole_arm import OVERSHOOT
+from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.flows.fields import Array
-from dt_viz.motion.dodging import NO_DODGE, dodge
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import ArmAvoidance
@@ -32,8 +32,16 @@ def around(arm, posture, offset=(0, 0, 0), diameter=0.15):
     return ArmAvoidance(Union((Sphere(as_point(place), diameter),)), margin=MARGIN)
 
 
-def made(arm, q, avoidance, before=NO_DODGE, turn=0.0, velocities: Array = RESTS):
-    return dodge(arm, q, np.ones(len(q), bool), avoidance, velocities, before, turn)
+def made(arm, q, avoidance, before=None, turn=0.0, velocities: Array = RESTS):
+    """The way around, and the images of the postures under it."""
+    end = None if velocities.any() else q[-1]
+    found = clearing(arm, q, avoidance, velocities, before or Clearing(), turn, end)
+    return found, found.transform(arm, found.duration).inverse(arm.limits.inside(q))
+
+
+def chosen(direction):
+    """A way around an obstacle in this direction."""
+    return Clearing(directions=(direction,))
 
 
 def way_out(found):
@@ -50,34 +58,25 @@ def test_all_that_lies_ahead_is_cleared_and_the_end_stays(arm, q):
     np.testing.assert_allclose(p[-1], q[-1], atol=1e-9)
 
 
-def test_images_are_those_of_the_transform_which_is_a_bijection(arm, q):
+def test_the_transform_is_a_bijection(arm, q):
     found, p = made(arm, q, around(arm, q[50]))
     assert np.abs(p - q).max() > 0.1
-    assert np.linalg.norm((found.transform.inverse(arm.limits.inside(q)) - p) * LEVERS, axis=1).max() < 2e-3
-    assert np.linalg.norm((found.transform.forward(p) - q) * LEVERS, axis=1).max() < 3e-3
+    there_and_back = found.transform(arm, found.duration).forward(p)
+    assert np.linalg.norm((there_and_back - q) * LEVERS, axis=1).max() < 3e-3
 
 
 def test_nothing_near_or_nothing_to_avoid_changes_nothing(arm, q):
     for avoidance in (None, around(arm, q[50], (0, 0, 0.6))):
         found, p = made(arm, q, avoidance)
-        assert found is NO_DODGE
+        assert found.field is None
         np.testing.assert_array_equal(p, q)
 
 
-def test_what_the_field_does_not_reach_is_not_called_clear(arm, q):
-    """The margin that is asked for is wider than the field."""
+def test_a_margin_wider_than_the_reach_of_the_temperature_is_kept(arm, q):
     avoidance = replace(around(arm, q[50], (0, -0.14, 0.1)), margin=0.1, temperature=0.5)
     found, p = made(arm, q, avoidance)
     assert 0.02 < arm.clearance(q, avoidance.obstacle).min() < avoidance.margin - OVERSHOOT
-    assert not found.cleared
-    np.testing.assert_array_equal(p, q)
-
-
-def test_only_hosts_are_cleared(arm, q):
-    avoidance = around(arm, q[70], diameter=0.1)
-    hosts = np.arange(len(q)) < 30
-    assert arm.clearance(q[hosts], avoidance.obstacle).min() > MARGIN
-    assert dodge(arm, q, hosts, avoidance, RESTS, NO_DODGE, 0.0)[0] is NO_DODGE
+    assert found.cleared and arm.clearance(p, avoidance.obstacle).min() > 0.1 - OVERSHOOT - 2e-3
 
 
 def test_the_way_out_turns_no_further_than_it_may(arm, q):
@@ -85,7 +84,7 @@ def test_the_way_out_turns_no_further_than_it_may(arm, q):
     best, _ = made(arm, q, avoidance)
     way = way_out(best)
     across = np.cross(way, [0.3, 0.5, 0.8])
-    other = type(best)(best.transform, (across / np.linalg.norm(across),))
+    other = chosen(across / np.linalg.norm(across))
     turned = way_out(made(arm, q, avoidance, other, turn=0.1)[0])
     assert np.arccos(turned @ way_out(other)) == pytest.approx(0.1, abs=1e-6)
     assert turned @ way > way_out(other) @ way
@@ -93,9 +92,27 @@ def test_the_way_out_turns_no_further_than_it_may(arm, q):
     np.testing.assert_allclose(there, way, atol=1e-9)
 
 
+def test_a_way_out_that_has_to_turn_round_turns_over_the_top(arm, q):
+    avoidance = around(arm, q[50])
+    best, _ = made(arm, q, avoidance)
+    opposite = -way_out(best)
+    turned = way_out(made(arm, q, avoidance, chosen(opposite), turn=0.3)[0])
+    assert np.arccos(turned @ opposite) == pytest.approx(0.3, abs=1e-6)
+    assert turned[2] > opposite[2] + 0.1
+
+
+def test_what_is_nearly_far_enough_away_stays(arm, q):
+    """Nearer than the margin, but by no more than bodies stick out of the spheres that cover them."""
+    apart = arm.clearance(q, around(arm, q[50], (0, 0, 0.3)).obstacle).min()
+    avoidance = replace(around(arm, q[50], (0, 0, 0.3)), margin=apart + 0.5 * OVERSHOOT, temperature=0.5)
+    found, p = made(arm, q, avoidance)
+    assert found.field is not None and found.cleared and found.duration == 0
+    np.testing.assert_allclose(p, q, atol=1e-12)
+
+
 def test_images_move_as_gradually_as_the_obstacle(arm, q):
     """While it crosses the motion, no posture jumps."""
-    before, last = NO_DODGE, None
+    before, last = Clearing(), None
     for x in np.arange(-0.12, 0.0, 0.002):
         before, p = made(arm, q, around(arm, q[50], (0, x, 0.05)), before, turn=0.02)
         if last is not None:

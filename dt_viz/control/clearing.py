@@ -1,0 +1,154 @@
+"""The flow around obstacles of a robot in the loop: a diffeomorphism of configuration space made for its own motion.
+
+It is the flow of `dt_viz.arm.cspace.WholeArmField`, as `dt_viz.arm.whole_arm` makes it for all rollouts of a task at
+once. No posture is pinned: a robot at rest gives way, too, and where nothing comes too near, the flow is the identity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.arm.cspace import REACH_PER_TEMPERATURE, WholeArmField, squared_lengths
+from dt_viz.arm.escape import escape_directions
+from dt_viz.arm.robot import NUM_JOINTS
+from dt_viz.arm.whole_arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm
+from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.ways import OPPOSITE, turned
+from dt_viz.transforms.base import ArmAvoidance
+
+NUM_COMPARED = 16
+"""Number of colliding postures that escape directions are compared by, about; half of it where an obstacle moves, for
+each is then compared with several places of the obstacle."""
+STEP = 0.05
+"""Flow time between two looks at the clearance."""
+COARSE_STEP = 0.1
+"""Length of a Runge–Kutta step, in flow time."""
+BEYOND = 0.03
+"""Reach of the field beyond the margin, metres, at least."""
+NO_PINS = np.empty((0, NUM_JOINTS))
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Clearing:
+    """The way around obstacles for a motion ahead."""
+
+    field: WholeArmField | None = None
+    """Generator of ψ_q; None where nothing is in the way."""
+    directions: tuple[Array | None, ...] = ()
+    """Escape direction (3,) from each obstacle; None for those that are not in the way."""
+    duration: float = 0.0
+    """Shortest flow time after which the motion is clear."""
+
+    @property
+    def cleared(self) -> bool:
+        """Whether there is such a time."""
+        return self.duration < MAX_DURATION
+
+    def transform(self, arm: WholeArm, duration: float) -> Diffeomorphism:
+        """ψ_q for a flow time, from the postures where the robot moves to those of its undisturbed motion."""
+        if self.field is None or duration <= 0:
+            return Identity(NUM_JOINTS)
+        return Conjugated(Flow(self.field, duration, max(2, math.ceil(duration / COARSE_STEP))), arm.limits)
+
+
+def clearing(
+    arm: WholeArm,
+    q: Array,
+    avoidance: ArmAvoidance | None,
+    velocities: Array,
+    before: Clearing,
+    turn: float,
+    end: Array | None,
+) -> Clearing:
+    """Find the way around obstacles.
+
+    Args:
+        arm: whose body points are to be clear.
+        q: (N, 6) postures of the undisturbed motion that are to be clear, in their order, rad.
+        avoidance: what is to be avoided, and by how much.
+        velocities: (P, 3) of the obstacles, m/s.
+        before: whose escape directions are gone on with; those of obstacles that are not in the way any more are kept.
+        turn: largest angle by which a direction turns away from that before, rad.
+        end: (6,) free posture beside which the clearance may be what it has itself; None is none.
+    """
+    if avoidance is None or not avoidance.obstacle.parts:
+        return Clearing()
+    q, parts = arm.limits.inside(q), avoidance.obstacle.parts
+    known = before.directions if len(before.directions) == len(parts) else (None,) * len(parts)
+    chain = arm.robot.chain(q.T)
+    points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
+    tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
+    directions = tuple(
+        _direction(arm, points, tangents, part, velocity, avoidance.margin, way, turn)
+        for part, velocity, way in zip(parts, velocities, known, strict=True)
+    )
+    met = [(part, way) for part, way in zip(parts, directions, strict=True) if way is not None]
+    if not met:
+        return Clearing()
+    obstacles, ways = zip(*met, strict=True)
+    reach = max(REACH_PER_TEMPERATURE * avoidance.temperature, avoidance.margin + BEYOND)
+    field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), NO_PINS, reach)
+    return Clearing(field, directions, _duration(arm, field, q, avoidance, end))
+
+
+def _direction(
+    arm: WholeArm,
+    points: Array,
+    tangents: Array,
+    part: Obstacle,
+    velocity: Array,
+    margin: float,
+    before: Array | None,
+    turn: float,
+) -> Array | None:
+    """Choose the escape direction (3,) from one obstacle; that before where no body point (P, 3, N) is too near it."""
+    distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.body.radius[:, None]
+    clearance = distance.min(axis=0)
+    near = np.flatnonzero(clearance < margin)
+    if not len(near):
+        return before
+    bent = np.flatnonzero(clearance < BESIDE)
+    num = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
+    compared = points[:, :, near[:: max(1, len(near) // num)]]
+    best, *_ = escape_directions(
+        compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity, before=before
+    )
+    if before is None:
+        return best
+    if before @ best < OPPOSITE:
+        best = best + UP + 1e-3 * np.roll(before, 1)
+        best = best / np.linalg.norm(best)
+    return turned(before, best, turn)
+
+
+def _duration(arm: WholeArm, field: WholeArmField, q: Array, avoidance: ArmAvoidance, end: Array | None) -> float:
+    """Find the shortest flow time after which the postures (N, 6) are clear, or `MAX_DURATION`."""
+    duration, state = 0.0, arm.limits.forward(q)
+    lacking = lack(arm, q, avoidance, end)
+    while (lacking > 0).any():
+        if duration >= MAX_DURATION:
+            return MAX_DURATION
+        state, before = field.rk4(state[lacking > 0], -STEP, 1), lacking[lacking > 0]
+        lacking = lack(arm, arm.limits.inverse(state), avoidance, end)
+        part = 1.0
+        if (lacking <= 0).all():
+            part = float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
+        duration += part * STEP
+    return duration
+
+
+def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) -> Array:
+    """Distances (N,), metres, by which postures p (N, 6) miss the clearance that is asked for.
+
+    That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
+    """
+    asked: Array | float = avoidance.margin - OVERSHOOT
+    if end is not None and (room := float(arm.clearance(end[None], avoidance.obstacle)[0]) - ROUNDING) > 0:
+        asked = np.minimum(asked, room + SLOPE * np.sqrt(squared_lengths(p, end[None])[:, 0]))
+    return asked - arm.clearance(p, avoidance.obstacle)

@@ -1,0 +1,98 @@
+"""Limits of the joints' velocities, a class of one method each; what they allow is the feasible set of a tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dt_viz.arm.robot import Robot
+from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
+from dt_viz.control.obstacle_motion import Sighting
+from dt_viz.flows.fields import Array
+from dt_viz.kernels.proximity import proximity
+from dt_viz.obstacles.arrays import records
+
+NUM_POINTS = 8
+"""Number of body points, those nearest to obstacles, that have a barrier."""
+BRAKING_SHARE = 0.8
+"""Part of the acceleration limit that braking before a joint limit counts on: ticks are not infinitely short."""
+IMMOBILE = 1e-4
+"""Squared slope of a distance, m²/rad², up to which no joint moves the point to speak of."""
+
+
+@dataclass(frozen=True)
+class VelocityLimit:
+    """|q̇| ≤ the limit of each joint."""
+
+    limits: Array
+    """(6,) rad/s."""
+
+    def bounds(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
+        """Lowest and highest velocities (6,), rad/s, in a tick of `dt` seconds after `velocity` (6,) at q (6,)."""
+        return -self.limits, self.limits
+
+
+@dataclass(frozen=True)
+class AccelerationLimit:
+    """|q̈| ≤ the limit of all joints."""
+
+    limit: float
+    """rad/s²."""
+
+    def bounds(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
+        """See `VelocityLimit`."""
+        return velocity - self.limit * dt, velocity + self.limit * dt
+
+
+@dataclass(frozen=True)
+class RangeLimit:
+    """Joints stay within their range: they are never faster than they can brake."""
+
+    robot: Robot
+    acceleration: float
+    """Limit for all joints, rad/s²."""
+
+    def bounds(self, q: Array, velocity: Array, dt: float) -> tuple[Array, Array]:
+        """See `VelocityLimit`."""
+        return -self._fastest(q - self.robot.lower, dt), self._fastest(self.robot.upper - q, dt)
+
+    def _fastest(self, room: Array, dt: float) -> Array:
+        """Velocities v (6,) towards limits `room` (6,) away after which braking at b suffices: room − v·dt = v²/2b."""
+        b = BRAKING_SHARE * self.acceleration
+        return np.where(room > 0, b * (np.sqrt(dt * dt + 2 * np.maximum(room, 0) / b) - dt), room / dt)
+
+
+@dataclass(frozen=True)
+class ObstacleLimit:
+    """No part of the arm comes nearer to an obstacle than it can stop: a control barrier for each body point.
+
+    With h the distance of its sphere beyond the clearance, ḣ ≥ −γh (Ames et al., "Control Barrier Functions: Theory and
+    Applications", 2019), where ḣ counts the obstacle's own velocity: what approaches moves a robot at rest, too.
+    """
+
+    arm: WholeArm
+    clearance: float
+    """Distance that is kept, metres."""
+    gain: float
+    """γ, 1/s."""
+    reach: float
+    """Distance from which on a body point has a barrier, metres."""
+
+    def rows(self, q: Array, seen: Sighting) -> tuple[Array, Array, float]:
+        """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,), and the distance from the nearest obstacle."""
+        if seen.avoidance is None or not seen.avoidance.obstacle.parts:
+            return np.empty((0, len(q))), np.empty(0), np.inf
+        shapes, values = records(seen.avoidance.obstacle.parts)
+        robot, links = self.arm.robot, self.arm.links
+        part, distance, slopes, outward = proximity(robot.records, links.records, shapes, values, q, self.reach)
+        if not len(distance):
+            return slopes, distance, np.inf
+        distance = distance + OVERSHOOT
+        h = distance - min(self.clearance, seen.avoidance.margin / 2)
+        near = np.argsort(h)[:NUM_POINTS]
+        near = near[(slopes[near] ** 2).sum(axis=1) > IMMOBILE]
+        approach = np.einsum("ki,ki->k", outward[near], seen.velocities[part[near]])
+        # a point that is too near comes out faster than one that is far away may come in
+        bounds = approach - self.gain * np.where(h[near] > 0, h[near], 2 * h[near])
+        return slopes[near], bounds, float(distance.min())

@@ -1,0 +1,47 @@
+"""What may be chosen about a robot in the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """Settings of `dt_viz.control.controller.Controller`."""
+
+    acceleration: float = 4.0
+    """Limit of the joints' acceleration, rad/s². The arm's URDF names none; joints then reach their limits of velocity,
+    0.63 and 0.84 rad/s, within about 0.2 s."""
+    course_speed: float = 0.85
+    """Part of the velocity limits that the undisturbed motion uses: the rest closes gaps."""
+    gain: float = 8.0
+    """Rate at which a gap between the robot and its target is closed, 1/s."""
+    patience: float = 0.25
+    """Gap, rad, at which the clock of the motion stands still and waits for the robot."""
+    look_period: float = 0.03
+    """Time between two looks at moving obstacles, seconds."""
+    lead: float = 0.15
+    """Time by which moving obstacles are anticipated, seconds: that until the joints have followed."""
+    room: float = 0.06
+    """Growth of the margin with an obstacle's speed, m per m/s."""
+    window: float = 1.2
+    """Time of the motion ahead that is to be clear of moving obstacles, seconds; of obstacles at rest all is."""
+    turning: float = 3.0
+    """Rate at which the way out of an obstacle turns, rad/s."""
+    easing: float = 3.0
+    """Rate at which the duration of the flow around obstacles falls, and half that at which it rises, 1/s."""
+    clearance: float = 5e-3
+    """Distance of the arm from an obstacle that is kept even by a motion that has no way out, metres; at most half the
+    margin."""
+    barrier_gain: float = 5.0
+    """γ, 1/s: the distance beyond that clearance falls at most at this rate."""
+    barrier_reach: float = 0.25
+    """Distance from which on an obstacle slows the arm down, metres."""
+    homing_speed: float = 2.0
+    """Speed of the way home, relative to that of the learned motion."""
+    holding_speed: float = 0.25
+    """Speed at which the hand follows whoever holds it, m/s."""
+    shove_time: float = 0.3
+    """Duration of a shove, seconds, if the joints can be as fast."""
+    convergence: float = 0.5
+    """Time constant with which the arm converges to the postures of its motion, seconds."""

@@ -1,0 +1,1 @@
+"""Compiled inner loops: pure functions of arrays for what a drag repeats, free of the interpreter (numba)."""

@@ -1,0 +1,82 @@
+"""Kinematics of an arm and the distances of its body points, posture by posture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dt_viz.kernels.compiled import compiled, kernel
+from dt_viz.kernels.distances import Number, Shapes, Values, distance
+
+JOINT = np.dtype(
+    [
+        ("rotation", np.float64, (3, 3)),  # orientation in the joint before, at angle zero
+        ("translation", np.float64, 3),  # position there, metres
+    ]
+)
+"""A joint, which turns about its own z axis."""
+BODY_POINT = np.dtype(
+    [
+        ("joint", np.int64),  # that it moves with
+        ("offset", np.float64, 3),  # position in that joint's frame, metres
+        ("radius", np.float64),  # of its sphere, metres
+    ]
+)
+"""A point of a link, which is covered by such spheres."""
+
+Array = NDArray[Any]
+"""Of floats, or of complex numbers for derivatives."""
+Joints = NDArray[Any]
+"""(n,) joints of dtype `JOINT`, from the base to the hand."""
+BodyPoints = NDArray[Any]
+"""(P,) body points of dtype `BODY_POINT`."""
+
+
+@compiled
+def chain(joints: Joints, q: Array, axes: Array, origins: Array) -> None:
+    """Write the frames of the joints at angles q (n,): `axes` (n, 3, 3) [joint, column, component], `origins` (n, 3).
+
+    Frame i is frame i − 1 times the joint's fixed rotation R_i, then a turn by q_i about its z axis.
+    """
+    for i in range(len(joints)):
+        cos, sin = np.cos(q[i]), np.sin(q[i])
+        R, shift = joints[i].rotation, joints[i].translation
+        for k in range(3):
+            if i == 0:
+                x, y, z = R[k, 0] + 0 * cos, R[k, 1] + 0 * cos, R[k, 2] + 0 * cos
+                origins[0, k] = shift[k]
+            else:
+                a, b, c = axes[i - 1, 0, k], axes[i - 1, 1, k], axes[i - 1, 2, k]
+                x = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
+                y = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
+                z = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
+                origins[i, k] = origins[i - 1, k] + shift[0] * a + shift[1] * b + shift[2] * c
+            axes[i, 0, k] = x * cos + y * sin
+            axes[i, 1, k] = y * cos - x * sin
+            axes[i, 2, k] = z
+
+
+@compiled
+def placed(offset: Array, joint: int, axes: Array, origins: Array, k: int) -> Number:
+    """Coordinate k, metres, of what is fixed to a joint at an offset (3,)."""
+    turned = offset[0] * axes[joint, 0, k] + offset[1] * axes[joint, 1, k] + offset[2] * axes[joint, 2, k]
+    return origins[joint, k] + turned
+
+
+@kernel
+def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
+    """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
+    axes, origins, nearest = np.empty((len(joints), 3, 3)), np.empty((len(joints), 3)), np.empty(len(q))
+    for row in range(len(q)):
+        chain(joints, q[row], axes, origins)
+        smallest = np.inf
+        for p in range(len(points)):
+            offset, joint = points[p].offset, points[p].joint
+            x, y = placed(offset, joint, axes, origins, 0), placed(offset, joint, axes, origins, 1)
+            z = placed(offset, joint, axes, origins, 2)
+            for k in range(len(shapes)):
+                smallest = min(smallest, distance(shapes[k], values, x, y, z) - points[p].radius)
+        nearest[row] = smallest
+    return nearest

@@ -1,0 +1,92 @@
+"""Compiling of kernels: once for each version and processor, into the user's cache folder.
+
+Compiling takes seconds a kernel, loading milliseconds. Files of the cache carry a checksum, are written whole or not at
+all, and are made anew where they are damaged. Without a folder that can be written, each process compiles for itself.
+The environment variable NUMBA_CACHE_DIR names another folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import pickle
+import platform
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba.core.compiler import CompileResult
+from numba.core.registry import CPUDispatcher
+from numba.core.serialize import dumps
+
+from dt_viz.folders import default_cache_folder
+
+logger = logging.getLogger(__name__)
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def compiled(function: F) -> F:
+    """Compile a function that kernels call; errors of arithmetic give nan or inf as in numpy."""
+    return numba.njit(nogil=True, error_model="numpy")(function)
+
+
+def kernel(function: F) -> F:
+    """Compile a function that Python calls, and keep its code for the next process."""
+    dispatcher: Any = compiled(function)
+    dispatcher._cache = _Cache(dispatcher)
+    return dispatcher
+
+
+class _Cache:
+    """Machine code of one kernel, with the interface of numba's caches."""
+
+    def __init__(self, dispatcher: CPUDispatcher) -> None:
+        self._name = f"{dispatcher.py_func.__module__.rpartition('.')[2]}.{dispatcher.py_func.__name__}"
+
+    def load_overload(self, signature: object, target_context: Any) -> CompileResult | None:  # noqa: ANN401 - numba's
+        """Return the code for these types of arguments; None where there is none, or it is damaged."""
+        target_context.refresh()
+        path = self._path(signature, target_context.codegen())
+        try:
+            checksum, data = (content := path.read_bytes())[:32], content[32:]
+        except OSError:
+            return None
+        if hashlib.sha256(data).digest() != checksum:
+            logger.warning("the compiled code in %s is damaged: it is made again", path)
+            return None
+        return CompileResult._rebuild(target_context, *pickle.loads(data))
+
+    def save_overload(self, signature: object, result: CompileResult) -> None:
+        """Keep the code for these types of arguments, if the folder can be written."""
+        path, data = self._path(signature, result.codegen), dumps(result._reduce())
+        unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            unfinished.write_bytes(hashlib.sha256(data).digest() + data)
+            unfinished.replace(path)
+        except OSError as error:
+            unfinished.unlink(missing_ok=True)
+            _say_once(str(error))
+
+    def _path(self, signature: object, codegen: Any) -> Path:  # noqa: ANN401 - numba's
+        key = repr((signature, codegen.magic_tuple(), _version())).encode()
+        folder = Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else default_cache_folder() / "kernels"
+        return folder / f"{self._name}-{hashlib.sha256(key).hexdigest()[:24]}"
+
+
+@lru_cache(maxsize=1)
+def _version() -> tuple[str, ...]:
+    """Digest of the kernels' source, which call each other, and versions of what compiles them."""
+    source = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        source.update(path.read_bytes())
+    return source.hexdigest(), numba.__version__, platform.python_version()
+
+
+@lru_cache(maxsize=1)
+def _say_once(error: str) -> None:
+    logger.warning("compiled code cannot be kept, so that each start compiles it again for a minute: %s", error)

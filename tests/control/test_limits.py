@@ -1,0 +1,98 @@
+"""Limits of a tick: what each allows is what it says, and a robot that obeys never leaves them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
+from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
+from dt_viz.control.obstacle_motion import Sighting
+from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
+from dt_viz.obstacles.union import Union
+from dt_viz.transforms.base import ArmAvoidance
+
+STEP = 1e-5
+TICK = 0.01
+KEPT, GAIN, REACH = 5e-3, 5.0, 0.25
+
+
+@pytest.fixture(scope="module", name="arm")
+def _arm(engine):
+    return engine.follower.whole_arm
+
+
+@pytest.fixture(scope="module", name="barrier")
+def _barrier(arm):
+    return ObstacleLimit(arm, KEPT, GAIN, REACH)
+
+
+def distances(arm: WholeArm, q, seen, moved=0.0):
+    """Distances h of the moving links' spheres from the parts, for all pairs, after the parts have moved for a time."""
+    points, parts = arm.links.positions(arm.robot, q), seen.avoidance.obstacle.parts
+    moving = zip(parts, moved * seen.velocities, strict=True)
+    return np.concatenate([part.signed_distance(points - shift) - arm.links.radius for part, shift in moving]) + (
+        OVERSHOOT - min(KEPT, seen.avoidance.margin / 2)
+    )
+
+
+def scenes(arm: WholeArm, num):
+    """Postures, and one or two obstacles near the arm, which rest or move."""
+    rng = np.random.default_rng(5)
+    for k in range(num):
+        q = arm.robot.home + rng.normal(scale=0.5, size=6)
+        points = arm.links.positions(arm.robot, q)
+        shapes = []
+        for _ in range(1 + k % 2):
+            way = rng.normal(size=3)
+            at = as_point(points[rng.integers(5, len(points))] + way / np.linalg.norm(way) * rng.uniform(0.12, 0.2))
+            shapes.append((Sphere(at, 0.15), Box(at, (0.1, 0.12, 0.14)), Cylinder(at, 0.1, 0.2))[k % 3])
+        velocities = rng.normal(scale=0.15, size=(len(shapes), 3)) * (k % 2)
+        yield q, Sighting(0.0, ArmAvoidance(Union(tuple(shapes)), margin=0.02), velocities)
+
+
+def test_rows_are_the_rates_at_which_distances_change(arm, barrier):
+    """With the slope s by the joints and the obstacle's own velocity: ḣ = s·q̇ − n·v ≥ −γh is s·q̇ ≥ b."""
+    rng = np.random.default_rng(1)
+    for q, seen in scenes(arm, 40):
+        slopes, bounds, nearest = barrier.rows(q, seen)
+        h = distances(arm, q, seen)
+        assert nearest == pytest.approx(h.min() + KEPT)
+        for velocity in rng.normal(size=(3, 6)):
+            rate = (distances(arm, q + STEP * velocity, seen, STEP) - h) / STEP
+            slack = rate + GAIN * np.where(h > 0, h, 2 * h)  # of all pairs; rows are those of the nearest
+            for row in slopes @ velocity - bounds:
+                assert np.abs(slack - row).min() < 2e-3
+
+
+def test_less_is_kept_where_less_is_asked_for_and_nothing_without_obstacles(arm, barrier):
+    q, seen = next(scenes(arm, 1))
+    assert seen.avoidance is not None
+    closer = replace(seen, avoidance=replace(seen.avoidance, margin=0.0))
+    (slopes, bounds, nearest), (same, lower, as_near) = barrier.rows(q, seen), barrier.rows(q, closer)
+    assert nearest == as_near
+    np.testing.assert_array_equal(slopes, same)
+    np.testing.assert_allclose(bounds - lower, GAIN * KEPT, atol=1e-12)
+    for nothing in (None, ArmAvoidance(Union(()))):
+        slopes, bounds, nearest = barrier.rows(q, replace(seen, avoidance=nothing, velocities=np.empty((0, 3))))
+        assert slopes.shape == (0, 6) and not len(bounds) and nearest == np.inf
+
+
+def test_who_obeys_brakes_before_the_range_ends_and_keeps_speed_and_acceleration(arm):
+    """Random wishes for 10⁵ ticks, many of them towards a limit."""
+    robot, rng, acceleration = arm.robot, np.random.default_rng(2), 4.0
+    limits = RangeLimit(robot, acceleration), VelocityLimit(robot.velocity_limits), AccelerationLimit(acceleration)
+    q, velocity, nearest = robot.home.copy(), np.zeros(6), np.inf
+    for _ in range(2000):
+        wanted = rng.normal(scale=2.0, size=6)
+        for _ in range(50):
+            lower, upper = np.full(6, -np.inf), np.full(6, np.inf)
+            for limit in limits:
+                lowest, highest = limit.bounds(q, velocity, TICK)
+                lower, upper = np.clip(lower, lowest, highest), np.clip(upper, lowest, highest)
+            before, velocity = velocity, np.clip(wanted, lower, upper)
+            assert np.abs(velocity - before).max() <= acceleration * TICK * (1 + 1e-9)
+            q = q + TICK * velocity
+            nearest = min(nearest, (q - robot.lower).min(), (robot.upper - q).min())
+        assert (np.abs(velocity) <= robot.velocity_limits * (1 + 1e-9)).all()
+    assert 0 <= nearest < 0.01

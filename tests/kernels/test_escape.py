@@ -1,0 +1,127 @@
+"""Compiled loops of the whole arm: the same numbers as array operations, for random arms, obstacles and postures."""
+
+import numpy as np
+import plain_escape
+import pytest
+from laws.registry import OBSTACLES, TILTED
+
+from dt_viz.arm.body_points import load_body_points
+from dt_viz.arm.cspace import COMPLEX_STEP, WholeArmField
+from dt_viz.arm.robot import load_jaco
+from dt_viz.arm.whole_arm import WholeArm
+from dt_viz.flows.integrators import integrate, integrate_adaptive, rk4
+from dt_viz.interruption import UnwantedError, interruptible
+from dt_viz.obstacles.shapes import as_point
+from dt_viz.obstacles.union import Union
+
+ROBOT = load_jaco()
+ARM = WholeArm(ROBOT, load_body_points())
+NUM = 60
+
+
+class Plain:
+    """A field that is no `CompiledField`, so that flows take its array operations step by step."""
+
+    dim = 6
+
+    def __init__(self, field):
+        self.field = field
+
+    def __call__(self, q):
+        return plain_escape.velocities(self.field, q)
+
+    def with_jacobian(self, q):
+        raise NotImplementedError
+
+
+SEVERAL = ("torus", "sphere", "scan", "plate")
+
+
+@pytest.fixture(scope="module", params=["sphere", "box 3:1", "disc", "torus", "larger cloud", "several"])
+def field(request):
+    """The escape from one obstacle, or four, somewhere about the hand of the arm that is ready."""
+    rng = np.random.default_rng(3)
+    names = SEVERAL if request.param == "several" else (request.param,)
+    places = ROBOT.end_effector(ROBOT.home) + rng.uniform(-0.15, 0.15, (len(names), 3))
+    parts = tuple(OBSTACLES[name].moved(as_point(at), TILTED) for name, at in zip(names, places, strict=True))
+    directions = rng.normal(size=(len(parts), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    pins = ROBOT.home + rng.normal(0, 0.5, (2, 6))
+    return WholeArmField(ROBOT, ARM.body, parts, directions, pins, 0.1)
+
+
+@pytest.fixture(scope="module")
+def postures():
+    return ROBOT.home + np.random.default_rng(4).normal(0, 0.4, (NUM, 6))
+
+
+def test_velocities_are_those_of_array_operations(field, postures):
+    expected = plain_escape.velocities(field, postures)
+    assert (np.abs(expected).max(axis=1) > 0.01).sum() > NUM / 8  # so many are in the way
+    np.testing.assert_allclose(field(postures), expected, rtol=0, atol=1e-12)
+
+
+def test_derivatives_by_complex_steps_are_those_of_array_operations(field, postures):
+    direction = np.random.default_rng(5).normal(size=(NUM, 6))
+    expected = np.imag(plain_escape.velocities(field, postures + 1j * COMPLEX_STEP * direction)) / COMPLEX_STEP
+    _, jacobian = field.with_jacobian(postures)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", jacobian, direction), expected, rtol=0, atol=1e-11)
+
+
+def test_clearance_is_that_of_array_operations(field, postures):
+    points = ARM.body.of_chain(ROBOT.chain(postures.T)).transpose(0, 2, 1)
+    expected = (Union(field.obstacles).signed_distance(points) - ARM.body.radius[:, None]).min(axis=0)
+    np.testing.assert_allclose(ARM.clearance(postures, Union(field.obstacles)), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_far_away_and_beyond_a_grid_distances_are_those_of_array_operations(name):
+    q = ROBOT.home + np.random.default_rng(6).normal(0, 1.0, (200, 6))
+    for away in (0.2, 0.5, 2.0):
+        part = OBSTACLES[name].moved((away, -0.4, 0.3), (0.3, 0.2, 0.9, 0.1))
+        points = ARM.body.of_chain(ROBOT.chain(q.T)).transpose(0, 2, 1)
+        expected = (part.signed_distance(points) - ARM.body.radius[:, None]).min(axis=0)
+        np.testing.assert_allclose(ARM.clearance(q, part), expected, rtol=0, atol=1e-12)
+    assert (ARM.clearance(q, Union(())) == np.inf).all()
+
+
+@pytest.mark.parametrize("duration", [-0.7, 0.4])
+def test_runge_kutta_steps_are_those_of_array_operations(field, postures, duration):
+    expected, _ = integrate(rk4, Plain(field), postures, None, duration, 5)
+    carried, _ = integrate(rk4, field, postures, None, duration, 5)
+    np.testing.assert_allclose(carried, expected, rtol=0, atol=1e-11)
+
+
+def test_adaptive_steps_are_as_exact_as_those_of_array_operations(field, postures):
+    """Not the same to rounding: beside a kink of a distance it decides whether a step is made again."""
+    before = postures.copy()
+    exact, _ = integrate(rk4, field, postures, None, -0.7, 2000)
+    plain, _ = integrate_adaptive(Plain(field), postures, None, -0.7, 1e-6)
+    carried, _ = integrate_adaptive(field, postures, None, -0.7, 1e-6)
+    np.testing.assert_allclose(np.abs(carried - exact), np.abs(plain - exact), rtol=1e-2, atol=1e-7)
+    np.testing.assert_allclose(carried, exact, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(postures, before)
+
+
+def test_too_many_steps_are_an_error(field, postures):
+    with pytest.raises(ArithmeticError, match="more than 2 steps"):
+        integrate_adaptive(field, postures, None, -0.7, 1e-9, max_rounds=2)
+
+
+def test_a_flow_that_is_not_wanted_any_more_ends_between_blocks(field, postures):
+    looks = iter([True, False])
+
+    def wanted():
+        if not next(looks):
+            raise UnwantedError
+
+    with pytest.raises(UnwantedError), interruptible(wanted):
+        field.rk4(np.tile(postures, (40, 1)), -0.5, 4)
+
+
+def test_no_postures_and_other_layouts_of_memory(field, postures):
+    assert field(np.empty((0, 6))).shape == field.rk4(np.empty((0, 6)), 1.0, 2).shape == (0, 6)
+    assert ARM.clearance(np.empty((0, 6)), Union(field.obstacles)).shape == (0,)
+    transposed = np.asfortranarray(postures)
+    transposed.flags.writeable = False
+    np.testing.assert_array_equal(field(transposed), field(postures))
