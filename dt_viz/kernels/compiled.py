@@ -31,7 +31,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def compiled(function: F) -> F:
     """Compile a function that kernels call; errors of arithmetic give nan or inf as in numpy."""
-    return numba.njit(nogil=True, error_model="numpy")(function)
+    decorator: Any = numba.njit(nogil=True, error_model="numpy")
+    return decorator(function)
 
 
 def kernel(function: F) -> F:
@@ -74,7 +75,8 @@ class _Cache:
 
     def _path(self, signature: object, codegen: Any) -> Path:  # noqa: ANN401 - numba's
         key = repr((signature, codegen.magic_tuple(), _version())).encode()
-        folder = Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else default_cache_folder() / "kernels"
+        chosen = os.environ.get("NUMBA_CACHE_DIR")
+        folder = Path(chosen) if chosen else default_cache_folder() / "kernels"
         return folder / f"{self._name}-{hashlib.sha256(key).hexdigest()[:24]}"
 
 
