@@ -358,7 +358,7 @@ async def test_a_visitor_who_does_not_listen_costs_no_memory(url, server):
             visitor.draw(frame, Pace(0.02, 10.0, 0))
             held.append(len(state.message_buffer.message_from_id))
             await asyncio.sleep(0.01)
-        assert 5 < held[-1] < 50, held  # a frame has about ten messages
+        assert 5 < max(held) < 50, held  # a frame has about ten messages; some are taken to be sent, and wait there
         client._socket.transport.abort()  # who does not listen says no goodbye either
         client._receiving = asyncio.create_task(asyncio.sleep(0))
 
