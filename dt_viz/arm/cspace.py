@@ -17,7 +17,7 @@ from dt_viz.arm.body_points import BodyPoints
 from dt_viz.arm.robot import NUM_JOINTS, Robot, cross
 from dt_viz.arm.tracking import DIRECTION_WEIGHT
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.interruption import checkpoint
 from dt_viz.kernels import escape
 from dt_viz.obstacles.arrays import records
@@ -85,7 +85,7 @@ class ArmField:
 
 
 @dataclass(frozen=True, eq=False)
-class WholeArmField(ArmField):
+class WholeArmField(ArmField, CompiledField):
     """Generator V_q whose reverse flow takes the arm out of obstacles, each along an escape direction.
 
     A body point x_b with sphere radius r_b has the occupancy w_b = S(d(x_b) − r_b), d the distance from an obstacle's

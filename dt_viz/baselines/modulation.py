@@ -12,7 +12,7 @@ they are stepped as if that were 1 in base space, where no step is lost on its c
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -22,7 +22,6 @@ from dt_viz.baselines.surface import distance_and_normal
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.flows.tabulated import tabulated
 from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
@@ -50,8 +49,6 @@ LEAST = 1e-3
 """Smallest ‖dy/ds‖ that a step is measured by."""
 NUM_KEPT = 4
 """Number of sets of starts whose images are kept."""
-MARGIN = 0.2
-"""Distance beyond the imitation's motions, in base space, to which ψ⁻¹ is tabulated, metres."""
 NUM_BETWEEN = 3
 """Number of samples for each step."""
 
@@ -113,7 +110,7 @@ class _State:
 @dataclass(frozen=True, eq=False)
 class _Planner:
     system: DiffeomorphicSystem
-    """Our imitation; ψ⁻¹ is read from a table where motions pass obstacles of usual size."""
+    """Our imitation."""
     goal: Array
     """(3,), metres."""
     tolerance: float
@@ -205,8 +202,5 @@ class Modulation(Method):
         self.tolerance = tolerance
 
     def fit(self, problem: Problem) -> Planner:
-        """Take what is learned already, and tabulate it; see `Method`."""
-        learned = problem.learned
-        rays = np.concatenate([learned.demonstrated.rays.z0, [learned.system.base.goal]])
-        transform = tabulated(learned.system.transform, rays, MARGIN)
-        return _Planner(replace(learned.system, transform=transform), learned.goal, self.tolerance)
+        """Take what is learned already; see `Method`."""
+        return _Planner(problem.learned.system, problem.learned.goal, self.tolerance)

@@ -242,10 +242,9 @@ class Controller:
             self._watch()
             self._ease(dt)
             course, transform = self._begun, self._clearing.transform(self._arm, self._duration)
-            at = self._clock
-            self._advance(float(np.abs(self._target(transform, at) - q).max()), dt)
-            now, then = (self._target(transform, clock) for clock in (at, self._clock))
-            self._at = then
+            now = self._target(transform)
+            self._advance(float(np.abs(now - q).max()), dt)
+            self._at = then = self._target(transform)
             self._velocity = self._feasible(q, (then - now) / dt + min(self.settings.gain, 0.5 / dt) * (now - q), dt)
             self._q = q + dt * self._velocity
             self._settle(course)
@@ -330,11 +329,9 @@ class Controller:
         if seen.speed > 0:
             late = self._now - seen.time
             avoidance = seen.expected(settings.lead + late, settings.room)
-            times = self._clock + np.linspace(0, settings.window, NUM_CLEAR_MOVING)
-            ahead, end = (
-                np.stack([course.at(clock) for clock in times if clock <= course.end or clock == times[0]]),
-                None,
-            )
+            last = min(self._clock + settings.window, course.end)
+            times = np.unique(np.linspace(self._clock, last, NUM_CLEAR_MOVING))
+            ahead, end = np.stack([course.at(clock) for clock in times]), None
         else:
             avoidance, ahead = seen.avoidance, course.after(self._clock)
             ahead, end = ahead[:: max(1, len(ahead) // NUM_CLEAR)], self._arm.limits.inside(ahead[-1])
@@ -346,9 +343,9 @@ class Controller:
         rise = self._clearing.duration - self._duration
         self._duration += float(np.clip(rise, -self.settings.easing * dt, 2 * self.settings.easing * dt))
 
-    def _target(self, transform: Diffeomorphism, clock: float) -> Array:
-        """The posture (6,) where the robot is to be at a time of the course."""
-        q = self._begun.at(clock)
+    def _target(self, transform: Diffeomorphism) -> Array:
+        """The posture (6,) where the robot is to be at this time of the course."""
+        q = self._begun.at(self._clock)
         return transform.inverse(self._arm.limits.inside(q)[None])[0] if self._duration > 0 else q
 
     def _advance(self, gap: float, dt: float) -> None:

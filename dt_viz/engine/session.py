@@ -116,6 +116,8 @@ class Session:
         self._future: list[Scenario] = []
         self._gesture: tuple[str, float] = ("", 0.0)
         self._held = False
+        self._unadopted = False
+        """Whether the scenario was edited by a drag and is not shown on the controls yet."""
         self._learning = self._stopped = self._closed = False
         self._failed = False
         """Whether the last computation ended by an error, so that what is shown is not all that the scenario asks for.
@@ -156,7 +158,10 @@ class Session:
             self.scenario = edited
             if needs_frames:
                 self._submit()
-        self._adopt()
+            # a drag sends edits faster than the controls can show them: they are shown with the next frame
+            self._unadopted = self._held and needs_frames
+        if not self._unadopted:
+            self._adopt()
 
     def begin_gesture(self) -> None:
         """The user took hold of something: edits until `end_gesture` are undone together, however slow."""
@@ -174,6 +179,7 @@ class Session:
             if self._held and self._gesture[0] and self._past and not _is_step(self.scenario, self._past[-1]):
                 self._past.pop()
             self._gesture, self._held = ("", 0.0), False
+        self._catch_up()
 
     def choose_task(self, name: str) -> None:
         """Begin another task, with what else was chosen.
@@ -273,7 +279,13 @@ class Session:
     def _adopt(self) -> None:
         """Show the newest scenario on the controls: one thread after the other, so that the newest is shown last."""
         with self._adopting:
+            self._unadopted = False
             self._display.adopt(self.scenario)
+
+    def _catch_up(self) -> None:
+        """Show what a drag has edited."""
+        if self._unadopted:
+            self._adopt()
 
     def _retreat(self, abandoned: Scenario) -> bool:
         """Go back from a scenario that has no picture to the one shown last, as if it had never been chosen.
@@ -334,6 +346,7 @@ class Session:
     def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
         scenario, edited = job
         wanted = partial(_end_if, superseded)
+        self._catch_up()
         for frame in self._engine.frames(scenario, partial(self._learn, scenario), wanted):
             now = time.perf_counter()
             if self._learning:

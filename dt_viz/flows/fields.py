@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,17 +38,16 @@ class VectorField(Protocol):
         ...
 
 
-@runtime_checkable
-class CompiledField(VectorField, Protocol):
-    """A field whose flow is a compiled loop over the points, without tangents."""
+class CompiledField(ABC):
+    """Mixin of a `VectorField` whose flow is a compiled loop over the points, without tangents."""
 
+    @abstractmethod
     def rk4(self, s: Array, duration: float, steps: int) -> Array:
         """Carry the points `s` (N, d) along in equal steps of the classical Runge–Kutta method."""
-        ...
 
+    @abstractmethod
     def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
         """Carry the points `s` (N, d) along as `integrate_adaptive` does. Raises ArithmeticError as it does."""
-        ...
 
 
 @dataclass(frozen=True)

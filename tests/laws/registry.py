@@ -30,7 +30,6 @@ from dt_viz.flows.fields import GaussianGrid, GridRBF, InPlane, PlacedField, Rep
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.phased import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
 from dt_viz.flows.systems import Attractor
-from dt_viz.flows.tabulated import Tabulated
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import AvoidanceField, StretchedField
@@ -242,7 +241,6 @@ MAPS: dict[str, Map] = {
     "shear for each condition": Map(Shear(Waves(3, 3)), 1e-14, 1e-14, states(3, 3), 1e-6),
     "translation": Map(Translation(np.array([0.1, -0.2])), 1e-15, 1e-15),
     "on places": Map(OnPlaces(bump(2), 3), 1e-6, 1e-5, states(2, 2)),
-    "table": Map(Tabulated.around(Flow(bent(2), 0.8, 16), uniform(2)(40), 0.05), 1e-6),
     "coupling": Map(coupling(), 1e-14),
     "normalisation": Map(Normalisation(np.array([2.0, 0.5]), np.array([0.3, -1.0])), 1e-14, scales=False),
     "joint limits": Map(LIMITS, 1e-9, 1e-9, beside_limits, 1e-4),

@@ -80,18 +80,19 @@ def tubes(paths: Array, radius: float, ball: float = 0.0) -> Array:
     """Return the vertices (R, K, `NUM_SIDES`, 3) of tubes around paths (R, T, 3), metres, in K rings.
 
     The rings do not twist: their frames go along by double reflection (Wang et al., "Computation of Rotation
-    Minimizing Frames", 2008).
+    Minimizing Frames", 2008), which takes a frame of each ring to one of the next.
     """
     tangents = np.gradient(paths, axis=1)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=2, keepdims=True), 1e-12)
-    normals = np.empty_like(paths)
-    least = np.eye(3)[np.abs(tangents[:, 0]).argmin(axis=1)]
-    normals[:, 0] = least - (least * tangents[:, 0]).sum(axis=1, keepdims=True) * tangents[:, 0]
-    for k in range(1, paths.shape[1]):
-        between = paths[:, k] - paths[:, k - 1]
-        normal, tangent = _reflected(between, normals[:, k - 1]), _reflected(between, tangents[:, k - 1])
-        normals[:, k] = _reflected(tangents[:, k] - tangent, normal)
+    least = np.eye(3)[np.abs(tangents).argmin(axis=2)]
+    normals = least - (least * tangents).sum(axis=2, keepdims=True) * tangents
     normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    across, between = np.cross(tangents, normals), np.diff(paths, axis=1)
+    normal, tangent = _reflected(between, normals[:, :-1]), _reflected(between, tangents[:, :-1])
+    carried = _reflected(tangents[:, 1:] - tangent, normal)
+    twist = np.arctan2((carried * across[:, 1:]).sum(axis=2), (carried * normals[:, 1:]).sum(axis=2))
+    angle = np.pad(np.cumsum(twist, axis=1), ((0, 0), (1, 0)))[..., None]
+    normals = np.cos(angle) * normals + np.sin(angle) * across
     turn = np.linspace(0, 2 * np.pi, NUM_SIDES, endpoint=False)[:, None]
 
     def ring(normal: Array, tangent: Array) -> Array:
@@ -102,8 +103,8 @@ def tubes(paths: Array, radius: float, ball: float = 0.0) -> Array:
     first, along = paths[:, :1, None], tangents[:, :1, None]
     if ball == 0:
         return np.concatenate([np.broadcast_to(first, ends.shape), rings, ends], axis=1)
-    angle = np.linspace(np.pi, 0, BALL_RINGS)[None, :, None, None]
-    globe = first + ball * (np.cos(angle) * along + np.sin(angle) * ring(normals[:, :1], tangents[:, :1]))
+    height = np.linspace(np.pi, 0, BALL_RINGS)[None, :, None, None]
+    globe = first + ball * (np.cos(height) * along + np.sin(height) * ring(normals[:, :1], tangents[:, :1]))
     return np.concatenate([globe, rings, ends], axis=1)
 
 
@@ -132,6 +133,6 @@ def middles_of(paths: Sequence[Array]) -> Array:
 
 
 def _reflected(across: Array, vectors: Array) -> Array:
-    """Vectors (R, 3) reflected in planes across others (R, 3)."""
-    size = np.maximum((across * across).sum(axis=1, keepdims=True), 1e-18)
-    return vectors - 2 * (across * vectors).sum(axis=1, keepdims=True) / size * across
+    """Vectors (*B, 3) reflected in planes across others (*B, 3)."""
+    size = np.maximum((across * across).sum(axis=-1, keepdims=True), 1e-18)
+    return vectors - 2 * (across * vectors).sum(axis=-1, keepdims=True) / size * across
