@@ -139,11 +139,9 @@ class WholeArmField(ArmField, CompiledField):
         return escape.velocities(self._escape, np.array(q, order="C"))
 
     def rk4(self, s: Array, duration: float, steps: int) -> Array:
-        """See `CompiledField`."""
         return self._in_blocks(s, lambda block: escape.flow(self._escape, block, float(duration), steps))
 
     def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-        """See `CompiledField`."""
 
         def carried(block: Array) -> Array:
             q, num_failed = escape.adaptive_flow(self._escape, block, float(duration), float(tolerance), max_steps)

@@ -90,7 +90,6 @@ class Coupling(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return len(self.frequencies) - 1 + self.amplitudes.shape[1] // 2
 
     def scaled(self, fraction: float) -> Coupling:
@@ -137,7 +136,6 @@ class Normalisation(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return len(self.scale)
 
     def scaled(self, fraction: float) -> Normalisation:

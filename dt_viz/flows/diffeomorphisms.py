@@ -107,7 +107,6 @@ class Flow(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.field.dim
 
     def scaled(self, fraction: float) -> Flow:
@@ -169,15 +168,12 @@ class AdaptiveFlow(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.field.dim
 
     def scaled(self, fraction: float) -> AdaptiveFlow:
-        """See `Diffeomorphism`."""
         return replace(self, duration=fraction * self.duration)
 
     def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        """See `Diffeomorphism`."""
         return _AtOnce(replace(self, tolerance=tolerance), tolerance)
 
     def path(self, s: Array, tolerance: float) -> tuple[Array, Array] | None:
@@ -197,15 +193,12 @@ class _AtOnce(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.flow.dim
 
     def scaled(self, fraction: float) -> Diffeomorphism:
-        """See `Diffeomorphism`."""
         return replace(self, flow=self.flow.scaled(fraction))
 
     def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        """See `Diffeomorphism`."""
         return self.flow.at_tolerance(tolerance)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
@@ -230,15 +223,12 @@ class Chain(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.parts[0].dim
 
     def scaled(self, fraction: float) -> Chain:
-        """See `Diffeomorphism`."""
         return Chain([part.scaled(fraction) for part in self.parts])
 
     def at_tolerance(self, tolerance: float) -> Chain:
-        """See `Diffeomorphism`."""
         return Chain([part.at_tolerance(tolerance) for part in self.parts])
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
@@ -255,15 +245,12 @@ class Inverse(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.of.dim
 
     def scaled(self, fraction: float) -> Inverse:
-        """See `Diffeomorphism`."""
         return Inverse(self.of.scaled(fraction))
 
     def at_tolerance(self, tolerance: float) -> Inverse:
-        """See `Diffeomorphism`."""
         return Inverse(self.of.at_tolerance(tolerance))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
@@ -278,11 +265,9 @@ class Identity(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.dimension
 
     def scaled(self, fraction: float) -> Identity:
-        """See `Diffeomorphism`."""
         return self
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
@@ -300,15 +285,12 @@ class Conjugated(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return self.by.dim
 
     def scaled(self, fraction: float) -> Conjugated:
-        """See `Diffeomorphism`."""
         return replace(self, inner=self.inner.scaled(fraction))
 
     def at_tolerance(self, tolerance: float) -> Conjugated:
-        """See `Diffeomorphism`."""
         return Conjugated(self.inner.at_tolerance(tolerance), self.by.at_tolerance(tolerance))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
@@ -351,7 +333,6 @@ class Placed(Diffeomorphism):
         return replace(self, inner=self.inner.scaled(fraction))
 
     def at_tolerance(self, tolerance: float) -> Placed:
-        """See `Diffeomorphism`."""
         return replace(self, inner=self.inner.at_tolerance(tolerance / self.scale))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:

@@ -103,7 +103,6 @@ class Shear(Diffeomorphism):
         return self.predictions.dim + 1 + self.predictions.num_conditions
 
     def scaled(self, fraction: float) -> Shear:
-        """See `Diffeomorphism`."""
         return replace(self, amount=fraction * self.amount)
 
     def at(self, rest: Array) -> Translation:
@@ -134,11 +133,9 @@ class Translation(Diffeomorphism):
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
         return len(self.shift)
 
     def scaled(self, fraction: float) -> Translation:
-        """See `Diffeomorphism`."""
         return Translation(fraction * self.shift)
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
@@ -160,11 +157,9 @@ class OnPlaces(Diffeomorphism):
         return self.transform.dim + self.num_rest
 
     def scaled(self, fraction: float) -> OnPlaces:
-        """See `Diffeomorphism`."""
         return replace(self, transform=self.transform.scaled(fraction))
 
     def at_tolerance(self, tolerance: float) -> OnPlaces:
-        """See `Diffeomorphism`."""
         return replace(self, transform=self.transform.at_tolerance(tolerance))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
@@ -191,21 +186,17 @@ class PhasedAttractor(Attractor):
     """p: with a large one, what leads off the motion fades early."""
 
     def states(self, places: Array, label: float | None = None) -> Array:
-        """See `Attractor`."""
         return self.predictions.states(places, label)
 
     def states_like(self, places: Array, image: Array) -> Array:
-        """See `Attractor`."""
         states, label = self.states(places), slice(2 * self.predictions.dim + 1, None)
         states[..., label] = image[label]  # ψ leaves phase and condition as they are
         return states
 
     def demonstrated(self, starts: Array) -> Array:
-        """See `Attractor`."""
         return self.predictions.demonstrated(starts)
 
     def caught(self, state: Array, below: Array) -> Array:
-        """See `Attractor`."""
         d = self.predictions.dim
         phase = self.predictions.caught(np.concatenate([below, state[d:]]))
         return np.concatenate([state[:d], [phase], state[d + 1 :]])

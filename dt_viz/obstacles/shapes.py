@@ -438,7 +438,6 @@ class CloudObstacle(_Triangles):
 
     @property
     def solid(self) -> Solid:
-        """See `Cloud`."""
         return self.cloud.solid
 
     def labelled(self) -> tuple[Array, Mask]:

@@ -96,15 +96,12 @@ class Ball(TaskObject):
 
     @property
     def start(self) -> None:
-        """See `TaskObject`."""
         return None
 
     def surface(self) -> tuple[Array, Indices]:
-        """See `TaskObject`."""
         return Sphere((0.0, 0.0, 0.0), 2 * self.radius).surface()
 
     def moved(self, place: Array, hand: Hand) -> Array:
-        """See `TaskObject`."""
         return hand.place if hand.arrived == 0 else self.fallen(hand.goal, hand.arrived)
 
     def fallen(self, place: Array, seconds: float) -> Array:
@@ -134,17 +131,14 @@ class PushedBox(TaskObject):
 
     @property
     def start(self) -> Array:
-        """See `TaskObject`."""
         return np.array([*self.middle, self.sizes[2] / 2])
 
     def surface(self) -> tuple[Array, Indices]:
-        """See `TaskObject`."""
         vertices, faces = Box((0.0, 0.0, 0.0), self.sizes).surface()
         x, y = self.direction
         return vertices @ np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]]), faces
 
     def moved(self, place: Array, hand: Hand) -> Array:
-        """See `TaskObject`."""
         along, across = np.array(self.direction), np.array([-self.direction[1], self.direction[0]])
         length, width, height = self.sizes
         offset, step = hand.place[:2] - place[:2], hand.place[:2] - hand.before[:2]
@@ -169,11 +163,9 @@ class LiftedBox(TaskObject):
 
     @property
     def start(self) -> Array:
-        """See `TaskObject`."""
         return np.array([*self.middle, 0.0])
 
     def surface(self) -> tuple[Array, Indices]:
-        """See `TaskObject`."""
         length, width, height = self.sizes
         walls = [Box((0.0, 0.0, WALL / 2), (length, width, WALL))]
         walls += [Box((side * length / 2, 0.0, height / 2), (WALL, width, height)) for side in (-1, 1)]
@@ -184,7 +176,6 @@ class LiftedBox(TaskObject):
         return np.concatenate([vertices for vertices, _ in parts]), faces
 
     def moved(self, place: Array, hand: Hand) -> Array:
-        """See `TaskObject`."""
         step, grasped = hand.place - hand.before, place[2] > 0
         inside = np.linalg.norm(hand.place - [*place[:2], self.grasp]) < GRASP
         if hand.arrived > 0 or not (grasped or (inside and step[2] > 0)):

@@ -159,12 +159,10 @@ class Avoidance(Transform):
 
     @property
     def acts(self) -> bool:
-        """See `Transform`."""
         return self.space == "task" and bool(self.obstacles)
 
     @property
     def arm_avoidance(self) -> ArmAvoidance | None:
-        """See `Transform`."""
         if self.space == "task":
             return None
         flow = self.generator, self.temperature, self.margin, self.duration, self.integration
@@ -172,11 +170,9 @@ class Avoidance(Transform):
 
     @property
     def avoided(self) -> Union:
-        """See `Transform`."""
         return Union(self.obstacles)
 
     def in_plane(self, plane: tuple[Point, Point]) -> Avoidance:
-        """See `Transform`."""
         return replace(self, plane=plane)
 
     def _field(self) -> VectorField:

@@ -132,30 +132,24 @@ class BiasPoint(Transform):
 
     @property
     def anchor(self) -> Point:
-        """See `Transform`."""
         return self.position
 
     @property
     def anchor_plane(self) -> tuple[Point, Point] | None:
-        """See `Transform`."""
         return self.plane
 
     def in_plane(self, plane: tuple[Point, Point]) -> BiasPoint:
-        """See `Transform`."""
         return replace(self, plane=plane)
 
     @property
     def region(self) -> float | None:
-        """See `Transform`."""
         return self.radius
 
     @property
     def ends_motions(self) -> bool:
-        """See `Transform`."""
         return self.moves_goal
 
     def anchored(self, place: Point) -> BiasPoint:
-        """See `Transform`."""
         return replace(self, position=place)
 
     def axes(self) -> Array:

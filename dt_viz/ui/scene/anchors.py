@@ -155,7 +155,6 @@ class Anchors(Dragged):
 
     @property
     def handles(self) -> Iterable[Handles]:
-        """See `Dragged`."""
         return [item.handles for item in self.items]
 
     def draw(self, frame: Frame) -> None:

@@ -67,7 +67,6 @@ class Onion(Following, Picture):
         )
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         self.follow(frame.arm)
 
     def _show(self, motion: ArmMotion) -> None:

@@ -74,7 +74,6 @@ class ComparedMotions(Picture):
         """Of the methods that were ever shown."""
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         shown = {compared.method.name: compared for compared in frame.comparison if compared.method.name in COLOURS}
         for name in set(self.motions) - set(shown):
             self.motions[name].node.visible = False
@@ -86,7 +85,6 @@ class ComparedMotions(Picture):
             self.motions[name].show(compared, frame.rollouts[frame.chosen or 0], names)
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self._dark = dark
         for motions in self.motions.values():
             self._dye(motions)

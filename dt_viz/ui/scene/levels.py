@@ -32,7 +32,6 @@ class LevelRollouts(Picture):
         self.label = scene.add_label("/level/label", "", anchor="bottom-center", font_screen_scale=1.1)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         if frame.level is not None:
             paths = frame.levels[frame.level]
             self.tubes.show(middles_of(paths))

@@ -31,7 +31,6 @@ class Generator(Picture):
         self._shown: object = None
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         picture = frame.pictures.generator
         if picture is not None and picture is not self._shown:
             self._shown = picture
@@ -47,7 +46,6 @@ class WarpedGrid(Picture):
         super().__init__(self.lines.node)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         if frame.pictures.grid is not None:
             beside = frame.level is not None
             self.lines.show(frame.pictures.grid.lines)
@@ -55,5 +53,4 @@ class WarpedGrid(Picture):
             self.lines.node.thickness = THIN if beside else THICK
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self._dark = dark

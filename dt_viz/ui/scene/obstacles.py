@@ -126,7 +126,6 @@ class Obstacles(Dragged):
 
     @property
     def handles(self) -> Iterable[Handles]:
-        """See `Dragged`."""
         return [item.handles for item in self.items]
 
     def adopt(self, scenario: Scenario) -> None:

@@ -82,13 +82,11 @@ class Panels(Picture):
         self._dark = False
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self._dark = dark
         for nodes in self.panels:
             nodes.dye(dark)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         panels = frame.pictures.panels
         if not panels:
             return

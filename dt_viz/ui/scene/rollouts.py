@@ -81,7 +81,6 @@ class Demonstrations(Picture):
         super().__init__(self._lines.node)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         self._middles.of(frame.rollouts)
         self._lines.show_segments(self._middles.beside(self._lines.segments(frame.task.paths)))
 
@@ -94,14 +93,12 @@ class Ghost(Picture):
         super().__init__(self._lines.node)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         own = frame.ghost[: len(frame.ghost) - frame.num_added]
         undisturbed = own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
         self._middles.of(frame.rollouts)
         self._lines.show_segments(self._middles.beside(self._lines.segments(undisturbed)))
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self._lines.dye(dark)
 
 
@@ -126,7 +123,6 @@ class Rollouts(Picture):
         """Time at which some jumped, seconds."""
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         middles = self._middles.of(frame.rollouts)
         number = np.arange(len(middles))
         followed = number == (frame.chosen if frame.level is None else None)
@@ -144,7 +140,6 @@ class Rollouts(Picture):
         self._fade_what_jumped(frame.task, middles)
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self._added = palette.shade(palette.ADDED, dark)
 
     def _fade_what_jumped(self, task: object, middles: Array) -> None:

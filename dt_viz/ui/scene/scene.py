@@ -53,7 +53,6 @@ class Goal(Picture):
         scene.add_label("/end/label", "end", **label)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         self._goal.position = frame.goal
         self._end.position = frame.reached
         elsewhere = bool(np.linalg.norm(frame.reached - frame.goal) > MAX_GOAL_MISS)

@@ -45,13 +45,11 @@ class FieldArrows(Picture):
         super().__init__(self.arrows.node)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         field = frame.pictures.field
         if field is not None:
             self.arrows.show(field.points, field.velocities)
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self.arrows.paint(*(palette.shade(colour, dark) for colour in (palette.ARROW_SLOW, palette.ARROW_FAST)))
 
 
@@ -65,7 +63,6 @@ class Streamlines(Picture):
         self.heads = Arrows(scene, "/streamlines/heads", colour, colour, HEAD_LENGTH)
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         lines = frame.pictures.streamlines
         if lines is not None:
             self.lines.show(lines)
@@ -75,7 +72,6 @@ class Streamlines(Picture):
             self.heads.show(points, ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12))
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self.lines.dye(dark)
         colour = palette.linear(palette.shade(palette.STREAMLINE, dark))
         self.heads.paint(colour, colour)
@@ -123,7 +119,6 @@ class ColourSlice(Picture):
         self._shown: object = None
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         picture = frame.pictures.colour
         if picture is not None and picture is not self._shown:
             self._shown = picture
@@ -190,7 +185,6 @@ class OccupancySlice(Picture):
         self._shown: object = None
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`."""
         picture = frame.pictures.occupancy
         if picture is None or picture is self._shown:
             return
@@ -202,7 +196,6 @@ class OccupancySlice(Picture):
         assign(self.points, picture.points, colours)
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self.outline.dye(dark)
 
 

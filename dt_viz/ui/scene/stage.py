@@ -58,5 +58,4 @@ class Table(Picture):
         """See `Picture`: it never changes."""
 
     def dye(self, dark: bool) -> None:
-        """See `Picture`."""
         self.node.color = palette.shade(palette.TABLE, dark)
