@@ -1,6 +1,5 @@
 """Modulation: nothing flows into an obstacle, nothing changes far away, and motions are those of the velocity."""
 
-
 import numpy as np
 import pytest
 
