@@ -9,29 +9,27 @@ milliseconds and over all sessions together:
     from an edit until the vector field is ready, too (stage LIVE).
 ``rebuild_median_ms``
     for computing the rollouts alone, without the wait for the frame before.
+``whole_median_ms``, ``whole_p95_ms``
+    for all of a drag's frame: rollouts, what the robot in the loop is given, the field.
+``unit_ms``
+    time of a fixed piece of numpy work, in which figures of different machines compare.
 ``frames``, ``skipped``
     rebuilds, and edits that a newer one replaced before they were begun.
-``drag_frame_bytes``
-    median and largest number of bytes that a browser is sent for one drag frame of the page as the task begins: all
-    that comes over its WebSocket, compressed, from one picture of the rollouts to the next. A real server is visited by
-    viser's protocol for this, and its obstacle is dragged by as many edits a second as a browser sends.
 """
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
@@ -47,10 +45,10 @@ from dt_viz.evaluate.options import (
     positive_number,
     print_table,
     ready_to_write,
+    unit_ms,
     whole_number,
     write_json,
 )
-from dt_viz.evaluate.protocol_client import ROLLOUT, ProtocolClient
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.motion.nominal import NUM_SAMPLES
@@ -60,11 +58,8 @@ from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
-from dt_viz.ui.server import Server
 
 EDITS_PER_SECOND = 60
-BROWSER_EDITS_PER_SECOND = 20
-"""Rate of the edits of a drag in a browser, at most."""
 WARM_UP_SECONDS = 1.0
 AMPLITUDE = 0.06
 """Amplitude of the obstacle's motion, metres."""
@@ -107,7 +102,7 @@ class Recorder:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
     add_task(parser)
-    add_space(parser)
+    add_space(parser, "cspace")
     parser.add_argument("--drag", choices=("obstacle", "bias"), default="obstacle", help="what (default: %(default)s)")
     parser.add_argument(
         "--obstacles", type=whole_number(0), default=1, help="in the scene, along the path (default: %(default)s)"
@@ -144,16 +139,11 @@ def run(options: argparse.Namespace) -> int:
         if recorder.error is not None:
             print(f"a session failed: {recorder.error}", file=sys.stderr)
             return 1
-    server = Server(tasks, fits, task=task.name, port=0)
-    try:
-        sent = asyncio.run(_drag_in_a_page(server, positions, options.seconds))
-    finally:
-        server.close()
-
     frames = [frame for recorder in recorders for frame in recorder.frames]
     first = 1e3 * np.array([seconds for stage, seconds, _ in frames if stage is Stage.ROLLOUTS])
     live = 1e3 * np.array([seconds for stage, seconds, _ in frames if stage is Stage.LIVE])
     rebuild = 1e3 * np.array([seconds for stage, _, seconds in frames if stage is Stage.ROLLOUTS])
+    whole, unit = 1e3 * np.array([seconds for stage, _, seconds in frames if stage is Stage.LIVE]), unit_ms()
     figures = {
         "median_ms": float(np.median(first)),
         "p95_ms": float(np.percentile(first, 95)),
@@ -162,7 +152,9 @@ def run(options: argparse.Namespace) -> int:
         "live_median_ms": float(np.median(live)),
         "live_p95_ms": float(np.percentile(live, 95)),
         "rebuild_median_ms": float(np.median(rebuild)),
-        "drag_frame_bytes": {"median": float(np.median(sent)), "largest": int(sent.max()), "frames": len(sent)},
+        "whole_median_ms": float(np.median(whole)),
+        "whole_p95_ms": float(np.percentile(whole, 95)),
+        "unit_ms": unit,
         "settings": {
             "task": task.name,
             "space": options.space,
@@ -187,13 +179,16 @@ def run(options: argparse.Namespace) -> int:
             ("rollouts", f"{figures['median_ms']:.1f}", f"{figures['p95_ms']:.1f}"),
             ("also the field", f"{figures['live_median_ms']:.1f}", f"{figures['live_p95_ms']:.1f}"),
             ("computing rollouts", f"{figures['rebuild_median_ms']:.1f}", f"{np.percentile(rebuild, 95):.1f}"),
+            ("computing all of it", f"{figures['whole_median_ms']:.1f}", f"{figures['whole_p95_ms']:.1f}"),
+            (
+                f"  in units of {unit:.1f} ms",
+                f"{np.median(whole) / unit:.1f}",
+                f"{np.percentile(whole, 95) / unit:.1f}",
+            ),
         ],
     )
     rate = len(first) / options.sessions / elapsed
     print(f"{num_edits} edits, {len(first)} frames ({rate:.1f} a second and session), {figures['skipped']} skipped")
-    print(
-        f"sent for a drag frame of the page: median {np.median(sent) / 1e3:.0f} kB, largest {sent.max() / 1e3:.0f} kB"
-    )
     return 0
 
 
@@ -244,36 +239,6 @@ def _drag(
             place = position(tick / EDITS_PER_SECOND + 1.7 * k)
             session.edit("drag", **_moved(session.scenario, place))
     return ticks * len(sessions), time.perf_counter() - began
-
-
-async def _drag_in_a_page(
-    server: Server, position: Callable[[float], tuple[float, float, float]], seconds: float
-) -> NDArray[np.int64]:
-    """Drag the first obstacle of a page as it begins; return the bytes received from each picture to the next."""
-    pictures: list[int] = []
-    async with ProtocolClient(f"ws://{server.host}:{server.port}") as client:
-
-        def see(name: str, changes: Mapping[str, Any], _now: float) -> None:
-            if name == ROLLOUT and "vertices" in changes:
-                pictures.append(client.num_bytes)
-
-        await client.look()
-        if not await client.wait_for(lambda: client.has_picture, PATIENCE):
-            raise InputError(
-                "--task", f"a page without a picture after {PATIENCE:g} s", "a task that can be shown live"
-            )
-        (session,) = (visitor.session for visitor in server.visitors)
-        await asyncio.to_thread(_settle, [session])
-        client.changed = see
-        began = time.perf_counter()
-        while (elapsed := time.perf_counter() - began) < seconds or len(pictures) <= 1:
-            if elapsed > max(seconds, PATIENCE):
-                raise InputError(
-                    "--task", f"a page that stays as it is for {elapsed:g} s", "a task that can be shown live"
-                )
-            session.edit("drag", **_moved(session.scenario, position(elapsed)))
-            await asyncio.sleep(1 / BROWSER_EDITS_PER_SECOND)
-    return np.diff(pictures)
 
 
 def _settle(sessions: Sequence[Session]) -> None:

@@ -1,323 +1,259 @@
-"""Let several visitors drag at once in a real server, as browsers do, and measure how soon each sees its edits.
+"""Let visitors drag at once in a real server, as browsers do, and count every picture that each of them gets.
 
-The server is a separate process; the visitors speak viser's protocol from this one, and decode all messages. Each drags
-the obstacle around its place, 20 edits a second. The obstacle's pose in a picture is found by comparing the rollouts
-with those that the engine computes here for each pose. The JSON file holds:
+The server is a process of its own, a new one for each number of visitors; the visitors speak viser's protocol from this
+process, and decode all messages. Each drags the first obstacle around its place, 20 edits a second, to a new place each
+time; each picture of the rollouts carries the place that it is computed for, and so the edit that it answers. Pictures
+that refine an answer are not counted. The JSON file holds ``unit_ms``, the time of a fixed piece of numpy work before
+all (figures of different machines compare in this unit), and under ``visits`` for each number of visitors:
 
 ``first_picture_s``
-    for each round and visitor, from the start of all until its rollouts and status line arrive; null if they do not.
-``median_ms``, ``p95_ms``
-    from the edit that a picture shows until it is decoded, over all pictures of all visitors while they drag.
+    for each visitor, from the start of all until its rollouts and status are there; null if they do not come in time.
 ``visitors``
-    for each: ``frames`` (pictures of a pose that it dragged to), ``others`` (finer pictures at rest), ``median_ms``,
-    ``p95_ms``, ``megabytes`` received, and ``last_shown``, whether the last picture is of the last pose.
-``peak_memory_mb``, ``threads``
-    of the server; null if its process is unknown, or the system does not report them.
+    for each: ``pictures_per_s``, the edits that it saw answered, and of ``gap_ms``, from one picture to the next, and
+    ``latency_ms``, from an edit to its picture, the ``median``, ``p95`` and ``worst`` (null without pictures);
+    ``bytes``, median received from one picture to the next; ``last_shown``, whether the last edit is answered in the
+    end; ``lost``, why the connection ended, empty if it did not.
+``ping_ms``
+    round trips of WebSocket pings to the server's event loop, all visitors together.
+``cores``, ``peak_memory_mb``, ``threads``
+    processor time of the server in a second, and what it has at most; null if its process is unknown, or the system
+    does not report them.
+``messages_per_s``
+    number of WebSocket messages that each visitor receives.
 
-With ``--rest`` nobody drags: the visitors look on while the arm goes its round, and the file holds beside the memory
-
-``core_percent``, ``messages_per_s``
-    processor time of the server for each visitor, in percent of a core; and what each receives.
+With ``--rest`` nobody drags: the visitors look on while the arm goes its round.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import math
 import os
 import platform
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Frame, Stage
 from dt_viz.evaluate.options import (
     InputError,
     add_lasa,
-    avoiding,
     chosen_task,
     positive_number,
     print_table,
     ready_to_write,
+    unit_ms,
     whole_number,
     write_json,
 )
-from dt_viz.evaluate.protocol_client import ROLLOUT, LostError, ProtocolClient
-from dt_viz.folders import default_cache_folder
-from dt_viz.learning.store import FitStore
-from dt_viz.obstacles.shapes import Point, Sphere, as_point
+from dt_viz.evaluate.protocol_client import ANSWERED, ROLLOUT, LostError, ProtocolClient
+from dt_viz.flows.fields import Array
+from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.ui.scene.tubes import evenly_bent
+from dt_viz.ui.panel.avoid import OFF, SPACES
 
 EDITS_PER_SECOND = 20
 """Rate of a drag's edits; no page sends more."""
-NUM_POSES, RADIUS = 100, 0.06
-"""Number of poses on the circle around the obstacle's place, in the task's slice, and its radius, metres."""
-FIRST_PICTURE = 20.0
+RADIUS, LAP = 0.06, 5.0
+"""Radius of the circle around the obstacle's place, in the task's slice, metres, and the time for one lap, seconds."""
+WIDENING = 1e-7
+"""Growth of the radius from one edit to the next, metres, by which no place comes twice."""
+FIRST_PICTURE = 60.0
 """Longest accepted time until a visitor has a picture, seconds."""
-REST = 3.0
-"""Time after the drag until the picture is final, seconds."""
 SETTLED = 10.0
-"""Time after the first picture until nothing is refined any more, seconds."""
+"""Time after the first pictures until nothing is refined any more, seconds."""
 PATIENCE = 60.0
-"""Longest time to wait for the last pose, seconds."""
-SAME = 1e-4
-"""Largest distance between equal rollouts, metres; those of neighbouring poses differ by 1 mm."""
-
-Middle = NDArray[np.float32]
-"""Points (K, 3) of the rollout that the arm follows, metres."""
-
-
-class Poses:
-    """Poses that the obstacle is dragged to, with the rollout that the arm follows for each; the whole arm avoids."""
-
-    def __init__(self, engine: Engine, task: Task) -> None:
-        self._engine, self._task = engine, task
-        angles = 2 * np.pi * np.arange(NUM_POSES) / NUM_POSES
-        circle = RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        centre = np.asarray(task.obstacle_position)
-        self.positions: list[Point] = [as_point(place) for place in centre + circle @ task.slice.axes.T]
-        """Positions of the obstacle's centre, metres."""
-        self._coarse = [self._middle(next(self._frames(index))) for index in range(NUM_POSES)]
-
-    def find(self, shown: Middle) -> int | None:
-        """Return the index of the pose whose first frame has this rollout."""
-        return next((index for index, middle in enumerate(self._coarse) if _same(middle, shown)), None)
-
-    def has(self, index: int, shown: Middle | None) -> bool:
-        """Return whether this rollout is of this pose, in any of its frames."""
-        for frame in self._frames(index):
-            if shown is not None and _same(self._middle(frame), shown):
-                return True
-            if frame.stage >= Stage.FINE:
-                break
-        return False
-
-    def _frames(self, index: int) -> Iterator[Frame]:
-        return self._engine.frames(avoiding(self._task, Avoidance(Sphere(self.positions[index]), space="cspace")))
-
-    def _middle(self, frame: Frame) -> Middle:
-        return evenly_bent(frame.rollouts[frame.chosen or 0]).astype(np.float32)
+"""Longest time to wait for the picture of the last edit, seconds."""
+PING_PAUSE = 0.25
+"""Time between two pings of a visitor, seconds."""
 
 
 @dataclass
 class Visit:
-    """One visitor in the last round."""
+    """What one visitor sends and sees."""
 
     client: ProtocolClient
-    poses: Poses
-    first: int
-    """Index of the pose that its drag begins with."""
-    edits: list[float] = field(default_factory=list)
+    edits: dict[Point, int] = field(default_factory=dict)
+    """Numbers of the edits by their places."""
+    sent: list[float] = field(default_factory=list)
     """Times at which they were sent, seconds of `time.perf_counter`."""
-    latencies: list[float] = field(default_factory=list)
-    """Latency of each picture of a pose, seconds."""
-    num_frames: int = 0
-    num_others: int = 0
-    num_bytes: int = 0
-    """Number of bytes received before the drag."""
+    seen: list[tuple[int, float, int]] = field(default_factory=list)
+    """For each picture that answers an edit newer than before: the edit's number, when it was there, and the number of
+    bytes received until then."""
+    pings: list[float] = field(default_factory=list)
+    """Round trips, seconds."""
+    num_messages: int = 0
+    """Number of messages that came while it was measured."""
     lost: str = ""
     """Reason for the end of the connection; empty while it lasts."""
 
-    def pose(self, edit: int) -> int:
-        """Return the index of an edit's pose."""
-        return (self.first + edit) % NUM_POSES
-
-    async def drag(self, seconds: float) -> None:
-        """Drag the obstacle, release it, and wait for the final picture."""
-        self.num_bytes = self.client.num_bytes
-        self.client.changed = self._see
-        try:
-            await self.client.grab()
-            began = time.perf_counter()
-            for edit in range(max(1, round(EDITS_PER_SECOND * seconds))):
-                await asyncio.sleep(max(0.0, began + edit / EDITS_PER_SECOND - time.perf_counter()))
-                self.edits.append(time.perf_counter())
-                await self.client.move(self.poses.positions[self.pose(edit)])
-            await self.client.release()
-            await self.client.wait_for(lambda: self._latest == self.pose(len(self.edits) - 1), PATIENCE)
-            await asyncio.sleep(REST)
-        except LostError as error:
-            self.lost = str(error)
-
-    def shows_the_last_pose(self) -> bool:
-        """Return whether the current picture is of the last edit."""
-        return not self.lost and self.poses.has(self.pose(len(self.edits) - 1), self.client.rollout)
-
-    _latest: int | None = None
-
-    def _see(self, name: str, changes: Any, now: float) -> None:  # noqa: ANN401 - properties of a node
-        """Find the edit that a new picture shows."""
+    def see(self, name: str, changes: Mapping[str, Any], now: float) -> None:
+        """Take a change of the page; see `ProtocolClient.changed`."""
         if name != ROLLOUT or "vertices" not in changes:
             return
-        shown = self.client.rollout
-        self._latest = None if shown is None else self.poses.find(shown)
-        if self._latest is None:
-            self.num_others += 1
-            return
-        self.num_frames += 1
-        newest = len(self.edits) - 1
-        edit = newest - (self.pose(newest) - self._latest) % NUM_POSES
-        if edit >= 0:
-            self.latencies.append(now - self.edits[edit])
+        place = self.client.nodes[ANSWERED].get("position")
+        edit = -1 if place is None else self.edits.get(as_point(place), -1)
+        if edit > (self.seen[-1][0] if self.seen else -1):
+            self.seen.append((edit, now, self.client.num_bytes))
+
+    async def drag(self, places: Sequence[Point]) -> None:
+        """Drag the obstacle through places, let it go, and wait for the picture of the last one."""
+        self.client.changed = self.see
+        await self.client.grab()
+        began = time.perf_counter()
+        for number, place in enumerate(places):
+            await asyncio.sleep(max(0.0, began + number / EDITS_PER_SECOND - time.perf_counter()))
+            self.edits[place] = number
+            self.sent.append(time.perf_counter())
+            await self.client.move(place)
+        await self.client.release()
+
+    @property
+    def last_shown(self) -> bool:
+        """Whether the last edit is answered."""
+        return bool(self.seen) and self.seen[-1][0] == len(self.sent) - 1
+
+    def figures(self) -> dict[str, Any]:
+        """The figures of a visitor that has dragged; see the module. Pictures count until the last edit."""
+        began, ended = self.sent[0], self.sent[-1]
+        during = [now for _, now, _ in self.seen if now <= ended]
+        return {
+            "pictures_per_s": len(during) * EDITS_PER_SECOND / len(self.sent),
+            "gap_ms": _spread(np.diff([began, *during, ended])),
+            "latency_ms": _spread(np.array([now - self.sent[edit] for edit, now, _ in self.seen])),
+            "bytes": float(np.median(np.diff([total for *_, total in self.seen]))) if len(self.seen) > 1 else None,
+            "last_shown": self.last_shown,
+            "lost": self.lost,
+        }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
     parser.add_argument("--task", default="draw_s", help="that the server begins with (default: %(default)s)")
     add_lasa(parser)
-    parser.add_argument("--clients", type=whole_number(1), default=8, help="visitors at once (default: %(default)s)")
-    parser.add_argument("--seconds", type=positive_number("seconds", 3600), default=60.0, help="to drag (default: 60)")
+    modes = tuple(mode.lower() for mode in (*SPACES, OFF))
+    parser.add_argument("--avoid", choices=modes, help="what gives way; as the page opens unless given")
     parser.add_argument(
-        "--rounds", type=whole_number(1), default=1, help="that all open the page; in the last they drag (default: 1)"
+        "--clients", type=whole_number(1), nargs="+", default=(1, 2, 4, 8, 16), help="visitors at once, in turn"
     )
-    parser.add_argument("--rest", action="store_true", help="drag nothing: measure what a visitor costs who looks on")
+    parser.add_argument("--seconds", type=positive_number("seconds", 3600), default=20.0, help="to drag (default: 20)")
+    parser.add_argument("--rest", action="store_true", help="drag nothing: measure what visitors cost who look on")
     parser.add_argument("--url", type=_url, help="of a server that runs already, such as ws://127.0.0.1:8080")
     parser.add_argument("--out", type=Path, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 1 if a visitor had no picture in time, or was not shown the last pose."""
-    tasks, task = chosen_task(options)
+    """Run the subcommand; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
+    _, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, ".json")
-    if options.rest:
-        return _run_at_rest(options, out)
-    fits = FitStore(default_cache_folder())
-    fits.get(task.demonstrations)
-    poses = Poses(Engine(tasks, fits, load_jaco()), task)
-    with _server(options) as (url, process):
-        firsts, visits, num_threads = asyncio.run(_visit(options, url, process, poses))
-        memory = _status(process, "VmHWM")
-    shown = [visit.shows_the_last_pose() for visit in visits]
-    latencies = np.array([latency for visit in visits for latency in visit.latencies])
-    figures = {
-        "first_picture_s": firsts,
-        **_percentiles(latencies),
-        "frames": sum(visit.num_frames for visit in visits),
-        "visitors": [
-            {
-                "first_picture_s": first,
-                "frames": visit.num_frames,
-                "others": visit.num_others,
-                **_percentiles(np.array(visit.latencies)),
-                "megabytes": (visit.client.num_bytes - visit.num_bytes) / 1e6,
-                "last_shown": last,
-                "lost": visit.lost,
-            }
-            for first, visit, last in zip(firsts[-1], visits, shown, strict=bool(visits))
-        ],
-        "peak_memory_mb": None if memory is None else memory / 1024,
-        "threads": num_threads,
-        "settings": {
-            "task": task.name,
-            "clients": options.clients,
-            "seconds": options.seconds,
-            "rounds": options.rounds,
-            "edits_per_second": EDITS_PER_SECOND,
-            "cores": os.cpu_count(),
-            "python": platform.python_version(),
-        },
-    }
+    unit = unit_ms()
+    print(f"{task.name}; a fixed piece of numpy work takes {unit:.1f} ms")
+    visits = []
+    for number in options.clients:
+        with _server(options, number) as (url, process):
+            visits.append(asyncio.run(_visited(options, url, process, task, number)))
+    _print(visits)
     if out is not None:
-        write_json(out, figures)
-    _print(figures)
-    complete = all(first is not None and first <= FIRST_PICTURE for round_ in firsts for first in round_)
-    return 0 if complete and all(shown) else 1
+        settings = {"task": task.name, "avoid": options.avoid, "seconds": options.seconds, "rest": options.rest}
+        machine = {"cores": os.cpu_count(), "python": platform.python_version(), "numpy": np.__version__}
+        write_json(out, {"unit_ms": unit, "visits": visits, "settings": settings | machine})
+    return 0 if all(_is_complete(figures, rest=options.rest) for figures in visits) else 1
 
 
-def _run_at_rest(options: argparse.Namespace, out: Path | None) -> int:
-    """Measure the server while nobody edits anything; 1 if a visitor had no picture in time, or was lost."""
-    with _server(options) as (url, process):
-        if process is None or _processor_seconds(process) is None:
-            raise InputError(
-                "--rest", "a server whose processor time is unknown", "one started by this command, on Linux"
-            )
-        figures = asyncio.run(_look_on(options, url, process))
-        memory = _status(process, "VmHWM")
-    if figures is None:
-        return 1
-    figures["peak_memory_mb"] = None if memory is None else memory / 1024
-    if out is not None:
-        write_json(out, figures)
-    print(
-        f"{options.task}, {options.clients} visitors who look on for {options.seconds:g} s: "
-        f"{figures['core_percent']:.1f} % of a core and {figures['messages_per_s']:.1f} messages a second for each"
-    )
-    return 0
+def places_of(task: Task, number: int, num_edits: int) -> list[Point]:
+    """Return where one of several visitors drags the obstacle: a circle in the task's slice, no place twice."""
+    edits = np.arange(num_edits)
+    angles = 2 * np.pi * edits / (EDITS_PER_SECOND * LAP) + number
+    circle = (RADIUS + WIDENING * edits)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return [as_point(place) for place in np.asarray(task.obstacle_position) + circle @ task.slice.axes.T]
 
 
-async def _look_on(options: argparse.Namespace, url: str, process: int) -> dict[str, float | None] | None:
-    """The figures of visitors who only look on; None if one has no picture in time, or is lost."""
+async def _visited(
+    options: argparse.Namespace, url: str, process: int | None, task: Task, number: int
+) -> dict[str, Any]:
+    """Open the page so many times, drag in all, and return the figures; see the module."""
     async with AsyncExitStack() as stack:
-        clients, began = [ProtocolClient(url) for _ in range(options.clients)], time.perf_counter()
-        if None in await asyncio.gather(*(_first_picture(stack, client, began) for client in clients)):
-            return None
-        await asyncio.sleep(SETTLED)
-        before, spent = sum(client.num_messages for client in clients), _processor_seconds(process)
+        clients = [ProtocolClient(url) for _ in range(number)]
         began = time.perf_counter()
-        await asyncio.sleep(options.seconds)
-        each = (time.perf_counter() - began) * options.clients
-        after, finally_spent = sum(client.num_messages for client in clients), _processor_seconds(process)
-        if spent is None or finally_spent is None or any(client.lost for client in clients):
-            return None
-        return {"core_percent": 100 * (finally_spent - spent) / each, "messages_per_s": (after - before) / each}
+        firsts = await asyncio.gather(*(_first_picture(stack, client, options.avoid, began) for client in clients))
+        figures: dict[str, Any] = {"clients": number, "first_picture_s": firsts, "visitors": []}
+        if None in firsts:
+            return figures
+        await asyncio.sleep(SETTLED)
+        visits = [Visit(client) for client in clients]
+        before, began = _processor_seconds(process), time.perf_counter()
+        num_edits = 0 if options.rest else max(1, round(EDITS_PER_SECOND * options.seconds))
+        drags = (_measured(visit, places_of(task, k, num_edits), options.seconds) for k, visit in enumerate(visits))
+        await asyncio.gather(*drags)
+        elapsed, after = time.perf_counter() - began, _processor_seconds(process)
+        for visit in visits if not options.rest else ():
+            with suppress(LostError):
+                await visit.client.wait_for(lambda visit=visit: visit.last_shown, PATIENCE)
+        return figures | {
+            "visitors": [{"lost": visit.lost} if options.rest else visit.figures() for visit in visits],
+            "ping_ms": _spread(np.array([ping for visit in visits for ping in visit.pings])),
+            "messages_per_s": float(np.mean([visit.num_messages for visit in visits])) / elapsed,
+            "cores": None if before is None or after is None else (after - before) / elapsed,
+            "peak_memory_mb": _status(process, "VmHWM", 1024),
+            "threads": _status(process, "Threads"),
+        }
 
 
-async def _visit(
-    options: argparse.Namespace, url: str, process: int | None, poses: Poses
-) -> tuple[list[list[float | None]], list[Visit], int | None]:
-    """Run all rounds; return seconds until each visitor's first picture, the last visits, and the most threads."""
-    firsts = []
-    num_threads = [_status(process, "Threads")]
-    for last in [False] * (options.rounds - 1) + [True]:
-        async with AsyncExitStack() as stack:
-            clients = [ProtocolClient(url) for _ in range(options.clients)]
-            began = time.perf_counter()
-            firsts.append(await asyncio.gather(*(_first_picture(stack, client, began) for client in clients)))
-            num_threads.append(_status(process, "Threads"))
-            if not last:
-                continue
-            if None in firsts[-1]:
-                break
-            visits = [Visit(client, poses, k * NUM_POSES // options.clients) for k, client in enumerate(clients)]
-            await asyncio.gather(*(visit.drag(options.seconds) for visit in visits))
-            num_threads.append(_status(process, "Threads"))
-            return firsts, visits, max((n for n in num_threads if n is not None), default=None)
-    return firsts, [], max((n for n in num_threads if n is not None), default=None)
-
-
-async def _first_picture(stack: AsyncExitStack, client: ProtocolClient, began: float) -> float | None:
+async def _first_picture(
+    stack: AsyncExitStack, client: ProtocolClient, avoid: str | None, began: float
+) -> float | None:
     """Open a page; return the seconds until it has a picture, None if it has none in time."""
     try:
         await stack.enter_async_context(client)
         await client.look()
         if await client.wait_for(lambda: client.has_picture, FIRST_PICTURE):
-            return time.perf_counter() - began
+            elapsed = time.perf_counter() - began
+            if avoid is not None:
+                await client.set("Avoid", avoid.capitalize())
+            return elapsed
     except (LostError, OSError) as error:
         print(f"a visitor was lost: {error}", file=sys.stderr)
     return None
 
 
+async def _measured(visit: Visit, places: Sequence[Point], seconds: float) -> None:
+    """Have a visitor drag through places, or look on for some seconds if there are none, and ping the server."""
+    before = visit.client.num_messages
+    pinging = asyncio.create_task(_ping(visit))
+    try:
+        await (visit.drag(places) if places else asyncio.sleep(seconds))
+    except LostError as error:
+        visit.lost = str(error)
+    visit.num_messages = visit.client.num_messages - before
+    pinging.cancel()
+    with suppress(asyncio.CancelledError):
+        await pinging
+
+
+async def _ping(visit: Visit) -> None:
+    """Ping the server again and again; a connection that is lost ends it."""
+    try:
+        while True:
+            visit.pings.append(await visit.client.ping())
+            await asyncio.sleep(PING_PAUSE)
+    except LostError as error:
+        visit.lost = str(error)
+
+
 @contextmanager
-def _server(options: argparse.Namespace) -> Iterator[tuple[str, int | None]]:
+def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int | None]]:
     """Yield the address of the WebSocket, and the server's process if it is started here."""
     if options.url is not None:
         yield options.url, None
         return
-    arguments = ["--port", "0", "--task", options.task, "--max-sessions", str(options.clients)]
+    arguments = ["--port", "0", "--task", options.task, "--max-sessions", str(number)]
     if options.lasa is not None:
         arguments += ["--lasa", str(options.lasa)]
     program = "from dt_viz.cli import main; raise SystemExit(main())"
@@ -335,17 +271,17 @@ def _server(options: argparse.Namespace) -> Iterator[tuple[str, int | None]]:
             process.terminate()
 
 
-def _status(process: int | None, name: str) -> int | None:
+def _status(process: int | None, name: str, divisor: int = 1) -> int | None:
     """Read a number of /proc/PID/status, kB or a count; None if there is none."""
     try:
         text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
     except OSError:
         return None
     found = re.search(rf"^{name}:\s*(\d+)", text, re.MULTILINE)
-    return None if found is None else int(found[1])
+    return None if found is None else int(found[1]) // divisor
 
 
-def _processor_seconds(process: int) -> float | None:
+def _processor_seconds(process: int | None) -> float | None:
     """Processor time that a process has used, seconds; None if it is gone, or the system does not report it."""
     try:
         fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
@@ -354,46 +290,56 @@ def _processor_seconds(process: int) -> float | None:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _same(expected: Middle, shown: Middle) -> bool:
-    return expected.shape == shown.shape and bool(np.abs(expected - shown).max() < SAME)
+def _spread(seconds: Array) -> dict[str, float] | None:
+    """Median, 95 % and largest of times, ms; None without any."""
+    if not len(seconds):
+        return None
+    median, p95, worst = 1e3 * np.percentile(seconds, [50, 95, 100])
+    return {"median": float(median), "p95": float(p95), "worst": float(worst)}
 
 
-def _percentiles(latencies: NDArray[np.float64]) -> dict[str, float | None]:
-    if not len(latencies):
-        return {"median_ms": None, "p95_ms": None}
-    return {"median_ms": 1e3 * float(np.median(latencies)), "p95_ms": 1e3 * float(np.percentile(latencies, 95))}
+def _is_complete(figures: Mapping[str, Any], *, rest: bool) -> bool:
+    visitors = figures["visitors"]
+    return bool(visitors) and all(not visitor["lost"] and (rest or visitor["last_shown"]) for visitor in visitors)
 
 
-def _print(figures: dict[str, Any]) -> None:
-    settings = figures["settings"]
-    for number, firsts in enumerate(figures["first_picture_s"], 1):
-        in_time = [first for first in firsts if first is not None]
-        slowest = f", the last after {max(in_time):.1f} s" if in_time else ""
-        print(f"round {number}: {len(in_time)} of {len(firsts)} have a picture{slowest}")
-    header = ("visitor", "first picture s", "frames/s", "median ms", "95 % ms", "others", "MB", "last pose shown")
-    rows = [
-        (
-            f"{number}",
-            _text(visitor["first_picture_s"], ".1f"),
-            _text(visitor["frames"] / settings["seconds"], ".1f"),
-            _text(visitor["median_ms"], ".0f"),
-            _text(visitor["p95_ms"], ".0f"),
-            f"{visitor['others']}",
-            _text(visitor["megabytes"], ".1f"),
-            visitor["lost"] or ("yes" if visitor["last_shown"] else "no"),
-        )
-        for number, visitor in enumerate(figures["visitors"], 1)
-    ]
-    print_table(header, rows)
-    print(
-        f"edit → picture of it: median {_text(figures['median_ms'], '.0f')} ms, "
-        f"95 % {_text(figures['p95_ms'], '.0f')} ms, {figures['frames']} pictures; "
-        f"server: {_text(figures['peak_memory_mb'], '.0f')} MB at most, {_text(figures['threads'], 'd')} threads"
+def _print(visits: Sequence[Mapping[str, Any]]) -> None:
+    header = ("visitors", "first picture s", "pictures/s of each", "gap ms", "edit → picture ms", "kB", "ping ms")
+    print_table((*header, "cores", "MB", "messages/s", "lost", "last shown"), [_row(figures) for figures in visits])
+    print("gaps, edit → picture, pings: median / 95 % / worst; of the gaps and pictures those of the worst visitor")
+
+
+def _row(figures: Mapping[str, Any]) -> tuple[str, ...]:
+    """The row of a number of visitors in the table."""
+    firsts, visitors = figures["first_picture_s"], figures["visitors"]
+    shown = [visitor for visitor in visitors if "last_shown" in visitor]
+    rates = [visitor["pictures_per_s"] for visitor in shown]
+    return (
+        str(figures["clients"]),
+        "–" if None in firsts else f"{max(firsts):.1f}",
+        f"{min(rates):.1f} to {max(rates):.1f}" if rates else "–",
+        _worst(visitor["gap_ms"] for visitor in shown),
+        _worst(visitor["latency_ms"] for visitor in shown),
+        _text(max((visitor["bytes"] / 1e3 for visitor in shown if visitor["bytes"]), default=None), ".0f"),
+        _worst([figures.get("ping_ms")]),
+        _text(figures.get("cores"), ".2f"),
+        _text(figures.get("peak_memory_mb"), "d"),
+        _text(figures.get("messages_per_s"), ".0f"),
+        str(sum(bool(visitor["lost"]) for visitor in visitors) + firsts.count(None)),
+        f"{sum(visitor['last_shown'] for visitor in shown)} of {len(shown)}" if shown else "–",
     )
 
 
+def _worst(spreads: Iterator[dict[str, float] | None] | Sequence[dict[str, float] | None]) -> str:
+    """Text of the largest median, 95 % and worst of several spreads."""
+    known = [spread for spread in spreads if spread is not None]
+    if not known:
+        return "–"
+    return " / ".join(f"{max(spread[name] for spread in known):.0f}" for name in ("median", "p95", "worst"))
+
+
 def _text(number: float | None, form: str) -> str:
-    return "–" if number is None or not math.isfinite(number) else format(number, form)
+    return "–" if number is None else format(number, form)
 
 
 def _url(text: str) -> str:

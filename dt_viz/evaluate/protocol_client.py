@@ -26,6 +26,8 @@ from dt_viz.ui.scene.tubes import NUM_RINGS, NUM_SIDES
 
 ROLLOUT, OBSTACLE = "/rollouts/followed", "/obstacles/0"
 """Names of the tube of the rollout that the arm follows and of the first obstacle's gizmo in the scene tree."""
+ANSWERED = "/obstacles/answered"
+"""Name of the node at the place of the first obstacle for which the rollouts are computed."""
 STATUS = "Smallest det J"
 """Text in the details of every frame's status."""
 MAX_MESSAGE = 64 * 2**20
@@ -83,6 +85,13 @@ class ProtocolClient:
     ) -> None:
         await self._socket.close()
         await self._receiving
+
+    async def ping(self) -> float:
+        """Ping the server; return the seconds until its event loop has answered. Raises LostError."""
+        try:
+            return await (await self._socket.ping())
+        except websockets.ConnectionClosed as error:
+            raise LostError(str(error)) from error
 
     async def send(self, kind: str, **fields: Any) -> None:  # noqa: ANN401 - as the message has them
         """Send a message. Raises LostError."""
@@ -205,6 +214,8 @@ class ProtocolClient:
         elif kind == "SceneNodeUpdateMessage":
             self.nodes.setdefault(message["name"], {}).update(message["updates"])
             self.changed(message["name"], message["updates"], now)
+        elif kind == "SetPositionMessage":
+            self.nodes.setdefault(message["name"], {})["position"] = message["position"]
         elif kind == "SetSceneNodeVisibilityMessage":
             self.nodes.setdefault(message["name"], {})["visible"] = message["visible"]
         elif kind == "RemoveSceneNodeMessage":

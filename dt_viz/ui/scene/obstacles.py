@@ -11,6 +11,7 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
+from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Sphere
 from dt_viz.scenario.scenario import MAX_DIAMETER, Scenario
@@ -119,10 +120,17 @@ class Obstacles(Dragged):
             clicked: called with the index of one that is clicked.
         """
         super().__init__(scene.add_frame("/obstacles", show_axes=False))
+        self._answered = scene.add_frame("/obstacles/answered", show_axes=False, visible=False)
         self._scene = scene
         self._moved, self._grabbed, self._clicked = moved, grabbed, clicked
         self.items: list[ObstaclePicture] = []
         """Pictures of the obstacles, in the order of the scenario."""
+
+    def draw(self, frame: Frame) -> None:
+        """Tell the page, for those who measure it, where the first obstacle is that the frame is computed for."""
+        super().draw(frame)
+        for obstacle in frame.scenario.obstacles[:1]:
+            self._answered.position = obstacle.position
 
     @property
     def handles(self) -> Iterable[Handles]:
