@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.kernels.detours import detours
 from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 from dt_viz.obstacles.union import Union
 
@@ -63,18 +64,7 @@ def escape_directions(
         ahead = np.arange(0, min(COMING * speed, FARTHEST), STRIDE)
         centres = (centres + ahead[:, None, None] * velocity / speed).reshape(-1, 3)
         radii = np.tile(radii, len(ahead))
-    offset = points - centres[:, None, :, None]  # (B, P, 3, M)
-    squared, sum_of_radii = (offset**2).sum(axis=2), (radii[:, None] + margin + radius)[:, :, None]
-    ball, point, sample = np.nonzero(squared < (sum_of_radii + 2 * ON_THE_WAY) ** 2)
-    excess = (squared - sum_of_radii**2)[ball, point, sample]
-    along = directions @ offset[ball, point, :, sample].T  # (D, pairs)
-    under_root = along**2 - excess
-    root = np.sqrt(np.maximum(under_root, 0))
-    hit = (under_root > 0) & (root - along > 0) & (-along - root < ON_THE_WAY)
-    shift = np.where(hit, root - along, 0)
-    detour = shift.max(axis=1)
-    height = (points[:, 2] - radius[:, None])[point, sample]
-    below = np.maximum(-(height + shift * directions[:, 2:]), 0).max(axis=1)
+    detour, below = detours(directions, np.ascontiguousarray(points), radius, centres, radii, float(margin), ON_THE_WAY)
     parallel = np.abs(directions @ tangents.T).mean(axis=1)
     cost = detour * (1 + SIDEWAYS * parallel) + TABLE_WEIGHT * below
 

@@ -49,25 +49,30 @@ def _velocity(escape: Escape, q: Array, result: Array, work: tuple[Array, ...]) 
 
     With weights ŵ_b of the body points, J_c = Σ ŵ_b J_b and n_c = Σ ŵ_b n_b this is, for each obstacle,
 
-        −V_q = v·m·χ (H + J_cᵀJ_c/λ²)⁻¹ J_cᵀ n_c/λ²,   H = I + w_d DᵀD + w_x JᵀJ.
+        −V_q = v·m·χ (I + RᵀR)⁻¹ J_cᵀ n_c/λ²,   R = (√w_x J, √w_d D, J_c/λ).
     """
     n = len(q)
-    axes, origins, H, A, contact, lever, weight, pull = work
-    stiffness, moves = 1 / escape.damping**2, False
-    result[:] = 0
+    axes, origins, R, A, lever, weight, pull = work
+    moves = False
+    for i in range(n):
+        result[i] = 0
     chain(escape.joints, q, axes, origins)
     for k in range(len(escape.shapes)):
-        total, x, y, z = _contact(escape, k, axes, origins, lever, weight, contact)
+        total, x, y, z = _contact(escape, k, axes, origins, lever, weight, R)
         if total.real <= 0:
             continue
         if not moves:
-            _holding(escape, axes, origins, H, lever)
+            _holding(escape, axes, origins, R)
             moves = True
-        strength = escape.speed * np.sqrt(total) / total * stiffness
+        strength = escape.speed * np.sqrt(total) / (total * escape.damping)
         for i in range(n):
-            pull[i] = strength * (contact[i, 0] * x + contact[i, 1] * y + contact[i, 2] * z)
+            pull[i] = strength * (R[i, 6] * x + R[i, 7] * y + R[i, 8] * z)
             for j in range(i + 1):
-                A[i, j] = H[i, j] + stiffness * _product(contact, i, j)
+                product = R[i, 0] * R[j, 0]
+                for row in range(1, 9):
+                    product += R[i, row] * R[j, row]
+                A[i, j] = product
+            A[i, i] += 1
         _solve(A, pull)
         for i in range(n):
             result[i] -= pull[i]
@@ -79,14 +84,17 @@ def _velocity(escape: Escape, q: Array, result: Array, work: tuple[Array, ...]) 
 
 @compiled
 def _contact(
-    escape: Escape, k: int, axes: Array, origins: Array, lever: Array, weight: Array, contact: Array
+    escape: Escape, k: int, axes: Array, origins: Array, lever: Array, weight: Array, R: Array
 ) -> tuple[Number, Number, Number, Number]:
-    """Write J_cᵀ (n, 3) for obstacle k, with memory for levers (n, 3) and weights (n,); return Σw_b² and n_c·Σw_b²."""
+    """Write J_cᵀ/λ of obstacle k to R[:, 6:], with memory for levers (n, 3) and weights (n,).
+
+    Returns Σw_b² and n_c·Σw_b².
+    """
     n, points, shape, values, reach = len(weight), escape.points, escape.shapes[k], escape.values, escape.reach
     total = 0 * axes[0, 0, 0]
     wanted_x, wanted_y, wanted_z = total, total, total
-    lever[:] = 0
-    weight[:] = 0
+    for i in range(n):
+        weight[i] = lever[i, 0] = lever[i, 1] = lever[i, 2] = 0
     for p in range(len(points)):
         offset, joint = points[p].offset, points[p].joint
         x, y = placed(offset, joint, axes, origins, 0), placed(offset, joint, axes, origins, 1)
@@ -109,9 +117,10 @@ def _contact(
         for i in range(n - 1, -1, -1):
             if i < n - 1:  # each joint moves the points beyond it, too
                 weight[i] += weight[i + 1]
-                lever[i] += lever[i + 1]
+                for component in range(3):
+                    lever[i, component] += lever[i + 1, component]
             x, y = lever[i, 0] - weight[i] * origins[i, 0], lever[i, 1] - weight[i] * origins[i, 1]
-            _turn(axes, i, x / total, y / total, (lever[i, 2] - weight[i] * origins[i, 2]) / total, contact)
+            _turn(axes, i, x, y, lever[i, 2] - weight[i] * origins[i, 2], 1 / (total * escape.damping), R, 6)
     return total, wanted_x, wanted_y, wanted_z
 
 
@@ -132,44 +141,30 @@ def _work(q: Array) -> tuple[Array, ...]:
     """Memory for `_velocity` at postures like q (N, n)."""
     n, like = q.shape[1], q.dtype
     frames = np.empty((n, 3, 3), like), np.empty((n, 3), like)
-    systems = np.empty((n, n), like), np.empty((n, n), like)
-    return (*frames, *systems, np.empty((n, 3), like), np.empty((n, 3), like), np.empty(n, like), np.empty(n, like))
+    system = np.empty((n, 9), like), np.empty((n, n), like)
+    return (*frames, *system, np.empty((n, 3), like), np.empty(n, like), np.empty(n, like))
 
 
 @compiled
-def _holding(escape: Escape, axes: Array, origins: Array, H: Array, column: Array) -> None:
-    """Write the lower half of H (n, n); `column` (n, 3) is memory."""
+def _holding(escape: Escape, axes: Array, origins: Array, R: Array) -> None:
+    """Write √w_x Jᵀ and √w_d Dᵀ to R[:, :3] and R[:, 3:6]."""
     n, hand = len(origins), escape.hand
     tip = n - 1
     x, y = placed(hand, tip, axes, origins, 0), placed(hand, tip, axes, origins, 1)
     z = placed(hand, tip, axes, origins, 2)
-    length = np.sqrt(hand[0] ** 2 + hand[1] ** 2 + hand[2] ** 2)
-    H[:] = 0
+    staying = np.sqrt(escape.hand_weight)
+    upright = np.sqrt(escape.direction_weight / (hand[0] ** 2 + hand[1] ** 2 + hand[2] ** 2))
     for i in range(n):
-        H[i, i] = 1
-        _turn(axes, i, x - origins[i, 0], y - origins[i, 1], z - origins[i, 2], column)
-    for i in range(n):
-        for j in range(i + 1):
-            H[i, j] += escape.hand_weight * _product(column, i, j)
-    for i in range(n):
-        _turn(axes, i, x - origins[tip, 0], y - origins[tip, 1], z - origins[tip, 2], column)
-    for i in range(n):
-        for j in range(i + 1):
-            H[i, j] += escape.direction_weight / length**2 * _product(column, i, j)
+        _turn(axes, i, x - origins[i, 0], y - origins[i, 1], z - origins[i, 2], staying, R, 0)
+        _turn(axes, i, x - origins[tip, 0], y - origins[tip, 1], z - origins[tip, 2], upright, R, 3)
 
 
 @compiled
-def _turn(axes: Array, i: int, x: Number, y: Number, z: Number, column: Array) -> None:
-    """Write the velocity, at unit speed of joint i, of what has this lever from the joint, to row i of `column`."""
-    column[i, 0] = axes[i, 2, 1] * z - axes[i, 2, 2] * y
-    column[i, 1] = axes[i, 2, 2] * x - axes[i, 2, 0] * z
-    column[i, 2] = axes[i, 2, 0] * y - axes[i, 2, 1] * x
-
-
-@compiled
-def _product(rows: Array, i: int, j: int) -> Number:
-    """Scalar product of two rows of (n, 3)."""
-    return rows[i, 0] * rows[j, 0] + rows[i, 1] * rows[j, 1] + rows[i, 2] * rows[j, 2]
+def _turn(axes: Array, i: int, x: Number, y: Number, z: Number, scale: Number, R: Array, column: int) -> None:
+    """Write the velocity, at unit speed of joint i, of what has this lever from it, times a scale, to R[i, column:]."""
+    R[i, column] = scale * (axes[i, 2, 1] * z - axes[i, 2, 2] * y)
+    R[i, column + 1] = scale * (axes[i, 2, 2] * x - axes[i, 2, 0] * z)
+    R[i, column + 2] = scale * (axes[i, 2, 0] * y - axes[i, 2, 1] * x)
 
 
 @compiled
@@ -211,6 +206,13 @@ def velocities(escape: Escape, q: Array) -> Array:
     return result
 
 
+@compiled
+def _moved(s: Array, h: float, v: Array, there: Array) -> None:
+    """Write s + h·v (n,)."""
+    for i in range(len(s)):
+        there[i] = s[i] + h * v[i]
+
+
 @kernel
 def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
     """Postures q (N, n) carried along by classical Runge–Kutta steps of equal length, (N, n)."""
@@ -223,13 +225,14 @@ def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
             _velocity(escape, s, k1, work)
             if not k1.any():
                 break  # where the field vanishes its flow rests
-            there[:] = s + h / 2 * k1
+            _moved(s, h / 2, k1, there)
             _velocity(escape, there, k2, work)
-            there[:] = s + h / 2 * k2
+            _moved(s, h / 2, k2, there)
             _velocity(escape, there, k3, work)
-            there[:] = s + h * k3
+            _moved(s, h, k3, there)
             _velocity(escape, there, k4, work)
-            s += h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            for i in range(n):
+                s[i] += h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i])
     return q
 
 
@@ -249,7 +252,7 @@ def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, m
         if speed == 0:
             continue  # where the field vanishes its flow rests
         ahead = min(total, tolerance / speed)
-        end[:] = s + sign * ahead * k[0]
+        _moved(s, sign * ahead, k[0], end)
         _velocity(escape, end, k[1], work)
         turning = np.abs(k[1] - k[0]).max() / (ahead * speed)
         h, left = first_step(speed, turning, total, tolerance), total
@@ -258,13 +261,15 @@ def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, m
             continue
         for _ in range(max_steps):
             for i in range(1, 7):
-                end[:] = s
-                for j in range(i):
-                    end += sign * h * STAGES[i, j] * k[j]
+                for d in range(n):
+                    end[d] = s[d]
+                    for j in range(i):
+                        end[d] += sign * h * STAGES[i, j] * k[j, d]
                 _velocity(escape, end, k[i], work)
-            defect[:] = 0
-            for i in range(7):
-                defect += h * ERROR[i] * k[i]
+            for d in range(n):
+                defect[d] = 0
+                for i in range(7):
+                    defect[d] += h * ERROR[i] * k[i, d]
             error = np.abs(defect).max() / allowed_error(np.abs(end - s).max(), tolerance)
             if error <= 1:
                 s[:], k[0], left = end, k[6], left - h

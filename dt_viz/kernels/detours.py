@@ -1,0 +1,53 @@
+"""How far the arm would have to be shifted in each direction to leave an obstacle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dt_viz.kernels.arm import Array
+from dt_viz.kernels.compiled import kernel
+
+
+@kernel
+def detours(
+    directions: Array, points: Array, radius: Array, centres: Array, radii: Array, margin: float, length: float
+) -> tuple[Array, Array]:
+    """Find how far the arm has to be shifted until none of its spheres is nearer than a margin to a ball.
+
+    A ball that a sphere would meet only after more than `length` metres of the shift is not in the way.
+
+    Args:
+        directions: (D, 3) unit vectors.
+        points: (P, 3, M) centres of the arm's spheres at M samples, metres.
+        radius: (P,) their radii, metres.
+        centres: (B, 3) centres of the balls that cover the obstacle, metres.
+        radii: (B,) their radii, metres.
+        margin: required distance, metres.
+        length: see above.
+
+    Returns:
+        For each direction the shift (D,), and the greatest depth (D,) below the plane z = 0 of the spheres that are
+        near a ball, each shifted as far as it needs itself, metres.
+    """
+    shifts, depths = np.zeros(len(directions)), np.zeros(len(directions))
+    for b in range(len(centres)):
+        for p in range(len(points)):
+            apart = radii[b] + margin + radius[p]
+            for m in range(points.shape[2]):
+                x, y = points[p, 0, m] - centres[b, 0], points[p, 1, m] - centres[b, 1]
+                z = points[p, 2, m] - centres[b, 2]
+                squared = x * x + y * y + z * z
+                if squared >= (apart + 2 * length) ** 2:
+                    continue
+                lowest = points[p, 2, m] - radius[p]
+                for d in range(len(directions)):
+                    # along the direction it meets the ball, grown by `apart`, at −along ± root
+                    along = directions[d, 0] * x + directions[d, 1] * y + directions[d, 2] * z
+                    under_root, shift = along * along - squared + apart * apart, 0.0
+                    if under_root > 0:
+                        root = np.sqrt(under_root)
+                        if root > along and -along - root < length:
+                            shift = root - along
+                    shifts[d] = max(shifts[d], shift)
+                    depths[d] = max(depths[d], -lowest - shift * directions[d, 2])
+    return shifts, depths
