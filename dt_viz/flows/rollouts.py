@@ -119,14 +119,14 @@ def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: i
     Returns:
         The refined bundle. Wider gaps remain after `max_rounds`, and where it has `MAX_SAMPLES` samples.
     """
-    for round_ in range(max_rounds + 1):
+    for _ in range(max_rounds):
         same = np.diff(bundle.index) == 0
         gap = np.linalg.norm(np.diff(bundle.positions, axis=0), axis=1) * same
         # a gap between neighbouring floats on either side of an obstacle's centre cannot be divided
         divisible = np.diff(bundle.fraction) > 1e-13
         wide = np.flatnonzero((gap > spacing) & divisible)
         room = MAX_SAMPLES - len(bundle.index)
-        if not len(wide) or round_ == max_rounds or room <= 0:
+        if not len(wide) or room <= 0:
             break
         inside = np.r_[np.inf, np.where(same, gap, np.inf), np.inf]
         uneven = gap[wide] > UNEVEN * np.minimum(inside[:-2], inside[2:])[wide]
@@ -135,8 +135,8 @@ def refined(bundle: Bundle, evaluate: Evaluate, spacing: float, *, max_rounds: i
         if counts.sum() > room:
             widest = np.argsort(-gap[wide], kind="stable")
             counts[widest] = np.diff(np.minimum(np.cumsum(counts[widest]), room), prepend=0)
-        within = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in counts])
-        before = np.repeat(wide, counts)
+        before, last = np.repeat(wide, counts), np.repeat(np.cumsum(counts), counts)
+        within = 1 - (last - np.arange(len(last))) / (np.repeat(counts, counts) + 1)
         fraction = bundle.fraction[before] + within * (bundle.fraction[before + 1] - bundle.fraction[before])
         index = bundle.index[before]
         bundle = Bundle(

@@ -51,6 +51,14 @@ def test_it_ends_at_the_goal_is_invertible_and_is_saved_as_arrays(learned):
     assert again.warnings == imitation.warnings
 
 
+def test_its_clock_is_known_three_knots_beyond_the_farthest_start(learned):
+    _, imitation = learned
+    base = imitation.system.base
+    radii = np.linalg.norm(imitation.system.transform.forward(imitation.starts) - base.goal, axis=1)
+    clock = base.smoothing / base.speed * np.log(np.sinh(radii.max() / base.smoothing))
+    np.testing.assert_allclose(base.knots[-4], clock, atol=1e-9)
+
+
 def test_progress_can_cancel():
     class CancelledError(Exception):
         pass
