@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from dt_viz.kernels.arm import JOINT
+from dt_viz.kernels.arm import JOINT, chains, places
 from dt_viz.properties import cached_property
 
 if TYPE_CHECKING:
@@ -125,7 +125,9 @@ class Robot:
     def end_effector(self, q: ArrayLike) -> Array:
         """Compute the end-effector positions (*B, 3), metres, of configurations q (*B, 6), rad."""
         q = np.asarray(q, dtype=float)
-        return self.chain(q.reshape(-1, NUM_JOINTS).T).position.T.reshape(*q.shape[:-1], 3)
+        return places(self.records, self.end_effector_offset, q.reshape(-1, NUM_JOINTS).copy()).reshape(
+            *q.shape[:-1], 3
+        )
 
     def hand_direction(self, q: ArrayLike) -> Array:
         """Compute unit vectors (*B, 3), base frame, from the last joint to the end effector; q (*B, 6), rad."""
@@ -164,22 +166,8 @@ class Robot:
 
     def chain(self, q: Array) -> KinematicChain:
         """Compute the forward kinematics of q (6, N), rad, with the batch last."""
-        num = q.shape[1]
-        axes = np.empty((NUM_JOINTS, 3, 3, num), dtype=q.dtype)
-        origins = np.empty((NUM_JOINTS, 3, num), dtype=q.dtype)
-        cos, sin = np.cos(q), np.sin(q)
-        for i in range(NUM_JOINTS):
-            if i == 0:
-                fixed = np.broadcast_to(self.joint_rotations[0].T[:, :, None], (3, 3, num))
-                origins[0] = self.joint_translations[0][:, None]
-            else:
-                previous = axes[i - 1].reshape(3, -1)
-                fixed = (self.joint_rotations[i].T @ previous).reshape(3, 3, num)
-                origins[i] = origins[i - 1] + (self.joint_translations[i] @ previous).reshape(3, num)
-            axes[i, 0] = fixed[0] * cos[i] + fixed[1] * sin[i]
-            axes[i, 1] = fixed[1] * cos[i] - fixed[0] * sin[i]
-            axes[i, 2] = fixed[2]
-        hand = (self.end_effector_offset @ axes[-1].reshape(3, -1)).reshape(3, num)
+        axes, origins = chains(self.records, np.array(q.T, order="C"))
+        hand = (self.end_effector_offset @ axes[-1].reshape(3, -1)).reshape(3, -1)
         return KinematicChain(axes, origins, origins[-1] + hand, hand / np.linalg.norm(self.end_effector_offset))
 
 

@@ -35,6 +35,7 @@ from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.interruption import checkpoint
 from dt_viz.kernels.arm import clearance
+from dt_viz.kernels.proximity import proximity
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
@@ -44,7 +45,7 @@ from dt_viz.transforms.base import ArmAvoidance
 
 NUM_CONFIGURATIONS = 100
 """Samples of each rollout before refinement."""
-NUM_COARSE = 50
+NUM_COARSE = 40
 """The same for coarse motions."""
 MAX_DURATION = 2.0
 """Longest flow that is tried: a contact at full strength moves by 40 cm in it."""
@@ -73,13 +74,8 @@ NUM_EXTENDED_FOR = 40
 """Number of samples, those that lack most, that this time is chosen for."""
 COARSE_STEP = 0.2
 """Length of a coarse RK4 step, in flow time: off by a tenth of a millimetre at the hand, about."""
-COARSE_SPACING = 0.03
-"""Largest distance, metres at the hand, about, between samples that are integrated in coarse motions; samples between
-them are interpolated, which is off by a tenth of a millimetre, about, too."""
-NEAREST = 5e-6
-"""Smallest distance from a joint limit, rad, of the postures interpolated between: rounding may put them on it."""
-BULGE = 0.5
-"""Largest distance of an interpolated posture from the line between its neighbours, relative to their distance."""
+COARSE_SPACING = 0.025
+"""Distance, metres at the hand, about, up to which neighbouring samples of coarse motions may be apart."""
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
@@ -216,12 +212,15 @@ class WholeArm:
 
     def compiled(self) -> Iterator[float]:
         """Compile what a drag repeats for this processor, or load what was compiled before; yields the part done."""
-        q, field = (
-            self.robot.home[None],
-            WholeArmField(self.robot, self.body, (Sphere((0.0, 0.0, 0.0)),), np.eye(3)[:1], np.empty((0, NUM_JOINTS))),
-        )
+        q, obstacle = self.robot.home[None], Sphere((0.0, 0.0, 0.0))
+        field = WholeArmField(self.robot, self.body, (obstacle,), np.eye(3)[:1], np.empty((0, NUM_JOINTS)))
+        points = self.body.of_chain(self.robot.chain(q.T))
+        shapes, values = records((obstacle,))
         calls: tuple[Callable[[], object], ...] = (
-            lambda: self.clearance(q, Union(field.obstacles)),
+            lambda: self.robot.end_effector(q),
+            lambda: self.clearance(q, obstacle),
+            lambda: proximity(self.robot.records, self.links.records, shapes, values, q[0].copy(), 1.0),
+            lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, MAX_DURATION),
             lambda: field(q),
             lambda: field.rk4(q, 1.0, 1),
             lambda: field.dormand_prince(q, 1.0, TOLERANCE, 1000),
@@ -257,7 +256,8 @@ class WholeArm:
         Args:
             lifted: the motions below.
             avoidance: what is to be avoided, and how.
-            spacing: largest distance between neighbouring samples, metres at the hand, about.
+            spacing: largest distance between neighbouring samples, metres at the hand, about; in coarse motions it is
+                `COARSE_SPACING` if that is more.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
             before: the ways out of the obstacles where they were just before.
         """
@@ -518,21 +518,7 @@ class _Solver:
         def integrated(index: Indices, fraction: Array) -> Array:
             return self._evaluate(transform, index, fraction)
 
-        if not self._coarse:
-            return refined(bundle, integrated, self._spacing)
-        bundle = refined(bundle, integrated, COARSE_SPACING)
-        limits = self._arm.limits
-        p = np.clip(bundle.positions / LEVERS, limits.lower + NEAREST, limits.upper - NEAREST)
-        unbounded = limits.forward(p)  # where the flow acts, so that what lies between keeps the limits
-        curves = [
-            _interpolant(u, q) for u, q in zip(bundle.split(bundle.fraction), bundle.split(unbounded), strict=True)
-        ]
-
-        def interpolated(index: Indices, fraction: Array) -> Array:
-            between = np.concatenate([curves[k](fraction[index == k]) for k in np.unique(index)])
-            return (limits.inverse(between) * LEVERS)[:, None]
-
-        return refined(bundle, interpolated, self._spacing)
+        return refined(bundle, integrated, max(self._spacing, COARSE_SPACING) if self._coarse else self._spacing)
 
     def _lack(self, p: Array) -> Array:
         """(N,) metres by which the spheres at configurations (N, 6) miss the clearance that is asked for."""
@@ -592,25 +578,6 @@ class _Solver:
             if not len(state):
                 break
         return float(duration)
-
-
-def _interpolant(fraction: Array, q: Array) -> Callable[[Array], Array]:
-    """A spline through the samples q (T, 6) of a rollout at fractions (T,), not far from the lines between them.
-
-    Where the flow stretches the rollout without limit, fractions are so uneven that a spline alone leaves them.
-    """
-    spline, steps = CubicSpline(fraction, q), np.diff(q, axis=0)
-    most = BULGE * np.linalg.norm(steps, axis=1)
-
-    def at(u: Array) -> Array:
-        before = np.searchsorted(fraction, u, side="right").clip(1, len(steps)) - 1
-        part = (u - fraction[before]) / (fraction[before + 1] - fraction[before])
-        line = q[before] + part[:, None] * steps[before]
-        bulge = spline(u) - line
-        size = np.maximum(np.linalg.norm(bulge, axis=1), np.finfo(float).tiny)
-        return line + np.minimum(1, most[before] / size)[:, None] * bulge
-
-    return at
 
 
 def _crossing(before: Array, after: Array) -> float:

@@ -66,6 +66,34 @@ def placed(offset: Array, joint: int, axes: Array, origins: Array, k: int) -> Nu
 
 
 @kernel
+def chains(joints: Joints, q: Array) -> tuple[Array, Array]:
+    """Frames at angles q (N, n), batch last: axes (n, 3, 3, N) [joint, column, component] and origins (n, 3, N)."""
+    num, n = q.shape
+    axes, origins = np.empty((n, 3, 3, num), q.dtype), np.empty((n, 3, num), q.dtype)
+    turned, at = np.empty((n, 3, 3), q.dtype), np.empty((n, 3), q.dtype)
+    for row in range(num):
+        chain(joints, q[row], turned, at)
+        for i in range(n):
+            for k in range(3):
+                origins[i, k, row] = at[i, k]
+                axes[i, 0, k, row], axes[i, 1, k, row] = turned[i, 0, k], turned[i, 1, k]
+                axes[i, 2, k, row] = turned[i, 2, k]
+    return axes, origins
+
+
+@kernel
+def places(joints: Joints, offset: Array, q: Array) -> Array:
+    """Places (N, 3), metres, at angles q (N, n) of what is fixed to the last joint at an offset (3,)."""
+    n, result = len(joints), np.empty((len(q), 3), q.dtype)
+    axes, origins = np.empty((n, 3, 3), q.dtype), np.empty((n, 3), q.dtype)
+    for row in range(len(q)):
+        chain(joints, q[row], axes, origins)
+        for k in range(3):
+            result[row, k] = placed(offset, n - 1, axes, origins, k)
+    return result
+
+
+@kernel
 def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
     """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
     axes, origins, nearest = np.empty((len(joints), 3, 3)), np.empty((len(joints), 3)), np.empty(len(q))

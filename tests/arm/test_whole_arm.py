@@ -10,7 +10,16 @@ from dt_viz.arm import whole_arm
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.tracking import track
-from dt_viz.arm.whole_arm import MAX_DURATION, MAX_EXTENSION, OPPOSED, ROUNDING, ArmSolution, Lift, WholeArm
+from dt_viz.arm.whole_arm import (
+    COARSE_SPACING,
+    MAX_DURATION,
+    MAX_EXTENSION,
+    OPPOSED,
+    ROUNDING,
+    ArmSolution,
+    Lift,
+    WholeArm,
+)
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.following import Follower
@@ -129,7 +138,7 @@ class TestAroundTheMiddle:
 
     def test_neighbouring_samples_are_near(self, case, coarse):
         solution = case.avoiding(coarse=coarse)
-        spacing = LIVE.spacing if coarse else FINE.spacing
+        spacing = COARSE_SPACING if coarse else FINE.spacing
         for p, fraction in zip(split(solution, solution.p), split(solution, solution.fraction), strict=True):
             assert np.linalg.norm(np.diff(p * LEVERS, axis=0), axis=1).max() <= spacing
             assert (np.diff(fraction) > 0).all() and fraction[0] == 0 and fraction[-1] == 1
