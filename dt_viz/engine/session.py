@@ -28,8 +28,9 @@ logger = logging.getLogger(__name__)
 GESTURE_PAUSE = 1.0
 """Time without an edit, seconds, after which the next edit of the same control is a step of its own for undo."""
 MAX_UNDO = 200
-LIVE_PAUSE = 0.05
-"""Time between two drawings of the field while edits come faster, seconds; rollouts are drawn more often."""
+LIVE_PAUSE, LIVE_LATENCIES = 0.05, 2.0
+"""Shortest time between two drawings of the field while edits come faster, in seconds and in latencies of the rollouts:
+these are drawn more often, the more so the longer they take."""
 HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
 """Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
 REST = 0.1
@@ -367,7 +368,7 @@ class Session:
                 self._worker.rest(REST)
             elif frame.stage is Stage.ROLLOUTS:
                 last = self._live_frames[-1] if self._live_frames else -math.inf
-                pause = last + LIVE_PAUSE - now
+                pause = last + max(LIVE_PAUSE, LIVE_LATENCIES * self._latency) - now
                 if pause <= 0:
                     continue  # the field is due, whatever is waiting
                 self._worker.rest(pause)
