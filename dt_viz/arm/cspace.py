@@ -20,6 +20,7 @@ from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
 from dt_viz.interruption import checkpoint
 from dt_viz.kernels import escape
+from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.properties import cached_property
@@ -223,16 +224,19 @@ class JointLimits(Diffeomorphism):
 
     def inside(self, q: Array) -> Array:
         """Clip configurations (*B, 6) to a little less than the limits, where ψ is finite."""
+        lowest, highest = self._innermost
+        return np.minimum(np.maximum(q, lowest), highest)
+
+    @cached_property
+    def _innermost(self) -> tuple[Array, Array]:
+        """Bounds (6,) of what is inside."""
         slack = (1 - NEAREST_TO_LIMIT) * self.zone
-        return np.clip(q, self.lower + slack, self.upper - slack)
+        return self.lower + slack, self.upper - slack
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
-        free = np.clip(s.real, self.lower + self.zone, self.upper - self.zone)
-        excess = s - free
-        squared = (excess / self.zone) ** 2 * (self.fraction if inverse else -self.fraction)
-        stretch = 1 / np.sqrt(1 + squared)
-        mapped = np.where(excess == 0, s, free + excess * stretch)
-        return mapped, None if U is None else (stretch**3)[..., None] * U
+        part = self.fraction if inverse else -self.fraction
+        mapped, factor = stretched(np.array(s, order="C"), self.lower, self.upper, self.zone, part)
+        return mapped, None if U is None else (factor**3)[..., None] * U
 
 
 def squared_lengths(q: Array, pins: Array) -> Array:

@@ -341,7 +341,7 @@ class Controller:
     def _ease(self, dt: float) -> None:
         """Change the duration of the flow towards that which clears the motion ahead."""
         rise = self._clearing.duration - self._duration
-        self._duration += float(np.clip(rise, -self.settings.easing * dt, 2 * self.settings.easing * dt))
+        self._duration += min(max(rise, -self.settings.easing * dt), 2 * self.settings.easing * dt)
 
     def _target(self, transform: Diffeomorphism) -> Array:
         """The posture (6,) where the robot is to be at this time of the course."""
@@ -362,11 +362,12 @@ class Controller:
         lower, upper = np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
         for limit in self._limits:
             lowest, highest = limit.bounds(q, self._velocity, dt)
-            lower, upper = np.clip(lower, lowest, highest), np.clip(upper, lowest, highest)
+            lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
         seen = self._seen.expected(min(self._now - self._seen.time, STALE), 0.0)
         slopes, bounds, self._distance = self._barrier.rows(q, self._seen.where(seen))
-        if not len(bounds) or (slopes @ np.clip(wanted, lower, upper) >= bounds).all():
-            return np.clip(wanted, lower, upper)
+        nearest = _within(wanted, lower, upper)
+        if not len(bounds) or (slopes @ nearest >= bounds).all():
+            return nearest
         sense = np.repeat(np.array([0, SOFT], np.int32), (NUM_JOINTS, len(bounds)))
         solution, _, flag, _ = daqp.solve(
             np.eye(NUM_JOINTS),
@@ -376,7 +377,7 @@ class Controller:
             np.concatenate([lower, bounds]),
             sense,
         )
-        return np.clip(solution if flag > 0 else np.zeros(NUM_JOINTS), lower, upper)
+        return _within(solution if flag > 0 else np.zeros(NUM_JOINTS), lower, upper)
 
     def _settle(self, course: Course) -> None:
         """Take note of the end of a course, and go on from a shove."""
@@ -436,6 +437,11 @@ class Controller:
         if self._rest is not None and len(self._rest) == len(state) - 3:
             state = base.caught(np.concatenate([hand, self._rest]), stack.stacked.forward(hand))
         return towards(stack.system, self._section, q, state, settings.convergence, z, near)
+
+
+def _within(values: Array, lower: Array, upper: Array) -> Array:
+    """Clip values (6,); for so few `np.clip` takes five times as long."""
+    return np.minimum(np.maximum(values, lower), upper)
 
 
 def _same_course(before: Solved, after: Solved) -> bool:

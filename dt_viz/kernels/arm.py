@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dt_viz.kernels.compiled import compiled, kernel
+from dt_viz.kernels.compiled import compiled, short_kernel
 from dt_viz.kernels.distances import Number, Shapes, Values, distance
 
 JOINT = np.dtype(
@@ -65,7 +65,7 @@ def placed(offset: Array, joint: int, axes: Array, origins: Array, k: int) -> Nu
     return origins[joint, k] + turned
 
 
-@kernel
+@short_kernel
 def chains(joints: Joints, q: Array) -> tuple[Array, Array]:
     """Frames at angles q (N, n), batch last: axes (n, 3, 3, N) [joint, column, component] and origins (n, 3, N)."""
     num, n = q.shape
@@ -81,7 +81,7 @@ def chains(joints: Joints, q: Array) -> tuple[Array, Array]:
     return axes, origins
 
 
-@kernel
+@short_kernel
 def places(joints: Joints, offset: Array, q: Array) -> Array:
     """Places (N, 3), metres, at angles q (N, n) of what is fixed to the last joint at an offset (3,)."""
     n, result = len(joints), np.empty((len(q), 3), q.dtype)
@@ -93,7 +93,7 @@ def places(joints: Joints, offset: Array, q: Array) -> Array:
     return result
 
 
-@kernel
+@short_kernel
 def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
     """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
     axes, origins, nearest = np.empty((len(joints), 3, 3)), np.empty((len(joints), 3)), np.empty(len(q))

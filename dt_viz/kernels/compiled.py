@@ -31,13 +31,25 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def compiled(function: F) -> F:
     """Compile a function that kernels call; errors of arithmetic give nan or inf as in numpy."""
-    decorator: Any = numba.njit(nogil=True, error_model="numpy")
-    return decorator(function)
+    return _dispatcher(function)
 
 
 def kernel(function: F) -> F:
-    """Compile a function that Python calls, and keep its code for the next process."""
-    dispatcher: Any = compiled(function)
+    """Compile a function that Python calls, and keep its code for the next process; meanwhile other threads go on."""
+    return _kept(_dispatcher(function, nogil=True))
+
+
+def short_kernel(function: F) -> F:
+    """The same for what takes microseconds: letting other threads go on would take longer."""
+    return _kept(_dispatcher(function))
+
+
+def _dispatcher(function: F, **options: bool) -> Any:  # noqa: ANN401 - numba's
+    decorator: Any = numba.njit(error_model="numpy", **options)
+    return decorator(function)
+
+
+def _kept(dispatcher: Any) -> Any:  # noqa: ANN401
     dispatcher._cache = _Cache(dispatcher)
     return dispatcher
 

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, placed
-from dt_viz.kernels.compiled import kernel
+from dt_viz.kernels.compiled import short_kernel
 from dt_viz.kernels.distances import Shapes, Values, distance
 
 COMPLEX_STEP = 1e-30
 
 
-@kernel
+@short_kernel
 def proximity(
     joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array, reach: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
