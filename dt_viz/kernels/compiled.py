@@ -44,8 +44,8 @@ def short_kernel(function: F) -> F:
     return _kept(_dispatcher(function))
 
 
-def _dispatcher(function: F, **options: bool) -> Any:  # noqa: ANN401 - numba's
-    decorator: Any = numba.njit(error_model="numpy", **options)
+def _dispatcher(function: F, *, nogil: bool = False) -> Any:  # noqa: ANN401 - numba's
+    decorator: Any = numba.njit(nogil=nogil, error_model="numpy")
     return decorator(function)
 
 
