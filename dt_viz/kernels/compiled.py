@@ -44,7 +44,7 @@ def short_kernel(function: F) -> F:
     return _kept(_dispatcher(function))
 
 
-def _dispatcher(function: F, *, nogil: bool = False) -> Any:  # noqa: ANN401 - numba's
+def _dispatcher(function: Callable[..., Any], *, nogil: bool = False) -> Any:  # noqa: ANN401 - numba's
     decorator: Any = numba.njit(nogil=nogil, error_model="numpy")
     return decorator(function)
 
