@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import defaultdict
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
@@ -10,9 +11,13 @@ _Result = TypeVar("_Result")
 
 
 class Memo:
-    """The newest results of pure functions. For one thread."""
+    """The newest results of pure functions.
+
+    Several threads may share it. Where two compute the same result at once, both get the one that was there first.
+    """
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._results: defaultdict[str, dict[Hashable, Any]] = defaultdict(dict)
 
     def __call__(self, kind: str, key: Hashable, make: Callable[[], _Result], *, newest: int | None = None) -> _Result:
@@ -24,11 +29,16 @@ class Memo:
             make: computes the result.
             newest: number of results of this kind that are kept, those used last; None keeps all.
         """
-        results = self._results[kind]
-        result = results.pop(key) if key in results else make()
-        results[key] = result
-        while newest is not None and len(results) > newest:
-            del results[next(iter(results))]
+        with self._lock:
+            results = self._results[kind]
+            if key in results:
+                results[key] = result = results.pop(key)  # the newest now
+                return result
+        made = make()
+        with self._lock:
+            result = results.setdefault(key, made)
+            while newest is not None and len(results) > newest:
+                del results[next(iter(results))]
         return result
 
     def has(self, kind: str, key: Hashable) -> bool:

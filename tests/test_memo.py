@@ -5,10 +5,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from scenes import changing
+from scenes import changed, changing
 
+from dt_viz.engine.engine import Engine
 from dt_viz.engine.session import Session
 from dt_viz.memo import Memo
+from dt_viz.motion import following
+from dt_viz.scenario.tasks import TASKS
 
 
 def test_a_result_is_computed_once_kinds_do_not_mix_and_the_results_that_were_used_last_stay():
@@ -30,6 +33,35 @@ def test_what_fails_is_tried_again_and_leaves_what_is_kept():
         memo("a", 2, fail, newest=1)
     assert memo("a", 2, lambda: "made", newest=2) == "made"
     assert memo("a", 1, fail, newest=2) == "kept"
+
+
+def test_two_threads_that_compute_a_result_at_once_get_the_same_one():
+    memo, together = Memo(), threading.Barrier(2)
+    found: list[Any] = []
+
+    def make():
+        together.wait(60)
+        return object()
+
+    threads = [threading.Thread(target=lambda: found.append(memo("a", 1, make))) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 2 and found[0] is found[1]
+
+
+def test_engines_that_share_what_is_learned_and_stances_compute_them_once(fits, robot, initial, monkeypatch):
+    made, stances = [], following.stances
+    monkeypatch.setattr(following, "stances", lambda *given: made.append(1) or stances(*given))
+    shared, scenario = Memo(), initial("push_box")
+    x, y, z = scenario.obstacles[0].position
+    beside = changed(scenario, obstacles=scenario.obstacles[0].moved((x - 0.1, y, z)), space="cspace")
+    engines = [Engine(TASKS, fits, robot, shared) for _ in range(2)]
+    learned = {id(engine.nominal(beside).learned) for engine in engines}
+    for engine in engines:
+        list(engine.follower.alternatives(engine.nominal(beside), beside.arm_avoidance))
+    assert len(learned) == len(made) == 1
 
 
 class Blank:

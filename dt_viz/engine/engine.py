@@ -88,12 +88,22 @@ class Engine:
     which they pass it, and the arm its stance; where it then rests this choice is all that is left of the drag.
     """
 
-    def __init__(self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot) -> None:
+    def __init__(
+        self, tasks: Mapping[str, TaskEntry], fits: FitStore, robot: Robot, shared: Memo | None = None
+    ) -> None:
+        """Take what engines share.
+
+        Args:
+            tasks: by name.
+            fits: what was learned before.
+            robot: the arm.
+            shared: what keeps the results that no visitor's edits change; None keeps them for this engine alone.
+        """
         self._tasks = tasks
         self._fits = fits
-        self.memo = Memo()
-        """All results that are kept."""
-        self.follower = Follower(robot, self.memo)
+        self.memo, self._shared = Memo(), Memo() if shared is None else shared
+        """All other results that are kept."""
+        self.follower = Follower(robot, self.memo, self._shared)
         self.arm = LiveArm(self.follower)
         """The arm in the loop."""
         self.comparison = Comparison(self.follower, self.memo)
@@ -137,7 +147,7 @@ class Engine:
             key = (scenario.task, scenario.style, scenario.style_amount)
             learned = self.memo("styled", key, lambda: self._styled(scenario), newest=NEWEST)
         else:
-            learned = self.memo("learned", key, lambda: self._learned(scenario, progress))
+            learned = self._shared("learned", key, lambda: self._learned(scenario, progress))
         strand = learned.strand  # a start that is dragged leaves nothing behind
         added = [self.memo("strand", (learned, s), lambda s=s: strand(s), newest=NEWEST) for s in scenario.starts]
         return self.memo("nominal", (learned, scenario.starts), lambda: learned.nominal(added), newest=4)

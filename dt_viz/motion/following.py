@@ -35,6 +35,8 @@ NUM_ON_PATH = 20
 """Samples of the mean motion that stances are tried on."""
 SELF_STRIDE = 5
 """Stride of the configurations between which the distance of the arm's links from each other is searched."""
+NUM_STANCES = 32
+"""Number of stances whose joints are kept."""
 NEWEST = 2 * MAX_STARTS
 """Number of added starts whose joints are kept."""
 
@@ -64,17 +66,19 @@ class Admission:
 class Follower:
     """Lifts motions of the end effector to the joints."""
 
-    def __init__(self, robot: Robot, memo: Memo | None = None) -> None:
+    def __init__(self, robot: Robot, memo: Memo | None = None, shared: Memo | None = None) -> None:
         """Take an arm.
 
         Args:
             robot: the arm.
             memo: what keeps the joints along what a drag leaves unchanged.
+            shared: what keeps the stances of tasks, for other followers, too.
         """
         self.robot = robot
         self.body = load_body_points()
         self.whole_arm = WholeArm(robot, self.body)
         self._memo = Memo() if memo is None else memo
+        self._shared = Memo() if shared is None else shared
 
     def undisturbed(self, nominal: Nominal) -> Lift:
         """The joints along the motion without any behaviour.
@@ -236,7 +240,7 @@ class Follower:
         if before is None and (enough or (room >= margin).all()):
             yield None, room >= 0
         paths = learned.demonstrated.paths
-        known = self._memo(
+        known = self._shared(
             "stances",
             learned,
             lambda: stances(self.robot, self.whole_arm.body, usual.reference, learned.task.starts, _mean(paths)),
@@ -282,7 +286,7 @@ class Follower:
             nearest = [load_collision_model().nearest_to_itself(path) for path in paths]
             return all(near is None or near.distance >= SELF_MARGIN for near in nearest)
 
-        return self._memo("sound", (learned, stance), sound)
+        return self._shared("sound", (learned, stance), sound)
 
     def out_of_reach(self, nominal: Nominal) -> Mask:
         """(R,) bool: which rollouts begin at an added start that the arm cannot get to.
@@ -346,10 +350,9 @@ class Follower:
     def _demonstrated(self, learned: Learned, stance: Stance | None = None) -> Lift:
         """The joints along the rollouts from the task's starts. Raises UnreachableError, also a second time."""
         if stance is not None:
-            return self._memo(
-                "stance", (learned, stance), lambda: _lift_demonstrated(self.robot, learned, np.array(stance)), newest=8
-            )
-        lifted = self._memo("demonstrated", learned, lambda: _lift_usual(self.robot, learned))
+            stood = lambda: _lift_demonstrated(self.robot, learned, np.array(stance))  # noqa: E731
+            return self._shared("stance", (learned, stance), stood, newest=NUM_STANCES)
+        lifted = self._shared("demonstrated", learned, lambda: _lift_usual(self.robot, learned))
         if isinstance(lifted, UnreachableError):
             raise lifted
         return lifted

@@ -15,6 +15,7 @@ import viser
 from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.learning.store import FitStore
+from dt_viz.memo import Memo
 from dt_viz.obstacles.files import MAX_BYTES
 from dt_viz.scenario.tasks import TaskEntry
 from dt_viz.ui.gate import Gate
@@ -73,7 +74,7 @@ class Server:
         self._tasks, self._fits, self._task = tasks, fits, task
         self._titles = {name: entry.title for name, entry in tasks.items()}
         self._max_sessions = max_sessions
-        self._robot = load_jaco()
+        self._robot, self._shared = load_jaco(), Memo()
         self._lock = threading.Condition()
         self._visitors: dict[int, Visitor | None] = {}
         """Those with a page, and None for those whose page is being built."""
@@ -153,7 +154,7 @@ class Server:
                 self._lock.notify_all()
 
     def _build_page(self, client: viser.ClientHandle) -> None:
-        engine = Engine(self._tasks, self._fits, self._robot)
+        engine = Engine(self._tasks, self._fits, self._robot, self._shared)
         try:
             visitor = Visitor(client, engine, self._robot, self._titles, self._task)
         except Exception as error:
