@@ -76,7 +76,7 @@ class Task:
             imitation.base.placed(self.origin, axes, self.scale),
         )
 
-    @property
+    @cached_property
     def paths(self) -> tuple[Array, ...]:
         """Each demonstration in the world, (T_i, 3), metres."""
         return tuple(self.to_world(d.positions) for d in self.demonstrations)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import viser
 from scipy.spatial import KDTree
 
-from dt_viz.engine.frame import Frame
+from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.fields import Array
 from dt_viz.properties import cached_property
 from dt_viz.ui.scene import palette
@@ -73,30 +75,47 @@ class Middles:
         return segments[np.isinf(away)]
 
 
-class Demonstrations(Picture):
-    """The demonstrations, as thin lines, where no rollout covers them."""
+class _Beside(Picture, ABC):
+    """Lines where no rollout covers them; while a drag goes on they follow with the field."""
 
-    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
-        self._lines, self._middles = Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018), middles
-        super().__init__(self._lines.node)
+    def __init__(self, lines: Lines, middles: Middles) -> None:
+        super().__init__(lines.node)
+        self._lines, self._middles = lines, middles
+        self._drawn: tuple[object, bool] | None = None
+        """Task drawn last, and whether its rollouts covered something."""
 
     def draw(self, frame: Frame) -> None:
+        drawn = frame.task, self._middles.shown
+        if frame.stage is Stage.ROLLOUTS and drawn == self._drawn:
+            return
+        self._drawn = drawn
         self._middles.of(frame.rollouts)
-        self._lines.show_segments(self._middles.beside(self._lines.segments(frame.task.paths)))
+        self._lines.show_segments(self._middles.beside(self._lines.segments(self._paths(frame))))
+
+    @abstractmethod
+    def _paths(self, frame: Frame) -> Sequence[Array]:
+        """Return the paths (T_i, 3), metres."""
 
 
-class Ghost(Picture):
-    """The undisturbed motion of the rollout that the arm follows, dashed, where no rollout covers it."""
+class Demonstrations(_Beside):
+    """The demonstrations, as thin lines."""
 
     def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
-        self._lines, self._middles = Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012), middles
-        super().__init__(self._lines.node)
+        super().__init__(Lines(scene, "/demonstrations", palette.DEMONSTRATION, 0.0018), middles)
 
-    def draw(self, frame: Frame) -> None:
+    def _paths(self, frame: Frame) -> Sequence[Array]:
+        return frame.task.paths
+
+
+class Ghost(_Beside):
+    """The undisturbed motion of the rollout that the arm follows, dashed."""
+
+    def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
+        super().__init__(Lines(scene, "/ghost", palette.GHOST, 0.003, dash=0.012), middles)
+
+    def _paths(self, frame: Frame) -> Sequence[Array]:
         own = frame.ghost[: len(frame.ghost) - frame.num_added]
-        undisturbed = own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
-        self._middles.of(frame.rollouts)
-        self._lines.show_segments(self._middles.beside(self._lines.segments(undisturbed)))
+        return own if frame.chosen is None else frame.ghost[frame.chosen : frame.chosen + 1]
 
     def dye(self, dark: bool) -> None:
         self._lines.dye(dark)

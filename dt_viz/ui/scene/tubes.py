@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import viser
@@ -108,6 +109,7 @@ def tubes(paths: Array, radius: float, ball: float = 0.0) -> Array:
     return np.concatenate([globe, rings, ends], axis=1)
 
 
+@lru_cache(maxsize=16)
 def tube_faces(num: int, num_rings: int, num_sides: int) -> Indices:
     """Return the faces (F, 3), outward, of so many tubes."""
     corner = np.arange(num * num_rings * num_sides).reshape(num, num_rings, num_sides)
