@@ -1,10 +1,12 @@
-"""Let a sphere cross the motion of the robot in the loop, on random smooth paths, and measure how it dodges.
+"""Let obstacles cross the motion of the robot in the loop, on random smooth paths, and measure how it dodges.
 
-The sphere's path has its middle at the hand of the undisturbed motion, and the sphere is there when the hand would be.
-The npz file holds for run i:
+An obstacle's path has its middle at the hand of the undisturbed motion, and the obstacle is there when the hand would
+be. The npz file holds for run i:
 
-``q_i`` (T, 6), ``t_i`` (T,), ``obstacle_i`` (T, 3)
-    joint angles, rad, seconds, and the sphere's centre, metres, at each tick; NaN once it has gone.
+``q_i`` (T, 6), ``t_i`` (T,), ``obstacle_i`` (T, 3), or (T, P, 3) for P > 1 obstacles
+    joint angles, rad, seconds, and the obstacle's centre, metres, at each tick; NaN while it is not there.
+``wxyz_i`` (P, 4)
+    orientations of boxes.
 
 and ``diameter``, metres. With `--beside`, ``potential_q_i`` and ``stepped_q_i`` with their ``_t_i`` and ``_obstacle_i``
 are those of the same arm with a repulsive potential field, and of its field stepped at the paper's 20 Hz.
@@ -29,6 +31,7 @@ from dt_viz.control.controller import Controller, Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.options import (
+    InputError,
     add_task,
     avoiding,
     chosen_task,
@@ -45,7 +48,7 @@ from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import LIVE
-from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -57,12 +60,14 @@ HALF_LENGTH = 0.40
 """Half the length of a sphere's path, metres."""
 WIGGLE, WAVELENGTH = 0.04, 0.5
 """Amplitude and length of a path's waves, metres."""
+BOX = np.array([1.0, 0.8, 0.6])
+"""Sides of a box, in diameters."""
 PEDESTAL_ROOM = 0.10
 """Distance, metres, that a path keeps from the base and link 1, which no joint moves out of its way."""
 TABLE_ROOM = 0.01
-"""Height of the sphere above the table, metres."""
+"""Height of the obstacle above the table, metres."""
 START_ROOM = 0.05
-"""Distance of the arm from the sphere at the beginning, metres."""
+"""Distance of the arm from an obstacle that comes, where the arm is undisturbed, metres."""
 LONGEST = 30.0
 """Time after the sphere has gone within which the goal has to be reached, seconds."""
 AT_GOAL = 1e-3
@@ -76,29 +81,50 @@ REPULSION = 1.5
 
 
 @dataclass(frozen=True, eq=False)
+class Passage:
+    """An obstacle that passes."""
+
+    path: Array
+    """(N, 3) evenly spaced places of its centre, metres."""
+    comes: float
+    """Time at which it comes, seconds."""
+    length: float
+    """Length of the path, metres."""
+    speed: float
+    """m/s."""
+    wxyz: Quaternion = UPRIGHT
+
+    @property
+    def gone(self) -> float:
+        """Time after which it is not there any more, seconds."""
+        return self.comes + self.length / self.speed
+
+    def at(self, t: float) -> Array:
+        """(3,) its centre, metres; NaN where it is not there."""
+        if not self.comes <= t < self.gone:
+            return np.full(3, np.nan)
+        place = (t - self.comes) * self.speed / self.length * (len(self.path) - 1)
+        return np.array([np.interp(place, np.arange(len(self.path)), axis) for axis in self.path.T])
+
+
+@dataclass(frozen=True, eq=False)
 class Crossing:
-    """A sphere that crosses a motion."""
+    """Obstacles that cross a motion."""
 
     start: int
     """Rollout that the robot follows."""
     begins: float
     """Time at which the robot sets out, seconds."""
-    path: Array
-    """(N, 3) evenly spaced places of the sphere, metres."""
-    length: float
-    """Length of the path, metres."""
-    speed: float
-    """m/s."""
+    passages: tuple[Passage, ...]
 
     @property
     def gone(self) -> float:
-        """Time after which there is no sphere, seconds."""
-        return self.length / self.speed
+        """Time after which there is no obstacle, seconds."""
+        return max(passage.gone for passage in self.passages)
 
     def at(self, t: float) -> Array:
-        """(3,) the sphere's centre, metres."""
-        place = np.clip(t / self.gone, 0, 1) * (len(self.path) - 1)
-        return np.array([np.interp(place, np.arange(len(self.path)), axis) for axis in self.path.T])
+        """(P, 3) the centres, metres; NaN for those that are not there."""
+        return np.stack([passage.at(t) for passage in self.passages])
 
 
 @dataclass
@@ -108,6 +134,7 @@ class Run:
     q: list[Array] = field(default_factory=list)
     t: list[float] = field(default_factory=list)
     obstacle: list[Array] = field(default_factory=list)
+    """(P, 3) centres of the obstacles, metres."""
     ticks: list[float] = field(default_factory=list)
     """Processor times of the ticks, seconds."""
     phases: set[Phase] = field(default_factory=set)
@@ -127,7 +154,7 @@ class Arm(Protocol):
 
 
 class InTheLoop:
-    """The controller, which looks at the sphere now and then."""
+    """The controller, which looks at the obstacles now and then."""
 
     def __init__(self, bench: Bench, crossing: Crossing, settings: ControllerSettings) -> None:
         self._bench, self.controller = bench, Controller(bench.follower, bench.solved, settings)
@@ -140,10 +167,10 @@ class InTheLoop:
         if not self._went and t >= crossing.begins:
             self.controller.go()
             self._went = True
-        present = t < crossing.gone
-        if t >= self._looks and (present or self._present):
-            self._present, self._looks = present, t + LOOK_PERIOD
-            self.controller.see(self._bench.avoidance(self._bench.sphere(crossing.at(t)) if present else ()))
+        parts = self._bench.obstacles(crossing, t)
+        if t >= self._looks and (parts or self._present):
+            self._present, self._looks = bool(parts), t + LOOK_PERIOD
+            self.controller.see(self._bench.avoidance(parts))
         began = time.thread_time()
         velocity = self.controller.step(q, TICK)
         run.ticks.append(time.thread_time() - began)
@@ -159,8 +186,8 @@ class InTheLoop:
 class Bench:
     """A task's robot."""
 
-    def __init__(self, engine: Engine, task: str, diameter: float, margin: float) -> None:
-        self.diameter, self.margin = diameter, margin
+    def __init__(self, engine: Engine, task: str, diameter: float, margin: float, *, boxes: bool = False) -> None:
+        self.diameter, self.margin, self._boxes = diameter, margin, boxes
         self.follower: Follower = engine.follower
         self.robot: Robot = engine.follower.robot
         self._task = engine.task(task)
@@ -171,13 +198,25 @@ class Bench:
         self.goal = self.solved.nominal.goal
         self.starts = self.section.postures(self.solved.nominal.starts[:, None])[:, 0]
 
-    def sphere(self, place: Array) -> Sphere:
-        """The sphere with its centre at a place (3,), metres."""
+    def shape(self, place: Array, wxyz: Quaternion = UPRIGHT) -> Obstacle:
+        """The sphere, or box, with its centre at a place (3,), metres."""
+        if self._boxes:
+            a, b, c = self.diameter * BOX
+            return Box(as_point(place), (a, b, c), wxyz)
         return Sphere(as_point(place), self.diameter)
 
-    def avoidance(self, obstacle: Sphere | tuple[()]) -> ArmAvoidance | None:
+    def turned(self, rng: np.random.Generator) -> Quaternion:
+        """A random orientation; spheres need none."""
+        return as_quaternion(rng.normal(size=4)) if self._boxes else UPRIGHT
+
+    def obstacles(self, crossing: Crossing, t: float) -> tuple[Obstacle, ...]:
+        """Those that are there at a time."""
+        places = zip(crossing.passages, crossing.at(t), strict=True)
+        return tuple(self.shape(place, passage.wxyz) for passage, place in places if np.isfinite(place[0]))
+
+    def avoidance(self, obstacles: tuple[Obstacle, ...]) -> ArmAvoidance | None:
         """What the whole arm is to avoid."""
-        return avoiding(self._task, Avoidance(obstacle, space="cspace", margin=self.margin)).arm_avoidance
+        return avoiding(self._task, Avoidance(obstacles, space="cspace", margin=self.margin)).arm_avoidance
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
@@ -191,30 +230,52 @@ class Bench:
         return self.robot.end_effector(joints), joints
 
 
-def crossings(bench: Bench, speed: float, runs: int, seed: int) -> Iterator[tuple[Crossing, float]]:
-    """Spheres that cross, and the seconds that the robot takes without them."""
+def crossings(bench: Bench, speed: float, runs: int, seed: int, num: int = 1) -> Iterator[tuple[Crossing, float]]:
+    """Obstacles that cross, so many at once, and the seconds that the robot takes without them."""
     rng, known = np.random.default_rng(seed), {}
-    body, wall = bench.follower.whole_arm, bench.follower.body.on_pedestal
-    pedestal = wall.positions(bench.robot, bench.starts[0])
     for run in range(runs):
         start = run % len(bench.starts)
         if start not in known:
             known[start] = bench.undisturbed(start)
         hand, joints = known[start]
-        while True:
-            at = int(rng.uniform(0.25, 0.75) * len(hand))
-            path = _path(hand[at] + rng.normal(scale=0.02, size=3), rng)
-            length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-            sphere = bench.sphere(path[0])
-            room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - bench.diameter / 2
-            if (
-                path[:, 2].min() >= bench.diameter / 2 + TABLE_ROOM
-                and room.min() >= PEDESTAL_ROOM
-                and body.clearance(joints[:1], sphere)[0] >= START_ROOM
-            ):
-                break
-        middle = length / 2 / speed
-        yield Crossing(start, max(middle - at * TICK, 0.0), path, length, speed), TICK * len(hand)
+        drawn = [_drawn(bench, hand, joints, speed, rng) for _ in range(num)]
+        times = [at * TICK - length / 2 / speed for at, _, length, _ in drawn]
+        begins = max(0.0, *(-time for time in times))
+        passages = (
+            Passage(path, begins + time, length, speed, wxyz)
+            for time, (_, path, length, wxyz) in zip(times, drawn, strict=True)
+        )
+        yield Crossing(start, begins, tuple(passages)), TICK * len(hand)
+
+
+def _drawn(
+    bench: Bench, hand: Array, joints: Array, speed: float, rng: np.random.Generator
+) -> tuple[int, Array, float, Quaternion]:
+    """Draw an obstacle: the tick at which it is to be at the hand, its path (N, 3), its length, and how it is turned.
+
+    Args:
+        bench: its robot.
+        hand: (T, 3) at all ticks of the undisturbed motion, metres.
+        joints: (T, 6) there, rad.
+        speed: of the obstacle, m/s.
+        rng: what it is drawn by.
+    """
+    body, wall = bench.follower.whole_arm, bench.follower.body.on_pedestal
+    pedestal = wall.positions(bench.robot, bench.starts[0])
+    while True:
+        at = int(rng.uniform(0.25, 0.75) * len(hand))
+        path = _path(hand[at] + rng.normal(scale=0.02, size=3), rng)
+        wxyz = bench.turned(rng)
+        length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        first = bench.shape(path[0], wxyz)
+        room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - first.radius
+        passing = joints[max(0, at - round(length / 2 / speed / TICK))]
+        if (
+            path[:, 2].min() >= first.radius + TABLE_ROOM
+            and room.min() >= PEDESTAL_ROOM
+            and body.clearance(passing[None], first)[0] >= START_ROOM
+        ):
+            return at, path, length, wxyz
 
 
 def _path(middle: Array, rng: np.random.Generator) -> Array:
@@ -232,40 +293,48 @@ def simulated(bench: Bench, crossing: Crossing, arm: Arm) -> Run:
         t = k * TICK
         run.q.append(q)
         run.t.append(t)
-        run.obstacle.append(crossing.at(t) if t < crossing.gone else np.full(3, np.nan))
+        run.obstacle.append(crossing.at(t))
         if t > max(crossing.gone, crossing.begins) and arm.resting:
             break
         q = q + TICK * arm.tick(t, q, crossing, run)
     return run
 
 
-def smallest_distance(bench: Bench, run: Run) -> float:
-    """Smallest distance of the arm's meshes from the sphere, also between ticks, metres."""
-    q, places, robot = np.array(run.q), np.array(run.obstacle), bench.robot
-    there = np.isfinite(places[:, 0])
-    q, places = q[there], places[there]
-    cover = bench.follower.body
-    points = cover.positions(robot, q)
-    gaps = np.linalg.norm(points - places[:, None], axis=2) - cover.radius - bench.diameter / 2
-    model, best = load_collision_model(), np.inf
+def smallest_distance(bench: Bench, run: Run, crossing: Crossing) -> float:
+    """Smallest distance of the arm's meshes from the obstacles, also between ticks, metres."""
+    q, places = np.array(run.q), np.array(run.obstacle)
+    found = np.inf
+    for passage, centres in zip(crossing.passages, places.transpose(1, 0, 2), strict=True):
+        there = np.isfinite(centres[:, 0])
+        found = min(found, _smallest_distance(bench, q[there], centres[there], passage.wxyz))
+    return found
+
+
+def _smallest_distance(bench: Bench, q: Array, places: Array, wxyz: Quaternion) -> float:
+    """The same from one obstacle at places (T, 3), metres, at joints q (T, 6), rad."""
+    cover, model, best = bench.follower.body, load_collision_model(), np.inf
+    points, still = cover.positions(bench.robot, q), bench.shape(np.zeros(3), wxyz)
+
+    def gap(points: Array, place: Array) -> float:
+        """A lower bound, as the spheres cover the meshes."""
+        return float((still.signed_distance(points - place) - cover.radius).min())
 
     def measured(joints: Array, place: Array) -> float:
-        return float(model.obstacle_distance(joints[None], bench.sphere(place))[0][0])
+        return float(model.obstacle_distance(joints[None], bench.shape(place, wxyz))[0][0])
 
-    for k in np.argsort(gaps.min(axis=1)):  # the spheres cover the meshes: their distances are lower bounds
-        if gaps[k].min() >= best:
+    gaps = (still.signed_distance(points - places[:, None]) - cover.radius).min(axis=1)
+    for k in np.argsort(gaps):
+        if gaps[k] >= best:
             break
         best = min(best, measured(q[k], places[k]))
     # between ticks no covering sphere and the obstacle move towards each other by more than both move
     travel = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1) + np.linalg.norm(
         np.diff(places, axis=0), axis=1
     )
-    low = np.minimum(gaps[:-1].min(axis=1), gaps[1:].min(axis=1)) - travel / 2
-    for k in np.flatnonzero(low < best):
+    for k in np.flatnonzero(np.minimum(gaps[:-1], gaps[1:]) - travel / 2 < best):
         for u in np.linspace(0, 1, SUBDIVISIONS + 1)[1:-1]:
             joints, place = (1 - u) * q[k] + u * q[k + 1], (1 - u) * places[k] + u * places[k + 1]
-            near = np.linalg.norm(cover.positions(robot, joints) - place, axis=1) - cover.radius
-            if near.min() - bench.diameter / 2 < best:
+            if gap(cover.positions(bench.robot, joints), place) < best:
                 best = min(best, measured(joints, place))
     return best
 
@@ -281,7 +350,7 @@ class _Field:
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
         """See `Arm`."""
         if t >= self._next - TICK / 2:
-            sphere = self._bench.sphere(crossing.at(t)) if t < crossing.gone else None
+            sphere = next(iter(self._bench.obstacles(crossing, t)), None)
             self._wanted = self._at(q, sphere) if t >= crossing.begins else self._away(q, sphere)
             self._next += self._period
         limits = self._bench.robot.velocity_limits
@@ -298,10 +367,10 @@ class _Field:
         missed = np.linalg.norm(self._bench.robot.end_effector(self._q) - self._bench.goal)
         return bool(missed < AT_GOAL / 10)
 
-    def _at(self, q: Array, sphere: Sphere | None) -> Array:
+    def _at(self, q: Array, sphere: Obstacle | None) -> Array:
         raise NotImplementedError
 
-    def _away(self, q: Array, sphere: Sphere | None) -> Array:
+    def _away(self, q: Array, sphere: Obstacle | None) -> Array:
         return np.zeros(NUM_JOINTS)
 
 
@@ -312,11 +381,11 @@ class Potential(_Field):
         super().__init__(bench, 2 * TICK)
         self._hand = bench.solved.stack.system.at_tolerance(1e-5)
 
-    def _at(self, q: Array, sphere: Sphere | None) -> Array:
+    def _at(self, q: Array, sphere: Obstacle | None) -> Array:
         velocity = self._hand.velocity(self._bench.robot.end_effector(q))
         return self._bench.section.velocities(q, velocity) + self._away(q, sphere)
 
-    def _away(self, q: Array, sphere: Sphere | None) -> Array:
+    def _away(self, q: Array, sphere: Obstacle | None) -> Array:
         if sphere is None:
             return np.zeros(NUM_JOINTS)
         robot, body = self._bench.robot, self._bench.follower.whole_arm.body
@@ -342,9 +411,9 @@ class Stepped(_Field):
         super().__init__(bench, PAPER_PERIOD)
         self._dodging = Controller(bench.follower, bench.solved)
 
-    def _at(self, q: Array, sphere: Sphere | None) -> Array:
+    def _at(self, q: Array, sphere: Obstacle | None) -> Array:
         bench = self._bench
-        self._dodging.see(bench.avoidance(() if sphere is None else sphere))
+        self._dodging.see(bench.avoidance(() if sphere is None else (sphere,)))
         self._dodging.step(q, self._period)
         system: ArmSystem = self._dodging.system
         return system.velocity(bench.follower.whole_arm.limits.inside(q))
@@ -353,9 +422,13 @@ class Stepped(_Field):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the subcommand's arguments."""
     add_task(parser)
-    parser.add_argument("--speed", type=positive_number("m/s", 2), required=True, metavar="V", help="of the sphere")
+    parser.add_argument("--speed", type=positive_number("m/s", 2), required=True, metavar="V", help="of the obstacle")
     parser.add_argument("--runs", type=whole_number(1), default=20, help="(default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the paths (default: %(default)s)")
+    parser.add_argument("--obstacles", type=whole_number(1), default=1, help="at once (default: %(default)s)")
+    parser.add_argument(
+        "--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned at random, not spheres"
+    )
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
     parser.add_argument("--no-anticipation", action="store_true", help="the flow is made for where the sphere was seen")
@@ -367,9 +440,10 @@ def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".npz")
-    bench = Bench(
-        Engine(tasks, FitStore(default_cache_folder()), load_jaco()), task.name, options.diameter, options.margin
-    )
+    if options.beside and (options.boxes or options.obstacles > 1):
+        raise InputError("--beside", "several obstacles, or boxes", "one sphere")
+    engine = Engine(tasks, FitStore(default_cache_folder()), load_jaco())
+    bench = Bench(engine, task.name, options.diameter, options.margin, boxes=options.boxes)
     settings = ControllerSettings(lead=0.0, room=0.0) if options.no_anticipation else ControllerSettings()
     kinds: dict[str, Callable[[Crossing], Arm]] = {"": lambda crossing: InTheLoop(bench, crossing, settings)}
     if options.beside:
@@ -377,16 +451,21 @@ def run(options: argparse.Namespace) -> int:
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: dict[str, list[Figures]] = {kind: [] for kind in kinds}
     rows = []
-    for i, (crossing, seconds) in enumerate(crossings(bench, options.speed, options.runs, options.seed)):
+    found_crossings = crossings(bench, options.speed, options.runs, options.seed, options.obstacles)
+    for i, (crossing, seconds) in enumerate(found_crossings):
         for kind, make in kinds.items():
             found = simulated(bench, crossing, make(crossing))
             figures[kind].append(Figures.of(bench, crossing, found, seconds))
-            arrays |= {f"{kind}q_{i}": found.q, f"{kind}t_{i}": found.t, f"{kind}obstacle_{i}": found.obstacle}
+            places = np.array(found.obstacle)[:, 0] if options.obstacles == 1 else found.obstacle
+            arrays |= {f"{kind}q_{i}": found.q, f"{kind}t_{i}": found.t, f"{kind}obstacle_{i}": places}
             if not kind:
+                arrays[f"wxyz_{i}"] = [passage.wxyz for passage in crossing.passages]
                 rows.append((str(i), *figures[kind][-1].cells()))
                 print(*rows[-1], " ".join(sorted(p.value for p in found.phases)), flush=True)
     write_npz(out, **arrays)
-    print(f"\n{task.name}, sphere of {options.diameter:g} m at {options.speed:g} m/s, margin {options.margin:g} m")
+    shape = "box" if options.boxes else "sphere"
+    size = f"{options.obstacles} {shape}(s) of {options.diameter:g} m"
+    print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {options.margin:g} m")
     names = {"": "in the loop", "potential_": "potential field", "stepped_": "stepped at 20 Hz"}
     print_table(HEADER, [(names[kind], *summary(found)) for kind, found in figures.items()])
     return 0
@@ -420,7 +499,7 @@ class Figures:
         q = np.array(run.q)
         velocity = np.diff(q, axis=0, prepend=q[:1]) / TICK
         return cls(
-            smallest_distance(bench, run),
+            smallest_distance(bench, run, crossing),
             float(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal)),
             float((np.abs(velocity) / bench.robot.velocity_limits).max()),
             float(np.abs(np.diff(velocity, axis=0)).max() / TICK / ControllerSettings().acceleration),
