@@ -41,10 +41,6 @@ class Memo:
                 del results[next(iter(results))]
         return result
 
-    def has(self, kind: str, key: Hashable) -> bool:
-        """Whether the result for a key is kept."""
-        return key in self._results[kind]
-
     def count(self, kind: str) -> int:
         """Number of results of a kind that are kept."""
         return len(self._results[kind])

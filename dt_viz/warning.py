@@ -37,8 +37,6 @@ class Kind(Enum):
     """A motion gives way to an obstacle and passes beside a bias point."""
     UNSAMPLED = auto()
     """The motions are stretched too far to be drawn exactly."""
-    START_LEFT_OUT = auto()
-    """The arm cannot begin an added motion."""
     OUT_OF_REACH = auto()
     """The arm cannot reach a place."""
     PATH_MISSED = auto()

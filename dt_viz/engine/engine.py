@@ -210,15 +210,14 @@ class Engine:
         Where that is blocked it stays with the motion that is shown, and gives way to what is in its way now.
         """
         scenario = frame.scenario
-        with _in_turn():
-            if frame.blocked:
-                solved = replace(self._shown[scenario.task].newest, scenario=scenario.motion)
-            else:
-                solved = self.solved(scenario, LIVE if frame.stage < Stage.FINE else FINE)
-            try:
-                self.arm.follow(solved, frame.chosen)
-            except UnreachableError:
-                self.arm.stop()
+        if frame.blocked:
+            solved = replace(self._shown[scenario.task].newest, scenario=scenario.motion)
+        else:
+            solved = self.solved(scenario, LIVE if frame.stage < Stage.FINE else FINE)
+        try:
+            self.arm.follow(solved, frame.chosen)
+        except UnreachableError:
+            self.arm.stop()
 
     def _learned(self, scenario: Scenario, progress: Progress | None) -> Learned:
         task = self.task(scenario.task)
@@ -260,11 +259,10 @@ class Engine:
     def _stages(self, scenario: Scenario, checkpoint: Checkpoint) -> Iterator[Frame]:
         with _in_turn():
             blocked = self._blocked(scenario, LIVE)
-        if blocked:
+            frame = None if blocked else self._rollouts(scenario, LIVE)
+        if frame is None:
             yield from self._stages_without_motion(scenario, blocked, checkpoint)
             return
-        with _in_turn():
-            frame = self._rollouts(scenario, LIVE)
         yield frame
         with _in_turn():
             frame, live = self._with_arm(scenario, LIVE), self.solved(scenario, LIVE)
