@@ -259,11 +259,11 @@ class Engine:
     def _stages(self, scenario: Scenario, checkpoint: Checkpoint) -> Iterator[Frame]:
         with _in_turn():
             blocked = self._blocked(scenario, LIVE)
-            frame = None if blocked else self._rollouts(scenario, LIVE)
-        if frame is None:
+            first = None if blocked else self._rollouts(scenario, LIVE)
+        if first is None:
             yield from self._stages_without_motion(scenario, blocked, checkpoint)
             return
-        yield frame
+        yield first
         with _in_turn():
             frame, live = self._with_arm(scenario, LIVE), self.solved(scenario, LIVE)
             frame = replace(frame, stage=Stage.LIVE, pictures=self._pictures(scenario, live, coarse=True))

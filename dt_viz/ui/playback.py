@@ -15,7 +15,10 @@ from dt_viz.flows.fields import Array
 
 logger = logging.getLogger(__name__)
 
-PICTURES_PER_SECOND = 20
+SHORTEST, LONGEST = 1 / 20, 1 / 6
+"""Bounds of the time from one picture of the arm to the next, seconds."""
+PART = 1 / 12
+"""Part of that time that moving and drawing the arm takes, at most: the more visitors there are, the fewer pictures."""
 
 
 def at_moment(motion: ArmMotion, moment: float) -> tuple[Array, Array]:
@@ -122,9 +125,8 @@ class Playback:
             self._thread.join(timeout=1)
 
     def _loop(self) -> None:
-        period = 1 / PICTURES_PER_SECOND
+        period = SHORTEST
         before = time.monotonic()
-        # at even times, however long a picture takes
         while not self._closed.wait(max(0.0, before + period - time.monotonic())):
             now = time.monotonic()
             try:
@@ -133,7 +135,7 @@ class Playback:
                 logger.exception("the arm stopped")
                 self.live.stop()
                 self._fail(error)
-            before = now
+            before, period = now, min(max(SHORTEST, (time.monotonic() - now) / PART), LONGEST)
 
     def advance(self, seconds: float) -> None:
         """Let some real time pass, in seconds, and have the arm drawn; called by the playback's thread only."""

@@ -174,12 +174,13 @@ def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, init
 
 
 def test_an_engine_keeps_the_stance_that_it_shows_while_an_obstacle_is_dragged(new_engine, initial):
-    engine, stances = new_engine(), []
+    engine = new_engine()
     nominal = engine.nominal(initial("push_box"))
-    for distance in np.arange(0.11, 0.195, 0.01):
-        ball = beside_goal(nominal, distance)
-        scenario = changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN)
+    balls = [beside_goal(nominal, distance) for distance in np.arange(0.11, 0.195, 0.01)]
+    scenarios = [changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN) for ball in balls]
+    stances = []
+    for scenario in scenarios:
         assert not frame_at(engine, scenario, Stage.LIVE).blocked
         stances.append(engine.solved(scenario, LIVE).nominal.stance)
     assert stances[0] is not None and set(stances) == {stances[0]}
-    assert new_engine().solved(scenario, LIVE).nominal.stance != stances[0]
+    assert new_engine().solved(scenarios[-1], LIVE).nominal.stance != stances[0]

@@ -1,6 +1,7 @@
 """Playback: the arm in the loop, or its finished motion again and again, on a thread of its own."""
 
 import threading
+import time
 from typing import Any, cast
 
 import numpy as np
@@ -63,7 +64,7 @@ def ramp(begin, end, seconds):
 
 @pytest.fixture
 def player(monkeypatch):
-    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 1e-4)  # its thread sleeps until it is closed
+    monkeypatch.setattr(playback_module, "SHORTEST", 1e4)  # its thread sleeps until it is closed
     player = Player()
     yield player
     player.playback.close()
@@ -78,7 +79,7 @@ def test_both_arms_are_shown_at_the_same_moment(moment):
 
 
 def test_the_arm_moves_without_being_asked_to(monkeypatch):
-    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
+    monkeypatch.setattr(playback_module, "SHORTEST", 1 / 200)
     arm, moved = Arm(), threading.Event()
     playback = playback_of(arm, lambda: moved.set() if arm.q[0] > 0.1 else None)
     assert moved.wait(PATIENCE)
@@ -86,7 +87,7 @@ def test_the_arm_moves_without_being_asked_to(monkeypatch):
 
 
 def test_an_arm_that_cannot_move_is_said_to_and_waits_for_its_next_motion(monkeypatch):
-    monkeypatch.setattr(playback_module, "PICTURES_PER_SECOND", 200)
+    monkeypatch.setattr(playback_module, "SHORTEST", 1 / 200)
     arm: Any = Arm()
     said, moved = [], threading.Event()
     advance = arm.advance
@@ -112,6 +113,22 @@ def test_nothing_moves_before_it_begins():
     playback.begin()
     assert drawn.wait(PATIENCE)
     playback.close()
+
+
+def test_the_longer_a_picture_takes_the_fewer_there_are(monkeypatch):
+    monkeypatch.setattr(playback_module, "SHORTEST", 1e-3)
+    begun, enough = [], threading.Event()
+
+    def draw():
+        begun.append(time.monotonic())
+        time.sleep(0.005)
+        if len(begun) > 5:
+            enough.set()
+
+    playback = playback_of(Arm(), draw)
+    assert enough.wait(PATIENCE)
+    playback.close()
+    assert np.diff(begun)[1:].min() > 0.9 * 0.005 / playback_module.PART
 
 
 def test_its_time_has_the_chosen_pace_and_a_pause_stops_it(player):
