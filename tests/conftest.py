@@ -30,7 +30,9 @@ from hypothesis import HealthCheck, settings
 from playwright.sync_api import sync_playwright
 from scenes import avoiding, frame_at
 
+from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.robot import Robot, load_jaco
+from dt_viz.arm.whole_arm import WholeArm
 from dt_viz.engine.engine import Engine
 from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Sphere
@@ -45,6 +47,12 @@ settings.register_profile(
     max_examples=25,
 )
 settings.load_profile("dt-viz")
+
+
+def pytest_sessionstart(session):
+    """Compile once what workers then load, so that no test takes as long as compiling does."""
+    if getattr(session.config.option, "numprocesses", None):
+        list(WholeArm(load_jaco(), load_body_points()).compiled())
 
 
 @pytest.fixture(autouse=True)
