@@ -43,8 +43,9 @@ GAIN = 2.0
 """g in mean half sizes of the obstacle, so that a motion through its middle takes somewhat less than a unit of time."""
 ASLEEP = 3.0
 """‖A(y − c)‖ from which on an end hardly moves, so that the field needs no factor for it."""
-END_RADIUS = 0.5
-"""ρ_e relative to the distance of the end from the motions in the obstacle."""
+END_RADIUS, LEAST_END_RADIUS = 0.5, 2e-3
+"""ρ_e relative to the distance of the end from the motions in the obstacle, and at least, metres: an end may lack the
+margin itself, and the field is not to jump there."""
 SLOWEST = 0.3
 """Smallest speed, in g, that the duration allows for: samples beside an end are hardly carried."""
 LONGEST = 2.0
@@ -214,7 +215,7 @@ class Passes:
         ends = self.ends[np.linalg.norm((self.ends - centre) @ inverse.T, axis=1) < ASLEEP]
         distance = np.linalg.norm(self.points[:, None] - ends, axis=2).min(axis=0)
         gain = GAIN * float(half.mean())
-        field = Sideways(centre, inverse, gain * direction, ends, np.maximum(END_RADIUS * distance, TINY))
+        field = Sideways(centre, inverse, gain * direction, ends, np.maximum(END_RADIUS * distance, LEAST_END_RADIUS))
         on_the_way = self.points + (np.linspace(0, 1, len(SIMPSON))[:, None] * way)[:, :, None] * direction
         speed = -(field(on_the_way.reshape(-1, 3)) @ direction).reshape(len(SIMPSON), -1)
         duration = way * (SIMPSON @ (1 / np.maximum(speed, SLOWEST * gain)))

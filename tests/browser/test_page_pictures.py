@@ -12,8 +12,9 @@ pytestmark = [pytest.mark.browser, needs_chromium]
 
 
 @pytest.mark.slow
-def test_a_scene_is_seen_with_its_panels_and_nothing_is_complained_of(tmp_path, capsys):
+def test_a_scene_is_seen_with_its_panels_and_nothing_is_complained_of(tmp_path, capsys, monkeypatch):
     """A picture of fig. 2 has the colours of rollouts and goals in each third of what the panel leaves."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert main(["pictures", "--only", "steps", "--size", "1280,720", "--out", str(tmp_path)]) == 0
     assert SCENES["steps"].title in capsys.readouterr().out
     image = np.asarray(Image.open(tmp_path / "steps.png").convert("RGB")).astype(int)

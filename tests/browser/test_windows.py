@@ -108,7 +108,7 @@ def faults(boxes):
 @windows(PHONE, PROJECTOR)
 def test_nothing_of_the_first_controls_is_cut_or_overlaps(visit):
     page, _ = visit
-    assert faults(boxes(page)) == []
+    wait_until(lambda: faults(boxes(page)) == [], "the panel is laid out")
 
 
 @windows(PROJECTOR)
