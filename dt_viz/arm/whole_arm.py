@@ -73,7 +73,7 @@ MAX_EXTENSION = 0.15
 NUM_EXTENDED_FOR = 40
 """Number of samples, those that lack most, that this time is chosen for."""
 COARSE_STEP = 0.2
-"""Length of a coarse RK4 step, in flow time: off by a tenth of a millimetre at the hand, about."""
+"""Length of a coarse RK4 step, in flow time: off by at most 0.4 mm at the hand in drags around Draw S."""
 COARSE_SPACING = 0.025
 """Distance, metres at the hand, about, up to which neighbouring samples of coarse motions may be apart."""
 TOLERANCE = 3e-9
@@ -220,7 +220,7 @@ class WholeArm:
             lambda: self.robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
             lambda: proximity(self.robot.records, self.links.records, shapes, values, q[0].copy(), 1.0),
-            lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, MAX_DURATION),
+            lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
             lambda: field.rk4(q, 1.0, 1),
             lambda: field.dormand_prince(q, 1.0, TOLERANCE, 1000),

@@ -1,16 +1,16 @@
 """Drag an obstacle or a bias point through a motion and measure the time from each edit until its frame is ready.
 
 Session, worker and engine are the real ones; a display that records replaces the page. The JSON file holds, in
-milliseconds and over all sessions together:
+milliseconds, the median and the 95 % of
 
 ``median_ms``, ``p95_ms``
-    from an edit until its rollouts are ready (stage ROLLOUTS, the first frame of a rebuild).
+    the time from an edit until its rollouts are ready (stage ROLLOUTS, the first frame of a rebuild).
 ``live_median_ms``, ``live_p95_ms``
-    from an edit until the vector field is ready, too (stage LIVE).
-``rebuild_median_ms``
-    for computing the rollouts alone, without the wait for the frame before.
+    that until the vector field is ready, too (stage LIVE).
+``rebuild_median_ms``, ``rebuild_p95_ms``
+    that for computing the rollouts alone, without the wait for the frame before.
 ``whole_median_ms``, ``whole_p95_ms``
-    for all of a drag's frame: rollouts, what the robot in the loop is given, the field.
+    that for computing all of a drag's frame: rollouts, what the robot in the loop is given, the field.
 ``unit_ms``
     time of a fixed piece of numpy work, in which figures of different machines compare.
 ``frames``, ``skipped``
@@ -24,7 +24,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Pace, Session
+from dt_viz.engine.session import Display, Pace, Session
 from dt_viz.evaluate.options import (
     InputError,
     add_space,
@@ -70,7 +70,7 @@ PATIENCE = 120.0
 
 
 @dataclass
-class Recorder:
+class Recorder(Display):
     """A display that only records."""
 
     frames: list[tuple[Stage, float, float]] = field(default_factory=list)
@@ -81,22 +81,11 @@ class Recorder:
     error: Exception | None = None
 
     def draw(self, frame: Frame, pace: Pace) -> None:
-        """See `Display`."""
         self.frames.append((frame.stage, pace.latency, frame.seconds))
         self.num_skipped, self.num_rollouts = pace.num_skipped, len(frame.rollouts)
 
-    def adopt(self, scenario: Scenario) -> None:
-        """See `Display`."""
-
-    def learning(self, fraction: float, message: str) -> None:
-        """See `Display`."""
-
     def fail(self, error: Exception) -> None:
-        """See `Display`."""
         self.error = error
-
-    def cancelled(self, task: str) -> None:
-        """See `Display`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -107,62 +96,48 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--obstacles", type=whole_number(0), default=1, help="in the scene, along the path (default: %(default)s)"
     )
-    parser.add_argument("--sessions", type=whole_number(1), default=1, help="that drag at once (default: %(default)s)")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), required=True, help="to measure")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 1 if a session reported an error."""
+    """Run the subcommand; 1 if the session reported an error."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".json")
-    fits = FitStore(default_cache_folder())
+    fits, scenario, shown = FitStore(default_cache_folder()), _scenario(task, options), Recorder()
     fits.get(task.demonstrations)
-    scenario = _scenario(task, options)
-    recorders = [Recorder() for _ in range(options.sessions)]
-    robot = load_jaco()
-    sessions = [Session(Engine(tasks, fits, robot), lambda _: scenario, task.name, shown) for shown in recorders]
+    session = Session(Engine(tasks, fits, load_jaco()), lambda _: scenario, task.name, shown)
     positions = moving_through(task)
     try:
-        _settle(sessions)
-        _drag(sessions, positions, WARM_UP_SECONDS)
-        _settle(sessions)
-        skipped_before = sum(recorder.num_skipped for recorder in recorders)
-        for recorder in recorders:
-            recorder.frames.clear()
-        num_edits, elapsed = _drag(sessions, positions, options.seconds)
-        _settle(sessions)
+        _settle(session)
+        _drag(session, positions, WARM_UP_SECONDS)
+        _settle(session)
+        skipped_before = shown.num_skipped
+        shown.frames.clear()
+        num_edits, elapsed = _drag(session, positions, options.seconds)
+        _settle(session)
     finally:
-        for session in sessions:
-            session.close()
-    for recorder in recorders:
-        if recorder.error is not None:
-            print(f"a session failed: {recorder.error}", file=sys.stderr)
-            return 1
-    frames = [frame for recorder in recorders for frame in recorder.frames]
-    first = 1e3 * np.array([seconds for stage, seconds, _ in frames if stage is Stage.ROLLOUTS])
-    live = 1e3 * np.array([seconds for stage, seconds, _ in frames if stage is Stage.LIVE])
-    rebuild = 1e3 * np.array([seconds for stage, _, seconds in frames if stage is Stage.ROLLOUTS])
-    whole, unit = 1e3 * np.array([seconds for stage, _, seconds in frames if stage is Stage.LIVE]), unit_ms()
+        session.close()
+    if shown.error is not None:
+        print(f"the session failed: {shown.error}", file=sys.stderr)
+        return 1
+    first, live = (np.array([f[1:] for f in shown.frames if f[0] is stage]) for stage in (Stage.ROLLOUTS, Stage.LIVE))
+    unit, num_skipped = unit_ms(), shown.num_skipped - skipped_before
+    seconds = {"": first[:, 0], "live_": live[:, 0], "rebuild_": first[:, 1], "whole_": live[:, 1]}
+    spreads = {name: 1e3 * np.percentile(values, [50, 95]) for name, values in seconds.items()}
     figures = {
-        "median_ms": float(np.median(first)),
-        "p95_ms": float(np.percentile(first, 95)),
+        **{f"{name}median_ms": float(median) for name, (median, _) in spreads.items()},
+        **{f"{name}p95_ms": float(p95) for name, (_, p95) in spreads.items()},
         "frames": len(first),
-        "skipped": sum(recorder.num_skipped for recorder in recorders) - skipped_before,
-        "live_median_ms": float(np.median(live)),
-        "live_p95_ms": float(np.percentile(live, 95)),
-        "rebuild_median_ms": float(np.median(rebuild)),
-        "whole_median_ms": float(np.median(whole)),
-        "whole_p95_ms": float(np.percentile(whole, 95)),
+        "skipped": num_skipped,
         "unit_ms": unit,
         "settings": {
             "task": task.name,
             "space": options.space,
-            "sessions": options.sessions,
             "seconds": options.seconds,
             "edits": num_edits,
-            "edits_per_second": num_edits / options.sessions / elapsed,
-            "rollouts": recorders[0].num_rollouts,
+            "edits_per_second": num_edits / elapsed,
+            "rollouts": shown.num_rollouts,
             "points_a_rollout": NUM_SAMPLES if options.space == "task" else NUM_CONFIGURATIONS,
             "drag": options.drag,
             "obstacles": options.obstacles,
@@ -172,23 +147,12 @@ def run(options: argparse.Namespace) -> int:
         },
     }
     write_json(out, figures)
-    print(f"{task.name}, {options.sessions} session(s), {recorders[0].num_rollouts} rollouts")
-    print_table(
-        ("edit → frame ready", "median ms", "95 % ms"),
-        [
-            ("rollouts", f"{figures['median_ms']:.1f}", f"{figures['p95_ms']:.1f}"),
-            ("also the field", f"{figures['live_median_ms']:.1f}", f"{figures['live_p95_ms']:.1f}"),
-            ("computing rollouts", f"{figures['rebuild_median_ms']:.1f}", f"{np.percentile(rebuild, 95):.1f}"),
-            ("computing all of it", f"{figures['whole_median_ms']:.1f}", f"{figures['whole_p95_ms']:.1f}"),
-            (
-                f"  in units of {unit:.1f} ms",
-                f"{np.median(whole) / unit:.1f}",
-                f"{np.percentile(whole, 95) / unit:.1f}",
-            ),
-        ],
-    )
-    rate = len(first) / options.sessions / elapsed
-    print(f"{num_edits} edits, {len(first)} frames ({rate:.1f} a second and session), {figures['skipped']} skipped")
+    print(f"{task.name}, {shown.num_rollouts} rollouts")
+    names = ("rollouts", "also the field", "computing rollouts", "computing all of it")
+    rows = [(name, *(f"{ms:.1f}" for ms in spread)) for name, spread in zip(names, spreads.values(), strict=True)]
+    in_units = (f"  in units of {unit:.1f} ms", *(f"{ms / unit:.1f}" for ms in spreads["whole_"]))
+    print_table(("edit → frame ready", "median ms", "95 % ms"), [*rows, in_units])
+    print(f"{num_edits} edits, {len(first)} frames ({len(first) / elapsed:.1f} a second), {num_skipped} skipped")
     return 0
 
 
@@ -225,23 +189,16 @@ def _moved(scenario: Scenario, place: tuple[float, float, float]) -> dict[str, A
 
 
 def _drag(
-    sessions: Sequence[Session], position: Callable[[float], tuple[float, float, float]], seconds: float
+    session: Session, position: Callable[[float], tuple[float, float, float]], seconds: float
 ) -> tuple[int, float]:
-    """Edit all sessions at `EDITS_PER_SECOND` from this thread, as a server's event loop does.
-
-    Each session is at a place of its own on the curve. Return the number of edits and their time in seconds.
-    """
-    began = time.perf_counter()
-    ticks = max(1, round(EDITS_PER_SECOND * seconds))
-    for tick in range(1, ticks + 1):
+    """Edit at `EDITS_PER_SECOND` from this thread; return the number of edits and their time, seconds."""
+    began, num = time.perf_counter(), max(1, round(EDITS_PER_SECOND * seconds))
+    for tick in range(1, num + 1):
         time.sleep(max(0.0, began + tick / EDITS_PER_SECOND - time.perf_counter()))
-        for k, session in enumerate(sessions):
-            place = position(tick / EDITS_PER_SECOND + 1.7 * k)
-            session.edit("drag", **_moved(session.scenario, place))
-    return ticks * len(sessions), time.perf_counter() - began
+        session.edit("drag", **_moved(session.scenario, position(tick / EDITS_PER_SECOND)))
+    return num, time.perf_counter() - began
 
 
-def _settle(sessions: Sequence[Session]) -> None:
-    for session in sessions:
-        if not session.wait_idle(PATIENCE):
-            raise InputError("--task", f"frames that take more than {PATIENCE:g} s", "a task that can be shown live")
+def _settle(session: Session) -> None:
+    if not session.wait_idle(PATIENCE):
+        raise InputError("--task", f"frames that take more than {PATIENCE:g} s", "a task that can be shown live")

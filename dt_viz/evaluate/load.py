@@ -15,9 +15,9 @@ all (figures of different machines compare in this unit), and under ``visits`` f
     end; ``lost``, why the connection ended, empty if it did not.
 ``ping_ms``
     round trips of WebSocket pings to the server's event loop, all visitors together.
-``cores``, ``peak_memory_mb``, ``threads``
-    processor time of the server in a second, and what it has at most; null if its process is unknown, or the system
-    does not report them.
+``cores``, ``peak_memory_mb``
+    processor time of the server in a second, and its memory at most; null if its process is unknown, or the system does
+    not report them.
 ``messages_per_s``
     number of WebSocket messages that each visitor receives.
 
@@ -34,7 +34,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,8 +89,6 @@ class Visit:
     bytes received until then."""
     pings: list[float] = field(default_factory=list)
     """Round trips, seconds."""
-    num_messages: int = 0
-    """Number of messages that came while it was measured."""
     lost: str = ""
     """Reason for the end of the connection; empty while it lasts."""
 
@@ -104,7 +102,7 @@ class Visit:
             self.seen.append((edit, now, self.client.num_bytes))
 
     async def drag(self, places: Sequence[Point]) -> None:
-        """Drag the obstacle through places, let it go, and wait for the picture of the last one."""
+        """Drag the obstacle through places, and let it go."""
         self.client.changed = self.see
         await self.client.grab()
         began = time.perf_counter()
@@ -120,16 +118,17 @@ class Visit:
         """Whether the last edit is answered."""
         return bool(self.seen) and self.seen[-1][0] == len(self.sent) - 1
 
-    def figures(self) -> dict[str, Any]:
-        """The figures of a visitor that has dragged; see the module. Pictures count until the last edit."""
-        began, ended = self.sent[0], self.sent[-1]
-        during = [now for _, now, _ in self.seen if now <= ended]
+    def figures(self, seconds: float) -> dict[str, Any]:
+        """The figures of a visitor that was to drag for so long; see the module. Later pictures do not count."""
+        began = self.sent[0] if self.sent else 0.0
+        during = [now for _, now, _ in self.seen if now <= began + seconds]
+        sizes = np.diff([total for *_, total in self.seen])
         return {
-            "pictures_per_s": len(during) * EDITS_PER_SECOND / len(self.sent),
-            "gap_ms": _spread(np.diff([began, *during, ended])),
+            "pictures_per_s": len(during) / seconds,
+            "gap_ms": _spread(np.diff([began, *during, began + seconds])),
             "latency_ms": _spread(np.array([now - self.sent[edit] for edit, now, _ in self.seen])),
-            "bytes": float(np.median(np.diff([total for *_, total in self.seen]))) if len(self.seen) > 1 else None,
-            "last_shown": self.last_shown,
+            "bytes": float(np.median(sizes)) if len(sizes) else None,
+            "last_shown": self.last_shown and not self.lost,
             "lost": self.lost,
         }
 
@@ -164,7 +163,8 @@ def run(options: argparse.Namespace) -> int:
         settings = {"task": task.name, "avoid": options.avoid, "seconds": options.seconds, "rest": options.rest}
         machine = {"cores": os.cpu_count(), "python": platform.python_version(), "numpy": np.__version__}
         write_json(out, {"unit_ms": unit, "visits": visits, "settings": settings | machine})
-    return 0 if all(_is_complete(figures, rest=options.rest) for figures in visits) else 1
+    last = [visitor.get("last_shown", not visitor["lost"]) for figures in visits for visitor in figures["visitors"]]
+    return 0 if len(last) == sum(options.clients) and all(last) else 1
 
 
 def places_of(task: Task, number: int, num_edits: int) -> list[Point]:
@@ -187,22 +187,24 @@ async def _visited(
         if None in firsts:
             return figures
         await asyncio.sleep(SETTLED)
-        visits = [Visit(client) for client in clients]
-        before, began = _processor_seconds(process), time.perf_counter()
-        num_edits = 0 if options.rest else max(1, round(EDITS_PER_SECOND * options.seconds))
-        drags = (_measured(visit, places_of(task, k, num_edits), options.seconds) for k, visit in enumerate(visits))
-        await asyncio.gather(*drags)
+        visits, num_edits = [Visit(client) for client in clients], max(1, round(EDITS_PER_SECOND * options.seconds))
+        before, num_before = _processor_seconds(process), sum(client.num_messages for client in clients)
+        began = time.perf_counter()
+        drags = [() if options.rest else places_of(task, k, num_edits) for k in range(number)]
+        measured = (_measured(visit, places, options.seconds) for visit, places in zip(visits, drags, strict=True))
+        await asyncio.gather(*measured)
         elapsed, after = time.perf_counter() - began, _processor_seconds(process)
+        num_messages = sum(client.num_messages for client in clients) - num_before
         for visit in visits if not options.rest else ():
             with suppress(LostError):
                 await visit.client.wait_for(lambda visit=visit: visit.last_shown, PATIENCE)
+        seconds = num_edits / EDITS_PER_SECOND
         return figures | {
-            "visitors": [{"lost": visit.lost} if options.rest else visit.figures() for visit in visits],
+            "visitors": [{"lost": visit.lost} if options.rest else visit.figures(seconds) for visit in visits],
             "ping_ms": _spread(np.array([ping for visit in visits for ping in visit.pings])),
-            "messages_per_s": float(np.mean([visit.num_messages for visit in visits])) / elapsed,
+            "messages_per_s": num_messages / number / elapsed,
             "cores": None if before is None or after is None else (after - before) / elapsed,
-            "peak_memory_mb": _status(process, "VmHWM", 1024),
-            "threads": _status(process, "Threads"),
+            "peak_memory_mb": _peak_memory(process),
         }
 
 
@@ -225,13 +227,11 @@ async def _first_picture(
 
 async def _measured(visit: Visit, places: Sequence[Point], seconds: float) -> None:
     """Have a visitor drag through places, or look on for some seconds if there are none, and ping the server."""
-    before = visit.client.num_messages
     pinging = asyncio.create_task(_ping(visit))
     try:
         await (visit.drag(places) if places else asyncio.sleep(seconds))
     except LostError as error:
         visit.lost = str(error)
-    visit.num_messages = visit.client.num_messages - before
     pinging.cancel()
     with suppress(asyncio.CancelledError):
         await pinging
@@ -271,14 +271,12 @@ def _server(options: argparse.Namespace, number: int) -> Iterator[tuple[str, int
             process.terminate()
 
 
-def _status(process: int | None, name: str, divisor: int = 1) -> int | None:
-    """Read a number of /proc/PID/status, kB or a count; None if there is none."""
-    try:
-        text = Path(f"/proc/{process}/status").read_text(encoding="ascii")
-    except OSError:
-        return None
-    found = re.search(rf"^{name}:\s*(\d+)", text, re.MULTILINE)
-    return None if found is None else int(found[1]) // divisor
+def _peak_memory(process: int | None) -> float | None:
+    """The most memory that a process has had, MB; None if it is gone, or the system does not report it."""
+    with suppress(OSError):
+        found = re.search(r"VmHWM:\s*(\d+)", Path(f"/proc/{process}/status").read_text(encoding="ascii"))
+        return None if found is None else int(found[1]) / 1024
+    return None
 
 
 def _processor_seconds(process: int | None) -> float | None:
@@ -296,11 +294,6 @@ def _spread(seconds: Array) -> dict[str, float] | None:
         return None
     median, p95, worst = 1e3 * np.percentile(seconds, [50, 95, 100])
     return {"median": float(median), "p95": float(p95), "worst": float(worst)}
-
-
-def _is_complete(figures: Mapping[str, Any], *, rest: bool) -> bool:
-    visitors = figures["visitors"]
-    return bool(visitors) and all(not visitor["lost"] and (rest or visitor["last_shown"]) for visitor in visitors)
 
 
 def _print(visits: Sequence[Mapping[str, Any]]) -> None:
@@ -323,19 +316,17 @@ def _row(figures: Mapping[str, Any]) -> tuple[str, ...]:
         _text(max((visitor["bytes"] / 1e3 for visitor in shown if visitor["bytes"]), default=None), ".0f"),
         _worst([figures.get("ping_ms")]),
         _text(figures.get("cores"), ".2f"),
-        _text(figures.get("peak_memory_mb"), "d"),
+        _text(figures.get("peak_memory_mb"), ".0f"),
         _text(figures.get("messages_per_s"), ".0f"),
         str(sum(bool(visitor["lost"]) for visitor in visitors) + firsts.count(None)),
         f"{sum(visitor['last_shown'] for visitor in shown)} of {len(shown)}" if shown else "–",
     )
 
 
-def _worst(spreads: Iterator[dict[str, float] | None] | Sequence[dict[str, float] | None]) -> str:
+def _worst(spreads: Iterable[dict[str, float] | None]) -> str:
     """Text of the largest median, 95 % and worst of several spreads."""
     known = [spread for spread in spreads if spread is not None]
-    if not known:
-        return "–"
-    return " / ".join(f"{max(spread[name] for spread in known):.0f}" for name in ("median", "p95", "worst"))
+    return " / ".join(f"{max(spread[name] for spread in known):.0f}" for name in (known[0] if known else ())) or "–"
 
 
 def _text(number: float | None, form: str) -> str:

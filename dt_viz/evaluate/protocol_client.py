@@ -18,11 +18,9 @@ import msgspec
 import numpy as np
 import websockets
 import zstandard
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
-
-from dt_viz.ui.scene.tubes import NUM_RINGS, NUM_SIDES
 
 ROLLOUT, OBSTACLE = "/rollouts/followed", "/obstacles/0"
 """Names of the tube of the rollout that the arm follows and of the first obstacle's gizmo in the scene tree."""
@@ -137,14 +135,6 @@ class ProtocolClient:
         return True
 
     @property
-    def rollout(self) -> NDArray[np.float32] | None:
-        """Middle (`NUM_RINGS`, 3) of the tube of the rollout that the arm follows, metres; None without one."""
-        vertices = self.nodes.get(ROLLOUT, {}).get("vertices")
-        if vertices is None or vertices.size <= 3 * NUM_SIDES * NUM_RINGS:  # at first there is a triangle without size
-            return None
-        return vertices.reshape(-1, NUM_SIDES, 3)[-NUM_RINGS - 1 : -1].mean(axis=1)
-
-    @property
     def status(self) -> str:
         """The details of the status, as HTML; empty before there are some."""
         texts = (str(control.get("content", "")) for control in self.controls.values())
@@ -157,8 +147,8 @@ class ProtocolClient:
 
     @property
     def has_picture(self) -> bool:
-        """Whether rollouts and their status are on the page."""
-        return self.rollout is not None and bool(self.status)
+        """Whether rollouts and their status are on the page; before the first there is a triangle without size."""
+        return np.ptp(self.nodes.get(ROLLOUT, {}).get("vertices", 0)) > 0 and bool(self.status)
 
     def find(self, label: str) -> str:
         """Return the identifier of the control with this label. Raises KeyError."""

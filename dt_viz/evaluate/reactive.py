@@ -153,17 +153,16 @@ class Arm(Protocol):
         ...
 
 
-class InTheLoop:
+class InTheLoop(Arm):
     """The controller, which looks at the obstacles now and then."""
 
-    def __init__(self, bench: Bench, crossing: Crossing, settings: ControllerSettings) -> None:
-        self._bench, self.controller = bench, Controller(bench.follower, bench.solved, settings)
+    def __init__(self, bench: Bench, crossing: Crossing) -> None:
+        self._bench, self.controller = bench, Controller(bench.follower, bench.solved)
         self.controller.begin(bench.starts[crossing.start], crossing.start)
         self.controller.home(crossing.start)
         self._looks, self._went, self._present = 0.0, False, True
 
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
-        """See `Arm`."""
         if not self._went and t >= crossing.begins:
             self.controller.go()
             self._went = True
@@ -179,7 +178,6 @@ class InTheLoop:
 
     @property
     def resting(self) -> bool:
-        """See `Arm`."""
         return self._went and not self._present and self.controller.phase is Phase.RESTING
 
 
@@ -287,7 +285,7 @@ def _path(middle: Array, rng: np.random.Generator) -> Array:
 
 
 def simulated(bench: Bench, crossing: Crossing, arm: Arm) -> Run:
-    """Run an arm until it rests at the goal, or `LONGEST` seconds after the sphere has gone."""
+    """Run an arm until it rests at the goal, or `LONGEST` seconds after the obstacles have gone."""
     run, q = Run(), bench.starts[crossing.start].copy()
     for k in range(int((crossing.gone + crossing.begins + LONGEST) / TICK)):
         t = k * TICK
@@ -315,15 +313,11 @@ def _smallest_distance(bench: Bench, q: Array, places: Array, wxyz: Quaternion) 
     cover, model, best = bench.follower.body, load_collision_model(), np.inf
     points, still = cover.positions(bench.robot, q), bench.shape(np.zeros(3), wxyz)
 
-    def gap(points: Array, place: Array) -> float:
-        """A lower bound, as the spheres cover the meshes."""
-        return float((still.signed_distance(points - place) - cover.radius).min())
-
     def measured(joints: Array, place: Array) -> float:
         return float(model.obstacle_distance(joints[None], bench.shape(place, wxyz))[0][0])
 
     gaps = (still.signed_distance(points - places[:, None]) - cover.radius).min(axis=1)
-    for k in np.argsort(gaps):
+    for k in np.argsort(gaps):  # the spheres cover the meshes: their distances are lower bounds
         if gaps[k] >= best:
             break
         best = min(best, measured(q[k], places[k]))
@@ -334,12 +328,13 @@ def _smallest_distance(bench: Bench, q: Array, places: Array, wxyz: Quaternion) 
     for k in np.flatnonzero(np.minimum(gaps[:-1], gaps[1:]) - travel / 2 < best):
         for u in np.linspace(0, 1, SUBDIVISIONS + 1)[1:-1]:
             joints, place = (1 - u) * q[k] + u * q[k + 1], (1 - u) * places[k] + u * places[k + 1]
-            if gap(cover.positions(bench.robot, joints), place) < best:
+            near = still.signed_distance(cover.positions(bench.robot, joints) - place) - cover.radius
+            if near.min() < best:
                 best = min(best, measured(joints, place))
     return best
 
 
-class _Field:
+class _Field(Arm):
     """An arm that is given velocities of a field at equal times, within the limits."""
 
     def __init__(self, bench: Bench, period: float) -> None:
@@ -348,7 +343,6 @@ class _Field:
         self._q = np.zeros(NUM_JOINTS)
 
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
-        """See `Arm`."""
         if t >= self._next - TICK / 2:
             sphere = next(iter(self._bench.obstacles(crossing, t)), None)
             self._wanted = self._at(q, sphere) if t >= crossing.begins else self._away(q, sphere)
@@ -363,7 +357,6 @@ class _Field:
 
     @property
     def resting(self) -> bool:
-        """See `Arm`."""
         missed = np.linalg.norm(self._bench.robot.end_effector(self._q) - self._bench.goal)
         return bool(missed < AT_GOAL / 10)
 
@@ -426,12 +419,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=whole_number(1), default=20, help="(default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the paths (default: %(default)s)")
     parser.add_argument("--obstacles", type=whole_number(1), default=1, help="at once (default: %(default)s)")
-    parser.add_argument(
-        "--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned at random, not spheres"
-    )
+    parser.add_argument("--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned, not spheres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
-    parser.add_argument("--no-anticipation", action="store_true", help="the flow is made for where the sphere was seen")
     parser.add_argument("--beside", action="store_true", help="also a potential field, and stepping at 20 Hz")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
@@ -444,15 +434,14 @@ def run(options: argparse.Namespace) -> int:
         raise InputError("--beside", "several obstacles, or boxes", "one sphere")
     engine = Engine(tasks, FitStore(default_cache_folder()), load_jaco())
     bench = Bench(engine, task.name, options.diameter, options.margin, boxes=options.boxes)
-    settings = ControllerSettings(lead=0.0, room=0.0) if options.no_anticipation else ControllerSettings()
-    kinds: dict[str, Callable[[Crossing], Arm]] = {"": lambda crossing: InTheLoop(bench, crossing, settings)}
+    kinds: dict[str, Callable[[Crossing], Arm]] = {"": lambda crossing: InTheLoop(bench, crossing)}
     if options.beside:
         kinds |= {"potential_": lambda _: Potential(bench), "stepped_": lambda _: Stepped(bench)}
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: dict[str, list[Figures]] = {kind: [] for kind in kinds}
     rows = []
-    found_crossings = crossings(bench, options.speed, options.runs, options.seed, options.obstacles)
-    for i, (crossing, seconds) in enumerate(found_crossings):
+    crossed = crossings(bench, options.speed, options.runs, options.seed, options.obstacles)
+    for i, (crossing, seconds) in enumerate(crossed):
         for kind, make in kinds.items():
             found = simulated(bench, crossing, make(crossing))
             figures[kind].append(Figures.of(bench, crossing, found, seconds))

@@ -70,14 +70,8 @@ def chains(joints: Joints, q: Array) -> tuple[Array, Array]:
     """Frames at angles q (N, n), batch last: axes (n, 3, 3, N) [joint, column, component] and origins (n, 3, N)."""
     num, n = q.shape
     axes, origins = np.empty((n, 3, 3, num), q.dtype), np.empty((n, 3, num), q.dtype)
-    turned, at = np.empty((n, 3, 3), q.dtype), np.empty((n, 3), q.dtype)
     for row in range(num):
-        chain(joints, q[row], turned, at)
-        for i in range(n):
-            for k in range(3):
-                origins[i, k, row] = at[i, k]
-                axes[i, 0, k, row], axes[i, 1, k, row] = turned[i, 0, k], turned[i, 1, k]
-                axes[i, 2, k, row] = turned[i, 2, k]
+        chain(joints, q[row], axes[..., row], origins[..., row])
     return axes, origins
 
 

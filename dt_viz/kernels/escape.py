@@ -49,7 +49,7 @@ def _velocity(escape: Escape, q: Array, result: Array, work: tuple[Array, ...]) 
 
     With weights ŵ_b of the body points, J_c = Σ ŵ_b J_b and n_c = Σ ŵ_b n_b this is, for each obstacle,
 
-        −V_q = v·m·χ (I + RᵀR)⁻¹ J_cᵀ n_c/λ²,   R = (√w_x J, √w_d D, J_c/λ).
+        −V_q = v·m·χ (I + R Rᵀ)⁻¹ J_cᵀ n_c/λ²,   R = (√w_x Jᵀ, √w_d Dᵀ, J_cᵀ/λ), (n, 9).
     """
     n = len(q)
     axes, origins, R, A, lever, weight, pull = work

@@ -12,7 +12,7 @@ import viser
 from dt_viz.arm.robot import Robot
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Pace, Session
+from dt_viz.engine.session import Display, Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
 from dt_viz.scenario.scenario import Scenario, View
@@ -50,8 +50,8 @@ def initial_scenario(engine: Engine, task: str) -> Scenario:
     return replace(scenario, stack=with_avoidance(scenario, obstacles=(sphere,)))
 
 
-class Visitor:
-    """Shows a session in the browser of one visitor; see `Display`."""
+class Visitor(Display):
+    """Shows a session in the browser of one visitor."""
 
     def __init__(
         self, client: viser.ClientHandle, engine: Engine, robot: Robot, titles: Mapping[str, str], task: str
@@ -116,7 +116,6 @@ class Visitor:
         self._tripod.width = width
 
     def draw(self, frame: Frame, pace: Pace) -> None:
-        """See `Display`."""
         beside = tuple(panel.shown for panel in frame.pictures.panels)
         others = frame.stage is not Stage.ROLLOUTS and len(beside) != len(self._tripod.panels)
         if self.shown is None or frame.task is not self.shown.task or others:
@@ -137,7 +136,6 @@ class Visitor:
         self.shown = frame
 
     def adopt(self, scenario: Scenario) -> None:
-        """See `Display`."""
         with self.client.atomic():
             self.pictures.adopt(scenario)
             self._view = view = scenario.view
@@ -155,15 +153,12 @@ class Visitor:
         self._panel.adopt(scenario)
 
     def learning(self, fraction: float, message: str) -> None:
-        """See `Display`."""
         self._panel.learning(fraction, message)
 
     def fail(self, error: Exception) -> None:
-        """See `Display`."""
         self._panel.fail(error)
 
     def cancelled(self, task: str) -> None:
-        """See `Display`."""
         self._panel.cancelled(task)
 
     def close(self) -> None:

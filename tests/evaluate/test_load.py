@@ -68,8 +68,8 @@ def test_a_picture_answers_the_edit_of_its_place_and_only_new_answers_count(visi
     assert not visit.last_shown
     show(visit, 3, 5.35)
     assert visit.last_shown
-    figures = visit.figures()
-    assert figures["pictures_per_s"] == pytest.approx(2 / 4 * load.EDITS_PER_SECOND)  # the last came after the drag
+    figures = visit.figures(0.3)
+    assert figures["pictures_per_s"] == pytest.approx(2 / 0.3)  # the last came after the drag
     assert figures["gap_ms"] == pytest.approx({"median": 60.0, "p95": 177.0, "worst": 190.0})
     assert figures["latency_ms"] == pytest.approx({"median": 50.0, "p95": 59.0, "worst": 60.0})
     assert figures["bytes"] == 2000
@@ -79,9 +79,20 @@ def test_a_place_that_nobody_asked_for_answers_nothing(visit):
     visit.see(ROLLOUT, {"vertices": None}, 5.1)
     visit.client.nodes[ANSWERED]["position"] = (0.1, 0.2, 0.3)
     visit.see(ROLLOUT, {"vertices": None}, 5.2)
-    figures = visit.figures()
+    figures = visit.figures(0.3)
     assert figures["pictures_per_s"] == 0 and figures["latency_ms"] is None and not figures["last_shown"]
     assert figures["gap_ms"]["worst"] == pytest.approx(300.0)  # nothing came for as long as it dragged
+
+
+def test_who_is_lost_saw_nothing_for_the_rest_of_the_drag(visit):
+    show(visit, 3, 5.35)
+    assert visit.figures(10.0)["last_shown"]
+    visit.lost = "gone"
+    figures = visit.figures(10.0)
+    assert figures["pictures_per_s"] == pytest.approx(0.1) and figures["gap_ms"]["worst"] == pytest.approx(9650.0)
+    assert not figures["last_shown"]
+    nothing = load.Visit(visit.client, lost="before the first edit").figures(10.0)
+    assert nothing["pictures_per_s"] == 0 and nothing["gap_ms"]["worst"] == pytest.approx(1e4)
 
 
 def test_all_visitors_who_come_and_drag_at_once_are_shown_their_last_edit(tmp_path, capsys, url):

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 from pages import frame_of, ignored
-from scenes import avoiding, changed
+from scenes import avoiding, changed, frame_at
 from viser import transforms  # noqa: TID251
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.cspace import LEVERS
 from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import ArmMotion
+from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
@@ -245,6 +246,20 @@ def test_lines_that_rollouts_cover_are_drawn_where_the_rollouts_are_hidden(drawn
     pictures.adopt(scenario)
     np.testing.assert_array_equal(ghost.points, before[0])
     np.testing.assert_array_equal(demonstrations.points, before[1])
+
+
+def test_lines_that_rollouts_cover_follow_a_drag_with_the_field(drawn, engine):
+    pictures, scenario = drawn
+    demonstrations = pictures.layer("demonstrations").node
+    before = demonstrations.points
+    x, y, z = scenario.obstacles[0].position
+    moved = changed(scenario, obstacles=scenario.obstacles[0].moved((x + 0.05, y, z)))
+    first, live = (frame_at(engine, moved, stage) for stage in (Stage.ROLLOUTS, Stage.LIVE))
+    pictures.draw(first)
+    np.testing.assert_array_equal(demonstrations.points, before)
+    pictures.draw(live)
+    covered = pictures.middles.beside(pictures.layer("demonstrations")._lines.segments(first.task.paths))
+    assert len(demonstrations.points) == len(covered) and not np.array_equal(demonstrations.points, before)
 
 
 @pytest.mark.parametrize("changes", [{"task": "lift_box"}, {"scene": "cloud"}, {"objective": "velocity"}], ids=str)
