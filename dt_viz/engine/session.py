@@ -76,23 +76,18 @@ class Display(Protocol):
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         """Show a frame. Called on the worker thread, in the order of the edits."""
-        ...
 
     def adopt(self, scenario: Scenario) -> None:
         """Show the scenario's choices on the controls, and what is to be visible."""
-        ...
 
     def learning(self, fraction: float, message: str) -> None:
         """Show how far learning a task is, from 0 to 1."""
-        ...
 
     def fail(self, error: Exception) -> None:
         """Show that the scenario could not be computed, and why."""
-        ...
 
     def cancelled(self, task: str) -> None:
         """Show that learning this task was cancelled. What is adopted was shown before."""
-        ...
 
 
 class Session:
