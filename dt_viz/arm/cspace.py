@@ -7,7 +7,6 @@ complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference o
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +17,6 @@ from dt_viz.arm.robot import NUM_JOINTS, Robot, cross
 from dt_viz.arm.tracking import DIRECTION_WEIGHT
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
-from dt_viz.interruption import checkpoint
 from dt_viz.kernels import escape
 from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.arrays import records
@@ -28,6 +26,8 @@ from dt_viz.properties import cached_property
 COMPLEX_STEP = 1e-30
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
+POSTURE_DIFFERENCE = 1e-5
+"""Step of those for the derivative of the field, rad."""
 
 REACH_PER_TEMPERATURE = 0.08 / 6
 """Reach of an obstacle's field, metres, for each unit of the temperature T."""
@@ -46,9 +46,6 @@ LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
 """Approximate motion of the hand for each joint's turning, m/rad: converts a distance of postures to a length."""
 PIN = 0.03
 """Size of the region around a pinned posture in which the field fades out, metres of that distance."""
-
-BLOCK = 64
-"""Number of configurations that a flow carries along between two looks at whether they are still wanted."""
 
 SPEED = 0.2
 """Distance that a contact at full strength escapes in a unit of flow time, metres."""
@@ -79,10 +76,7 @@ class ArmField:
 
     def with_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        num, d = q.shape
-        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
-        values = self(shifted).reshape(d, num, d)
-        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,27 +133,23 @@ class WholeArmField(ArmField, CompiledField):
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
         return escape.velocities(self._escape, np.array(q, order="C"))
 
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6), by differences of fourth order, at configurations `q` (N, 6)."""
+        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(NUM_JOINTS)
+        shifted = (q[:, None, None] + steps).reshape(-1, NUM_JOINTS)
+        near, before, far, behind = np.moveaxis(self(shifted).reshape(len(q), 4, NUM_JOINTS, NUM_JOINTS), 1, 0)
+        slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
+        return self(q), slopes.transpose(0, 2, 1)
+
     def rk4(self, s: Array, duration: float, steps: int) -> Array:
-        return self._in_blocks(s, lambda block: escape.flow(self._escape, block, float(duration), steps))
+        return escape.flow(self._escape, np.array(s, order="C"), float(duration), steps)
 
     def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-
-        def carried(block: Array) -> Array:
-            q, num_failed = escape.adaptive_flow(self._escape, block, float(duration), float(tolerance), max_steps)
-            if num_failed:
-                raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
-            return q
-
-        return self._in_blocks(s, carried)
-
-    def _in_blocks(self, s: Array, carried: Callable[[Array], Array]) -> Array:
-        """Carry points (N, 6) along block by block, so that what is not wanted any more ends soon."""
-        blocks = [np.array(s[i : i + BLOCK], order="C") for i in range(0, len(s), BLOCK)]
-        done = []
-        for block in blocks:
-            checkpoint()
-            done.append(carried(block))
-        return np.concatenate(done) if done else s.copy()
+        points = np.array(s, order="C")
+        q, num_failed = escape.adaptive_flow(self._escape, points, float(duration), float(tolerance), max_steps)
+        if num_failed:
+            raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
+        return q
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +169,13 @@ class GradientField(ArmField):
         force: Any = sum(self._force(obstacle, points) for obstacle in self.obstacles)
         moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
         return (chain.axes[:, 2] * moment).sum(axis=1).T
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        num, d = q.shape
+        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
+        values = self(shifted).reshape(d, num, d)
+        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
 
     def _force(self, obstacle: Obstacle, points: Array) -> Array:
         """Compute the forces (P, 3, N) of one obstacle on body points (P, 3, N): −30u²(1 − u)² times their way out."""

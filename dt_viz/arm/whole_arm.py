@@ -34,7 +34,7 @@ from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.interruption import checkpoint
-from dt_viz.kernels.arm import clearance
+from dt_viz.kernels.blocks import clearance
 from dt_viz.kernels.proximity import proximity
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
