@@ -51,10 +51,9 @@ class Stances:
     """(K,) root mean square distance of the postures from the usual ones, metres, by `LEVERS`."""
 
     @cached_property
-    def _points(self) -> Array:
-        """Body points (B, K·(R + T), 3) of the postures, metres."""
-        q = np.concatenate([self.at_starts, self.on_path], axis=1)
-        return self.body.positions(self.robot, q.reshape(-1, NUM_JOINTS)).transpose(1, 0, 2)
+    def _postures(self) -> Array:
+        """(K·(R + T), 6) postures at the starts and on the path, rad."""
+        return np.concatenate([self.at_starts, self.on_path], axis=1).reshape(-1, NUM_JOINTS)
 
     @cached_property
     def _stuck(self) -> Array:
@@ -65,7 +64,7 @@ class Stances:
 
     def clearance(self, obstacle: Union | Obstacle) -> tuple[Array, Array]:
         """Distances, metres, of the covering spheres from an obstacle, at the starts (K, R) and on the path (K, T)."""
-        distance = (obstacle.signed_distance(self._points) - self.body.radius[:, None]).min(axis=0)
+        distance = self.body.clearance(self.robot, self._postures, obstacle)
         distance, num_starts = distance.reshape(len(self.references), -1), self.at_starts.shape[1]
         return distance[:, :num_starts], distance[:, num_starts:]
 

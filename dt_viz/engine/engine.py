@@ -349,11 +349,17 @@ class Engine:
         pictures = compose.pictures(scenario, solved, books, arrows=view.field and not carried, coarse=coarse)
         if arm is None or not carried:
             return pictures
-        layers, robot = tuple(layer for _, layer in scenario.active), self.follower.robot
+        robot, reference, rest = (
+            self.follower.robot,
+            self.follower.reference(solved.nominal),
+            compose.rest(scenario, solved),
+        )
+        made_for = solved.below if solved.stack.built or scenario.warp < 1 else solved.below.learned
+        layers = tuple(layer for _, layer in scenario.active)
         lifted = self.memo(
             "lifted field",
-            (solved.below, layers, view.slice, compose.rest(scenario, solved).tobytes()),
-            lambda: LiftedField.of(compose.field(scenario, solved), robot, self.follower.reference(solved.nominal)),
+            (made_for, layers, view.slice, rest.tobytes(), reference.tobytes()),
+            lambda: LiftedField.of(compose.field(scenario, solved), robot, reference),
             newest=2,
         )
         return replace(pictures, field=lifted.around(arm.transform, robot, scenario.obstacle))
