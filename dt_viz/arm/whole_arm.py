@@ -25,7 +25,7 @@ from dt_viz.arm.cspace import (
     JointLimits,
     WholeArmField,
 )
-from dt_viz.arm.escape import ALIKE, escape_directions
+from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import JointPath, track
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
@@ -38,7 +38,7 @@ from dt_viz.kernels.proximity import proximity
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.obstacles.ways import Way, remembered
+from dt_viz.obstacles.ways import Way, remembered, travel
 from dt_viz.properties import cached_property
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -79,6 +79,8 @@ TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
 """Colliding samples that ways out are compared by."""
+DURATION_CHANGE = 50.0
+"""Largest change of the flow time for each metre that an obstacle is dragged: contacts move by 1 cm a millimetre."""
 LONG = 1.0
 """Flow time beyond which other ways out and stances are tried, too: such motions wind around the obstacle."""
 NUM_WAYS = 3
@@ -243,7 +245,7 @@ class WholeArm:
         spacing: float,
         *,
         coarse: bool,
-        before: Sequence[Way | None] = (),
+        before: ArmSolution | None = None,
     ) -> ArmSolution:
         """The motions around the obstacle.
 
@@ -252,8 +254,8 @@ class WholeArm:
         the one with the least detour, else the one that comes nearest to working, all by coarse motions. All this looks
         at the hosts only: guests do not change their motions.
 
-        While an obstacle is dragged, the side on which all motions pass it is kept until another one is much shorter.
-        Coarse motions then turn to that side as the obstacle moves on, instead of jumping there.
+        While an obstacle is dragged, the side on which all motions pass it is kept until another one is much shorter,
+        or this one fails; see `followed`.
 
         Args:
             lifted: the motions below.
@@ -261,51 +263,72 @@ class WholeArm:
             spacing: largest distance between neighbouring samples, metres at the hand, about; in coarse motions it is
                 `COARSE_SPACING` if that is more.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
-            before: the ways out of the obstacles where they were just before.
+            before: the motions around the obstacles where they were just before.
         """
-        parts, known = avoidance.obstacle.parts, remembered(before, avoidance.obstacle.parts)
-        sides = self._sides(lifted, avoidance, known)
-        pins = self.limits.forward(self.limits.inside(lifted.pins))  # where the flow meets them
-
-        def solution(ways: Sequence[Way | None], *, coarse: bool = True) -> ArmSolution:
-            generator = self._generator(ways, avoidance, pins)
-            found = _Solver(self, lifted, avoidance, generator, spacing, coarse=coarse).solution()
-            return replace(found, ways=tuple(ways))
-
-        def gradually(ways: Sequence[Way | None]) -> ArmSolution | None:
-            """The motions turning to these ways out; None where they are there, or cannot turn."""
-            turned = [
-                way.turned_from(last, found) if way is not None and last is not None else way
-                for way, last, found in zip(ways, known, sides, strict=True)
-            ]
-            if all(way is there for way, there in zip(turned, ways, strict=True)):
-                return None
-            tried = solution(turned)
-            return tried if tried.cleared else None
-
+        parts = avoidance.obstacle.parts
+        known = remembered(() if before is None else before.ways, parts)
+        sides, pins = self._sides(lifted, avoidance, known), self._pins(lifted)
         best = None
         for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
-            escapes = [found[min(attempt, len(found) - 1)] if found else None for found in sides]
             ways = [
-                None if side is None else Way(part, side, side, kept=last is not None)
-                for part, side, last in zip(parts, escapes, known, strict=True)
+                _way(part, found[min(attempt, len(found) - 1)], last) if found else None
+                for part, found, last in zip(parts, sides, known, strict=True)
             ]
-            if avoidance.duration is not None or avoidance.generator == "probability":
-                return solution(ways, coarse=coarse)
-            met = [(way, last) for way, last in zip(ways, known, strict=True) if way is not None and last is not None]
-            alike = all(way.side @ last.side > ALIKE for way, last in met)
-            if coarse and alike and (tried := gradually(ways)):  # that there is a way is known
+            generator = self._generator(ways, avoidance, pins)
+            by_hand = avoidance.duration is not None or avoidance.generator == "probability"
+            solver = _Solver(self, lifted, avoidance, generator, spacing, coarse=coarse or not by_hand)
+            tried = replace(solver.solution(), ways=tuple(ways))
+            if by_hand:
                 return tried
-            tried = solution(ways)
-            if coarse and not alike and tried.cleared and (on_the_way := gradually(ways)):
-                return on_the_way
             if best is None or self._better(tried, best):
                 best = tried
-            if tried.soon or (tried.cleared and met):
+            if tried.soon or (tried.cleared and any(way is not None and way.kept for way in ways)):
                 break
         if best is None:
             return self.undisturbed(lifted, avoidance, spacing)
-        return best if coarse else solution(best.ways, coarse=False)
+        if coarse:
+            return best
+        generator = self._generator(best.ways, avoidance, pins)
+        return replace(_Solver(self, lifted, avoidance, generator, spacing, coarse=False).solution(), ways=best.ways)
+
+    def followed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float, before: ArmSolution) -> ArmSolution:
+        """Coarse motions that follow an obstacle which is dragged: they change no faster than the obstacle moves.
+
+        Ways out turn towards the sides that are to be taken, and the flow's duration changes, by so much for each metre
+        of the drag. So no motion jumps, where a side is changed or none clears it: until the new way is there, motions
+        may come nearer to the obstacle than the margin. Where a way is there and does not clear it, the next side is
+        turned to. For the other arguments see `avoiding`.
+
+        Args:
+            lifted: the motions below.
+            avoidance: what is to be avoided.
+            spacing: as in `avoiding`.
+            before: the motions where the obstacles were just before.
+        """
+        parts = avoidance.obstacle.parts
+        known = remembered(before.ways, parts)
+        failed = not before.cleared and before.duration >= MAX_DURATION
+        ways: list[Way | None] = []
+        for part, found, last in zip(parts, self._sides(lifted, avoidance, known), known, strict=True):
+            if not found:
+                ways.append(None)
+            elif last is None:
+                ways.append(_way(part, found[0], last))
+            else:
+                side = found[1] if failed and last.is_there and len(found) > 1 else found[0]
+                ways.append(_way(part, side, last).turned_from(last, found))
+        if not any(ways):
+            return self.undisturbed(lifted, avoidance, spacing)
+        moved = max(travel(last.obstacle, part) for last, part in zip(known, parts, strict=True) if last is not None)
+        change = DURATION_CHANGE * moved
+        between = max(before.duration - change, 0.0), min(before.duration + change, MAX_DURATION)
+        generator = self._generator(ways, avoidance, self._pins(lifted))
+        solver = _Solver(self, lifted, avoidance, generator, spacing, coarse=True, between=between)
+        return replace(solver.solution(), ways=tuple(ways))
+
+    def _pins(self, lifted: Lift) -> Array:
+        """The postures (K, 6) that do not move, where the flow meets them."""
+        return self.limits.forward(self.limits.inside(lifted.pins))
 
     def _better(self, tried: ArmSolution, best: ArmSolution) -> bool:
         """Whether one solution's motions clear the obstacle with less detour than another's, or come nearer to it."""
@@ -419,6 +442,7 @@ class _Solver:
         spacing: float,
         *,
         coarse: bool,
+        between: tuple[float, float] = (0.0, MAX_DURATION),
     ) -> None:
         self._arm = arm
         self._lifted = lifted
@@ -426,6 +450,7 @@ class _Solver:
         self._generator = generator
         self._spacing = spacing
         self._coarse = coarse and generator is not None
+        self._shortest, self._longest = between
         self._room = arm.clearance(lifted.pins, avoidance.obstacle) - ROUNDING
 
     def solution(self) -> ArmSolution:
@@ -437,7 +462,7 @@ class _Solver:
             hosts = self._lifted.tracked.q[: self._lifted.num_hosts]
             q = self._arm.limits.inside(hosts[:, ::STRIDE].reshape(-1, NUM_JOINTS))
             duration = self._clearing_duration(q[self._lack(q) > 0])
-        return self._with_duration(min(duration, MAX_DURATION))
+        return self._with_duration(min(max(duration, self._shortest), self._longest))
 
     def _with_duration(self, duration: float) -> ArmSolution:
         transform = self._transform(duration)
@@ -447,12 +472,12 @@ class _Solver:
         for _ in range(MAX_ROUNDS):
             p = (bundle.positions / LEVERS)[self._of_hosts(bundle)]
             lack = self._lack(p)
-            if duration >= MAX_DURATION or not (lack > ROUNDING).any():
+            if duration >= self._longest or not (lack > ROUNDING).any():
                 break
-            more = min(self._clearing_duration(p[lack > 0]), MAX_DURATION - duration)
+            more = min(self._clearing_duration(p[lack > 0]), self._longest - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
-        for _ in range(0 if self._coarse or duration >= MAX_DURATION else MAX_ROUNDS):
+        for _ in range(0 if self._coarse or duration >= self._longest else MAX_ROUNDS):
             p = (bundle.positions / LEVERS)[self._of_hosts(bundle)]
             lack = self._mesh_lack(p)
             worst = np.argsort(-lack)[:NUM_EXTENDED_FOR]
@@ -543,13 +568,13 @@ class _Solver:
         return room_asked(np.array(p, order="C"), self._lifted.pins, room, LEVERS, SLOPE, float(margin))
 
     def _clearing_duration(self, p: Array) -> float:
-        """The shortest duration after which the flow has carried configurations (N, 6) clear, or `MAX_DURATION`."""
+        """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
         assert self._generator is not None
         limits, duration = self._arm.limits, 0.0
         state, lack = limits.forward(p), self._lack(p)
         while len(state):
-            if duration >= MAX_DURATION:
-                return MAX_DURATION
+            if duration >= self._longest:
+                return self._longest
             checkpoint()
             state, _ = integrate(rk4, self._generator, state, None, -SNAPSHOT, 1)
             before, lack = lack, self._lack(limits.inverse(state))
@@ -577,6 +602,11 @@ class _Solver:
             if not len(state):
                 break
         return float(duration)
+
+
+def _way(obstacle: Obstacle, side: Array, before: Way | None) -> Way:
+    """The way out of an obstacle to a side, which goes on from that before, if any."""
+    return Way(obstacle, side, side, kept=before is not None)
 
 
 def _crossing(before: Array, after: Array) -> float:

@@ -27,7 +27,7 @@ from dt_viz.memo import Memo
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower
 from dt_viz.motion.nominal import Learned, Nominal
-from dt_viz.motion.solve import Solved, kept_stance, solve, warped
+from dt_viz.motion.solve import Solved, goes_on, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.pictures.arm_field import LiftedField
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
@@ -164,7 +164,7 @@ class Engine:
         Raises:
             UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
         """
-        return self._solved(scenario, self._admission(scenario).nominal, precision)
+        return self._solved(scenario, self._admission(scenario, precision).nominal, precision)
 
     def _solved(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
         """The motion of a scenario from the starts that the arm can begin at."""
@@ -243,17 +243,22 @@ class Engine:
         assert isinstance(imitation, AugmentedImitation)
         return imitation
 
-    def _admission(self, scenario: Scenario) -> Admission:
-        """Whether the scenario has a motion, and from which starts."""
+    def _admission(self, scenario: Scenario, precision: Precision) -> Admission:
+        """Whether the scenario has a motion, and from which starts.
+
+        While an obstacle is dragged the arm keeps its stance; where it rests, another one may leave more starts free.
+        """
         nominal, avoidance = self.nominal(scenario), scenario.arm_avoidance
         if avoidance is None:
             return Admission(nominal)
         before = self._before(scenario, nominal.learned)
-        return self.follower.admission(nominal, avoidance, before and kept_stance(scenario, before))
+        if before is None or not goes_on(scenario, before):
+            return self.follower.admission(nominal, avoidance)
+        return self.follower.admission(nominal, avoidance, before.nominal.stance, keeps=precision is LIVE)
 
     def _motion(self, scenario: Scenario, precision: Precision) -> tuple[Solved | None, tuple[MotionWarning, ...]]:
         """The motion of a scenario, and why it has none, at the ends or between them."""
-        admission = self._admission(scenario)
+        admission = self._admission(scenario, precision)
         if admission.blocked:
             return None, admission.blocked
         solved = self._solved(scenario, admission.nominal, precision)
@@ -294,6 +299,9 @@ class Engine:
         )
         frame = replace(frame, stage=Stage.CERTIFIED, certificates=certificates)
         yield frame
+        if fine.arm is not None:
+            with _in_turn(checkpoint):
+                self.follower.stances(fine.nominal.learned)  # a drag may need them at once
         yield from self._compared_at_rest(frame, fine, checkpoint)
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:

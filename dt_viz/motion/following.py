@@ -11,7 +11,7 @@ import numpy as np
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import SELF_MARGIN, CollisionModel, load_collision_model
 from dt_viz.arm.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
-from dt_viz.arm.stances import stances
+from dt_viz.arm.stances import Stances, stances
 from dt_viz.arm.tracking import JointPath, UnreachableError, drawn_onto, inverse_kinematics, track
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
 from dt_viz.flows.fields import Array, Indices, Mask
@@ -158,7 +158,9 @@ class Follower:
         """
         return track(self.robot, path, self.reference(nominal), before)
 
-    def admission(self, nominal: Nominal, avoidance: ArmAvoidance, before: Stance | None = None) -> Admission:
+    def admission(
+        self, nominal: Nominal, avoidance: ArmAvoidance, before: Stance | None = None, *, keeps: bool = False
+    ) -> Admission:
         """Whether the whole arm can move around what it avoids, from which starts, and in which stance.
 
         Args:
@@ -166,24 +168,27 @@ class Follower:
             avoidance: what is to be avoided.
             before: the stance where the obstacle was just before, which is kept while none leaves more starts free;
                 None is the usual one.
+            keeps: whether `before` is kept while it leaves the goal and any start free.
         """
-        asked = avoidance.obstacle, avoidance.margin, before
-        return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=1)
+        asked = avoidance.obstacle, avoidance.margin, before, keeps
+        return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=2)
 
     def alternatives(self, nominal: Nominal, avoidance: ArmAvoidance) -> Iterator[Nominal]:
         """The same motions in other stances that have room at as many starts and at the goal, the best first."""
-        ranked = self._stances(nominal.learned, avoidance.obstacle, avoidance.margin, nominal.stance)
+        ranked = self._stances(nominal.learned, avoidance.obstacle, avoidance.margin, nominal.stance, keeps=False)
         _, free = next(ranked)
         for stance, others in ranked:
             if not (others >= free).all():
                 return
             yield self._standing(nominal, stance)
 
-    def _admission(self, nominal: Nominal, obstacle: Union, margin: float, before: Stance | None) -> Admission:
+    def _admission(
+        self, nominal: Nominal, obstacle: Union, margin: float, before: Stance | None, keeps: bool
+    ) -> Admission:
         blocked = self._unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
         if blocked:
             return Admission(nominal, blocked)
-        stance, free = next(self._stances(nominal.learned, obstacle, margin, before))
+        stance, free = next(self._stances(nominal.learned, obstacle, margin, before, keeps=keeps))
         if not free[-1]:
             text = "the goal is inside the obstacle: the arm there touches it"
             return Admission(nominal, (MotionWarning(Kind.GOAL_COVERED, text, ARM),))
@@ -224,27 +229,27 @@ class Follower:
         return ()
 
     def _stances(
-        self, learned: Learned, obstacle: Union, margin: float, before: Stance | None
+        self, learned: Learned, obstacle: Union, margin: float, before: Stance | None, *, keeps: bool
     ) -> Iterator[tuple[Stance | None, Mask]]:
         """The stances with most room at the task's starts and goal, the best first: the usual one where it has enough.
 
-        But the stance `before`, if it is not the usual one, comes before all that leave no more starts free.
+        But the stance `before`, if it is not the usual one, comes before all that leave no more starts free; where it
+        is kept, before all, if it leaves the goal and any start free.
 
         Yields:
             A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
         """
+        if keeps and before is not None:
+            free = self.whole_arm.clearance(self._demonstrated(learned, before).pins, obstacle) >= 0
+            if free[-1] and free[:-1].any():
+                yield before, free
         usual, asked = self._demonstrated(learned), max(margin - OVERSHOOT, 0.0)
         near = self.whole_arm.clearance(usual.pins, obstacle)
         enough = bool((near >= asked).all())
         room = near if enough else self._true_room(usual.pins, obstacle, near, margin)
-        if before is None and (enough or (room >= margin).all()):
+        if before is None and (enough or (room >= margin).all() or (keeps and room[-1] >= 0 and room[:-1].max() >= 0)):
             yield None, room >= 0
-        paths = learned.demonstrated.paths
-        known = self._shared(
-            "stances",
-            learned,
-            lambda: stances(self.robot, self.whole_arm.body, usual.reference, learned.task.starts, _mean(paths)),
-        )
+        known = self.stances(learned)
         clearance = known.room(obstacle)  # of the spheres, which are larger than the arm
         free, ample = clearance >= 0, clearance >= margin
         free[0], ample[0] = room >= 0, room >= margin
@@ -262,6 +267,19 @@ class Follower:
             if left[best] and (stance is None or self._sound(learned, stance)):
                 left &= ~known.alike(int(best))
                 yield stance, free[best]
+
+    def stances(self, learned: Learned) -> Stances:
+        """The stances for a task's motions; the first time it takes a second or so.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        usual, paths = self._demonstrated(learned).reference, learned.demonstrated.paths
+        return self._shared(
+            "stances",
+            learned,
+            lambda: stances(self.robot, self.whole_arm.body, usual, learned.task.starts, _mean(paths)),
+        )
 
     def _true_room(self, q: Array, obstacle: Union, near: Array, enough: float) -> Array:
         """Distances (N,), metres, of the arm at configurations q (N, 6) where `near` is not enough already.

@@ -10,7 +10,7 @@ import numpy as np
 from dt_viz.arm.whole_arm import ArmSolution, Lift
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
-from dt_viz.motion.nominal import Nominal, Stance
+from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
 from dt_viz.obstacles.ways import remembered
@@ -72,14 +72,11 @@ def solve(
     Raises:
         UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
     """
-    scenario = replace(scenario, warp=1.0)
-    if precision is LIVE and before is not None and (lacking := _lacking(nominal, scenario, before)) is not None:
-        solved = _solved(scenario, lacking, precision, follower, before)
-        if solved.cleared:
-            return solved
-    avoidance = scenario.arm_avoidance
+    scenario, avoidance = replace(scenario, warp=1.0), scenario.arm_avoidance
     if avoidance is None or avoidance.duration is not None:
         return _solved(scenario, nominal, precision, follower, before)
+    if precision is LIVE and before is not None and goes_on(scenario, before):
+        return _solved(scenario, _as_many(nominal, before), precision, follower, before, follows=True)
     solved = _with_a_way(scenario, nominal, follower, before)
     if precision is not LIVE:
         solved = _solved(scenario, solved.nominal, precision, follower, before)
@@ -94,8 +91,6 @@ def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower, before
     """
     solved, avoidance = _solved(scenario, nominal, LIVE, follower, before), scenario.arm_avoidance
     if avoidance is None or solved.arm is None or solved.arm.soon:
-        return solved
-    if solved.cleared and before is not None and _goes_on(scenario, before):
         return solved
     for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
         tried = _solved(scenario, other, LIVE, follower, before)
@@ -123,31 +118,32 @@ def _unless_it_touches(solved: Solved, follower: Follower) -> Solved:
     return replace(solved, blocked=(MotionWarning(Kind.NO_WAY, text, ARM),))
 
 
-def kept_stance(scenario: Scenario, before: Solved) -> Stance | None:
-    """The stance that the arm keeps while it avoids what is dragged: that before; None is the usual one."""
-    return before.nominal.stance if _goes_on(scenario, before) else None
-
-
-def _goes_on(scenario: Scenario, before: Solved) -> bool:
+def goes_on(scenario: Scenario, before: Solved) -> bool:
     """Whether the arm was avoiding an obstacle that is hardly anywhere else now."""
     if before.arm is None or scenario.arm_avoidance is None:
         return False
     return any(remembered(before.arm.ways, scenario.arm_avoidance.obstacle.parts))
 
 
-def _lacking(nominal: Nominal, scenario: Scenario, before: Solved) -> Nominal | None:
-    """The motion without the starts that had no way before; None where all had one."""
+def _as_many(nominal: Nominal, before: Solved) -> Nominal:
+    """The motion without the starts that had no way before, if any others are left."""
     without = set(before.nominal.left_out) - set(nominal.left_out)
     kept = [k for k, number in enumerate(nominal.numbers) if number not in without]
-    if not without or not kept or before.nominal.stance != nominal.stance or not _goes_on(scenario, before):
-        return None
+    if not without or not kept or before.nominal.stance != nominal.stance:
+        return nominal
     return nominal.only(kept, before.nominal.warnings)
 
 
 def _solved(
-    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Solved | None = None
+    scenario: Scenario,
+    nominal: Nominal,
+    precision: Precision,
+    follower: Follower,
+    before: Solved | None = None,
+    *,
+    follows: bool = False,
 ) -> Solved:
-    """The motion in the stance of `nominal`; see `solve`."""
+    """The motion in the stance of `nominal`, see `solve`; `follows` is whether it goes on from that before."""
     stack = build_stack(nominal, scenario.active, precision, before and before.stack)
     avoidance = scenario.arm_avoidance
     if avoidance is None:
@@ -158,8 +154,11 @@ def _solved(
         lifted = follower.behaving(nominal, stack, exact=not live, before=joints)
     else:
         lifted = follower.undisturbed(nominal)
-    ways = () if before is None or before.arm is None else before.arm.ways
-    arm = follower.whole_arm.avoiding(lifted, avoidance, precision.spacing, coarse=live, before=ways)
+    spacing, last = precision.spacing, None if before is None else before.arm
+    if follows and last is not None:
+        arm = follower.whole_arm.followed(lifted, avoidance, spacing, last)
+    else:
+        arm = follower.whole_arm.avoiding(lifted, avoidance, spacing, coarse=live, before=last)
     return Solved(scenario, nominal, nominal, stack, arm, lifted)
 
 

@@ -34,6 +34,11 @@ class Way:
     """Longest displacement of a motion along `direction`, metres."""
 
     @property
+    def is_there(self) -> bool:
+        """Whether it has turned to its side."""
+        return self.direction is self.side
+
+    @property
     def offset(self) -> Array:
         """(3,) that motion's displacement, metres."""
         return self.length * self.direction
@@ -48,7 +53,7 @@ class Way:
         start, towards = before.direction, self.side
         if start @ towards < OPPOSITE:
             towards = next((direction for direction in across if abs(start @ direction) < -OPPOSITE), towards)
-        angle = TURNING * _travel(before.obstacle, self.obstacle) / self.obstacle.radius
+        angle = TURNING * travel(before.obstacle, self.obstacle) / self.obstacle.radius
         direction = turned(start, towards, angle)
         return self if direction is self.side else replace(self, direction=direction)
 
@@ -59,8 +64,8 @@ def remembered(ways: Sequence[Way | None], obstacles: Sequence[Obstacle]) -> tup
         return (None,) * len(obstacles)
 
     def known(way: Way | None, obstacle: Obstacle) -> Way | None:
-        travel = math.inf if way is None else _travel(way.obstacle, obstacle)
-        return way if way is not None and travel < NEARBY and (travel > 0 or way.kept) else None
+        moved = math.inf if way is None else travel(way.obstacle, obstacle)
+        return way if way is not None and moved < NEARBY and (moved > 0 or way.kept) else None
 
     return tuple(known(way, obstacle) for way, obstacle in zip(ways, obstacles, strict=True))
 
@@ -73,7 +78,7 @@ def turned(start: Array, towards: Array, most: float) -> Array:
     return towards if angle <= most else math.cos(most) * start + math.sin(most) / size * across
 
 
-def _travel(before: Obstacle, after: Obstacle) -> float:
+def travel(before: Obstacle, after: Obstacle) -> float:
     """Distance that an obstacle has moved, metres; infinite where it has also become another one."""
     if before.moved(after.position, after.wxyz) != after:
         return math.inf

@@ -8,13 +8,15 @@ import pytest
 from scenes import changed, frame_at
 
 from dt_viz.arm.escape import STAYING, escape_directions
+from dt_viz.arm.whole_arm import DURATION_CHANGE
 from dt_viz.engine.frame import Stage
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.following import Follower
-from dt_viz.motion.solve import kept_stance, solve
+from dt_viz.motion.solve import goes_on, solve
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.obstacles.ways import TURNING
 from dt_viz.scenario.scenario import View
 from dt_viz.transforms.base import ArmAvoidance
 
@@ -168,9 +170,9 @@ def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, init
     solved = solve(scenario, other, LIVE, follower)
     x, y, z = ball.position
     moved, away = (changed(scenario, obstacles=ball.moved((x, y, z + by))) for by in (0.005, 0.5))
-    assert kept_stance(moved, solved) == other.stance is not None
-    assert kept_stance(away, solved) is None
-    assert kept_stance(scenario, replace(solved, arm=None)) is None
+    assert goes_on(moved, solved) and other.stance is not None
+    assert not goes_on(away, solved)
+    assert not goes_on(scenario, replace(solved, arm=None))
 
 
 def test_an_engine_keeps_the_stance_that_it_shows_while_an_obstacle_is_dragged(new_engine, initial):
@@ -184,3 +186,25 @@ def test_an_engine_keeps_the_stance_that_it_shows_while_an_obstacle_is_dragged(n
         stances.append(engine.solved(scenario, LIVE).nominal.stance)
     assert stances[0] is not None and set(stances) == {stances[0]}
     assert new_engine().solved(scenarios[-1], LIVE).nominal.stance != stances[0]
+
+
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 9))])
+def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, seed):
+    """Ways out turn and durations grow with the drag, also where a side is changed or does not clear the obstacle."""
+    engine, rng = new_engine(), np.random.default_rng(seed)
+    task = engine.task("push_box")
+    through = task.mean_path[round(rng.uniform(0.3, 0.7) * 100)]
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    before = None
+    for step in np.arange(-0.02, 0.02, 1e-3):
+        ball = Sphere(as_point(through + step * direction), 0.15)
+        scenario = changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN)
+        assert not frame_at(engine, scenario, Stage.LIVE).blocked
+        arm = engine.solved(scenario, LIVE).arm
+        if before is not None and engine.solved(scenario, LIVE).nominal.stance == stance:
+            assert abs(arm.duration - before.duration) <= 1.001e-3 * DURATION_CHANGE
+            for way, last in zip(arm.ways, before.ways, strict=True):
+                if way is not None and last is not None:
+                    assert way.direction @ last.direction > np.cos(1.1 * TURNING * 1e-3 / ball.radius)
+        before, stance = arm, engine.solved(scenario, LIVE).nominal.stance
