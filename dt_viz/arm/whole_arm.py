@@ -223,6 +223,8 @@ class WholeArm:
         calls: tuple[Callable[[], object], ...] = (
             lambda: self.robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
+            lambda: track(self.robot, self.robot.end_effector(q)[:, None], q, reference=q),
+            lambda: room_asked(q, q, np.zeros(1), LEVERS, SLOPE, 0.0),
             lambda: proximity(self.robot.records, self.links.records, shapes, values, q[0].copy(), 1.0),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),

@@ -196,7 +196,7 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
     through = task.mean_path[round(rng.uniform(0.3, 0.7) * 100)]
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    before = None
+    before = stance = None
     for step in np.arange(-0.02, 0.02, 1e-3):
         ball = Sphere(as_point(through + step * direction), 0.15)
         scenario = changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN)

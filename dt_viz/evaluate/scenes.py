@@ -1,0 +1,67 @@
+"""Time from the click on each scene of the paper until its first motions, its field and its certificates are there.
+
+Each scene begins in an engine that has shown its task before, as on the page. The JSON file holds, by the scene's name,
+``rollouts_s``, ``live_s`` and ``certified_s``, seconds, and ``median`` and ``worst`` of the last.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import Engine
+from dt_viz.engine.frame import Stage
+from dt_viz.evaluate.options import add_lasa, print_table, ready_to_write, write_json
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
+from dt_viz.memo import Memo
+from dt_viz.scenario.paper_scenes import SCENES, offered
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import known_tasks
+
+SHOWN = (Stage.ROLLOUTS, Stage.LIVE, Stage.CERTIFIED)
+"""Stages that are timed."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the subcommand's arguments."""
+    parser.add_argument("--only", choices=tuple(SCENES), nargs="+", metavar="NAME", help=", ".join(SCENES))
+    add_lasa(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    tasks, out = known_tasks(options.lasa), ready_to_write(options.out, ".json")
+    fits, shared, figures = FitStore(default_cache_folder()), Memo(), {}
+    for scene in offered(tasks):
+        if options.only and scene.name not in options.only:
+            continue
+        engine = Engine(tasks, fits, load_jaco(), shared)
+        task = engine.task(scene.task)
+        _seconds(engine, Scenario(scene.task))  # as the page was before
+        for other in scene.tasks:
+            fits.get(tasks[other]().demonstrations)
+        figures[scene.name] = _seconds(engine, scene.scenario(task))
+        print(f"{scene.title}: certified after {figures[scene.name]['certified_s']:.2f} s", flush=True)
+    certified = [times["certified_s"] for times in figures.values()]
+    rows = [(SCENES[name].title, *(f"{seconds:.2f}" for seconds in times.values())) for name, times in figures.items()]
+    print_table(("scene", "rollouts s", "field s", "certified s"), rows)
+    print(f"certified: median {np.median(certified):.2f} s, worst {max(certified):.2f} s, {len(certified)} scenes")
+    write_json(out, {**figures, "median": float(np.median(certified)), "worst": max(certified)})
+    return 0
+
+
+def _seconds(engine: Engine, scenario: Scenario) -> dict[str, float]:
+    """Times until the first frame of each stage."""
+    began, times = time.perf_counter(), {}
+    for frame in engine.frames(scenario):
+        if frame.stage in SHOWN:
+            times.setdefault(f"{frame.stage.name.lower()}_s", time.perf_counter() - began)
+        if frame.stage is Stage.CERTIFIED:
+            break
+    return times
