@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from dt_viz.arm.robot import NUM_JOINTS, KinematicChain, Robot
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.kernels.arm import BODY_POINT
-from dt_viz.properties import cached_property
 from dt_viz.shipped import ASSETS
 
 

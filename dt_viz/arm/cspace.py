@@ -7,8 +7,8 @@ complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference o
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,10 @@ from dt_viz.arm.robot import NUM_JOINTS, Robot, cross
 from dt_viz.arm.tracking import DIRECTION_WEIGHT
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, CompiledField
-from dt_viz.interruption import checkpoint
 from dt_viz.kernels import escape
 from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.properties import cached_property
 
 COMPLEX_STEP = 1e-30
 DIFFERENCE = 1e-4
@@ -46,9 +44,6 @@ LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
 """Approximate motion of the hand for each joint's turning, m/rad: converts a distance of postures to a length."""
 PIN = 0.03
 """Size of the region around a pinned posture in which the field fades out, metres of that distance."""
-
-BLOCK = 64
-"""Number of configurations that a flow carries along between two looks at whether they are still wanted."""
 
 SPEED = 0.2
 """Distance that a contact at full strength escapes in a unit of flow time, metres."""
@@ -140,26 +135,14 @@ class WholeArmField(ArmField, CompiledField):
         return escape.velocities(self._escape, np.array(q, order="C"))
 
     def rk4(self, s: Array, duration: float, steps: int) -> Array:
-        return self._in_blocks(s, lambda block: escape.flow(self._escape, block, float(duration), steps))
+        return escape.flow(self._escape, np.array(s, order="C"), float(duration), steps)
 
     def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-
-        def carried(block: Array) -> Array:
-            q, num_failed = escape.adaptive_flow(self._escape, block, float(duration), float(tolerance), max_steps)
-            if num_failed:
-                raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
-            return q
-
-        return self._in_blocks(s, carried)
-
-    def _in_blocks(self, s: Array, carried: Callable[[Array], Array]) -> Array:
-        """Carry points (N, 6) along block by block, so that what is not wanted any more ends soon."""
-        blocks = [np.array(s[i : i + BLOCK], order="C") for i in range(0, len(s), BLOCK)]
-        done = []
-        for block in blocks:
-            checkpoint()
-            done.append(carried(block))
-        return np.concatenate(done) if done else s.copy()
+        start = np.array(s, order="C")
+        q, num_failed = escape.adaptive_flow(self._escape, start, float(duration), float(tolerance), max_steps)
+        if num_failed:
+            raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
+        return q
 
 
 @dataclass(frozen=True, eq=False)
