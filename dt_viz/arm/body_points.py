@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from dt_viz.arm.robot import NUM_JOINTS, KinematicChain, Robot
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.kernels.arm import BODY_POINT
+from dt_viz.kernels.blocks import clearance
+from dt_viz.obstacles.arrays import records
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.union import Union
 from dt_viz.shipped import ASSETS
 
 
@@ -63,6 +67,11 @@ class BodyPoints:
         points = np.zeros(len(self.joint), BODY_POINT)
         points["joint"], points["offset"], points["radius"] = self.joint, self.offset, self.radius
         return points
+
+    def clearance(self, robot: Robot, q: Array, obstacle: Union | Obstacle) -> Array:
+        """Compute distances (N,), metres, of the nearest sphere from an obstacle at configurations q (N, 6), rad."""
+        shapes, values = records(obstacle.parts if isinstance(obstacle, Union) else (obstacle,))
+        return clearance(robot.records, self.records, shapes, values, np.array(q, order="C"))
 
     @cached_property
     def by_joint(self) -> list[tuple[int, slice]]:

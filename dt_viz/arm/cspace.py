@@ -26,6 +26,8 @@ from dt_viz.obstacles.shapes import Obstacle
 COMPLEX_STEP = 1e-30
 DIFFERENCE = 1e-4
 """Step of the finite differences for the slope of an obstacle's distance, metres."""
+POSTURE_DIFFERENCE = 1e-5
+"""Step of those for the derivative of the field, rad."""
 
 REACH_PER_TEMPERATURE = 0.08 / 6
 """Reach of an obstacle's field, metres, for each unit of the temperature T."""
@@ -74,10 +76,7 @@ class ArmField:
 
     def with_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
-        num, d = q.shape
-        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
-        values = self(shifted).reshape(d, num, d)
-        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,12 +133,20 @@ class WholeArmField(ArmField, CompiledField):
         """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
         return escape.velocities(self._escape, np.array(q, order="C"))
 
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6), by differences of fourth order, at configurations `q` (N, 6)."""
+        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(NUM_JOINTS)
+        shifted = (q[:, None, None] + steps).reshape(-1, NUM_JOINTS)
+        near, before, far, behind = np.moveaxis(self(shifted).reshape(len(q), 4, NUM_JOINTS, NUM_JOINTS), 1, 0)
+        slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
+        return self(q), slopes.transpose(0, 2, 1)
+
     def rk4(self, s: Array, duration: float, steps: int) -> Array:
         return escape.flow(self._escape, np.array(s, order="C"), float(duration), steps)
 
     def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
-        start = np.array(s, order="C")
-        q, num_failed = escape.adaptive_flow(self._escape, start, float(duration), float(tolerance), max_steps)
+        points = np.array(s, order="C")
+        q, num_failed = escape.adaptive_flow(self._escape, points, float(duration), float(tolerance), max_steps)
         if num_failed:
             raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
         return q
@@ -162,6 +169,13 @@ class GradientField(ArmField):
         force: Any = sum(self._force(obstacle, points) for obstacle in self.obstacles)
         moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
         return (chain.axes[:, 2] * moment).sum(axis=1).T
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        num, d = q.shape
+        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
+        values = self(shifted).reshape(d, num, d)
+        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
 
     def _force(self, obstacle: Obstacle, points: Array) -> Array:
         """Compute the forces (P, 3, N) of one obstacle on body points (P, 3, N): −30u²(1 − u)² times their way out."""

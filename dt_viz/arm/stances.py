@@ -51,37 +51,34 @@ class Stances:
     """(K,) root mean square distance of the postures from the usual ones, metres, by `LEVERS`."""
 
     @cached_property
-    def _points(self) -> Array:
-        """Body points (B, K·(R + T), 3) of the postures, metres."""
-        q = np.concatenate([self.at_starts, self.on_path], axis=1)
-        return self.body.positions(self.robot, q.reshape(-1, NUM_JOINTS)).transpose(1, 0, 2)
-
-    @cached_property
     def _stuck(self) -> Array:
         """(K, T) weight of what is in the way on the path: near its ends, where no flow moves the arm, it is large."""
         ends = (self.on_path[:, [0, -1], None] - self.on_path[:, None]) * LEVERS
         near = np.exp(-(ends**2).sum(axis=3) / (2 * ENDS**2)).max(axis=1)
         return IN_THE_WAY * (1 + AT_ENDS * near)
 
-    def clearance(self, obstacle: Union | Obstacle) -> tuple[Array, Array]:
-        """Distances, metres, of the covering spheres from an obstacle, at the starts (K, R) and on the path (K, T)."""
-        distance = (obstacle.signed_distance(self._points) - self.body.radius[:, None]).min(axis=0)
-        distance, num_starts = distance.reshape(len(self.references), -1), self.at_starts.shape[1]
-        return distance[:, :num_starts], distance[:, num_starts:]
+    def room(self, obstacle: Union | Obstacle) -> Array:
+        """Distances (K, R + 1), metres, of the covering spheres from an obstacle, at the starts and the goal."""
+        return self._clearance(np.concatenate([self.at_starts, self.on_path[:, -1:]], axis=1), obstacle)
+
+    def _clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
+        """Distances (K, N), metres, at postures (K, N, 6)."""
+        return self.body.clearance(self.robot, q.reshape(-1, NUM_JOINTS), obstacle).reshape(q.shape[:2])
 
     def alike(self, stance: int) -> Mask:
         """(K,) which stances are like one of them."""
         apart = (self.on_path - self.on_path[stance]) * LEVERS
         return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < ALIKE
 
-    def cost(self, on_path: Array, asked: float) -> Array:
+    def cost(self, obstacle: Union | Obstacle, asked: float) -> Array:
         """Costs (K,), metres, of the detour from the usual postures and of what lies in the way on the path.
 
         Args:
-            on_path: (K, T) distances from the obstacle there, metres.
+            obstacle: what may be in the way.
             asked: clearance that is asked for, metres.
         """
-        return self.away + (self._stuck * np.maximum(asked - on_path, 0)).mean(axis=1)
+        lacking = np.maximum(asked - self._clearance(self.on_path, obstacle), 0)
+        return self.away + (self._stuck * lacking).mean(axis=1)
 
 
 def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: Array) -> Stances:

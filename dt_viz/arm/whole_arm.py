@@ -34,7 +34,6 @@ from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphis
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
-from dt_viz.kernels.arm import clearance
 from dt_viz.kernels.proximity import proximity
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
@@ -112,15 +111,18 @@ class Lift:
         return len(self.fractions) - self.num_guests
 
     @cached_property
-    def _splines(self) -> tuple[CubicSpline, ...]:
-        return tuple(CubicSpline(u, q) for u, q in zip(self.fractions, self.tracked.q, strict=True))
+    def _splines(self) -> tuple[Array, Array]:
+        """Fractions (R, T − 1) at which the cubics begin, and their coefficients (4, R·(T − 1), 6)."""
+        curves = [CubicSpline(u, q) for u, q in zip(self.fractions, self.tracked.q, strict=True)]
+        return self.fractions[:, :-1], np.concatenate([curve.c for curve in curves], axis=1)
 
     def at(self, index: Indices, fraction: Array) -> Array:
         """Configurations (N, 6), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
-        q = np.empty((len(index), NUM_JOINTS))
-        for rollout, spline in enumerate(self._splines):
-            rows = index == rollout
-            q[rows] = spline(fraction[rows])
+        begins, (a, b, c, d) = self._splines
+        apart = 2 * np.arange(len(begins))[:, None]  # so that one search finds the piece of the right rollout
+        piece = np.searchsorted((begins + apart).ravel(), fraction + 2 * index, side="right") - 1
+        u = (fraction - begins.ravel()[piece])[:, None]
+        q = d[piece] + u * (c[piece] + u * (b[piece] + u * a[piece]))
         return q if self.exactly is None else self.exactly(q, index, fraction)
 
     def only(self, rollout: int) -> Lift:
@@ -337,8 +339,7 @@ class WholeArm:
 
     def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
         """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
-        shapes, values = records(obstacle.parts if isinstance(obstacle, Union) else (obstacle,))
-        return clearance(self.robot.records, self.body.records, shapes, values, np.array(q, order="C"))
+        return self.body.clearance(self.robot, q, obstacle)
 
     def mesh_clearance(self, q: Array, obstacle: Union | Obstacle, enough: Array) -> Array:
         """Distance (N,), metres, of the arm's meshes at configurations q (N, 6) from the obstacle.
@@ -368,20 +369,19 @@ class WholeArm:
         flows would hold each other up, and motions turn back between them.
         """
         q, parts, margin = lifted.tracked.q[: lifted.num_hosts], avoidance.obstacle.parts, avoidance.margin
-        points = self.body.of_chain(self.robot.chain(q.reshape(-1, NUM_JOINTS).T))
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
-        places = points.transpose(0, 2, 1)
-        distances = [part.signed_distance(places) - self.body.radius[:, None] for part in parts]
-        clearance = np.array([distance.min(axis=0) for distance in distances]).reshape(len(parts), len(tangents))
+        q = q.reshape(-1, NUM_JOINTS)
+        clearance = np.array([self.clearance(q, part) for part in parts]).reshape(len(parts), len(q))
         near: Mask = clearance < margin
 
         def escapes(which: Indices) -> list[Array]:
             """Directions that leave all of these obstacles."""
             collides = np.flatnonzero(near[which].any(axis=0))
             bent = np.flatnonzero((clearance[which] < BESIDE).any(axis=0))
+            compared = q[collides[:: max(1, len(collides) // NUM_COMPARED)]]
             return escape_directions(
-                points[:, :, collides[:: max(1, len(collides) // NUM_COMPARED)]],
+                self.body.of_chain(self.robot.chain(compared.T)),
                 self.body.radius,
                 tangents[bent[:: max(1, len(bent) // NUM_COMPARED)]],
                 Union(tuple(parts[k] for k in which)),

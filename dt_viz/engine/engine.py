@@ -84,6 +84,8 @@ class Engine:
         self.comparison = Comparison(self.follower, self.memo)
         """Other methods beside ours."""
         self._shown: dict[str, _Shown] = {}
+        self._yielded: Solved | None = None
+        """The motion of the frame that was yielded last; where that is blocked, the one before."""
 
     def task(self, name: str) -> Task:
         """The task of that name, which all engines share; any thread may ask for it.
@@ -132,19 +134,21 @@ class Engine:
         """The undisturbed motion that a panel shows."""
         return self.nominal(Scenario(panel.task, state=panel.state), progress)
 
-    def solved(self, scenario: Scenario, precision: Precision, cancelled: Cancelled = never) -> Solved:
+    def solved(self, scenario: Scenario, precision: Precision) -> Solved:
         """The motion of a scenario that is not blocked, at a precision; what it raises see `frames`.
 
         Raises:
             UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
-            UnwantedError: it is cancelled.
         """
-        nominal, motion, follower = self._admission(scenario).nominal, scenario.motion, self.follower
-        before = self._before(scenario, nominal.learned)
+        return self._solved(scenario, self._admission(scenario).nominal, precision)
+
+    def _solved(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
+        """The motion of a scenario from the starts that the arm can begin at."""
+        motion, follower, before = scenario.motion, self.follower, self._before(scenario, nominal.learned)
         full = self.memo(
             "full",
             (replace(motion, warp=1.0), precision),
-            lambda: solve(motion, nominal, precision, follower, before, cancelled),
+            lambda: solve(motion, nominal, precision, follower, before),
             newest=2,
         )
         if motion.warp == 1:
@@ -165,11 +169,11 @@ class Engine:
             DemonstrationError, ImitationError: as `frames`.
             UnreachableError: the arm cannot get to where the motions start.
         """
-        blocked = self._blocked(scenario, FINE)
-        if blocked:
+        fine, blocked = self._motion(scenario, FINE)
+        if fine is None:
             *_, frame = self._stages_without_motion(scenario, blocked)
             return frame, ()
-        fine, frame = self.solved(scenario, FINE), self._rollouts(scenario, FINE)
+        frame = self._rollouts(scenario, fine, FINE)
         arms, certificates = [], frame.certificates
         for rollout in range(len(frame.rollouts)):
             arm, warnings = compose.arm_along(frame, fine, rollout, self.follower)
@@ -186,11 +190,10 @@ class Engine:
 
         Where that is blocked it stays with the motion that is shown, and gives way to what is in its way now.
         """
-        scenario = frame.scenario
+        solved = self._yielded
         if frame.blocked:
-            solved = replace(self._shown[scenario.task].newest, scenario=scenario.motion)
-        else:
-            solved = self.solved(scenario, LIVE if frame.stage < Stage.FINE else FINE)
+            solved = replace(self._shown[frame.scenario.task].newest, scenario=frame.scenario.motion)
+        assert solved is not None
         try:
             self.arm.follow(solved, frame.chosen)
         except UnreachableError:
@@ -224,9 +227,13 @@ class Engine:
         before = self._before(scenario, nominal.learned)
         return self.follower.admission(nominal, avoidance, before and kept_stance(scenario, before))
 
-    def _blocked(self, scenario: Scenario, precision: Precision) -> tuple[MotionWarning, ...]:
-        """Why the scenario has no motion, at the ends or between them; empty where it has one."""
-        return self._admission(scenario).blocked or self.solved(scenario, precision).blocked
+    def _motion(self, scenario: Scenario, precision: Precision) -> tuple[Solved | None, tuple[MotionWarning, ...]]:
+        """The motion of a scenario, and why it has none, at the ends or between them."""
+        admission = self._admission(scenario)
+        if admission.blocked:
+            return None, admission.blocked
+        solved = self._solved(scenario, admission.nominal, precision)
+        return (None, solved.blocked) if solved.blocked else (solved, ())
 
     def _before(self, scenario: Scenario, learned: Learned) -> Solved | None:
         """The motion of the task that was shown last; None where it was not learned alike."""
@@ -235,27 +242,29 @@ class Engine:
 
     def _stages(self, scenario: Scenario, cancelled: Cancelled) -> Iterator[Frame]:
         with _cores.slot():
-            blocked = self._blocked(scenario, LIVE)
-            first = None if blocked else self._rollouts(scenario, LIVE)
-        if first is None:
+            live, blocked = self._motion(scenario, LIVE)
+            first = None if live is None else self._rollouts(scenario, live, LIVE)
+        if live is None or first is None:
             yield from self._stages_without_motion(scenario, blocked, cancelled)
             return
+        self._yielded = live
         yield first
         with _cores.slot():
-            frame, live = self._with_arm(scenario, LIVE), self.solved(scenario, LIVE)
+            frame = self._with_arm(first, live, LIVE)
             frame = replace(frame, stage=Stage.LIVE, pictures=self._pictures(scenario, live, coarse=True))
             frame = self._compared(frame)
             self._shown[scenario.task] = _Shown(frame, live, live)
         yield frame
         with _cores.slot(cancelled):
-            fine = self.solved(scenario, FINE, cancelled)
+            fine = self.solved(scenario, FINE)
             end_if(cancelled)
-            frame = self._with_arm(scenario, FINE)
+            frame = self._with_arm(self._rollouts(scenario, fine, FINE), fine, FINE)
             frame = replace(frame, stage=Stage.FINE, pictures=self._pictures(scenario, fine, coarse=False))
             frame = self._compared(replace(frame, blocked=fine.blocked))
             if scenario.view.health_plots and frame.chosen is not None:
                 frame = replace(frame, profiles=compose.profiles(frame, fine, frame.chosen, self.follower))
             self._shown[scenario.task] = _Shown(frame, fine, live)
+        self._yielded = fine
         yield frame
         with _cores.slot(cancelled):
             certificates = self.memo(
@@ -288,9 +297,8 @@ class Engine:
                 frame = self._compared(frame, notes)
             yield frame
 
-    def _rollouts(self, scenario: Scenario, precision: Precision) -> Frame:
+    def _rollouts(self, scenario: Scenario, solved: Solved, precision: Precision) -> Frame:
         """The frame of stage ROLLOUTS."""
-        solved = self.solved(scenario, precision)
         frame = self.memo(
             "rollouts",
             (scenario.plain, precision),
@@ -299,9 +307,9 @@ class Engine:
         )
         return replace(frame, scenario=scenario, level=compose.level_of(scenario, solved.stack))
 
-    def _with_arm(self, scenario: Scenario, precision: Precision) -> Frame:
+    def _with_arm(self, frame: Frame, solved: Solved, precision: Precision) -> Frame:
         """The frame of stage ROLLOUTS, with the arm; at LIVE with its motion only if that is drawn."""
-        frame, solved = self._rollouts(scenario, precision), self.solved(scenario, precision)
+        scenario = frame.scenario
         moves = precision is not LIVE or scenario.view.shows_arm_motion
         before = self._joints_before(scenario, solved, precision)
         with_arm = self.memo(
@@ -329,11 +337,17 @@ class Engine:
         pictures = compose.pictures(scenario, solved, books, arrows=view.field and not carried, coarse=coarse)
         if arm is None or not carried:
             return pictures
-        layers, robot = tuple(layer for _, layer in scenario.active), self.follower.robot
+        robot, reference, rest = (
+            self.follower.robot,
+            self.follower.reference(solved.nominal),
+            compose.rest(scenario, solved),
+        )
+        made_for = solved.below if solved.stack.built or scenario.warp < 1 else solved.below.learned
+        layers = tuple(layer for _, layer in scenario.active)
         lifted = self.memo(
             "lifted field",
-            (solved.below, layers, view.slice, compose.rest(scenario, solved).tobytes()),
-            lambda: LiftedField.of(compose.field(scenario, solved), robot, self.follower.reference(solved.nominal)),
+            (made_for, layers, view.slice, rest.tobytes(), reference.tobytes()),
+            lambda: LiftedField.of(compose.field(scenario, solved), robot, reference),
             newest=2,
         )
         return replace(pictures, field=lifted.around(arm.transform, robot, scenario.obstacle))

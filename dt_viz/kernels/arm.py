@@ -1,4 +1,4 @@
-"""Kinematics of an arm and the distances of its body points, posture by posture."""
+"""Kinematics of an arm, posture by posture."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.kernels.compiled import compiled, short_kernel
-from dt_viz.kernels.distances import Number, Shapes, Values, distance
+from dt_viz.kernels.distances import Number
 
 JOINT = np.dtype(
     [
@@ -85,20 +85,3 @@ def places(joints: Joints, offset: Array, q: Array) -> Array:
         for k in range(3):
             result[row, k] = placed(offset, n - 1, axes, origins, k)
     return result
-
-
-@short_kernel
-def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
-    """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
-    axes, origins, nearest = np.empty((len(joints), 3, 3)), np.empty((len(joints), 3)), np.empty(len(q))
-    for row in range(len(q)):
-        chain(joints, q[row], axes, origins)
-        smallest = np.inf
-        for p in range(len(points)):
-            offset, joint = points[p].offset, points[p].joint
-            x, y = placed(offset, joint, axes, origins, 0), placed(offset, joint, axes, origins, 1)
-            z = placed(offset, joint, axes, origins, 2)
-            for k in range(len(shapes)):
-                smallest = min(smallest, distance(shapes[k], values, x, y, z) - points[p].radius)
-        nearest[row] = smallest
-    return nearest

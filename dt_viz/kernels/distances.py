@@ -56,14 +56,14 @@ def distance(shape: Record, values: Values, x: Number, y: Number, z: Number) -> 
     v = axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z
     w = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z
     if shape.kind == BOX:
-        return _beyond_faces(_magnitude(u) - half[0], _magnitude(v) - half[1], _magnitude(w) - half[2])
+        return beyond_faces(_magnitude(u) - half[0], _magnitude(v) - half[1], _magnitude(w) - half[2])
     if shape.kind == CYLINDER:
-        return _beyond_edge(np.sqrt(u * u + v * v) - half[0], _magnitude(w) - half[2])
+        return beyond_edge(np.sqrt(u * u + v * v) - half[0], _magnitude(w) - half[2])
     return shape.scale * _on_grid(shape, values, u / shape.scale, v / shape.scale, w / shape.scale)
 
 
 @compiled
-def _beyond_faces(x: Number, y: Number, z: Number) -> Number:
+def beyond_faces(x: Number, y: Number, z: Number) -> Number:
     """Distance from a box by the excess of each coordinate over its half size."""
     deepest = _larger(_larger(x, y), z)
     if deepest.real <= 0:
@@ -73,7 +73,7 @@ def _beyond_faces(x: Number, y: Number, z: Number) -> Number:
 
 
 @compiled
-def _beyond_edge(across: Number, along: Number) -> Number:
+def beyond_edge(across: Number, along: Number) -> Number:
     """Distance from a cylinder by the excess across and along its axis."""
     deepest = _larger(across, along)
     if deepest.real <= 0:

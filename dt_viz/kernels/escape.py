@@ -1,4 +1,4 @@
-"""Escape of the whole arm from obstacles: the generator of `dt_viz.arm.cspace.WholeArmField` and its flow."""
+"""The whole arm's escape from obstacles: the formulas of `dt_viz.arm.cspace.WholeArmField` and its flow."""
 
 from __future__ import annotations
 
@@ -6,10 +6,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, placed
+from dt_viz.kernels.arm import Array, BodyPoints, Joints
+from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, load, measure, put
 from dt_viz.kernels.compiled import compiled, kernel
-from dt_viz.kernels.distances import Number, Shapes, Values, distance
+from dt_viz.kernels.distances import Record, Shapes, Values
 from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, next_step
+
+BLOCK = block_of(
+    ("velocity", (MOST_JOINTS,)),  # V_q, rad per unit of flow time
+    ("total", ()),  # Σ w_b²
+    ("wanted", (3,)),  # n_c Σ w_b²
+    ("weight", (MOST_JOINTS,)),  # Σ w_b² of the points that a joint moves
+    ("lever", (MOST_JOINTS, 3)),  # Σ w_b² x_b of these
+    ("tip", (3,)),  # place of the end effector, metres
+    ("R", (MOST_JOINTS, 9)),
+    ("A", (MOST_JOINTS, MOST_JOINTS)),
+    ("pull", (MOST_JOINTS,)),
+    ("squared", ()),  # distance from a pin, m²
+    ("freedom", ()),  # χ
+    ("scale", ()),
+    ("start", (MOST_JOINTS,)),  # of a step, rad
+    ("sum", (MOST_JOINTS,)),  # of the slopes of a Runge–Kutta step
+    ("stages", (7, MOST_JOINTS)),
+    ("h", ()),  # length of a step, with its sign
+)
+"""Memory for the field and the steps of its flow."""
 
 
 class Escape(NamedTuple):
@@ -44,195 +65,273 @@ class Escape(NamedTuple):
 
 
 @compiled
-def _velocity(escape: Escape, q: Array, result: Array, work: tuple[Array, ...]) -> None:
-    """Write V_q (n,) at the posture q (n,), with the memory of `_work`.
+def _find_velocity(escape: Escape, block: Record) -> bool:
+    """Find V_q at the postures of the block; returns whether any of them moves.
 
     With weights ŵ_b of the body points, J_c = Σ ŵ_b J_b and n_c = Σ ŵ_b n_b this is, for each obstacle,
 
         −V_q = v·m·χ (I + R Rᵀ)⁻¹ J_cᵀ n_c/λ²,   R = (√w_x Jᵀ, √w_d Dᵀ, J_cᵀ/λ), (n, 9).
     """
-    n = len(q)
-    axes, origins, R, A, lever, weight, pull = work
-    moves = False
+    n, moves = len(escape.joints), False
+    velocity, pull, freedom = block.velocity, block.pull, block.freedom
     for i in range(n):
-        result[i] = 0
-    chain(escape.joints, q, axes, origins)
+        for lane in range(LANES):
+            velocity[i, lane] = 0
+    chain(escape.joints, block)
     for k in range(len(escape.shapes)):
-        total, x, y, z = _contact(escape, k, axes, origins, lever, weight, R)
-        if total.real <= 0:
+        if not _touch(escape, k, block):
             continue
         if not moves:
-            _holding(escape, axes, origins, R)
+            _hold(escape, block)
             moves = True
-        strength = escape.speed * np.sqrt(total) / (total * escape.damping)
+        _solve(escape, block)
         for i in range(n):
-            pull[i] = strength * (R[i, 6] * x + R[i, 7] * y + R[i, 8] * z)
-            for j in range(i + 1):
-                product = R[i, 0] * R[j, 0]
-                for row in range(1, 9):
-                    product += R[i, row] * R[j, row]
-                A[i, j] = product
-            A[i, i] += 1
-        _solve(A, pull)
-        for i in range(n):
-            result[i] -= pull[i]
+            for lane in range(LANES):
+                velocity[i, lane] -= pull[i, lane]
     if moves:
-        freedom = _freedom(escape, q)
+        _free(escape, block)
         for i in range(n):
-            result[i] *= freedom
+            for lane in range(LANES):
+                velocity[i, lane] *= freedom[lane]
+    return moves
 
 
 @compiled
-def _contact(
-    escape: Escape, k: int, axes: Array, origins: Array, lever: Array, weight: Array, R: Array
-) -> tuple[Number, Number, Number, Number]:
-    """Write J_cᵀ/λ of obstacle k to R[:, 6:], with memory for levers (n, 3) and weights (n,).
-
-    Returns Σw_b² and n_c·Σw_b².
-    """
-    n, points, shape, values, reach = len(weight), escape.points, escape.shapes[k], escape.values, escape.reach
-    total = 0 * axes[0, 0, 0]
-    wanted_x, wanted_y, wanted_z = total, total, total
-    for i in range(n):
-        weight[i] = lever[i, 0] = lever[i, 1] = lever[i, 2] = 0
+def _touch(escape: Escape, k: int, block: Record) -> bool:
+    """Find the contact with obstacle k and J_cᵀ/λ, which is R[:, 6:]; returns whether there is one in any lane."""
+    n, points, shape, reach = len(escape.joints), escape.points, escape.shapes[k], escape.reach
+    place, away, total, wanted = block.place, block.away, block.total, block.wanted
+    weight, lever, scale = block.weight, block.lever, block.scale
+    X, Y, Z = escape.sources[k]
+    touched = False
     for p in range(len(points)):
-        offset, joint = points[p].offset, points[p].joint
-        x, y = placed(offset, joint, axes, origins, 0), placed(offset, joint, axes, origins, 1)
-        z = placed(offset, joint, axes, origins, 2)
-        away = distance(shape, values, x, y, z) - points[p].radius
-        if away.real >= reach:
+        joint = points[p].joint
+        put(points[p].offset, joint, block)
+        measure(shape, escape.values, points[p].radius, block)
+        num_near = 0
+        for lane in range(LANES):
+            num_near += away[lane] < reach
+        if num_near == 0:
             continue
-        w = _fading((reach - away) / (reach - escape.cores[k, p])) ** 2
-        total += w
-        weight[joint] += w
-        lever[joint, 0] += w * x
-        lever[joint, 1] += w * y
-        lever[joint, 2] += w * z
-        x, y, z = x - escape.sources[k, 0], y - escape.sources[k, 1], z - escape.sources[k, 2]
-        share = w / np.sqrt(x * x + y * y + z * z)
-        wanted_x += share * x
-        wanted_y += share * y
-        wanted_z += share * z
-    if total.real > 0:
+        if not touched:
+            _clear(n, block)
+            touched = True
+        depth = reach - escape.cores[k, p]
+        for lane in range(LANES):
+            u = (reach - away[lane]) / depth
+            u = 1.0 if u > 1 else u
+            u = 0.0 if u < 0 else u
+            w = u * u * u * (10 - 15 * u + 6 * u * u)  # a smooth step, with two derivatives of 0 at both ends
+            scale[lane] = w * w
+            total[lane] += scale[lane]
+        for lane in range(LANES):
+            w = scale[lane]
+            x, y, z = place[0, lane], place[1, lane], place[2, lane]
+            weight[joint, lane] += w
+            lever[joint, 0, lane] += w * x
+            lever[joint, 1, lane] += w * y
+            lever[joint, 2, lane] += w * z
+        for lane in range(LANES):
+            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
+            share = scale[lane] / np.sqrt(x * x + y * y + z * z)
+            wanted[0, lane] += share * x
+            wanted[1, lane] += share * y
+            wanted[2, lane] += share * z
+    if touched:
+        origins = block.origins
+        for lane in range(LANES):
+            scale[lane] = 1 / ((total[lane] if total[lane] > 0 else 1.0) * escape.damping)
         for i in range(n - 1, -1, -1):
             if i < n - 1:  # each joint moves the points beyond it, too
-                weight[i] += weight[i + 1]
-                for component in range(3):
-                    lever[i, component] += lever[i + 1, component]
-            x, y = lever[i, 0] - weight[i] * origins[i, 0], lever[i, 1] - weight[i] * origins[i, 1]
-            _turn(axes, i, x, y, lever[i, 2] - weight[i] * origins[i, 2], 1 / (total * escape.damping), R, 6)
-    return total, wanted_x, wanted_y, wanted_z
+                for lane in range(LANES):
+                    weight[i, lane] += weight[i + 1, lane]
+                    lever[i, 0, lane] += lever[i + 1, 0, lane]
+                    lever[i, 1, lane] += lever[i + 1, 1, lane]
+                    lever[i, 2, lane] += lever[i + 1, 2, lane]
+            for c in range(3):
+                for lane in range(LANES):
+                    place[c, lane] = lever[i, c, lane] - weight[i, lane] * origins[i, c, lane]
+            _turn(i, 6, block)
+    return touched
 
 
 @compiled
-def _freedom(escape: Escape, q: Array) -> Number:
-    """χ: 0 at the pinned postures, 1 away from them."""
-    freedom = 1 + 0 * q[0]
-    for row in range(len(escape.pins)):
-        squared = 0 * q[0]
-        for i in range(len(q)):
-            squared += (escape.levers[i] * (q[i] - escape.pins[row, i])) ** 2
-        freedom *= 1 - np.exp(-squared / (2 * escape.pin**2))
-    return freedom
+def _clear(n: int, block: Record) -> None:
+    """Forget the contact before."""
+    total, wanted, weight, lever = block.total, block.wanted, block.weight, block.lever
+    for lane in range(LANES):
+        total[lane] = 0
+    for c in range(3):
+        for lane in range(LANES):
+            wanted[c, lane] = 0
+    for i in range(n):
+        for lane in range(LANES):
+            weight[i, lane] = 0
+        for c in range(3):
+            for lane in range(LANES):
+                lever[i, c, lane] = 0
 
 
 @compiled
-def _work(q: Array) -> tuple[Array, ...]:
-    """Memory for `_velocity` at postures like q (N, n)."""
-    n, like = q.shape[1], q.dtype
-    frames = np.empty((n, 3, 3), like), np.empty((n, 3), like)
-    system = np.empty((n, 9), like), np.empty((n, n), like)
-    return (*frames, *system, np.empty((n, 3), like), np.empty(n, like), np.empty(n, like))
-
-
-@compiled
-def _holding(escape: Escape, axes: Array, origins: Array, R: Array) -> None:
-    """Write √w_x Jᵀ and √w_d Dᵀ to R[:, :3] and R[:, 3:6]."""
-    n, hand = len(origins), escape.hand
-    tip = n - 1
-    x, y = placed(hand, tip, axes, origins, 0), placed(hand, tip, axes, origins, 1)
-    z = placed(hand, tip, axes, origins, 2)
+def _hold(escape: Escape, block: Record) -> None:
+    """Find √w_x Jᵀ and √w_d Dᵀ, which are R[:, :3] and R[:, 3:6]."""
+    n, hand, place, tip, origins, scale = (
+        len(escape.joints),
+        escape.hand,
+        block.place,
+        block.tip,
+        block.origins,
+        block.scale,
+    )
     staying = np.sqrt(escape.hand_weight)
     upright = np.sqrt(escape.direction_weight / (hand[0] ** 2 + hand[1] ** 2 + hand[2] ** 2))
+    put(hand, n - 1, block)
+    for c in range(3):
+        for lane in range(LANES):
+            tip[c, lane] = place[c, lane]
+    for column, weight in ((0, staying), (3, upright)):
+        for lane in range(LANES):
+            scale[lane] = weight
+        for i in range(n):
+            about = i if column == 0 else n - 1  # the direction is that from the last joint
+            for c in range(3):
+                for lane in range(LANES):
+                    place[c, lane] = tip[c, lane] - origins[about, c, lane]
+            _turn(i, column, block)
+
+
+@compiled
+def _turn(i: int, column: int, block: Record) -> None:
+    """Find the velocity of what has the lever `place` from joint i, at its unit speed, times `scale`: R[i, column:]."""
+    axes, place, scale, R = block.axes, block.place, block.scale, block.R
+    for lane in range(LANES):
+        a, b, c = axes[i, 2, 0, lane], axes[i, 2, 1, lane], axes[i, 2, 2, lane]
+        x, y, z = place[0, lane], place[1, lane], place[2, lane]
+        R[i, column, lane] = scale[lane] * (b * z - c * y)
+        R[i, column + 1, lane] = scale[lane] * (c * x - a * z)
+        R[i, column + 2, lane] = scale[lane] * (a * y - b * x)
+
+
+@compiled
+def _solve(escape: Escape, block: Record) -> None:
+    """Find the escape of one contact, `pull`: (I + R Rᵀ) pull = v·m·J_cᵀ n_c/λ², by Cholesky's decomposition."""
+    n, R, A, pull, scale = len(escape.joints), block.R, block.A, block.pull, block.scale
+    total, wanted = block.total, block.wanted
+    for lane in range(LANES):
+        m = np.sqrt(total[lane])
+        scale[lane] = escape.speed / ((m if m > 0 else 1.0) * escape.damping)
     for i in range(n):
-        _turn(axes, i, x - origins[i, 0], y - origins[i, 1], z - origins[i, 2], staying, R, 0)
-        _turn(axes, i, x - origins[tip, 0], y - origins[tip, 1], z - origins[tip, 2], upright, R, 3)
-
-
-@compiled
-def _turn(axes: Array, i: int, x: Number, y: Number, z: Number, scale: Number, R: Array, column: int) -> None:
-    """Write the velocity, at unit speed of joint i, of what has this lever from it, times a scale, to R[i, column:]."""
-    R[i, column] = scale * (axes[i, 2, 1] * z - axes[i, 2, 2] * y)
-    R[i, column + 1] = scale * (axes[i, 2, 2] * x - axes[i, 2, 0] * z)
-    R[i, column + 2] = scale * (axes[i, 2, 0] * y - axes[i, 2, 1] * x)
-
-
-@compiled
-def _fading(u: Number) -> Number:
-    """Smooth step from 0 at u = 0 to 1 at u = 1, with two derivatives of 0 at both ends."""
-    if u.real <= 0:
-        return 0 * u
-    if u.real >= 1:
-        return 0 * u + 1
-    return u * u * u * (10 - 15 * u + 6 * u * u)
-
-
-@compiled
-def _solve(A: Array, b: Array) -> None:
-    """Solve A x = b in place, A (n, n) symmetric and positive definite, of which the lower half is given (Cholesky)."""
-    n = len(b)
-    for i in range(n):
+        for lane in range(LANES):
+            towards = (
+                R[i, 6, lane] * wanted[0, lane] + R[i, 7, lane] * wanted[1, lane] + R[i, 8, lane] * wanted[2, lane]
+            )
+            pull[i, lane] = scale[lane] * towards
         for j in range(i + 1):
-            rest = A[i, j]
+            one = 1.0 if i == j else 0.0
+            for lane in range(LANES):
+                A[i, j, lane] = (
+                    one
+                    + (R[i, 0, lane] * R[j, 0, lane] + R[i, 1, lane] * R[j, 1, lane] + R[i, 2, lane] * R[j, 2, lane])
+                    + (R[i, 3, lane] * R[j, 3, lane] + R[i, 4, lane] * R[j, 4, lane] + R[i, 5, lane] * R[j, 5, lane])
+                    + (R[i, 6, lane] * R[j, 6, lane] + R[i, 7, lane] * R[j, 7, lane] + R[i, 8, lane] * R[j, 8, lane])
+                )
+    for i in range(n):  # A = L Lᵀ, with 1/L_ii on the diagonal
+        for j in range(i + 1):
             for k in range(j):
-                rest -= A[i, k] * A[j, k]
-            A[i, j] = np.sqrt(rest) if i == j else rest / A[j, j]
+                for lane in range(LANES):
+                    A[i, j, lane] -= A[i, k, lane] * A[j, k, lane]
+            for lane in range(LANES):
+                A[i, j, lane] = 1 / np.sqrt(A[i, i, lane]) if i == j else A[i, j, lane] * A[j, j, lane]
     for i in range(n):
         for k in range(i):
-            b[i] -= A[i, k] * b[k]
-        b[i] /= A[i, i]
+            for lane in range(LANES):
+                pull[i, lane] -= A[i, k, lane] * pull[k, lane]
+        for lane in range(LANES):
+            pull[i, lane] *= A[i, i, lane]
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
-            b[i] -= A[k, i] * b[k]
-        b[i] /= A[i, i]
+            for lane in range(LANES):
+                pull[i, lane] -= A[k, i, lane] * pull[k, lane]
+        for lane in range(LANES):
+            pull[i, lane] *= A[i, i, lane]
+
+
+@compiled
+def _free(escape: Escape, block: Record) -> None:
+    """Find χ: 0 at the pinned postures, 1 away from them."""
+    q, squared, freedom, pins, levers = block.q, block.squared, block.freedom, escape.pins, escape.levers
+    width = 2 * escape.pin**2
+    for lane in range(LANES):
+        freedom[lane] = 1
+    for row in range(len(pins)):
+        for lane in range(LANES):
+            squared[lane] = 0
+        for i in range(len(levers)):
+            lever, pin = levers[i], pins[row, i]
+            for lane in range(LANES):
+                squared[lane] += (lever * (q[i, lane] - pin)) ** 2
+        num_near = 0
+        for lane in range(LANES):
+            num_near += squared[lane] < 40 * width  # beyond, the factor is 1 to rounding
+        if num_near > 0:
+            for lane in range(LANES):
+                freedom[lane] *= 1 - np.exp(-squared[lane] / width)
+
+
+@compiled
+def _unload(values: Array, row: int, lane: int, result: Array) -> None:
+    """Write the entries of one lane of `values` (n, LANES) to result[row] (n,)."""
+    for i in range(result.shape[1]):
+        result[row, i] = values[i, lane]
 
 
 @kernel
 def velocities(escape: Escape, q: Array) -> Array:
-    """V_q (N, n) at postures q (N, n), which may be a tiny complex step away from real ones."""
-    result, work = np.empty_like(q), _work(q)
-    for row in range(len(q)):
-        _velocity(escape, q[row], result[row], work)
+    """V_q (N, n) at postures q (N, n)."""
+    rows, result, block = np.arange(len(q)), np.zeros_like(q), np.empty(1, BLOCK)[0]
+    for first in range(0, len(q), LANES):
+        num = load(block, q, rows, first)
+        if _find_velocity(escape, block):
+            for lane in range(num):
+                _unload(block.velocity, first + lane, lane, result)
     return result
 
 
 @compiled
-def _moved(s: Array, h: float, v: Array, there: Array) -> None:
-    """Write s + h·v (n,)."""
-    for i in range(len(s)):
-        there[i] = s[i] + h * v[i]
+def _moving(v: Array) -> Array:
+    """Rows of v (N, n) that are not zero."""
+    rows, num = np.empty(len(v), np.int64), 0
+    for row in range(len(v)):
+        if v[row].any():
+            rows[num] = row
+            num += 1
+    return rows[:num]
 
 
 @kernel
 def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
     """Postures q (N, n) carried along by classical Runge–Kutta steps of equal length, (N, n)."""
-    q, work = q.copy(), _work(q)
-    n, h = q.shape[1], duration / steps
-    k1, k2, k3, k4, there = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    for row in range(len(q)):
-        s = q[row]
+    rows, q, block = _moving(velocities(escape, q)), q.copy(), np.empty(1, BLOCK)[0]  # elsewhere the flow rests
+    n, h, at, start, slopes = q.shape[1], duration / steps, block.q, block.start, block.sum
+    velocity = block.velocity
+    for first in range(0, len(rows), LANES):
+        num = load(block, q, rows, first)
         for _ in range(steps):
-            _velocity(escape, s, k1, work)
-            if not k1.any():
-                break  # where the field vanishes its flow rests
-            _moved(s, h / 2, k1, there)
-            _velocity(escape, there, k2, work)
-            _moved(s, h / 2, k2, there)
-            _velocity(escape, there, k3, work)
-            _moved(s, h, k3, there)
-            _velocity(escape, there, k4, work)
             for i in range(n):
-                s[i] += h / 6 * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i])
+                for lane in range(LANES):
+                    start[i, lane] = at[i, lane]
+                    slopes[i, lane] = 0
+            for weight, ahead in ((h / 6, h / 2), (h / 3, h / 2), (h / 3, h), (h / 6, 0.0)):
+                _find_velocity(escape, block)
+                for i in range(n):
+                    for lane in range(LANES):
+                        slopes[i, lane] += weight * velocity[i, lane]
+                        at[i, lane] = start[i, lane] + ahead * velocity[i, lane]
+            for i in range(n):
+                for lane in range(LANES):
+                    at[i, lane] = start[i, lane] + slopes[i, lane]
+        for lane in range(num):
+            _unload(at, rows[first + lane], lane, q)
     return q
 
 
@@ -240,42 +339,91 @@ def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
 def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, max_steps: int) -> tuple[Array, int]:
     """Postures q (N, n) carried along by Dormand–Prince steps, and how many of them need more than `max_steps`.
 
-    The estimated error of a step is at most `tolerance`, rad; see `dt_viz.flows.integrators.integrate_adaptive`.
+    The estimated error of a step is at most `tolerance`, rad; see `dt_viz.flows.integrators.integrate_adaptive`. Each
+    lane takes steps of its own length, and the next posture when it has arrived.
     """
-    q, work, num_failed = q.copy(), _work(q), 0
-    n, total, sign = q.shape[1], abs(duration), np.sign(duration)
-    k, end, defect = np.empty((7, n)), np.empty(n), np.empty(n)
-    for row in range(len(q)):
-        s = q[row]
-        _velocity(escape, s, k[0], work)
-        speed = np.abs(k[0]).max()
-        if speed == 0:
-            continue  # where the field vanishes its flow rests
-        ahead = min(total, tolerance / speed)
-        _moved(s, sign * ahead, k[0], end)
-        _velocity(escape, end, k[1], work)
-        turning = np.abs(k[1] - k[0]).max() / (ahead * speed)
-        h, left = first_step(speed, turning, total, tolerance), total
-        if h < 0:
-            s += duration * k[0]
-            continue
-        for _ in range(max_steps):
-            for i in range(1, 7):
-                for d in range(n):
-                    end[d] = s[d]
-                    for j in range(i):
-                        end[d] += sign * h * STAGES[i, j] * k[j, d]
-                _velocity(escape, end, k[i], work)
-            for d in range(n):
-                defect[d] = 0
-                for i in range(7):
-                    defect[d] += h * ERROR[i] * k[i, d]
-            error = np.abs(defect).max() / allowed_error(np.abs(end - s).max(), tolerance)
+    v = velocities(escape, q)
+    rows, q, total, sign = _moving(v), q.copy(), abs(duration), np.sign(duration)
+    first_steps, num_failed, n = _first_steps(escape, q, v, rows, total, sign, tolerance), 0, q.shape[1]
+    block = np.empty(1, BLOCK)[0]
+    at, start, stages, h, velocity, defect = block.q, block.start, block.stages, block.h, block.velocity, block.sum
+    row_of, num_steps, left = np.full(LANES, -1), np.zeros(LANES, np.int64), np.zeros(LANES)
+    for i in range(n):
+        for lane in range(LANES):
+            start[i, lane] = q[rows[0], i] if len(rows) else 0.0
+            stages[0, i, lane] = 0
+    for lane in range(LANES):
+        h[lane] = 0
+    upcoming, num_busy = 0, 0
+    while True:
+        for lane in range(LANES):
+            if row_of[lane] < 0 and upcoming < len(rows):
+                row = rows[upcoming]
+                if first_steps[upcoming] < 0:  # one Euler step is exact enough
+                    q[row] += duration * v[row]
+                    upcoming += 1
+                    continue
+                row_of[lane], left[lane], num_steps[lane], h[lane] = row, total, 0, sign * first_steps[upcoming]
+                upcoming, num_busy = upcoming + 1, num_busy + 1
+                for i in range(n):
+                    start[i, lane], stages[0, i, lane] = q[row, i], v[row, i]
+        if num_busy == 0:
+            if upcoming < len(rows):
+                continue
+            return q, num_failed
+        for stage in range(1, 7):
+            for i in range(n):
+                for lane in range(LANES):
+                    defect[i, lane] = 0
+                for before in range(stage):
+                    weight = STAGES[stage, before]
+                    for lane in range(LANES):
+                        defect[i, lane] += weight * stages[before, i, lane]
+                for lane in range(LANES):
+                    at[i, lane] = start[i, lane] + h[lane] * defect[i, lane]
+            _find_velocity(escape, block)
+            for i in range(n):
+                for lane in range(LANES):
+                    stages[stage, i, lane] = velocity[i, lane]
+        for i in range(n):
+            for lane in range(LANES):
+                defect[i, lane] = 0
+            for stage in range(7):
+                weight = ERROR[stage]
+                for lane in range(LANES):
+                    defect[i, lane] += weight * stages[stage, i, lane]
+        for lane in range(LANES):
+            if row_of[lane] < 0:
+                continue
+            motion = error = 0.0
+            for i in range(n):
+                motion = max(motion, abs(at[i, lane] - start[i, lane]))
+                error = max(error, abs(h[lane] * defect[i, lane]))
+            error, length = error / allowed_error(motion, tolerance), abs(h[lane])
+            num_steps[lane] += 1
             if error <= 1:
-                s[:], k[0], left = end, k[6], left - h
-            if left <= 1e-12 * total:
-                break
-            h = min(next_step(h, error), left)
-        else:
-            num_failed += 1
-    return q, num_failed
+                left[lane] -= length
+                for i in range(n):
+                    start[i, lane], stages[0, i, lane] = at[i, lane], stages[6, i, lane]
+            arrived = left[lane] <= 1e-12 * total
+            if arrived or num_steps[lane] == max_steps:
+                _unload(start, row_of[lane], lane, q)
+                num_failed += not arrived
+                row_of[lane], h[lane], num_busy = -1, 0.0, num_busy - 1
+            else:
+                h[lane] = sign * min(next_step(length, error), left[lane])
+
+
+@compiled
+def _first_steps(escape: Escape, q: Array, v: Array, rows: Array, total: float, sign: float, tolerance: float) -> Array:
+    """Lengths of the first steps from the postures q[rows], whose velocities are v[rows]; see `first_step`."""
+    there, speeds, ahead = np.empty((len(rows), q.shape[1])), np.empty(len(rows)), np.empty(len(rows))
+    for k in range(len(rows)):
+        speeds[k] = np.abs(v[rows[k]]).max()
+        ahead[k] = min(total, tolerance / speeds[k])
+        there[k] = q[rows[k]] + sign * ahead[k] * v[rows[k]]
+    there = velocities(escape, there)
+    for k in range(len(rows)):
+        turning = np.abs(there[k] - v[rows[k]]).max() / (ahead[k] * speeds[k])
+        ahead[k] = first_step(speeds[k], turning, total, tolerance)
+    return ahead

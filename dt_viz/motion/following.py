@@ -245,14 +245,18 @@ class Follower:
             learned,
             lambda: stances(self.robot, self.whole_arm.body, usual.reference, learned.task.starts, _mean(paths)),
         )
-        at_starts, on_path = known.clearance(obstacle)  # of the spheres, which are larger than the arm
-        clearance = np.concatenate([at_starts, on_path[:, -1:]], axis=1)
+        clearance = known.room(obstacle)  # of the spheres, which are larger than the arm
         free, ample = clearance >= 0, clearance >= margin
         free[0], ample[0] = room >= 0, room >= margin
-        kept = np.zeros(len(free), bool) if before is None else (known.references == before).all(axis=1)
         # the goal first, then as many starts as possible, then as much room as is asked for
-        merit = [free[:, -1], free.sum(axis=1), kept, ample.sum(axis=1), -known.cost(on_path, asked)]
+        most = free[:, -1] * free.shape[1] + free.sum(axis=1)
+        kept = np.zeros(len(free), bool) if before is None else (known.references == before).all(axis=1)
         left = ~known.alike(0) if before is None and ample[0].all() else np.ones(len(free), bool)
+        if kept.any() and most[kept].max() == most.max():  # the rest is looked at only where this one does not do
+            best = int(np.argmax(kept))
+            left &= ~known.alike(best)
+            yield before, free[best]
+        merit = [most, kept, ample.sum(axis=1), -known.cost(obstacle, asked)]
         for best in np.lexsort(merit[::-1])[::-1]:
             stance = None if best == 0 else _as_stance(known.references[best])
             if left[best] and (stance is None or self._sound(learned, stance)):

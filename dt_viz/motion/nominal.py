@@ -14,6 +14,7 @@ from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import AnyImitation
+from dt_viz.memo import Memo
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
@@ -173,11 +174,19 @@ class Nominal:
         return self.numbers.index(number) if number in self.numbers else None
 
     def only(self, rollouts: Sequence[int] | Indices, warnings: Sequence[MotionWarning] = ()) -> Nominal:
-        """Some of the rollouts, and why the others are left out."""
-        kept = {self.numbers[k] for k in rollouts}
-        left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
-        strands = tuple(self.strands[k] for k in rollouts)
-        return replace(self, strands=strands, left_out=tuple(sorted(left_out)), warnings=tuple(warnings))
+        """Some of the rollouts, and why the others are left out: the same ones are the same object."""
+
+        def chosen() -> Nominal:
+            kept = {self.numbers[k] for k in rollouts}
+            left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
+            strands = tuple(self.strands[k] for k in rollouts)
+            return replace(self, strands=strands, left_out=tuple(sorted(left_out)), warnings=tuple(warnings))
+
+        return self._parts("only", (tuple(rollouts), tuple(warnings)), chosen, newest=4)
+
+    @cached_property
+    def _parts(self) -> Memo:
+        return Memo()
 
     def warped(self, fraction: float) -> Nominal:
         """The rollouts with the imitation's flows run for a fraction of their durations; samples keep their places."""

@@ -8,7 +8,6 @@ from itertools import islice
 import numpy as np
 
 from dt_viz.arm.whole_arm import ArmSolution, Lift
-from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal, Stance
@@ -56,12 +55,7 @@ class Solved:
 
 
 def solve(
-    scenario: Scenario,
-    nominal: Nominal,
-    precision: Precision,
-    follower: Follower,
-    before: Solved | None = None,
-    cancelled: Cancelled = never,
+    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Solved | None = None
 ) -> Solved:
     """The motion of a scenario, every flow run for its full duration.
 
@@ -74,11 +68,9 @@ def solve(
         before: the motion that was shown last, of the same learned motion. The sides on which it passes obstacles are
             kept while they do; and joints of LIVE are looked for from its own, which changes the result by less than a
             milliradian.
-        cancelled: asked before a precision better than LIVE.
 
     Raises:
         UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
-        UnwantedError: it is cancelled.
     """
     scenario = replace(scenario, warp=1.0)
     if precision is LIVE and before is not None and (lacking := _lacking(nominal, scenario, before)) is not None:
@@ -90,7 +82,6 @@ def solve(
         return _solved(scenario, nominal, precision, follower, before)
     solved = _with_a_way(scenario, nominal, follower, before)
     if precision is not LIVE:
-        end_if(cancelled)
         solved = _solved(scenario, solved.nominal, precision, follower, before)
     return _unless_it_touches(solved, follower)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 from dt_viz.learning.choice import State
@@ -156,7 +157,7 @@ class Scenario:
     """Name of the paper's scene that it began as, if any."""
     view: View = field(default_factory=View)
 
-    @property
+    @cached_property
     def active(self) -> tuple[tuple[int, Layer], ...]:
         """The layers that change the end effector's motion, from the inside out, each with its place in the stack."""
         return tuple((k, layer) for k, layer in enumerate(self.stack) if layer.on and layer.transform.acts)
@@ -166,7 +167,7 @@ class Scenario:
         """The transform that the page's obstacles belong to; one without obstacles if the stack has none."""
         return next((layer.transform for layer in self.stack if isinstance(layer.transform, Avoidance)), Avoidance())
 
-    @property
+    @cached_property
     def arm_avoidance(self) -> ArmAvoidance | None:
         """Avoidance by the whole arm in configuration space; None where only the end effector gives way.
 
@@ -184,12 +185,12 @@ class Scenario:
         """Whether some layer that is on leads motions around its obstacles."""
         return any(layer.on and bool(layer.transform.avoided.parts) for layer in self.stack)
 
-    @property
+    @cached_property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """The obstacles of all layers, also of those that are off."""
         return tuple(part for layer in self.stack for part in layer.transform.avoided.parts)
 
-    @property
+    @cached_property
     def obstacle(self) -> Union:
         """All obstacles as one."""
         return Union(self.obstacles)
@@ -199,12 +200,12 @@ class Scenario:
         """Number of the obstacle that has handles; None if there is no obstacle."""
         return min(self.view.selected, len(self.obstacles) - 1) if self.obstacles else None
 
-    @property
+    @cached_property
     def plain(self) -> Scenario:
         """The same with the view that a scenario begins with: all that moves, and nothing of how it is looked at."""
         return replace(self, view=View())
 
-    @property
+    @cached_property
     def motion(self) -> Scenario:
         """What the motions depend on: the same also without the choice of the one that the arm follows."""
         return replace(self, view=View(), arm_rollout=0, scene="")

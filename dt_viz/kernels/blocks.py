@@ -1,0 +1,174 @@
+"""Kinematics of an arm and its distances from obstacles, for a block of `LANES` postures at once.
+
+The innermost loops run over the lanes of a block, whose layout is known when they are compiled: so they become
+instructions for four or eight numbers at a time. One posture alone takes as long as `LANES` of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dt_viz.kernels.arm import Array, BodyPoints, Joints
+from dt_viz.kernels.compiled import compiled, short_kernel
+from dt_viz.kernels.distances import (
+    BOX,
+    CYLINDER,
+    GRID,
+    SPHERE,
+    Record,
+    Shapes,
+    Values,
+    beyond_edge,
+    beyond_faces,
+    distance,
+)
+
+LANES = 16
+"""Number of postures in a block."""
+MOST_JOINTS = 8
+"""Largest number of joints of an arm."""
+
+
+def block_of(*rows: tuple[str, tuple[int, ...]]) -> np.dtype:
+    """Memory for a block: these arrays, by name and shape, each with one entry for every lane."""
+    kinematics = (
+        ("q", (MOST_JOINTS,)),  # angles, rad
+        ("axes", (MOST_JOINTS, 3, 3)),  # of the joints' frames: [joint, column, component]
+        ("origins", (MOST_JOINTS, 3)),  # of these frames, metres
+        ("sine", ()),
+        ("cosine", ()),
+        ("place", (3,)),  # of a body point, metres
+        ("away", ()),  # its distance from an obstacle, metres
+    )
+    return np.dtype([(name, np.float64, (*shape, LANES)) for name, shape in (*kinematics, *rows)])
+
+
+BLOCK = block_of(("nearest", ()))
+"""Memory for `clearance`."""
+Blocks = NDArray[np.void]
+"""(1,) block of such a dtype."""
+
+
+@compiled
+def load(block: Record, q: Array, rows: Array, first: int) -> int:
+    """Take the postures q[rows[first:]] (n,) into the lanes, the last one into those left over; returns how many."""
+    num, angles = min(len(rows) - first, LANES), block.q
+    for lane in range(LANES):
+        row = rows[first + min(lane, num - 1)]
+        for i in range(q.shape[1]):
+            angles[i, lane] = q[row, i]
+    return num
+
+
+@compiled
+def chain(joints: Joints, block: Record) -> None:
+    """Find the frames of the joints: frame i is frame i − 1 times R_i, then a turn by q_i about its z axis."""
+    axes, origins, sine, cosine = block.axes, block.origins, block.sine, block.cosine
+    for i in range(len(joints)):
+        R, shift = joints[i].rotation, joints[i].translation
+        _sine_cosine(block, i)
+        if i == 0:
+            for k in range(3):
+                for lane in range(LANES):
+                    axes[0, 0, k, lane] = R[k, 0] * cosine[lane] + R[k, 1] * sine[lane]
+                    axes[0, 1, k, lane] = R[k, 1] * cosine[lane] - R[k, 0] * sine[lane]
+                    axes[0, 2, k, lane] = R[k, 2]
+                    origins[0, k, lane] = shift[k]
+            continue
+        for k in range(3):
+            for lane in range(LANES):
+                a, b, c = axes[i - 1, 0, k, lane], axes[i - 1, 1, k, lane], axes[i - 1, 2, k, lane]
+                x = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
+                y = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
+                axes[i, 0, k, lane] = x * cosine[lane] + y * sine[lane]
+                axes[i, 1, k, lane] = y * cosine[lane] - x * sine[lane]
+                axes[i, 2, k, lane] = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
+                origins[i, k, lane] = origins[i - 1, k, lane] + shift[0] * a + shift[1] * b + shift[2] * c
+
+
+@compiled
+def _sine_cosine(block: Record, i: int) -> None:
+    """Find sin q_i and cos q_i to 1e-16, for up to a thousand turns.
+
+    The angle less the nearest multiple of π/2, which is known to 100 bits, goes into the polynomials of fdlibm.
+    """
+    q, sine, cosine = block.q, block.sine, block.cosine
+    for lane in range(LANES):
+        quarters = np.floor(q[i, lane] * 0.6366197723675814 + 0.5)
+        x = q[i, lane] - quarters * 1.5707963267341256
+        x = x - quarters * 6.077100506303966e-11
+        x = x - quarters * 2.0222662487959506e-21
+        z = x * x
+        s = 2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)
+        s = 8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * s)
+        s = x + x * z * (-1.66666666666666324348e-01 + z * s)
+        c = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 - z * 1.13596475577881948265e-11)
+        c = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * c)
+        c = 1 - 0.5 * z + z * z * (4.16666666666666019037e-02 + z * c)
+        quadrant = quarters - 4 * np.floor(quarters * 0.25)
+        odd = (quadrant == 1) | (quadrant == 3)
+        turned_s, turned_c = c if odd else s, s if odd else c
+        sine[lane] = -turned_s if quadrant >= 2 else turned_s
+        cosine[lane] = -turned_c if (quadrant == 1) | (quadrant == 2) else turned_c
+
+
+@compiled
+def put(offset: Array, joint: int, block: Record) -> None:
+    """Find the place of what is fixed to a joint at an offset (3,), metres."""
+    axes, origins, place = block.axes, block.origins, block.place
+    u, v, w = offset[0], offset[1], offset[2]
+    for k in range(3):
+        for lane in range(LANES):
+            turned = u * axes[joint, 0, k, lane] + v * axes[joint, 1, k, lane] + w * axes[joint, 2, k, lane]
+            place[k, lane] = origins[joint, k, lane] + turned
+
+
+@compiled
+def measure(shape: Record, values: Values, radius: float, block: Record) -> None:
+    """Find the distance of a sphere about the place from an obstacle."""
+    place, away, kind = block.place, block.away, shape.kind
+    if kind == GRID:
+        for lane in range(LANES):
+            away[lane] = distance(shape, values, place[0, lane], place[1, lane], place[2, lane]) - radius
+        return
+    X, Y, Z = shape.position
+    half_u, half_v, half_w = shape.half
+    axes = shape.axes
+    a, b, c, d, e, f = axes[0, 0], axes[1, 0], axes[2, 0], axes[0, 1], axes[1, 1], axes[2, 1]
+    g, h, i = axes[0, 2], axes[1, 2], axes[2, 2]
+    if kind == SPHERE:
+        for lane in range(LANES):
+            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
+            away[lane] = np.sqrt(x * x + y * y + z * z) - half_u - radius
+    elif kind == BOX:
+        for lane in range(LANES):
+            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
+            u, v, w = abs(a * x + b * y + c * z), abs(d * x + e * y + f * z), abs(g * x + h * y + i * z)
+            away[lane] = beyond_faces(u - half_u, v - half_v, w - half_w) - radius
+    elif kind == CYLINDER:
+        for lane in range(LANES):
+            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
+            u, v, w = a * x + b * y + c * z, d * x + e * y + f * z, abs(g * x + h * y + i * z)
+            away[lane] = beyond_edge(np.sqrt(u * u + v * v) - half_u, w - half_w) - radius
+
+
+@short_kernel
+def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
+    """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
+    result, rows, block = np.full(len(q), np.inf), np.arange(len(q)), np.empty(1, BLOCK)[0]
+    away, nearest = block.away, block.nearest
+    for first in range(0, len(q), LANES):
+        num = load(block, q, rows, first)
+        chain(joints, block)
+        for lane in range(LANES):
+            nearest[lane] = np.inf
+        for p in range(len(points)):
+            put(points[p].offset, points[p].joint, block)
+            for k in range(len(shapes)):
+                measure(shapes[k], values, points[p].radius, block)
+                for lane in range(LANES):
+                    nearest[lane] = away[lane] if away[lane] < nearest[lane] else nearest[lane]
+        for lane in range(num):
+            result[first + lane] = nearest[lane]
+    return result
