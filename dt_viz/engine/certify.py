@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.whole_arm import ArmSolution
 from dt_viz.engine.frame import Frame
-from dt_viz.errors import Cancelled, end_if, never
-from dt_viz.flows.diffeomorphisms import Diffeomorphism
-from dt_viz.flows.fields import Array
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.certificates import (
     MAX_OFF,
@@ -30,29 +27,10 @@ from dt_viz.motion.solve import Solved
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.warning import ARM, Kind
 
-PART = 256
-"""Number of points that a map is evaluated at between two questions whether the certificates are still wanted."""
 
-
-def certify(frame: Frame, fine: Solved, follower: Follower, cancelled: Cancelled = never) -> Certificates:
-    """Certificates of the motions that the frame shows, with the transforms that they were solved with.
-
-    Raises:
-        UnwantedError: they are cancelled.
-    """
-    stack = replace(fine.stack, transform=_InParts(fine.stack.transform, cancelled))
-    fine = replace(fine, stack=stack)
-    if fine.arm is None:
-        known = _certified_hand(frame, fine)
-    else:
-        known = _certified_arm(frame, fine, fine.arm, follower, cancelled)
-    known = _certified_joints(known, frame, fine, follower)
-    end_if(cancelled)
-    return known if frame.arm is None else _with_meshes(known, frame, fine, cancelled)
-
-
-def _certified_joints(known: Certificates, frame: Frame, fine: Solved, follower: Follower) -> Certificates:
-    """Add the certificates of the arm's motion along the chosen rollout."""
+def certify(frame: Frame, fine: Solved, follower: Follower) -> Certificates:
+    """Certificates of the motions that the frame shows, with the transforms that they were solved with."""
+    known = _certified_hand(frame, fine) if fine.arm is None else _certified_arm(frame, fine, fine.arm, follower)
     if frame.arm is None or frame.chosen is None:
         return known
     path, due = frame.rollouts[frame.chosen], frame.times[frame.chosen]
@@ -72,9 +50,7 @@ def _certified_hand(frame: Frame, fine: Solved) -> Certificates:
     return replace(known, clearance=-depth if depth > 0 else known.clearance)
 
 
-def _certified_arm(
-    frame: Frame, fine: Solved, arm: ArmSolution, follower: Follower, cancelled: Cancelled
-) -> Certificates:
+def _certified_arm(frame: Frame, fine: Solved, arm: ArmSolution, follower: Follower) -> Certificates:
     scenario, robot, whole_arm = frame.scenario, follower.robot, follower.whole_arm
     p, undisturbed, known = arm.p.copy(), whole_arm.limits.inside(arm.q), frame.certificates
     if frame.arm is not None:
@@ -87,7 +63,6 @@ def _certified_arm(
         *hand_warnings(robot, p, path, tolerance=MAX_OFF),
         *fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed),
     )
-    end_if(cancelled)
     known, q = certified_arm(known, arm.transform, p, undisturbed, by_hand=integration.by_hand)
     shown = Shown(arm.index, arm.fraction, times, robot.end_effector(q))
     known = certified(known, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
@@ -96,7 +71,7 @@ def _certified_arm(
     return known.warning(*clearance_warnings(known.clearance, kept))
 
 
-def _with_meshes(known: Certificates, frame: Frame, fine: Solved, cancelled: Cancelled) -> Certificates:
+def with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates:
     """Certificates with distances of the arm's meshes: on the motion that it shows, and on all that it avoids along."""
     assert frame.arm is not None
     model, scenario, avoidance = load_collision_model(), frame.scenario, frame.scenario.arm_avoidance
@@ -107,35 +82,5 @@ def _with_meshes(known: Certificates, frame: Frame, fine: Solved, cancelled: Can
     if fine.arm is None or avoidance is None:
         return known
     hosts = range(len(frame.rollouts) - fine.nominal.num_added)
-    nearest = []
-    for host in hosts:
-        end_if(cancelled)
-        nearest.append(model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], avoidance.obstacle))
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], avoidance.obstacle) for host in hosts]
     return known.warning(*margin_warnings(scenario, nearest, fine.nominal.numbers))
-
-
-@dataclass(frozen=True)
-class _InParts(Diffeomorphism):
-    """A map that is evaluated at `PART` points at a time, and ends by UnwantedError when it is cancelled."""
-
-    whole: Diffeomorphism
-    cancelled: Cancelled
-
-    @property
-    def dim(self) -> int:
-        """See `Diffeomorphism`."""
-        return self.whole.dim
-
-    def scaled(self, fraction: float) -> Diffeomorphism:
-        """See `Diffeomorphism`."""
-        return replace(self, whole=self.whole.scaled(fraction))
-
-    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
-        images, tangents = s.copy(), None if U is None else U.copy()
-        for first in range(0, len(s), PART):
-            end_if(self.cancelled)
-            part = slice(first, first + PART)
-            images[part], moved = self.whole._map(s[part], None if U is None else U[part], inverse=inverse)
-            if tangents is not None:
-                tangents[part] = moved
-        return images, tangents

@@ -1,4 +1,4 @@
-"""Who computes when: what follows a hand comes before what refines, and there are no more at once than cores."""
+"""Who computes when: what follows a hand comes before what refines, and no more at once than there are cores."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from contextlib import contextmanager
 
 from dt_viz.errors import Cancelled, end_if, never
 
+NUM_SLOTS = os.cpu_count() or 1
+"""Number of computations at once."""
 LOOK = 0.02
-"""Interval, seconds, at which a refinement that waits asks whether it is still wanted."""
+"""Interval at which a refinement that waits asks whether it is still wanted, seconds."""
 
 
 class Cores:
-    """A bounded semaphore with two priorities. It is not reentrant: a holder must not wait for another slot.
+    """A bounded semaphore with two priorities.
 
     Those who follow a hand get a slot before those who refine; among equals, the one that has waited longest. One slot
-    is never a refinement's, unless there is only one.
+    is never a refinement's, unless there is only one. Nobody waits for a slot within a slot, nor within a
+    `functools.cached_property`, which has a lock for all instances in Python 3.10 and 3.11.
     """
 
-    def __init__(self, num: int = os.cpu_count() or 1) -> None:
+    def __init__(self, num: int = NUM_SLOTS) -> None:
         """Allow `num` computations at once."""
         self._changed = threading.Condition()
         self._free, self._free_to_refine = num, max(1, num - 1)
@@ -34,12 +37,13 @@ class Cores:
         """Wait for a slot, and have it within this block.
 
         Args:
-            cancelled: of a refinement: whether nobody wants it any more; None for what follows a hand.
+            cancelled: of a refinement, asked before it begins and while it waits; None for what follows a hand.
 
         Raises:
-            UnwantedError: the refinement is cancelled while it waits.
+            UnwantedError: it is cancelled.
         """
         refines = cancelled is not None
+        end_if(cancelled or never)
         with self._changed:
             place = refines, next(self._numbers)
             self.queue.append(place)
@@ -58,4 +62,5 @@ class Cores:
                 self._changed.notify_all()
 
     def _is_next(self, place: tuple[bool, int]) -> bool:
-        return min(self.queue) == place and self._free > 0 and (self._free_to_refine > 0 or not place[0])
+        refines, _ = place
+        return min(self.queue) == place and self._free > 0 and (self._free_to_refine > 0 or not refines)

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from dt_viz.arm.robot import Robot
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine import compose
-from dt_viz.engine.certify import certify
+from dt_viz.engine.certify import certify, with_meshes
 from dt_viz.engine.comparison import Comparison
 from dt_viz.engine.cores import Cores
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.live_arm import LiveArm
-from dt_viz.errors import Cancelled, end_if, never
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Rays
@@ -103,7 +103,7 @@ class Engine:
         Args:
             scenario: what to show.
             progress: called while a task is fitted for the first time; see `dt_viz.learning.imitation.fit`.
-            cancelled: asked after stage LIVE, between parts of the computation and while it waits for a slot.
+            cancelled: asked after stage LIVE, before each part of the computation and while it waits for a slot.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be read.
@@ -257,7 +257,7 @@ class Engine:
         yield frame
         with _cores.slot(cancelled):
             fine = self.solved(scenario, FINE)
-            end_if(cancelled)
+        with _cores.slot(cancelled):
             frame = self._with_arm(self._rollouts(scenario, fine, FINE), fine, FINE)
             frame = replace(frame, stage=Stage.FINE, pictures=self._pictures(scenario, fine, coarse=False))
             frame = self._compared(replace(frame, blocked=fine.blocked))
@@ -267,9 +267,11 @@ class Engine:
         self._yielded = fine
         yield frame
         with _cores.slot(cancelled):
-            certificates = self.memo(
-                "certificates", scenario.plain, lambda: certify(frame, fine, self.follower, cancelled), newest=1
-            )
+            key = scenario.plain
+            certificates = self.memo("certificates", key, lambda: certify(frame, fine, self.follower), newest=1)
+        if frame.arm is not None:
+            with _cores.slot(cancelled):
+                certificates = self.memo("meshes", key, lambda: with_meshes(certificates, frame, fine), newest=1)
         frame = replace(frame, stage=Stage.CERTIFIED, certificates=certificates)
         yield frame
         yield from self._compared_at_rest(frame, fine, cancelled)
