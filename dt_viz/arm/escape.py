@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.flows.fields import Array
-from dt_viz.kernels.detours import detours
+from dt_viz.kernels.detours import detours, distinct
 from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 from dt_viz.obstacles.union import Union
 
@@ -68,18 +68,11 @@ def escape_directions(
     parallel = np.abs(directions @ tangents.T).mean(axis=1)
     cost = detour * (1 + SIDEWAYS * parallel) + TABLE_WEIGHT * below
 
-    found: list[Array] = []
-    costs: list[float] = []
-    while (before is not None or len(found) < num) and np.isfinite(cost).any():
-        best = directions[cost.argmin()]
-        costs.append(float(cost.min()))
-        alike = directions @ best > ALIKE
-        share = np.where(alike, np.exp((cost.min() - cost) / (SELECTIVITY * cost.min())), 0)
-        escape = share @ directions
-        found.append(escape / np.linalg.norm(escape))
-        cost[alike] = np.inf
+    most = num if before is None else len(directions)
+    means, costs = distinct(directions, cost, float(ALIKE), SELECTIVITY, most)
+    found = list(means)
     if before is not None:
-        kept = int(np.argmax(np.stack(found) @ before))
+        kept = int(np.argmax(means @ before))
         if kept:
             found.insert(0 if costs[kept] < STAYING * costs[0] else 1, found.pop(kept))
     return found

@@ -7,11 +7,12 @@ Lengths are metres, angles radians, positions and directions in the robot's base
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dt_viz.arm.robot import NUM_JOINTS, KinematicChain, Robot
+from dt_viz.kernels.tracking import LIMIT_WEIGHT, Arm, Postures, settle, walk
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -27,18 +28,8 @@ DIRECTION_WEIGHT = 1.5
 being unique and tracked joints jump between wrist postures."""
 ASKED_DIRECTION_WEIGHT = 40.0
 """Weight w_d where inverse kinematics is given a direction: it chooses one posture and need not be continuous."""
-LIMIT_WEIGHT = 50.0
-"""Weight of the springs before the joint limits, against 1 for staying near the reference."""
 LIMIT_MARGIN = 0.15
 """Distance from the limit at which those springs start, rad."""
-DAMPING_FLOOR = 1e-6
-"""Least damping λ₀² of the pseudo-inverse, m²: bounds the step at a singularity, is negligible elsewhere."""
-DAMPING_PER_ERROR = 0.2
-"""Growth of λ² with the remaining error, m: about half the curvature of the forward kinematics."""
-CURVATURE = 0.1
-"""Curvature of the forward kinematics along the null space, m per rad²; see `_newton`."""
-STEP_LIMIT = 0.4
-"""Largest joint motion in one step, rad; beyond it the linear model is invalid."""
 
 STRIDE = 0.08
 """Distance along the path that a cold start covers in one step, metres."""
@@ -86,20 +77,6 @@ class JointPath:
     damped: NDArray[np.bool_]
 
 
-class _Posture(NamedTuple):
-    """Secondary objective in the null space; one column for each configuration, or one for all."""
-
-    reference: Array  # (6, N) or (6, 1), rad
-    direction: Array  # (3, N) or (3, 1), unit vectors, base frame
-    soft_lower: Array  # (6, N) or (6, 1), rad, starts of the springs before the limits
-    soft_upper: Array
-    direction_weight: Array  # (1, N) or (1, 1), against 1 for the reference
-
-    def take(self, columns: NDArray[np.intp]) -> _Posture:
-        """Select the postures of some columns, in their order."""
-        return _Posture(*(field[:, columns] for field in self))
-
-
 def inverse_kinematics(
     robot: Robot, target: ArrayLike, seed: ArrayLike | None = None, hand_direction: ArrayLike | None = None
 ) -> Array:
@@ -141,17 +118,16 @@ def inverse_kinematics(
     scatter = np.random.default_rng(0).normal(scale=0.8, size=(NUM_RESTARTS, NUM_JOINTS))
     scatter[:2] = 0.0
     starts = np.where(np.arange(NUM_RESTARTS)[:, None] % 2 == 0, reference, ready) + scatter
-    q = robot.clip(starts).T
-    posture = _posture(robot, reference[:, None], direction[:, None], weight)
-    for iteration in range(IK_ITERATIONS):
-        gain = 1.0 if iteration < IK_ITERATIONS - FINAL_SWEEPS else 0.0
-        q, step = _newton(robot, q, target[:, None], posture, gain)
-        if step.max() < 1e-6:
+    posture = _posture(robot, reference[None], direction[None], weight)
+    targets, which, q = np.tile(target, (len(starts), 1)), np.zeros(len(starts), int), robot.clip(starts)
+    for iteration in range(IK_ITERATIONS):  # all go on until each has come to rest
+        improves = iteration < IK_ITERATIONS - FINAL_SWEEPS
+        before, q = q, settle(_arm(robot), posture, q, targets, which, int(improves), int(not improves), -1.0)
+        if np.abs(q - before).max() < 1e-6:
             break
 
-    turns = np.where(np.isinf(robot.upper), np.round((q.T - reference) / (2 * np.pi)), 0.0)
-    q -= 2 * np.pi * turns.T
-    chain = robot.chain(q)
+    q -= 2 * np.pi * np.where(np.isinf(robot.upper), np.round((q - reference) / (2 * np.pi)), 0.0)
+    chain = robot.chain(q.T)
     miss = np.linalg.norm(chain.position - target[:, None], axis=0)
     if miss.min() > IK_TOLERANCE:
         shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
@@ -162,7 +138,7 @@ def inverse_kinematics(
             f"the target is {np.linalg.norm(target - shoulder):.2f} m from it."
         )
     cost = _posture_cost(q, chain, posture) + FLOOR_WEIGHT * np.maximum(0.0, -chain.origins[:, 2]).sum(axis=0)
-    return q[:, np.argmin(np.where(miss <= IK_TOLERANCE, cost, np.inf))]
+    return q[np.argmin(np.where(miss <= IK_TOLERANCE, cost, np.inf))]
 
 
 def track(
@@ -179,7 +155,7 @@ def track(
         h(q) = ½‖q − q_ref‖² + ½·w_d‖d(q) − d(q_ref)‖² + springs before the joint limits,
 
     d the direction of the hand. The step is the resolved-rate step with drift correction, written with the
-    Moore-Penrose pseudo-inverse J# in the metric of h's second derivative, damped as in `_newton`:
+    Moore-Penrose pseudo-inverse J# in the metric of h's second derivative, damped as in `dt_viz.kernels.tracking`:
 
         δq = J#(x_k − x(q)) − (I − J#J) H⁻¹∇h.
 
@@ -211,21 +187,21 @@ def track(
     shape = (*path.shape[:-1], NUM_JOINTS)
     paths, starts = path.reshape(-1, *path.shape[-2:]), robot.clip(start.reshape(-1, NUM_JOINTS))
     references = starts if reference is None else _references(robot, reference, start.shape)
-    posture = _posture(robot, references.T, robot.hand_direction(references).T, at_reference=True)
-    strides = [STRIDE, STRIDE / 4]
+    posture = _posture(robot, references, robot.hand_direction(references), at_reference=True)
+    strides, each = [STRIDE, STRIDE / 4], np.arange(len(paths))
     if initial is None:
         guess = _walk(robot, paths, starts, posture, strides.pop(0))
     else:
         guess = np.asarray(initial, dtype=float)
         if guess.shape != shape:
             raise ValueError(f"initial must be {shape} like the path, got {guess.shape}")
-    q = _sweep(robot, guess.reshape(*paths.shape[:2], NUM_JOINTS), paths, posture)
+    q = _swept(robot, guess.reshape(*paths.shape[:2], NUM_JOINTS), paths, posture, each)
     for stride in strides:
         lost = np.flatnonzero(loses_branch(q, paths))
         if not len(lost):
             break
-        part = posture.take(lost)
-        q[lost] = _sweep(robot, _walk(robot, paths[lost], starts[lost], part, stride), paths[lost], part)
+        part = Postures(*(field[lost] for field in posture))
+        q[lost] = _swept(robot, _walk(robot, paths[lost], starts[lost], part, stride), paths[lost], posture, lost)
     return _report(robot, q.reshape(shape), path)
 
 
@@ -241,11 +217,14 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
     Returns:
         (N, 6) rad, inside the limits; for a position out of reach a posture near it.
     """
-    posture = _posture(robot, reference[:, None], robot.hand_direction(reference)[:, None], at_reference=True)
-    columns, target = q.T, np.ascontiguousarray(positions.T)
-    for _ in range(NUM_CORRECTIONS):
-        columns, _ = _newton(robot, columns, target, posture, gain=0.0)
-    return columns.T
+    posture = _posture(robot, reference[None], robot.hand_direction(reference)[None], at_reference=True)
+    begin, targets = np.array(q, order="C"), np.array(positions, order="C")
+    return settle(_arm(robot), posture, begin, targets, np.zeros(len(q), int), 0, NUM_CORRECTIONS, -1.0)
+
+
+def _arm(robot: Robot) -> Arm:
+    """The arm for compiled loops."""
+    return Arm(robot.records, np.array(robot.end_effector_offset), np.array(robot.lower), np.array(robot.upper))
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -256,42 +235,20 @@ def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> A
     return robot.clip(np.broadcast_to(reference, shape).reshape(-1, NUM_JOINTS))
 
 
-def _walk(robot: Robot, paths: Array, starts: Array, posture: _Posture, stride: float) -> Array:
+def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: float) -> Array:
     """Walk along paths (B, T, 3), all at once, one stride after the other; return rough joints (B, T, 6)."""
     lines = np.concatenate([robot.end_effector(starts)[:, None], paths], axis=1)
     lengths = np.cumsum(np.linalg.norm(np.diff(lines, axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)
-    progress = np.linspace(0.0, 1.0, num_strides + 1)
-    knots = np.empty((num_strides + 1, 3, len(paths)))
-    for b, line in enumerate(lines):
-        travelled = np.concatenate([[0.0], lengths[b]])
-        for axis in range(3):
-            knots[:, axis, b] = np.interp(progress * travelled[-1], travelled, line[:, axis])
-    q = np.empty((num_strides + 1, NUM_JOINTS, len(paths)))
-    q[0] = starts.T
-    for k in range(1, num_strides + 1):
-        q[k], _ = _newton(robot, q[k - 1], knots[k], posture)
-    # interpolate at the waypoints, linearly in the distance travelled
-    place = lengths / np.maximum(lengths[:, -1:], 1e-12) * num_strides  # (B, T)
-    left = np.minimum(place.astype(int), num_strides - 1)
-    fraction = (place - left)[..., None]
-    rows = np.arange(len(paths))[:, None]
-    return (1 - fraction) * q[left, :, rows] + fraction * q[left + 1, :, rows]
+    return walk(_arm(robot), posture, lines, np.insert(lengths, 0, 0.0, axis=1), np.array(starts), num_strides)
 
 
-def _sweep(robot: Robot, q: Array, paths: Array, posture: _Posture) -> Array:
-    """Step all waypoints at once until none moves; q (B, T, 6), paths (B, T, 3), posture of B columns."""
-    shape, targets = q.shape, np.array(paths.reshape(-1, 3).T, order="C")
-    q = np.array(q.reshape(-1, NUM_JOINTS).T, order="C")
-    posture = posture.take(np.repeat(np.arange(shape[0]), shape[1]))
-    moving = np.arange(q.shape[1])
-    for sweep in range(MAX_SWEEPS + FINAL_SWEEPS):
-        gain = 1.0 if sweep < MAX_SWEEPS else 0.0
-        q[:, moving], step = _newton(robot, q[:, moving], targets[:, moving], posture.take(moving), gain)
-        moving = moving[step > STEP_TOLERANCE]
-        if not len(moving):
-            break
-    return np.ascontiguousarray(q.T).reshape(shape)
+def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:
+    """Step all waypoints until none moves; q (B, T, 6), paths (B, T, 3), `which` (B,) of the postures they have."""
+    each = np.repeat(which, paths.shape[1])
+    begin, targets = np.array(q.reshape(-1, NUM_JOINTS), order="C"), np.array(paths.reshape(-1, 3), order="C")
+    swept = settle(_arm(robot), posture, begin, targets, each, MAX_SWEEPS, FINAL_SWEEPS, STEP_TOLERANCE)
+    return swept.reshape(q.shape)
 
 
 def _report(robot: Robot, q: Array, path: Array) -> JointPath:
@@ -308,74 +265,14 @@ def _report(robot: Robot, q: Array, path: Array) -> JointPath:
 
 def _posture(
     robot: Robot, reference: Array, direction: Array, weight: float = DIRECTION_WEIGHT, *, at_reference: bool = False
-) -> _Posture:
-    """Make the posture of a reference (6, N); `at_reference` slackens the springs there, so that it is an optimum."""
-    soft_lower = np.broadcast_to(robot.lower[:, None] + LIMIT_MARGIN, reference.shape)
-    soft_upper = np.broadcast_to(robot.upper[:, None] - LIMIT_MARGIN, reference.shape)
+) -> Postures:
+    """Make the posture of references (B, 6); `at_reference` slackens the springs there, so that it is an optimum."""
+    soft_lower = np.broadcast_to(robot.lower + LIMIT_MARGIN, reference.shape)
+    soft_upper = np.broadcast_to(robot.upper - LIMIT_MARGIN, reference.shape)
     if at_reference:
         soft_lower, soft_upper = np.minimum(soft_lower, reference), np.maximum(soft_upper, reference)
-    return _Posture(reference, direction, soft_lower, soft_upper, np.full((1, reference.shape[1]), weight))
-
-
-def _newton(robot: Robot, q: Array, target: Array, posture: _Posture, gain: float = 1.0) -> tuple[Array, Array]:
-    """Make one damped resolved-rate step towards the targets and improve the posture in the null space.
-
-    With e = target − x(q), H ≈ ∇²h (Gauss-Newton) and p = −H⁻¹∇h:
-
-        δq = J#(λ) e + c·(I − J#(λ₀) J) p,   J#(λ) = H⁻¹Jᵀ(J H⁻¹ Jᵀ + λ²I)⁻¹.
-
-    λ² grows with ‖e‖, which keeps steps moderate far from the target and out of reach, and falls with it to the small
-    λ₀² of the projector, so that the posture does not pull the hand off its target. μ = (J H⁻¹ Jᵀ + λ₀²I)⁻¹ J p are the
-    multipliers of x(q) = target, and c = 1/(1 + κ‖μ‖) stands in for the curvature μ·∇²x that they add to H in the
-    null space; without it the posture overshoots again and again near singularities.
-
-    Args:
-        robot: the arm.
-        q: (6, N) rad.
-        target: (3, N) or (3, 1), metres.
-        posture: N columns, or one.
-        gain: factor of the null-space part; 0 leaves the plain pseudo-inverse.
-
-    Returns:
-        The configurations (6, N) after the step, inside the limits, and the largest joint motion (N,), rad.
-    """
-    chain = robot.chain(q)
-    J, D = chain.position_jacobian(), chain.direction_jacobian()  # (6, 3, N)
-    error = target - chain.position
-    excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
-
-    # H = diag(1/mobility) + w_d DᵀD, inverted by Woodbury: only 3 x 3 systems are solved.
-    mobility = 1.0 / (1.0 + LIMIT_WEIGHT * (excess != 0.0))  # (6, N)
-    mobile_D = mobility[:, None] * D
-    C = _spd_inverse(np.einsum("irn,isn->rsn", D, mobile_D), 1.0 / posture.direction_weight[0])
-    gain_D = np.einsum("rsn,isn->irn", C, mobile_D)
-    p = mobility * (posture.reference - q - LIMIT_WEIGHT * excess)
-    turn = posture.direction - chain.direction - np.einsum("irn,in->rn", D, p)
-    p = p + np.einsum("irn,rn->in", gain_D, turn)
-    H_inv_J = mobility[:, None] * J - np.einsum("isn,srn->irn", gain_D, np.einsum("isn,irn->srn", mobile_D, J))
-    S = np.einsum("irn,isn->rsn", J, H_inv_J)
-
-    damping = DAMPING_FLOOR + DAMPING_PER_ERROR * np.sqrt((error**2).sum(axis=0))
-    towards = np.einsum("rsn,sn->rn", _spd_inverse(S, damping), error)
-    multipliers = np.einsum("rsn,sn->rn", _spd_inverse(S, DAMPING_FLOOR), np.einsum("irn,in->rn", J, p))
-    caution = gain / (1.0 + CURVATURE * np.sqrt((multipliers**2).sum(axis=0)))
-    step = caution * p + np.einsum("irn,rn->in", H_inv_J, towards - caution * multipliers)
-
-    step *= np.minimum(1.0, STEP_LIMIT / np.maximum(np.abs(step).max(axis=0), 1e-12))
-    moved = np.clip(q + step, robot.lower[:, None], robot.upper[:, None])
-    return moved, np.abs(moved - q).max(axis=0)
-
-
-def _spd_inverse(A: Array, damping: Array | float) -> Array:
-    """Invert A + damping·I by cofactors; A (3, 3, N) symmetric, positive semidefinite."""
-    a, b, c = A[0, 0] + damping, A[1, 1] + damping, A[2, 2] + damping
-    f, g, h = A[1, 2], A[0, 2], A[0, 1]
-    out = np.empty(A.shape)
-    out[0, 0], out[1, 1], out[2, 2] = b * c - f * f, a * c - g * g, a * b - h * h
-    out[1, 2] = out[2, 1] = g * h - a * f
-    out[0, 2] = out[2, 0] = f * h - b * g
-    out[0, 1] = out[1, 0] = f * g - c * h
-    return out / (a * out[0, 0] + h * out[0, 1] + g * out[0, 2])
+    arrays = reference, direction, soft_lower, soft_upper, np.full(len(reference), weight)
+    return Postures(*(np.array(values, order="C") for values in arrays))
 
 
 def loses_branch(q: Array, paths: Array) -> NDArray[np.bool_]:
@@ -385,9 +282,9 @@ def loses_branch(q: Array, paths: Array) -> NDArray[np.bool_]:
     return np.any(np.abs(np.diff(q, axis=1)) > allowed[..., None], axis=(1, 2))
 
 
-def _posture_cost(q: Array, chain: KinematicChain, posture: _Posture) -> Array:
-    """Compute the posture cost h(q) of `track`, (N,)."""
+def _posture_cost(q: Array, chain: KinematicChain, posture: Postures) -> Array:
+    """Compute the posture cost h(q) of `track`, (N,), of one posture."""
     excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
-    away = ((q - posture.reference) ** 2).sum(axis=0)
-    turned = ((chain.direction - posture.direction) ** 2).sum(axis=0)
-    return 0.5 * (away + posture.direction_weight[0] * turned + LIMIT_WEIGHT * (excess**2).sum(axis=0))
+    away = ((q - posture.reference) ** 2).sum(axis=1)
+    turned = ((chain.direction - posture.direction.T) ** 2).sum(axis=0)
+    return 0.5 * (away + posture.direction_weight * turned + LIMIT_WEIGHT * (excess**2).sum(axis=1))

@@ -25,7 +25,6 @@ from dt_viz.arm.cspace import (
     GradientField,
     JointLimits,
     WholeArmField,
-    squared_lengths,
 )
 from dt_viz.arm.escape import ALIKE, escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
@@ -34,6 +33,7 @@ from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphis
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
+from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.proximity import proximity
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
@@ -539,8 +539,7 @@ class _Solver:
 
     def _asked(self, p: Array, margin: float, room: Array) -> Array:
         """(N,) metres of clearance that are asked for at configurations (N, 6), with this room (K,) at the pins."""
-        distance = np.sqrt(squared_lengths(p, self._lifted.pins))
-        return np.minimum(margin, (room + SLOPE * distance).min(axis=1))
+        return room_asked(np.array(p, order="C"), self._lifted.pins, room, LEVERS, SLOPE, float(margin))
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or `MAX_DURATION`."""

@@ -154,6 +154,23 @@ def measure(shape: Record, values: Values, radius: float, block: Record) -> None
 
 
 @short_kernel
+def room_asked(q: Array, pins: Array, room: Array, levers: Array, slope: float, margin: float) -> Array:
+    """Clearance (N,), metres, asked for at postures q (N, n): a margin, less beside pins (K, n) that have less `room`.
+
+    From its room (K,) at a pin it grows by `slope` for each metre of distance, with `levers` (n,), m/rad.
+    """
+    asked = np.full(len(q), margin)
+    for row in range(len(q)):
+        for k in range(len(pins)):
+            if room[k] < asked[row]:
+                squared = 0.0
+                for i in range(q.shape[1]):
+                    squared += (levers[i] * (q[row, i] - pins[k, i])) ** 2
+                asked[row] = min(asked[row], room[k] + slope * np.sqrt(squared))
+    return asked
+
+
+@short_kernel
 def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
     """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
     result, rows, block = np.full(len(q), np.inf), np.arange(len(q)), np.empty(1, BLOCK)[0]

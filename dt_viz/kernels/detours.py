@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.kernels.arm import Array
-from dt_viz.kernels.compiled import kernel
+from dt_viz.kernels.compiled import kernel, short_kernel
 
 
 @kernel
@@ -51,3 +51,33 @@ def detours(
                     shifts[d] = max(shifts[d], shift)
                     depths[d] = max(depths[d], -lowest - shift * directions[d, 2])
     return shifts, depths
+
+
+@short_kernel
+def distinct(directions: Array, cost: Array, alike: float, selectivity: float, num: int) -> tuple[Array, Array]:
+    """Gather directions that are alike, those about the cheapest first.
+
+    Args:
+        directions: (D, 3) unit vectors.
+        cost: (D,) their costs; infinite where they are out of the question.
+        alike: cosine of the largest angle from the cheapest direction of a group.
+        selectivity: relative difference in cost over which a direction's share in its group's mean falls by e.
+        num: largest number of groups.
+
+    Returns:
+        For F groups the means (F, 3), unit vectors, and the least costs (F,).
+    """
+    num = min(num, len(cost))
+    left, means, costs, found = cost.copy(), np.zeros((num, 3)), np.empty(num), 0
+    while found < num and left.min() < np.inf:
+        best, mean = left.argmin(), means[found]
+        costs[found] = least = left[best]
+        for d in range(len(directions)):
+            if directions[d] @ directions[best] > alike and left[d] < np.inf:
+                mean += (
+                    np.exp((least - left[d]) / (selectivity * least)) * directions[d] if least > 0 else directions[d]
+                )
+                left[d] = np.inf
+        mean /= np.sqrt(mean @ mean)
+        found += 1
+    return means[:found], costs[:found]

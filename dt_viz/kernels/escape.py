@@ -311,18 +311,24 @@ def _moving(v: Array) -> Array:
 @kernel
 def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
     """Postures q (N, n) carried along by classical Runge–Kutta steps of equal length, (N, n)."""
-    rows, q, block = _moving(velocities(escape, q)), q.copy(), np.empty(1, BLOCK)[0]  # elsewhere the flow rests
+    v = velocities(escape, q)
+    rows, q, block = _moving(v), q.copy(), np.empty(1, BLOCK)[0]  # elsewhere the flow rests
     n, h, at, start, slopes = q.shape[1], duration / steps, block.q, block.start, block.sum
     velocity = block.velocity
     for first in range(0, len(rows), LANES):
         num = load(block, q, rows, first)
-        for _ in range(steps):
+        for step in range(steps):
             for i in range(n):
                 for lane in range(LANES):
                     start[i, lane] = at[i, lane]
                     slopes[i, lane] = 0
-            for weight, ahead in ((h / 6, h / 2), (h / 3, h / 2), (h / 3, h), (h / 6, 0.0)):
-                _find_velocity(escape, block)
+            for stage, weight, ahead in ((0, h / 6, h / 2), (1, h / 3, h / 2), (2, h / 3, h), (3, h / 6, 0.0)):
+                if step == 0 and stage == 0:
+                    for lane in range(LANES):
+                        for i in range(n):
+                            velocity[i, lane] = v[rows[first + min(lane, num - 1)], i]
+                else:
+                    _find_velocity(escape, block)
                 for i in range(n):
                     for lane in range(LANES):
                         slopes[i, lane] += weight * velocity[i, lane]

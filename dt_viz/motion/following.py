@@ -254,8 +254,8 @@ class Follower:
         left = ~known.alike(0) if before is None and ample[0].all() else np.ones(len(free), bool)
         if kept.any() and most[kept].max() == most.max():  # the rest is looked at only where this one does not do
             best = int(np.argmax(kept))
-            left &= ~known.alike(best)
             yield before, free[best]
+            left &= ~known.alike(best)
         merit = [most, kept, ample.sum(axis=1), -known.cost(obstacle, asked)]
         for best in np.lexsort(merit[::-1])[::-1]:
             stance = None if best == 0 else _as_stance(known.references[best])

@@ -1,0 +1,382 @@
+"""Tracking of places with an arm's joints by Newton steps: the formulas of `dt_viz.arm.tracking.track`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dt_viz.kernels.arm import Array, Joints
+from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, load, put
+from dt_viz.kernels.compiled import compiled, kernel
+from dt_viz.kernels.distances import Record
+
+LIMIT_WEIGHT = 50.0
+"""Weight of the springs before the joint limits, against 1 for staying near the reference."""
+DAMPING_FLOOR = 1e-6
+"""Least damping λ₀² of the pseudo-inverse, m²: bounds the step at a singularity, is negligible elsewhere."""
+DAMPING_PER_ERROR = 0.2
+"""Growth of λ² with the remaining error, m: about half the curvature of the forward kinematics."""
+CURVATURE = 0.1
+"""Curvature of the forward kinematics along the null space, m per rad²; see `_newton`."""
+STEP_LIMIT = 0.4
+"""Largest joint motion in one step, rad; beyond it the linear model is invalid."""
+
+BLOCK = block_of(
+    ("target", (3,)),  # metres
+    ("error", (3,)),  # metres
+    ("reference", (MOST_JOINTS,)),
+    ("soft_lower", (MOST_JOINTS,)),
+    ("soft_upper", (MOST_JOINTS,)),
+    ("wanted", (3,)),  # direction of the hand
+    ("flexibility", ()),  # 1/w_d
+    ("direction", (3,)),  # of the hand
+    ("J", (MOST_JOINTS, 3)),  # velocity of the end effector for each joint's
+    ("D", (MOST_JOINTS, 3)),  # that of the hand's direction
+    ("mobility", (MOST_JOINTS,)),  # diagonal of the inverse of H without its part of the direction
+    ("G", (MOST_JOINTS, 3)),
+    ("H_inv_J", (MOST_JOINTS, 3)),
+    ("p", (MOST_JOINTS,)),  # −H⁻¹∇h
+    ("matrix", (6,)),  # a symmetric matrix: entries 00, 11, 22, 12, 02, 01
+    ("inverse", (6,)),
+    ("damping", ()),
+    ("mixed", (3, 3)),
+    ("v", (3,)),
+    ("multipliers", (3,)),
+    ("caution", ()),
+    ("largest", ()),
+    ("moves", ()),  # 1 where the lane has not arrived
+)
+"""Memory for a step of a block of postures."""
+
+
+class Arm(NamedTuple):
+    """An arm of n joints."""
+
+    joints: Joints
+    hand: Array
+    """(3,) position of the end effector in the last joint, metres."""
+    lower: Array
+    """(n,) rad."""
+    upper: Array
+    """(n,) rad."""
+
+
+class Postures(NamedTuple):
+    """B secondary objectives in the null space."""
+
+    reference: Array
+    """(B, n) rad."""
+    direction: Array
+    """(B, 3) unit vectors, base frame."""
+    soft_lower: Array
+    """(B, n) rad, starts of the springs before the limits."""
+    soft_upper: Array
+    """(B, n) rad."""
+    direction_weight: Array
+    """(B,) w_d, against 1 for the reference."""
+
+
+@compiled
+def _aim(postures: Postures, which: int, lane: int, block: Record) -> None:
+    """Take an objective into a lane."""
+    reference, soft_lower, soft_upper = block.reference, block.soft_lower, block.soft_upper
+    wanted, flexibility = block.wanted, block.flexibility
+    for i in range(postures.reference.shape[1]):
+        reference[i, lane] = postures.reference[which, i]
+        soft_lower[i, lane], soft_upper[i, lane] = postures.soft_lower[which, i], postures.soft_upper[which, i]
+    for c in range(3):
+        wanted[c, lane] = postures.direction[which, c]
+    flexibility[lane] = 1 / postures.direction_weight[which]
+
+
+@compiled
+def _newton(arm: Arm, gain: float, block: Record) -> None:
+    """Make one damped resolved-rate step towards the targets and improve the posture in the null space.
+
+    With e = target − x(q), H ≈ ∇²h (Gauss–Newton) and p = −H⁻¹∇h:
+
+        δq = J#(λ) e + c·(I − J#(λ₀) J) p,   J#(λ) = H⁻¹Jᵀ(J H⁻¹ Jᵀ + λ²I)⁻¹.
+
+    λ² grows with ‖e‖, which keeps steps moderate far from the target and out of reach, and falls with it to the small
+    λ₀² of the projector, so that the posture does not pull the hand off its target. μ = (J H⁻¹ Jᵀ + λ₀²I)⁻¹ J p are the
+    multipliers of x(q) = target, and c = 1/(1 + κ‖μ‖) stands in for the curvature μ·∇²x that they add to H in the
+    null space; without it the posture overshoots again and again near singularities.
+
+    `gain` is a factor of the null-space part; 0 leaves the plain pseudo-inverse. Postures end inside the limits;
+    `largest` is the largest joint motion, rad.
+    """
+    n, error, J, p, H_inv_J = len(arm.joints), block.error, block.J, block.p, block.H_inv_J
+    damping, inverse, v, multipliers, caution = block.damping, block.inverse, block.v, block.multipliers, block.caution
+    _linearise(arm, block)
+    _improve(n, block)
+    for lane in range(LANES):
+        squared = error[0, lane] ** 2 + error[1, lane] ** 2 + error[2, lane] ** 2
+        damping[lane] = DAMPING_FLOOR
+        caution[lane] = np.sqrt(squared)
+        multipliers[0, lane] = multipliers[1, lane] = multipliers[2, lane] = 0
+    for i in range(n):
+        for lane in range(LANES):
+            multipliers[0, lane] += J[i, 0, lane] * p[i, lane]
+            multipliers[1, lane] += J[i, 1, lane] * p[i, lane]
+            multipliers[2, lane] += J[i, 2, lane] * p[i, lane]
+    _invert(block)
+    for lane in range(LANES):
+        x, y, z = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
+        multipliers[0, lane] = inverse[0, lane] * x + inverse[5, lane] * y + inverse[4, lane] * z
+        multipliers[1, lane] = inverse[5, lane] * x + inverse[1, lane] * y + inverse[3, lane] * z
+        multipliers[2, lane] = inverse[4, lane] * x + inverse[3, lane] * y + inverse[2, lane] * z
+        damping[lane] = DAMPING_FLOOR + DAMPING_PER_ERROR * caution[lane]
+    _invert(block)
+    for lane in range(LANES):
+        a, b, c = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
+        care = gain / (1 + CURVATURE * np.sqrt(a * a + b * b + c * c))
+        x, y, z = error[0, lane], error[1, lane], error[2, lane]
+        v[0, lane] = inverse[0, lane] * x + inverse[5, lane] * y + inverse[4, lane] * z - care * a
+        v[1, lane] = inverse[5, lane] * x + inverse[1, lane] * y + inverse[3, lane] * z - care * b
+        v[2, lane] = inverse[4, lane] * x + inverse[3, lane] * y + inverse[2, lane] * z - care * c
+        caution[lane] = care
+    for i in range(n):
+        for lane in range(LANES):
+            along = (
+                H_inv_J[i, 0, lane] * v[0, lane] + H_inv_J[i, 1, lane] * v[1, lane] + H_inv_J[i, 2, lane] * v[2, lane]
+            )
+            p[i, lane] = caution[lane] * p[i, lane] + along
+    _move(arm, block)
+
+
+@compiled
+def _linearise(arm: Arm, block: Record) -> None:
+    """Find the error, and the derivatives J and D of the hand's place and direction."""
+    n, hand, axes, origins, place = len(arm.joints), arm.hand, block.axes, block.origins, block.place
+    target, error, direction, J, D = block.target, block.error, block.direction, block.J, block.D
+    length = np.sqrt(hand[0] ** 2 + hand[1] ** 2 + hand[2] ** 2)
+    chain(arm.joints, block)
+    put(hand, n - 1, block)
+    for c in range(3):
+        for lane in range(LANES):
+            error[c, lane] = target[c, lane] - place[c, lane]
+            direction[c, lane] = (place[c, lane] - origins[n - 1, c, lane]) / length
+    for i in range(n):
+        for lane in range(LANES):
+            a, b, c = axes[i, 2, 0, lane], axes[i, 2, 1, lane], axes[i, 2, 2, lane]
+            x, y = place[0, lane] - origins[i, 0, lane], place[1, lane] - origins[i, 1, lane]
+            z = place[2, lane] - origins[i, 2, lane]
+            J[i, 0, lane], J[i, 1, lane], J[i, 2, lane] = b * z - c * y, c * x - a * z, a * y - b * x
+            x, y, z = direction[0, lane], direction[1, lane], direction[2, lane]
+            D[i, 0, lane], D[i, 1, lane], D[i, 2, lane] = b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@compiled
+def _improve(n: int, block: Record) -> None:
+    """Find p = −H⁻¹∇h, H⁻¹Jᵀ and J H⁻¹ Jᵀ, which is `matrix`.
+
+    H = diag(1/mobility) + w_d DᵀD is inverted by Woodbury's formula: only 3 × 3 systems are solved.
+    """
+    q, J, D, G, H_inv_J, p, mobility = block.q, block.J, block.D, block.G, block.H_inv_J, block.p, block.mobility
+    direction, wanted, mixed, v, damping = block.direction, block.wanted, block.mixed, block.v, block.damping
+    reference, soft_lower, soft_upper, inverse = block.reference, block.soft_lower, block.soft_upper, block.inverse
+    flexibility = block.flexibility
+    for i in range(n):
+        for lane in range(LANES):
+            angle = q[i, lane]
+            inside = soft_lower[i, lane] if angle < soft_lower[i, lane] else angle
+            inside = soft_upper[i, lane] if inside > soft_upper[i, lane] else inside
+            excess = angle - inside
+            mobility[i, lane] = 1 / (1 + LIMIT_WEIGHT) if excess != 0 else 1.0
+            p[i, lane] = mobility[i, lane] * (reference[i, lane] - angle - LIMIT_WEIGHT * excess)
+            H_inv_J[i, 0, lane] = mobility[i, lane] * D[i, 0, lane]
+            H_inv_J[i, 1, lane] = mobility[i, lane] * D[i, 1, lane]
+            H_inv_J[i, 2, lane] = mobility[i, lane] * D[i, 2, lane]
+    _product(n, D, H_inv_J, block)
+    for lane in range(LANES):
+        damping[lane] = flexibility[lane]
+    _invert(block)
+    for c in range(3):
+        for lane in range(LANES):
+            v[c, lane] = wanted[c, lane] - direction[c, lane]
+            mixed[c, 0, lane] = mixed[c, 1, lane] = mixed[c, 2, lane] = 0
+    for i in range(n):
+        for lane in range(LANES):
+            x, y, z = H_inv_J[i, 0, lane], H_inv_J[i, 1, lane], H_inv_J[i, 2, lane]
+            G[i, 0, lane] = inverse[0, lane] * x + inverse[5, lane] * y + inverse[4, lane] * z
+            G[i, 1, lane] = inverse[5, lane] * x + inverse[1, lane] * y + inverse[3, lane] * z
+            G[i, 2, lane] = inverse[4, lane] * x + inverse[3, lane] * y + inverse[2, lane] * z
+        for c in range(3):
+            for lane in range(LANES):
+                v[c, lane] -= D[i, c, lane] * p[i, lane]
+                mixed[c, 0, lane] += H_inv_J[i, c, lane] * J[i, 0, lane]
+                mixed[c, 1, lane] += H_inv_J[i, c, lane] * J[i, 1, lane]
+                mixed[c, 2, lane] += H_inv_J[i, c, lane] * J[i, 2, lane]
+    for i in range(n):
+        for lane in range(LANES):
+            x, y, z = G[i, 0, lane], G[i, 1, lane], G[i, 2, lane]
+            p[i, lane] += x * v[0, lane] + y * v[1, lane] + z * v[2, lane]
+        for c in range(3):
+            for lane in range(LANES):
+                turned = G[i, 0, lane] * mixed[0, c, lane] + G[i, 1, lane] * mixed[1, c, lane]
+                turned += G[i, 2, lane] * mixed[2, c, lane]
+                H_inv_J[i, c, lane] = mobility[i, lane] * J[i, c, lane] - turned
+    _product(n, J, H_inv_J, block)
+
+
+@compiled
+def _product(n: int, A: Array, B: Array, block: Record) -> None:
+    """Find the symmetric matrix AᵀB of arrays (n, 3, LANES)."""
+    matrix = block.matrix
+    for entry in range(6):
+        for lane in range(LANES):
+            matrix[entry, lane] = 0
+    for i in range(n):
+        for lane in range(LANES):
+            matrix[0, lane] += A[i, 0, lane] * B[i, 0, lane]
+            matrix[1, lane] += A[i, 1, lane] * B[i, 1, lane]
+            matrix[2, lane] += A[i, 2, lane] * B[i, 2, lane]
+            matrix[3, lane] += A[i, 1, lane] * B[i, 2, lane]
+            matrix[4, lane] += A[i, 0, lane] * B[i, 2, lane]
+            matrix[5, lane] += A[i, 0, lane] * B[i, 1, lane]
+
+
+@compiled
+def _invert(block: Record) -> None:
+    """Find the inverse of `matrix` + `damping`·I by cofactors."""
+    matrix, inverse, damping = block.matrix, block.inverse, block.damping
+    for lane in range(LANES):
+        a, b, c = matrix[0, lane] + damping[lane], matrix[1, lane] + damping[lane], matrix[2, lane] + damping[lane]
+        f, g, h = matrix[3, lane], matrix[4, lane], matrix[5, lane]
+        x, y, z = b * c - f * f, f * g - h * c, h * f - g * b
+        scale = 1 / (a * x + h * y + g * z)
+        inverse[0, lane], inverse[1, lane], inverse[2, lane] = (
+            x * scale,
+            (a * c - g * g) * scale,
+            (a * b - h * h) * scale,
+        )
+        inverse[3, lane], inverse[4, lane], inverse[5, lane] = (g * h - a * f) * scale, z * scale, y * scale
+
+
+@compiled
+def _move(arm: Arm, block: Record) -> None:
+    """Move the joints by p, at most `STEP_LIMIT` and up to their limits, in the lanes that move."""
+    q, p, largest, moves, caution = block.q, block.p, block.largest, block.moves, block.caution
+    for lane in range(LANES):
+        largest[lane] = 0
+    for i in range(len(arm.joints)):
+        for lane in range(LANES):
+            size = abs(p[i, lane])
+            largest[lane] = size if size > largest[lane] else largest[lane]
+    for lane in range(LANES):
+        caution[lane] = STEP_LIMIT / largest[lane] if largest[lane] > STEP_LIMIT else 1.0
+        largest[lane] = 0
+    for i in range(len(arm.joints)):
+        lower, upper = arm.lower[i], arm.upper[i]
+        for lane in range(LANES):
+            moved = q[i, lane] + p[i, lane] * caution[lane]
+            moved = lower if moved < lower else moved
+            moved = upper if moved > upper else moved
+            size = abs(moved - q[i, lane])
+            largest[lane] = size if size > largest[lane] else largest[lane]
+            q[i, lane] = moved if moves[lane] > 0 else q[i, lane]
+
+
+@kernel
+def settle(
+    arm: Arm,
+    postures: Postures,
+    q: Array,
+    targets: Array,
+    which: NDArray[np.int64],
+    num_improving: int,
+    num_final: int,
+    tolerance: float,
+) -> Array:
+    """Step each posture until it moves less than a tolerance.
+
+    Args:
+        arm: the arm.
+        postures: B secondary objectives.
+        q: (N, n) where to begin, rad.
+        targets: (N, 3) places for the end effector, metres.
+        which: (N,) objective of each.
+        num_improving: largest number of steps that improve the posture, too.
+        num_final: largest number of steps after them that only correct the place.
+        tolerance: step, rad, after which a posture is left as it is.
+
+    Returns:
+        The postures (N, n), rad, inside the limits.
+    """
+    q, rows, block = q.copy(), np.arange(len(q)), np.empty(1, BLOCK)[0]
+    at, target, moves, largest = block.q, block.target, block.moves, block.largest
+    for first in range(0, len(q), LANES):
+        num = load(block, q, rows, first)
+        for lane in range(LANES):
+            row = first + min(lane, num - 1)
+            _aim(postures, which[row], lane, block)
+            moves[lane] = 1
+            for c in range(3):
+                target[c, lane] = targets[row, c]
+        for step in range(num_improving + num_final):
+            _newton(arm, 1.0 if step < num_improving else 0.0, block)
+            num_moving = 0
+            for lane in range(LANES):
+                moves[lane] = moves[lane] if largest[lane] > tolerance else 0.0
+                num_moving += moves[lane] > 0
+            if num_moving == 0:
+                break
+        for lane in range(num):
+            for i in range(q.shape[1]):
+                q[first + lane, i] = at[i, lane]
+    return q
+
+
+@kernel
+def walk(arm: Arm, postures: Postures, lines: Array, lengths: Array, starts: Array, num_strides: int) -> Array:
+    """Walk along lines, one step a stride.
+
+    Args:
+        arm: the arm.
+        postures: B secondary objectives, one for each line.
+        lines: (B, T + 1, 3) places of the end effector, metres, the first one that of the start.
+        lengths: (B, T + 1) distance travelled up to there, metres.
+        starts: (B, n) where to begin, rad.
+        num_strides: number of strides of equal length along each line.
+
+    Returns:
+        Rough postures (B, T, n), rad, at the places after the start: linear in the distance between strides.
+    """
+    num, n, last = len(lines), starts.shape[1], lines.shape[1] - 1
+    result, rows, block = np.empty((num, last, n)), np.arange(num), np.empty(1, BLOCK)[0]
+    q = np.empty((LANES, num_strides + 1, n))
+    at, target, moves, passed = block.q, block.target, block.moves, np.zeros(LANES, np.int64)
+    for first in range(0, num, LANES):
+        here = load(block, starts, rows, first)
+        for lane in range(LANES):
+            _aim(postures, first + min(lane, here - 1), lane, block)
+            moves[lane], passed[lane] = 1, 0
+        for stride in range(num_strides + 1):
+            if stride > 0:
+                for lane in range(LANES):
+                    row = first + min(lane, here - 1)
+                    travelled, piece = stride / num_strides * lengths[row, last], passed[lane]
+                    while piece < last - 1 and lengths[row, piece + 1] < travelled:
+                        piece += 1
+                    passed[lane], begins = piece, lengths[row, piece]
+                    part = (travelled - begins) / max(lengths[row, piece + 1] - begins, 1e-300)
+                    for c in range(3):
+                        target[c, lane] = lines[row, piece, c] + part * (
+                            lines[row, piece + 1, c] - lines[row, piece, c]
+                        )
+                _newton(arm, 1.0, block)
+            for lane in range(LANES):
+                for i in range(n):
+                    q[lane, stride, i] = at[i, lane]
+        for lane in range(here):
+            row = first + lane
+            for waypoint in range(last):
+                place = lengths[row, waypoint + 1] / max(lengths[row, last], 1e-12) * num_strides
+                left = min(int(place), num_strides - 1)
+                for i in range(n):
+                    result[row, waypoint, i] = q[lane, left, i] + (place - left) * (
+                        q[lane, left + 1, i] - q[lane, left, i]
+                    )
+    return result
