@@ -1,14 +1,30 @@
-"""Errors about data that cannot be used."""
+"""Errors about data that cannot be used, and the end of computations that nobody wants any more."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from dt_viz.interruption import UnwantedError
+Cancelled = Callable[[], bool]
+"""Tells whether nobody wants any more what is being computed."""
+
+
+class UnwantedError(Exception):
+    """Nobody wants any more what was being computed."""
+
+
+def never() -> bool:
+    """Say that what is being computed is wanted."""
+    return False
+
+
+def end_if(cancelled: Cancelled) -> None:
+    """End a computation between two of its parts: raise UnwantedError if it is cancelled."""
+    if cancelled():
+        raise UnwantedError
 
 
 class DataError(ValueError):
@@ -72,7 +88,7 @@ def parsing(kind: type[DataError], source: str | Path, field: str, accepted: str
         accepted: what it should be, unless a FormatError says better.
 
     Raises:
-        DataError: of that kind. UnwantedError is let through: nothing is wrong with the data then.
+        DataError: of that kind.
     """
     try:
         with (
@@ -80,7 +96,7 @@ def parsing(kind: type[DataError], source: str | Path, field: str, accepted: str
             naming(kind, source),
         ):  # what overflows is refused as not finite, or as too large
             yield
-    except (DataError, UnwantedError):
+    except DataError:
         raise
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__

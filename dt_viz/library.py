@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,7 +37,6 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE, Solution, build_stack
-from dt_viz.properties import cached_property
 from dt_viz.saving import SavedMotion, load_motion, save_motion
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.slices import Slice

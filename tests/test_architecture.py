@@ -12,7 +12,7 @@ import dt_viz
 
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-FOUNDATION = {"errors", "folders", "interruption", "memo", "metrics", "properties", "shipped", "warning"}
+FOUNDATION = {"errors", "folders", "memo", "metrics", "shipped", "warning"}
 """Modules of no package, which import each other only."""
 BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "transforms"}
 BELOW_ENGINE = BELOW_SCENARIO | {"arm", "scenario", "motion", "control", "pictures"}
@@ -49,7 +49,6 @@ ONLY_IMPORTERS: Mapping[str, set[str]] = {
     "jax": set(),
     "numba": {"kernels/compiled.py"},
     "pickle": {"kernels/compiled.py"},
-    "functools.cached_property": set(),
 }
 """Modules that only these files import."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from dt_viz.kernels.blocks import clearance
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
-from dt_viz.properties import cached_property
 from dt_viz.shipped import ASSETS
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -25,10 +25,8 @@ from dt_viz.arm.link_distances import (
     measure_from,
 )
 from dt_viz.arm.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
-from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.properties import cached_property
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 if TYPE_CHECKING:
@@ -202,7 +200,6 @@ class _Search:
         for k in np.argsort(values - slack):
             if values[k] >= self._best + slack[k]:
                 break
-            checkpoint()
             values[k] = self._measure.distance(poses, int(rows[k]), int(items[k]), float(self._best + slack[k]))
             if values[k] < self._best:
                 self._best, self._place, self._item = float(values[k]), float(places[k]), int(items[k])
@@ -285,7 +282,6 @@ class CollisionModel:
         for part in obstacle.parts if isinstance(obstacle, Union) else (obstacle,):
             for skin in self._skins:
                 if skin.frame > 1:
-                    checkpoint()
                     gaps = skin.gaps(poses, part, gaps)
         return gaps
 

@@ -8,6 +8,7 @@ complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from dt_viz.kernels import escape
 from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.properties import cached_property
 
 COMPLEX_STEP = 1e-30
 DIFFERENCE = 1e-4

@@ -10,7 +10,7 @@ Lengths are metres, angles radians, positions in the robot's base frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -20,7 +20,6 @@ import numpy as np
 from dt_viz.arm.robot import LinkMesh, Robot
 from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Sphere, rotation
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
-from dt_viz.properties import cached_property
 
 if TYPE_CHECKING:
     from dt_viz.flows.fields import Array, Indices

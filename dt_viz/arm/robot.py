@@ -8,7 +8,7 @@ angles, also for the continuous joints, which pinocchio keeps as (cos, sin).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +18,6 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from dt_viz.kernels.arm import JOINT, chains, places
-from dt_viz.properties import cached_property
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray

@@ -7,6 +7,7 @@ among them for all motions of a task at once, as the reference of one section x 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from dt_viz.arm.tracking import loses_branch, track
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
-from dt_viz.properties import cached_property
 
 NUM_TRIED = 384
 """Number of random postures that stances are made from."""

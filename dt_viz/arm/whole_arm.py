@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -32,14 +33,12 @@ from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphis
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
-from dt_viz.interruption import checkpoint
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.proximity import proximity
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import Way, remembered, travel
-from dt_viz.properties import cached_property
 from dt_viz.transforms.base import ArmAvoidance
 
 NUM_CONFIGURATIONS = 100
@@ -577,7 +576,6 @@ class _Solver:
         while len(state):
             if duration >= self._longest:
                 return self._longest
-            checkpoint()
             state, _ = integrate(rk4, self._generator, state, None, -SNAPSHOT, 1)
             before, lack = lack, self._lack(limits.inverse(state))
             if (lack <= 0).all():
@@ -594,7 +592,6 @@ class _Solver:
         limits, duration = self._arm.limits, 0.0
         state, lack = limits.forward(p), self._mesh_lack(p)
         for done in np.arange(0, MAX_EXTENSION, EXTENSION_STEP):
-            checkpoint()
             state, _ = integrate(rk4, self._generator, state, None, -EXTENSION_STEP, 1)
             before, lack = lack, self._mesh_lack(limits.inverse(state), SPEED * EXTENSION_STEP)
             clear = lack <= 0

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from typing import ClassVar, Protocol
 
 from dt_viz.arm.robot import Robot
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
@@ -57,11 +58,15 @@ class Plan:
 class Planner(Protocol):
     """A method that has been fitted to a task. Any thread may call it."""
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions from the starts (R, 3), metres, around obstacles (an empty union: none).
 
         Methods that plan joints start at the posture of the nearest demonstrated start, moved to the start by inverse
-        kinematics. It can be interrupted; see `dt_viz.interruption`.
+        kinematics. Methods that do not follow a drag ask between parts of their work whether they are cancelled.
+
+        Raises:
+            UnreachableError: the arm cannot get to a start.
+            UnwantedError: it is cancelled.
         """
         ...
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,12 @@ import numpy as np
 
 from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.weights import FOLDER, load_weights
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import evenly_sampled, refined
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.union import Union
-from dt_viz.properties import cached_property
 from dt_viz.scenario.tasks import Task
 
 VERSION = 1
@@ -277,7 +277,7 @@ class _Planner:
     system: EFlowSystem
     spacing: float
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan without regard to the obstacle; see `Planner`."""
         return Plan(*self.system.rollouts(starts, self.spacing))
 

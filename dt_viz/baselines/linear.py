@@ -8,8 +8,8 @@ import numpy as np
 
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.postures import Query, planned
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
-from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.union import Union
 
 
@@ -17,11 +17,10 @@ from dt_viz.obstacles.union import Union
 class _Planner:
     problem: Problem
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan without regard to the obstacle; see `Planner`."""
         queries = []
         for start in starts:
-            checkpoint()
             queries.append(Query.of(self.problem, start))
         return planned(self.problem, queries, [np.stack([query.start, query.goal]) for query in queries])
 

@@ -13,19 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.surface import distance_and_normal
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
-from dt_viz.properties import cached_property
 
 LEAST_SLANT = 0.1
 """Least n·r: beyond it the surface is not star-shaped about the reference point, and the modulation not defined."""
@@ -115,13 +114,12 @@ class _Planner:
     """(3,), metres."""
     tolerance: float
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         state = self._state(obstacle, self._images(starts.tobytes()))
         states, gone = [state], [np.zeros(len(starts))]
         moving, h = self._moving(state), FIRST / np.maximum(state.speed, LEAST)
         while moving.any() and len(states) < NUM_STEPS:
-            checkpoint()
             bend = np.zeros_like(state.z)
             if len(states) > 1:  # the method of Adams and Bashforth, of order 2, with steps of their own
                 last = gone[-1] - gone[-2]

@@ -25,8 +25,8 @@ from dt_viz.arm.robot import NUM_JOINTS
 from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.postures import Query, Surroundings, planned
 from dt_viz.baselines.weights import FOLDER, load_weights
+from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
-from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.shapes import rotation
 from dt_viz.obstacles.union import Union
 
@@ -152,12 +152,13 @@ class Search:
     """Z (28,) of the obstacle."""
     surroundings: Surroundings
     rng: np.random.Generator
+    cancelled: Cancelled = never
     known: dict[bytes, bool] = field(default_factory=dict)
     """Lines that were decided."""
 
     def free(self, start: Array, end: Array) -> bool:
         """Decide whether the straight line between two postures is free."""
-        checkpoint()
+        end_if(self.cancelled)
         line = start.tobytes() + end.tobytes()
         if line not in self.known:
             self.known[line] = self.surroundings.is_free(start, end)
@@ -215,14 +216,13 @@ class MPNetPlanner:
     problem: Problem
     model: MPNetModel
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
         encoded, surroundings = self.model.encoded(obstacle), Surroundings.of(self.problem.robot, obstacle)
         queries, ways, warnings = [], [], []
         for number, start in enumerate(starts):
-            checkpoint()
             query = Query.of(self.problem, start)
-            search = Search(self.model, encoded, surroundings, np.random.default_rng(SEED))
+            search = Search(self.model, encoded, surroundings, np.random.default_rng(SEED), cancelled)
             way = self.way(search, query)
             if not search.is_free(way):
                 warnings.append(f"the motion from start {number + 1} collides: no free way was found")

@@ -8,6 +8,7 @@ import numpy as np
 
 from dt_viz.arm.retiming import within_velocity_limits
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned, Nominal
@@ -23,7 +24,7 @@ from dt_viz.transforms.avoidance import Avoidance
 class _AlonePlanner:
     learned: Learned
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan without regard to the obstacle; see `Planner`."""
         nominal, numbers = from_starts(self.learned, starts)
         bundle = nominal.bundle
@@ -50,7 +51,7 @@ class _WholeArmPlanner:
     follower: Follower
     precision: Precision
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the whole arm; those that it finds no way for stay at their start. See `Planner`.
 
         Raises:

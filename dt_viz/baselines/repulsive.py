@@ -16,8 +16,8 @@ from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.eflow import EFlow, EFlowSystem
 from dt_viz.baselines.surface import distance_and_normal
 from dt_viz.baselines.weights import FOLDER
+from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
-from dt_viz.interruption import checkpoint
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.union import Union
 
@@ -68,7 +68,7 @@ class _Planner:
     """Length of a step, seconds."""
     spacing: float
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         motions = [_Motion() for _ in starts]
         rows, y = np.arange(len(starts)), starts
@@ -84,7 +84,7 @@ class _Planner:
             if not entering:
                 break
             rows, y = np.array([row for row, _ in entering]), np.stack([place for _, place in entering])
-            rows, y = self._stepped(obstacle, motions, rows, y)
+            rows, y = self._stepped(obstacle, motions, rows, y, cancelled)
             if not len(rows):
                 break
         return Plan(
@@ -92,7 +92,9 @@ class _Planner:
             tuple(np.concatenate(motion.times) for motion in motions),
         )
 
-    def _stepped(self, obstacle: Union, motions: list[_Motion], rows: Array, y: Array) -> tuple[Array, Array]:
+    def _stepped(
+        self, obstacle: Union, motions: list[_Motion], rows: Array, y: Array, cancelled: Cancelled
+    ) -> tuple[Array, Array]:
         """Step motions `rows` from `y` until they leave the range; which ones do, and where."""
         steps = [y]
         before, force = repulsion(obstacle, y)
@@ -100,7 +102,7 @@ class _Planner:
         left, open_ = np.zeros(len(rows), dtype=bool), np.arange(len(rows))
         window = round(STUCK_TIME / self.interval)
         for k in range(round(LONGEST / self.interval)):
-            checkpoint()
+            end_if(cancelled)
             y = y.copy()
             y[open_] += self.interval * (self.system.velocity(y[open_]) + force[open_])
             steps.append(y)

@@ -14,6 +14,7 @@ import numpy as np
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.ours import from_starts
 from dt_viz.baselines.surface import distance_and_normal
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array, InPlane, VectorField
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.stack import LIVE, Precision, build_stack
@@ -67,7 +68,7 @@ class _Planner:
     learned: Learned
     precision: Precision
 
-    def plan(self, obstacle: Union, starts: Array) -> Plan:
+    def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
         nominal, numbers = from_starts(self.learned, starts)
         avoidance = SignedDistanceAvoidance(obstacle.parts)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -14,7 +15,6 @@ from dt_viz.arm.tracking import track
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
-from dt_viz.properties import cached_property
 
 CONVERGED = 1e-5
 """Distance from the section, rad, that counts as none."""

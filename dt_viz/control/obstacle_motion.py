@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.properties import cached_property
 from dt_viz.transforms.base import ArmAvoidance
 
 SMOOTHING = 0.08

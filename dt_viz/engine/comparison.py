@@ -14,8 +14,8 @@ from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Planner, Prob
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.engine.compose import arm_along
 from dt_viz.engine.frame import Compared, Frame, Scores
+from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.interruption import checkpoint
 from dt_viz.memo import Memo
 from dt_viz.metrics import discrete_frechet, distance_from_path, maximum_collision_distance, resample_by_arc_length
 from dt_viz.motion.following import ArmMotion, Follower, arm_samples
@@ -91,23 +91,29 @@ class Comparison:
             for method in ((OURS, *chosen) if chosen else ())
         )
 
-    def complete(self, frame: Frame, learned: Learned, solved: Solved | None) -> Iterator[Mapping[str, str]]:
+    def complete(
+        self, frame: Frame, learned: Learned, solved: Solved | None, cancelled: Cancelled
+    ) -> Iterator[Mapping[str, str]]:
         """Work out what is left for a scenario that rests; stops whenever `of` would tell more.
 
         Args:
             frame: ours.
             learned: its task, learned.
             solved: our motion; None where there is none.
+            cancelled: asked between parts of the work.
 
         Yields:
             Notes for `of`: which method is planned next, and how many are left.
+
+        Raises:
+            UnwantedError: it is cancelled.
         """
         chosen = _chosen(frame.scenario)
         slow = [method for method in chosen if self._record(method, frame, learned).motions is None]
         for k, method in enumerate(slow):
             left = {later.name: NEXT for later in slow[k + 1 :]}
             yield {method.name: f"planning … ({k + 1} of {len(slow)})", **left}
-            self._plan(method, frame, learned)
+            self._plan(method, frame, learned, cancelled)
         if slow:
             yield {}
         if not frame.scenario.obstacle.parts:
@@ -115,7 +121,7 @@ class Comparison:
         for method in (OURS, *chosen) if chosen else ():
             record = self._record(method, frame, learned)
             if not record.is_complete:
-                record.arm_depth = self._arm_depth(method, record, frame, learned, solved)
+                record.arm_depth = self._arm_depth(method, record, frame, learned, solved, cancelled)
                 record.is_complete = True
                 yield {}
 
@@ -146,24 +152,26 @@ class Comparison:
             record.arms.get(rollout) if shows_arm else None,
         )
 
-    def _plan(self, method: Method, frame: Frame, learned: Learned) -> None:
+    def _plan(self, method: Method, frame: Frame, learned: Learned, cancelled: Cancelled = never) -> None:
         """Plan a method's motions unless they are known; those that do not avoid are the same around all obstacles."""
         record, obstacle = self._record(method, frame, learned), frame.scenario.obstacle
         if record.motions is not None:
             return
         if method.avoids:
-            record.motions = self._planned(method, learned, obstacle)
+            record.motions = self._planned(method, learned, obstacle, cancelled)
             return
-        motions = self._memo("motions", (method.name, learned), lambda: self._planned(method, learned, Union()))
+        motions = self._memo(
+            "motions", (method.name, learned), lambda: self._planned(method, learned, Union(), cancelled)
+        )
         scores = motions.scores and replace(motions.scores, hand_depth=hand_depth(motions.paths, obstacle))
         record.motions = replace(motions, scores=scores)
 
-    def _planned(self, method: Method, learned: Learned, obstacle: Union) -> _Motions:
+    def _planned(self, method: Method, learned: Learned, obstacle: Union, cancelled: Cancelled) -> _Motions:
         planner = self._memo("planner", (method.name, learned), lambda: self._fitted(method, learned), newest=NEWEST)
         if isinstance(planner, str):
             return _Motions(note=planner)
         try:
-            plan = planner.plan(obstacle, learned.task.starts)
+            plan = planner.plan(obstacle, learned.task.starts, cancelled)
         except UnreachableError as error:
             return _Motions(note=str(error))
         stays = sum(len(path) < 2 for path in plan.paths)
@@ -200,28 +208,34 @@ class Comparison:
         return track(self._follower.robot, path[_tracked(len(path))], start).q
 
     def _arm_depth(
-        self, method: Method, record: _Record, frame: Frame, learned: Learned, solved: Solved | None
+        self,
+        method: Method,
+        record: _Record,
+        frame: Frame,
+        learned: Learned,
+        solved: Solved | None,
+        cancelled: Cancelled,
     ) -> float | None:
         """How deep the arm's meshes enter the obstacle along a method's motions, metres; None where there are none."""
         motions, obstacle = record.motions, frame.scenario.obstacle
         if motions is None or not motions.paths:
             return None
         if method is not OURS:
-            return _deepest([self._joints(motions, learned, k) for k in range(len(motions.paths))], obstacle)
+            return _deepest([self._joints(motions, learned, k) for k in range(len(motions.paths))], obstacle, cancelled)
         if solved is None:
             return None
         try:
             arms = [arm_along(frame, solved, k, self._follower)[0] for k in range(len(frame.rollouts))]
         except UnreachableError:
             return None
-        return _deepest([arm.q for arm in arms], obstacle)
+        return _deepest([arm.q for arm in arms], obstacle, cancelled)
 
 
-def _deepest(joints: list[Array], obstacle: Union) -> float:
+def _deepest(joints: list[Array], obstacle: Union, cancelled: Cancelled) -> float:
     """How deep the arm's meshes enter an obstacle along postures (N_i, 6), rad, metres; 0 when they are clear."""
     model, depth = load_collision_model(), 0.0
     for q in joints:
-        checkpoint()
+        end_if(cancelled)
         depth = max(depth, -model.nearest_to_obstacle(q, obstacle).distance)
     return depth
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from dt_viz.arm.robot import Robot
@@ -12,13 +11,13 @@ from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine import compose
 from dt_viz.engine.certify import certify, with_meshes
 from dt_viz.engine.comparison import Comparison
+from dt_viz.engine.cores import Cores
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.live_arm import LiveArm
-from dt_viz.engine.turns import Turns
+from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Rays
-from dt_viz.interruption import Checkpoint, interruptible
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.imitation import ImitationSettings, Progress
 from dt_viz.learning.store import FitStore
@@ -37,35 +36,11 @@ from dt_viz.scenario.tasks import STYLES, Task, TaskEntry
 from dt_viz.transforms.base import Transform
 from dt_viz.warning import MotionWarning
 
-_turns = Turns()
-"""Engines take turns. Small array operations of several threads would fight for the interpreter, and all would lose:
-four sessions that drag at once get twice as many frames this way."""
+_cores = Cores()
+"""Slots of all engines."""
 
 NUM_BOOKS = 8
 """Number of learned motions whose pictures are kept."""
-
-
-def let_drags_pass(longest: float) -> None:
-    """Wait while an engine follows a hand, at most so many seconds; called often by what takes long beside engines."""
-    _turns.let_pass(longest)
-
-
-@contextmanager
-def _in_turn(checkpoint: Checkpoint | None = None) -> Iterator[None]:
-    """Within this block compute when it is this engine's turn, letting others go first when they are due.
-
-    Args:
-        checkpoint: of what refines: others that follow a hand are due before it, and what this raises ends it, also
-            while it waits for its turn.
-    """
-    wanted = checkpoint or (lambda: None)
-
-    def pause() -> None:
-        wanted()
-        _turns.give_way(wanted)
-
-    with _turns.taken(patient=checkpoint is not None, checkpoint=wanted), interruptible(pause):
-        yield
 
 
 @dataclass(frozen=True)
@@ -121,25 +96,26 @@ class Engine:
         return self._tasks[name]()
 
     def frames(
-        self, scenario: Scenario, progress: Progress | None = None, checkpoint: Checkpoint = lambda: None
+        self, scenario: Scenario, progress: Progress | None = None, cancelled: Cancelled = never
     ) -> Iterator[Frame]:
         """Frames for a scenario, one for each stage; stop iterating to skip what is not wanted any more.
 
         Args:
             scenario: what to show.
             progress: called while a task is fitted for the first time; see `dt_viz.learning.imitation.fit`.
-            checkpoint: called often after stage LIVE; what it raises ends the computation.
+            cancelled: asked after stage LIVE, before each part of the computation and while it waits for a slot.
 
         Raises:
             DemonstrationError: the task's demonstrations cannot be read.
             ImitationError: nothing can be learned from them.
+            UnwantedError: it is cancelled.
         """
         self.nominal(scenario, progress)
         for panel in scenario.view.panels:
             if panel.task:
                 self._imitated(panel, progress)
         began = time.perf_counter()
-        for frame in self._stages(scenario, checkpoint):
+        for frame in self._stages(scenario, cancelled):
             yield replace(frame, seconds=time.perf_counter() - began)
 
     def nominal(self, scenario: Scenario, progress: Progress | None = None) -> Nominal:
@@ -269,23 +245,24 @@ class Engine:
         shown = self._shown.get(scenario.task)
         return shown.newest if shown and shown.newest.nominal.learned is learned else None
 
-    def _stages(self, scenario: Scenario, checkpoint: Checkpoint) -> Iterator[Frame]:
-        with _in_turn():
+    def _stages(self, scenario: Scenario, cancelled: Cancelled) -> Iterator[Frame]:
+        with _cores.slot():
             live, blocked = self._motion(scenario, LIVE)
             first = None if live is None else self._rollouts(scenario, live, LIVE)
         if live is None or first is None:
-            yield from self._stages_without_motion(scenario, blocked, checkpoint)
+            yield from self._stages_without_motion(scenario, blocked, cancelled)
             return
         self._yielded = live
         yield first
-        with _in_turn():
+        with _cores.slot():
             frame = self._with_arm(first, live, LIVE)
             frame = replace(frame, stage=Stage.LIVE, pictures=self._pictures(scenario, live, coarse=True))
             frame = self._compared(frame)
             self._shown[scenario.task] = _Shown(frame, live, live)
         yield frame
-        with _in_turn(checkpoint):
+        with _cores.slot(cancelled):
             fine = self.solved(scenario, FINE)
+        with _cores.slot(cancelled):
             frame = self._with_arm(self._rollouts(scenario, fine, FINE), fine, FINE)
             frame = replace(frame, stage=Stage.FINE, pictures=self._pictures(scenario, fine, coarse=False))
             frame = self._compared(replace(frame, blocked=fine.blocked))
@@ -294,15 +271,18 @@ class Engine:
             self._shown[scenario.task] = _Shown(frame, fine, live)
         self._yielded = fine
         yield frame
-        certificates = self.memo(
-            "certificates", scenario.plain, lambda: self._certified(frame, fine, checkpoint), newest=1
-        )
+        with _cores.slot(cancelled):
+            key = scenario.plain
+            certificates = self.memo("certificates", key, lambda: certify(frame, fine, self.follower), newest=1)
+        if frame.arm is not None:
+            with _cores.slot(cancelled):
+                certificates = self.memo("meshes", key, lambda: with_meshes(certificates, frame, fine), newest=1)
         frame = replace(frame, stage=Stage.CERTIFIED, certificates=certificates)
         yield frame
         if fine.arm is not None:
-            with _in_turn(checkpoint):
+            with _cores.slot(cancelled):
                 self.follower.stances(fine.nominal.learned)  # a drag may need them at once
-        yield from self._compared_at_rest(frame, fine, checkpoint)
+        yield from self._compared_at_rest(frame, fine, cancelled)
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
         """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
@@ -314,13 +294,13 @@ class Engine:
         """What is learned for a scenario in the plain state, which other methods are compared with."""
         return self.nominal(replace(scenario, state="plain", style="")).learned
 
-    def _compared_at_rest(self, frame: Frame, solved: Solved | None, checkpoint: Checkpoint) -> Iterator[Frame]:
+    def _compared_at_rest(self, frame: Frame, solved: Solved | None, cancelled: Cancelled) -> Iterator[Frame]:
         """The last frame again and again, each with more of what is known of other methods."""
         if not frame.scenario.view.compared:
             return
-        left = self.comparison.complete(frame, self._plain(frame.scenario), solved)
+        left = self.comparison.complete(frame, self._plain(frame.scenario), solved, cancelled)
         while True:
-            with _in_turn(checkpoint):
+            with _cores.slot(cancelled):
                 notes = next(left, None)
                 if notes is None:
                     return
@@ -387,20 +367,12 @@ class Engine:
         key = (learned, rest.tobytes())
         return self.memo("sketchbook", key, lambda: _sketchbook(learned, rest), newest=NUM_BOOKS)
 
-    def _certified(self, frame: Frame, fine: Solved, checkpoint: Checkpoint) -> Certificates:
-        with _in_turn(checkpoint):
-            certificates = certify(frame, fine, self.follower)
-        if frame.arm is None:
-            return certificates
-        with interruptible(checkpoint):  # out of turn: the first time it prepares meshes for seconds
-            return with_meshes(certificates, frame, fine)
-
     def _stages_without_motion(
-        self, scenario: Scenario, blocked: tuple[MotionWarning, ...], checkpoint: Checkpoint = lambda: None
+        self, scenario: Scenario, blocked: tuple[MotionWarning, ...], cancelled: Cancelled = never
     ) -> Iterator[Frame]:
         """The last motion that was shown at every stage, or the undisturbed one, refined, if there is none."""
         if scenario.task not in self._shown:
-            undisturbed = self._stages(replace(scenario, stack=_without_obstacles(scenario.stack)), checkpoint)
+            undisturbed = self._stages(replace(scenario, stack=_without_obstacles(scenario.stack)), cancelled)
             next(frame for frame in undisturbed if frame.stage is Stage.FINE)
         shown = self._shown[scenario.task]
         good, solved = shown.frame, shown.newest
@@ -417,7 +389,7 @@ class Engine:
                 good = replace(good, pictures=self._pictures(seen, solved, coarse=stage is Stage.LIVE))
             good = replace(good, scenario=scenario, stage=stage, blocked=blocked, certificates=certificates)
             yield self._compared(good) if stage >= Stage.LIVE else replace(good, comparison=())
-        yield from self._compared_at_rest(good, None, checkpoint)
+        yield from self._compared_at_rest(good, None, cancelled)
 
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:

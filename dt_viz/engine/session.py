@@ -15,8 +15,7 @@ from typing import Any, Protocol
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.worker import LatestWorker
-from dt_viz.errors import DataError
-from dt_viz.interruption import UnwantedError, interruptible
+from dt_viz.errors import DataError, UnwantedError
 from dt_viz.learning.imitation import ImitationError
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario
@@ -51,11 +50,6 @@ class Pace:
 
 _Job = tuple[Scenario, float]
 """A scenario to compute, and when it was asked for, seconds."""
-
-
-def _end_if(superseded: Callable[[], bool]) -> None:
-    if superseded():
-        raise UnwantedError
 
 
 def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
@@ -311,8 +305,7 @@ class Session:
     def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:
         self._failed = False
         try:
-            with interruptible(self._end_if_closed):
-                self._show_frames(job, superseded)
+            self._show_frames(job, superseded)
         except UnwantedError:
             pass
         except Exception as error:
@@ -327,10 +320,6 @@ class Session:
         finally:
             self._learning = False
 
-    def _end_if_closed(self) -> None:
-        if self._closed:
-            raise UnwantedError
-
     def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
         with self._lock:
@@ -341,9 +330,8 @@ class Session:
 
     def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
         scenario, edited = job
-        wanted = partial(_end_if, superseded)
         self._catch_up()
-        for frame in self._engine.frames(scenario, partial(self._learn, scenario), wanted):
+        for frame in self._engine.frames(scenario, partial(self._learn, scenario), superseded):
             now = time.perf_counter()
             if self._learning:
                 edited = now - frame.seconds  # learning is no rebuild

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import check_at_most, too_many
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.interruption import checkpoint
 
 MAX_JSON = 4_000_000
 """Largest number of bytes of the scene's description, which takes some thirty times as many as Python objects."""
@@ -87,7 +86,6 @@ def read_glb(content: bytes, *, max_vertices: int, max_triangles: int) -> tuple[
     vertices, faces = np.empty((num_vertices, 3)), np.empty((num_triangles, 3), dtype=np.intp)
     v = f = 0
     for part in parts:
-        checkpoint()
         own = _numbers(scene, data, part.positions, "VEC3")
         corners = _corners(scene, data, part)
         if len(corners) and corners.max() >= len(own):

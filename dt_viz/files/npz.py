@@ -22,7 +22,6 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import check_at_most, too_many
-from dt_viz.interruption import checkpoint
 
 MAX_MEMBERS = 10_000
 """Largest number of members of an archive."""
@@ -135,7 +134,6 @@ class _Bytes:
         """Return the next `size` bytes; memory is taken for those that are there only."""
         data = bytearray()
         while len(data) < size:
-            checkpoint()
             chunk = self._file.read(min(size - len(data), CHUNK))
             if not chunk:
                 break

@@ -12,9 +12,8 @@ import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import check_at_most, too_many
-from dt_viz.files.text import LINES_PER_CHECKPOINT, numbered_lines
+from dt_viz.files.text import numbered_lines
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.interruption import checkpoint
 
 MAX_HEADER = 100_000
 """Largest number of bytes of the header."""
@@ -274,9 +273,7 @@ def _unequal_rows(content: bytes, at: int, element: _Element, order: str) -> tup
     lengths: dict[str, array[int]] = {name: array("q") for name in element.wanted}
     counts = [struct.Struct(order + np.dtype(p.count).char) if p.count else None for p in element.properties]
     sizes = [np.dtype(p.kind).itemsize for p in element.properties]
-    for row in range(element.num):
-        if row % LINES_PER_CHECKPOINT == 0:
-            checkpoint()
+    for _ in range(element.num):
         for p, count, size in zip(element.properties, counts, sizes, strict=True):
             num = 1
             if count is not None:

@@ -8,14 +8,11 @@ from collections.abc import Collection, Iterator, Sequence
 
 from dt_viz.errors import FormatError
 from dt_viz.files.checks import too_many
-from dt_viz.interruption import checkpoint
 
 MAX_LINES = 2_000_000
 """Largest number of lines of a file, empty lines and comments included."""
 MAX_LENGTH = 100_000
 """Largest number of characters in a line."""
-LINES_PER_CHECKPOINT = 1000
-"""Number of lines between two checkpoints, about a millisecond of reading."""
 
 
 def numbered_lines(content: bytes, *, errors: str = "strict", max_lines: int = MAX_LINES) -> Iterator[tuple[int, str]]:
@@ -46,8 +43,6 @@ def numbered_lines(content: bytes, *, errors: str = "strict", max_lines: int = M
         line = line.rstrip("\n")
         if len(line) > MAX_LENGTH:
             raise too_many(f"line {number}", MAX_LENGTH, "characters")
-        if number % LINES_PER_CHECKPOINT == 0:
-            checkpoint()
         yield number, line
 
 

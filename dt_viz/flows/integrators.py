@@ -12,7 +12,6 @@ from collections.abc import Callable
 import numpy as np
 
 from dt_viz.flows.fields import Array, CompiledField, Mask, VectorField
-from dt_viz.interruption import checkpoint
 from dt_viz.kernels.dormand_prince import ERROR, LONGEST_TURN, ROUNDING, SHORT, STAGES, STRAIGHT, TURN_ERROR
 
 Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
@@ -76,7 +75,6 @@ def integrate(
         return field.rk4(s, duration, steps), None
     h = duration / steps
     for _ in range(steps):
-        checkpoint()
         s, U = step(field, s, U, h)
     return s, U
 
@@ -114,7 +112,6 @@ def integrate_adaptive(
     for _ in range(max_rounds):
         if not len(active):
             return _split(state, s, U)
-        checkpoint()
         step = np.sign(duration) * h[:, None]
         stages = np.empty((len(STAGES), *start.shape))
         end, stages[0] = start, first

@@ -51,6 +51,11 @@ Blocks = NDArray[np.void]
 
 
 @compiled
+def keep(memory: Blocks) -> None:
+    """Keep the memory of a block up to here: numba frees it after its last use, and a record in it does not count."""
+
+
+@compiled
 def load(block: Record, q: Array, rows: Array, first: int) -> int:
     """Take the postures q[rows[first:]] (n,) into the lanes, the last one into those left over; returns how many."""
     num, angles = min(len(rows) - first, LANES), block.q
@@ -173,7 +178,8 @@ def room_asked(q: Array, pins: Array, room: Array, levers: Array, slope: float, 
 @short_kernel
 def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
     """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
-    result, rows, block = np.full(len(q), np.inf), np.arange(len(q)), np.empty(1, BLOCK)[0]
+    result, rows, memory = np.full(len(q), np.inf), np.arange(len(q)), np.empty(1, BLOCK)
+    block = memory[0]
     away, nearest = block.away, block.nearest
     for first in range(0, len(q), LANES):
         num = load(block, q, rows, first)
@@ -188,4 +194,5 @@ def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values
                     nearest[lane] = away[lane] if away[lane] < nearest[lane] else nearest[lane]
         for lane in range(num):
             result[first + lane] = nearest[lane]
+    keep(memory)
     return result

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dt_viz.kernels.arm import Array, BodyPoints, Joints
-from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, load, measure, put
+from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, measure, put
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record, Shapes, Values
 from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, next_step
@@ -288,12 +288,14 @@ def _unload(values: Array, row: int, lane: int, result: Array) -> None:
 @kernel
 def velocities(escape: Escape, q: Array) -> Array:
     """V_q (N, n) at postures q (N, n)."""
-    rows, result, block = np.arange(len(q)), np.zeros_like(q), np.empty(1, BLOCK)[0]
+    rows, result, memory = np.arange(len(q)), np.zeros_like(q), np.empty(1, BLOCK)
+    block = memory[0]
     for first in range(0, len(q), LANES):
         num = load(block, q, rows, first)
         if _find_velocity(escape, block):
             for lane in range(num):
                 _unload(block.velocity, first + lane, lane, result)
+    keep(memory)
     return result
 
 
@@ -312,7 +314,8 @@ def _moving(v: Array) -> Array:
 def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
     """Postures q (N, n) carried along by classical Runge–Kutta steps of equal length, (N, n)."""
     v = velocities(escape, q)
-    rows, q, block = _moving(v), q.copy(), np.empty(1, BLOCK)[0]  # elsewhere the flow rests
+    rows, q, memory = _moving(v), q.copy(), np.empty(1, BLOCK)  # elsewhere the flow rests
+    block = memory[0]
     n, h, at, start, slopes = q.shape[1], duration / steps, block.q, block.start, block.sum
     velocity = block.velocity
     for first in range(0, len(rows), LANES):
@@ -338,11 +341,12 @@ def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
                     at[i, lane] = start[i, lane] + slopes[i, lane]
         for lane in range(num):
             _unload(at, rows[first + lane], lane, q)
+    keep(memory)
     return q
 
 
 @kernel
-def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, max_steps: int) -> tuple[Array, int]:
+def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, max_steps: int) -> tuple[Array, int]:  # noqa: PLR0915
     """Postures q (N, n) carried along by Dormand–Prince steps, and how many of them need more than `max_steps`.
 
     The estimated error of a step is at most `tolerance`, rad; see `dt_viz.flows.integrators.integrate_adaptive`. Each
@@ -351,7 +355,8 @@ def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, m
     v = velocities(escape, q)
     rows, q, total, sign = _moving(v), q.copy(), abs(duration), np.sign(duration)
     first_steps, num_failed, n = _first_steps(escape, q, v, rows, total, sign, tolerance), 0, q.shape[1]
-    block = np.empty(1, BLOCK)[0]
+    memory = np.empty(1, BLOCK)
+    block = memory[0]
     at, start, stages, h, velocity, defect = block.q, block.start, block.stages, block.h, block.velocity, block.sum
     row_of, num_steps, left = np.full(LANES, -1), np.zeros(LANES, np.int64), np.zeros(LANES)
     for i in range(n):
@@ -376,6 +381,7 @@ def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, m
         if num_busy == 0:
             if upcoming < len(rows):
                 continue
+            keep(memory)
             return q, num_failed
         for stage in range(1, 7):
             for i in range(n):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.kernels.arm import Array, Joints
-from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, load, put
+from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, put
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record
 
@@ -305,7 +305,8 @@ def settle(
     Returns:
         The postures (N, n), rad, inside the limits.
     """
-    q, rows, block = q.copy(), np.arange(len(q)), np.empty(1, BLOCK)[0]
+    q, rows, memory = q.copy(), np.arange(len(q)), np.empty(1, BLOCK)
+    block = memory[0]
     at, target, moves, largest = block.q, block.target, block.moves, block.largest
     for first in range(0, len(q), LANES):
         num = load(block, q, rows, first)
@@ -326,6 +327,7 @@ def settle(
         for lane in range(num):
             for i in range(q.shape[1]):
                 q[first + lane, i] = at[i, lane]
+    keep(memory)
     return q
 
 
@@ -345,7 +347,8 @@ def walk(arm: Arm, postures: Postures, lines: Array, lengths: Array, starts: Arr
         Rough postures (B, T, n), rad, at the places after the start: linear in the distance between strides.
     """
     num, n, last = len(lines), starts.shape[1], lines.shape[1] - 1
-    result, rows, block = np.empty((num, last, n)), np.arange(num), np.empty(1, BLOCK)[0]
+    result, rows, memory = np.empty((num, last, n)), np.arange(num), np.empty(1, BLOCK)
+    block = memory[0]
     q = np.empty((LANES, num_strides + 1, n))
     at, target, moves, passed = block.q, block.target, block.moves, np.zeros(LANES, np.int64)
     for first in range(0, num, LANES):
@@ -379,4 +382,5 @@ def walk(arm: Arm, postures: Postures, lines: Array, lengths: Array, starts: Arr
                     result[row, waypoint, i] = q[lane, left, i] + (place - left) * (
                         q[lane, left + 1, i] - q[lane, left, i]
                     )
+    keep(memory)
     return result

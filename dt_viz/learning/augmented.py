@@ -17,7 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from numbers import Real
 from typing import TypeVar
 
@@ -32,7 +32,6 @@ from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
 from dt_viz.learning.unbending import groups_of
 from dt_viz.metrics import arc_length, interpolate
-from dt_viz.properties import cached_property
 
 FEWEST_KNOTS, MOST_KNOTS, POINTS_PER_KNOT = 30, 240, 5
 """Smallest and largest number of knots of a predicted motion, and number of points of a demonstration for each."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -24,7 +25,6 @@ from dt_viz.learning.trajectory import TrajectoryFit
 from dt_viz.learning.unbending import layers_along, regress, unbending
 from dt_viz.learning.velocity import VelocityFit
 from dt_viz.metrics import interpolate, resample_by_arc_length
-from dt_viz.properties import cached_property
 
 Progress = Callable[[float, str], None]
 

@@ -14,8 +14,6 @@ from typing import TypeAlias, Union
 
 import numpy as np
 
-from dt_viz.interruption import checkpoint
-
 # Numbers are an array. A cell array is the list of its values, a structure array the list of its structures, both in
 # column-major order. What a demonstration does not need (text, sparse or complex numbers, objects) is None.
 Value: TypeAlias = Union[np.ndarray, "list[Value]", "dict[str, Value]", None]
@@ -68,7 +66,6 @@ def _variables(content: bytes, order: str) -> Iterator["_Elements"]:
             return
         if num > MAX_VARIABLES:
             raise MatFileError(f"more than {MAX_VARIABLES} variables")
-        checkpoint()
         kind, data = elements.take()
         if kind == COMPRESSED:
             try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import Demonstration, samples_of
 from dt_viz.metrics import arc_length, resample_by_arc_length
-from dt_viz.properties import cached_property
 
 # Lengths are in units of the spread, the RMS distance of the demonstrations' points from their mean.
 SAME_GOAL = 1e-3  # distance from the goal up to which an end is at the goal

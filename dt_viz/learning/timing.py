@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import Attractor, asinh_exp, log_sinh
 from dt_viz.metrics import interpolate
-from dt_viz.properties import cached_property
 
 ARRIVED = 3e-4  # distance from the goal, relative to the ray's length, that counts as a demonstration's end
 MIN_PACE = 0.15  # smallest pace: a motion is at most about seven times as fast as the plain attractor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import ndimage
@@ -16,7 +16,6 @@ from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import fit_occupancy
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.triangles import grid_nodes
-from dt_viz.properties import cached_property
 
 MIN_POINTS = 50
 NUM_NODES = 44**3

@@ -28,7 +28,6 @@ from dt_viz.files.npz import NpzFile
 from dt_viz.files.ply import read_ply
 from dt_viz.files.text import decimal_numbers, read_table
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.interruption import checkpoint
 from dt_viz.obstacles.clouds import Cloud, check_points
 from dt_viz.obstacles.mending import closed
 from dt_viz.obstacles.solids import Solid
@@ -112,7 +111,6 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> Load
     suffix = _suffix(content, source, MESH_SUFFIXES, scale)
     with parsing(ShapeError, source, "file", f"a {suffix} file of a mesh"):
         vertices, faces = _triangles(content, suffix)
-        checkpoint()
         check_triangles(vertices, faces)
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
@@ -120,9 +118,7 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> Load
     with parsing(ShapeError, source, "mesh", "a closed mesh"):
         mesh = closed(vertices, faces)
         solid = Solid(mesh.vertices, mesh.faces)
-        checkpoint()
         grid = solid.distances
-    checkpoint()
     if not grid.depth > 0:
         found = f"walls thinner than {1e3 * grid.cell:.1f} mm, which leave nothing inside"
         raise ShapeError(source, "thickness", found, f"a solid thicker than about {2e3 * grid.cell:.0f} mm")
@@ -148,7 +144,6 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
     suffix = _suffix(content, source, CLOUD_SUFFIXES, scale)
     with parsing(ShapeError, source, "file", f"a {suffix} file of points"):
         points, labels = {".ply": _ply_points, ".npz": _npz_points, ".csv": _csv_points}[suffix](content)
-        checkpoint()
         check_at_most("points", len(points), MAX_POINTS)
         check_points(points, labels)
         occupied = points if labels is None else points[labels > 0.5]
@@ -160,7 +155,6 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
         if labels is None:
             points = np.unique(points, axis=0)
         cloud = Cloud(points, labels)
-    checkpoint()
     with parsing(ShapeError, source, "points", "points that something occupies"):
         depth = cloud.solid.distances.depth
     if not depth > 0:

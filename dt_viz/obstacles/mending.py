@@ -16,7 +16,6 @@ from scipy.sparse.csgraph import connected_components
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices, Mask
-from dt_viz.interruption import checkpoint
 
 SAME, NEAR = 1e-8, 1e-5
 """Sizes of the cells in which vertices are merged, always and where the surface would not be closed otherwise, relative
@@ -74,7 +73,6 @@ def closed(vertices: Array, faces: Indices) -> ClosedMesh:
             vertices, faces, note = _filled(vertices, faces, once)
             notes = [note]
         sides = np.sort(_sides(faces, len(vertices)))
-    checkpoint()
     if (sides[::2] == sides[1::2]).any():  # neighbours that run along their edge in the same direction
         turned = _turned(faces, len(vertices))
         faces = np.where(turned[:, None], faces[:, ::-1], faces)
@@ -112,7 +110,6 @@ def _without_seams(vertices: Array, faces: Indices, cell: float) -> tuple[Array,
     """
     before, once = np.inf, np.empty((0, 2), dtype=np.intp)
     for shift in itertools.product((0.0, 0.5), repeat=3):
-        checkpoint()
         vertices, faces = _merged(vertices, faces, cell, shift)
         if not len(faces):
             raise FormatError("faces", "only triangles without area", "a closed mesh of triangles")

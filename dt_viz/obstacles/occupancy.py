@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,6 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
 from dt_viz.flows.fields import Array, GaussianGrid, Mask, VectorField, second_orders, unit_orders
-from dt_viz.properties import cached_property
 
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")

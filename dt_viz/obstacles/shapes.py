@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -22,7 +22,6 @@ from dt_viz.obstacles.occupancy import (
     sample_labels,
 )
 from dt_viz.obstacles.solids import Solid
-from dt_viz.properties import cached_property
 
 Point = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import ndimage
@@ -20,7 +20,6 @@ from trimesh.triangles import closest_point
 from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.triangles import check_triangles, grid_nodes, inside_of_grid, surface_samples
-from dt_viz.properties import cached_property
 
 SMALLEST = 1e-9
 """Smallest size of a solid, and inverse of the largest, in its own unit."""

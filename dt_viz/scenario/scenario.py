@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 from dt_viz.learning.choice import State
 from dt_viz.learning.imitation import Objective
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
-from dt_viz.properties import cached_property
 from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.transforms.avoidance import Avoidance

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import AnyImitation
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
 from dt_viz.metrics import resample_by_arc_length
-from dt_viz.properties import cached_property
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.slices import Slice
 from dt_viz.shipped import ASSETS

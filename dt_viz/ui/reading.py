@@ -1,4 +1,4 @@
-"""Reading of uploaded files, one at a time over all visitors, while their visitors stay."""
+"""Reading of uploaded files, one at a time over all visitors."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from dt_viz.engine.engine import let_drags_pass
-from dt_viz.interruption import UnwantedError, interruptible
+from dt_viz.errors import UnwantedError, end_if
 
 logger = logging.getLogger(__name__)
 
 LOOK = 0.1
 """Interval of the checks whether a waiting visitor is still there, seconds."""
-LONGEST_PAUSE = 0.1
-"""Longest pause of reading at a checkpoint, in favour of drags, seconds."""
 
 _one_file = threading.Lock()
 """Lock of the reader: a file takes up to some hundred megabytes on its way to an obstacle."""
@@ -45,25 +42,25 @@ class Reader:
         return True
 
     def close(self) -> None:
-        """Stop waiting, and reading at the next checkpoint: the visitor has left."""
+        """Stop waiting, and drop what is being read: the visitor has left."""
         self._left.set()
 
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Wait until no other file is being read; within the block, drags go first at checkpoints.
+        """Wait until no other file is being read, and read within the block.
 
         Raises:
-            UnwantedError: the visitor has left.
+            UnwantedError: the visitor has left, before the block or within it.
         """
         if not _one_file.acquire(blocking=False):
             self._waits()
             while not _one_file.acquire(timeout=LOOK):
-                self._check()
+                end_if(self._left.is_set)
         try:
-            with interruptible(self._pause):
-                yield
+            yield
         finally:
             _one_file.release()
+        end_if(self._left.is_set)
 
     def _run(self, read: Callable[[], None]) -> None:
         try:
@@ -74,11 +71,3 @@ class Reader:
             logger.exception("a file could not be read")
         finally:
             self._busy.release()
-
-    def _pause(self) -> None:
-        self._check()
-        let_drags_pass(LONGEST_PAUSE)
-
-    def _check(self) -> None:
-        if self._left.is_set():
-            raise UnwantedError

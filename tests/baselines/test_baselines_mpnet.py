@@ -27,7 +27,7 @@ from dt_viz.baselines.mpnet import (
 )
 from dt_viz.baselines.mpnet_rrt import MPNetRRT
 from dt_viz.baselines.postures import Surroundings
-from dt_viz.interruption import interruptible
+from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 
@@ -198,17 +198,15 @@ class TestRRT:
     @needs_ompl
     def test_an_exception_within_ompl_ends_it(self, problem, in_the_way):
         alone, calls = [], []
-        with interruptible(lambda: alone.append(0)):
-            MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1])
+        MPNet().fit(problem).plan(in_the_way, problem.task.starts[:1], lambda: alone.append(0) is not None)
 
-        def interrupted():
+        def cancelled():
             calls.append(0)
-            if len(calls) == len(alone) + 20:
-                raise KeyboardInterrupt
+            return len(calls) == len(alone) + 20
 
         planner = MPNetRRT().fit(problem)
-        with pytest.raises(KeyboardInterrupt), interruptible(interrupted):
-            planner.plan(in_the_way, problem.task.starts[:1])
+        with pytest.raises(UnwantedError):
+            planner.plan(in_the_way, problem.task.starts[:1], cancelled)
         assert len(calls) == len(alone) + 20
 
     def test_without_ompl_it_says_what_is_missing(self, monkeypatch):

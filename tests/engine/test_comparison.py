@@ -16,8 +16,8 @@ from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.engine.comparison import NEXT, OTHERS, WAITS, curves, scored
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
+from dt_viz.errors import UnwantedError
 from dt_viz.evaluate.table1 import drawn
-from dt_viz.interruption import UnwantedError
 from dt_viz.metrics import frechet
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -104,12 +104,8 @@ def test_an_edit_ends_the_planning_of_a_slow_method_at_once(new_engine, initial)
     engine, scenario = new_engine(), shown(initial("push_box"), SLOW)
     frames, wanted = [], [True]
 
-    def leave():
-        if not wanted[0]:
-            raise UnwantedError
-
     with pytest.raises(UnwantedError):
-        for frame in engine.frames(scenario, checkpoint=leave):
+        for frame in engine.frames(scenario, cancelled=lambda: not wanted[0]):
             frames.append(frame)
             wanted[0] = not by_name(frame).get(SLOW) or "planning" not in by_name(frame)[SLOW].note
     assert by_name(frames[-1])[SLOW].note == "planning … (1 of 1)"
@@ -215,15 +211,10 @@ def test_of_a_single_demonstration_by_the_user_what_can_be_fitted_is_and_the_res
 @pytest.mark.usefixtures("quick")
 def test_interrupted_between_or_within_steps_it_goes_on_later(new_engine, initial):
     engine, scenario, frames = new_engine(), shown(initial("push_box"), LIVE, SLOW), []
-    for patience in 40 * 2 ** np.arange(20):
+    for patience in 2 ** np.arange(20):
         left = iter(range(patience))
-
-        def leave(left=left):
-            if next(left, None) is None:
-                raise UnwantedError
-
         with suppress(UnwantedError):
-            frames = list(engine.frames(scenario, checkpoint=leave))
+            frames = list(engine.frames(scenario, cancelled=lambda left=left: next(left, None) is None))
             break
     assert frames, "never done"
     *_, alone = new_engine().frames(scenario)

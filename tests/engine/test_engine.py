@@ -10,12 +10,11 @@ from oracles import used_fraction
 from scenes import avoiding, biases, changed, frame_at, kinds, says
 
 import dt_viz.engine.engine as engine_module
-import dt_viz.engine.turns as turns_module
+from dt_viz.engine.cores import Cores
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
-from dt_viz.engine.turns import Turns
+from dt_viz.errors import UnwantedError, never
 from dt_viz.flows import rollouts
-from dt_viz.interruption import UnwantedError, interruptible
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.motion import diagnostics
@@ -68,11 +67,6 @@ def assert_finite(frame):
         assert np.isfinite(field.points).all() and np.isfinite(field.velocities).all()
     if frame.arm is not None:
         assert np.isfinite(frame.arm.q).all()
-
-
-def refuse():
-    """A checkpoint of what is not wanted any more."""
-    raise UnwantedError
 
 
 def test_frames_come_in_the_order_of_their_stages_and_hold_what_they_promise(engine, scenario):
@@ -263,18 +257,6 @@ def test_times_increase_where_a_strong_bias_stretches_space_at_the_goal(engine, 
             assert used_fraction(frame.arm.times, frame.arm.q, robot.velocity_limits) <= 1 + 1e-9
 
 
-@pytest.mark.parametrize("space", ["task", "cspace"])
-def test_what_follows_a_hand_ends_where_the_thread_is_interrupted(new_engine, initial, space):
-    engine, scenario, passed = new_engine(), changed(initial("draw_s"), space=space), []
-    with interruptible(lambda: passed.append(None)):
-        frames = engine.frames(changed(scenario, margin=0.012))
-        assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
-    assert len(passed) > 20
-    with pytest.raises(UnwantedError), interruptible(refuse):
-        next(engine.frames(scenario))
-    assert frame_at(engine, scenario, Stage.LIVE).rollouts  # nothing is left locked
-
-
 def test_a_motion_that_would_take_too_many_samples_says_so(new_engine, initial, monkeypatch):
     scenario = initial("draw_s")
     frame = frame_at(new_engine(), scenario, Stage.FINE)
@@ -288,22 +270,17 @@ def test_a_motion_that_would_take_too_many_samples_says_so(new_engine, initial, 
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
-def test_wherever_refining_is_interrupted_it_leaves_nothing_half_done(fits, robot, space):
+def test_wherever_refining_is_cancelled_it_leaves_nothing_half_done(fits, robot, space):
     (demonstration, *_), passed = TASKS["draw_s"]().demonstrations, []
     one = TaskEntry("One", lambda: drawing_task("one", "One", "", (demonstration,)))
     undisturbed, engine = (Engine({"one": one}, fits, robot) for _ in range(2))
     scenario = avoiding("one", Sphere(one().obstacle_position), space=space)
-    *_, expected = undisturbed.frames(scenario, checkpoint=lambda: passed.append(None))
-    assert len(passed) > 50  # all along, not between a few long parts
-    for moment in (0, 0.05, 0.4):
-        left, stages = iter(range(int(moment * len(passed)))), []
-
-        def refuse_then(left=left):
-            if next(left, None) is None:
-                raise UnwantedError
-
+    *_, expected = undisturbed.frames(scenario, cancelled=lambda: passed.append(None) is not None)
+    assert len(passed) >= len(Stage)
+    for moment in range(len(passed)):
+        left, stages = iter(range(moment)), []
         with pytest.raises(UnwantedError):
-            for frame in engine.frames(scenario, checkpoint=refuse_then):
+            for frame in engine.frames(scenario, cancelled=lambda left=left: next(left, None) is None):
                 stages.append(frame.stage)
         assert stages[:2] == [Stage.ROLLOUTS, Stage.LIVE]  # what follows a hand comes first, and whole
     *_, found = engine.frames(scenario)
@@ -314,31 +291,30 @@ def test_wherever_refining_is_interrupted_it_leaves_nothing_half_done(fits, robo
     assert found.arm_duration == expected.arm_duration
 
 
-def test_while_one_engine_refines_another_follows_a_hand(new_engine, initial):
-    followed = threading.Event()
+@pytest.mark.parametrize("stage", [Stage.LIVE, Stage.FINE])
+def test_a_hand_is_followed_while_all_others_refine(new_engine, initial, monkeypatch, stage):
+    cores = Cores(2)
+    monkeypatch.setattr(engine_module, "_cores", cores)
+    frames = new_engine().frames(initial("lift_box"))
+    if stage is Stage.LIVE:
+        with cores.slot(never):
+            assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
+    else:
+        next(frames), next(frames)
+        with cores.slot(never):
+            refining = threading.Thread(target=lambda: next(frames), daemon=True)
+            refining.start()
+            refining.join(0.3)
+            assert refining.is_alive() and cores.queue  # one refinement at a time
+        refining.join(PATIENCE)
+        assert not refining.is_alive()
 
-    def follow():
-        frame_at(new_engine(), initial("lift_box"), Stage.LIVE)
-        followed.set()
 
-    def until_it_is_due():
-        while not followed.is_set() and not engine_module._turns._queue:
-            assert other.is_alive()
-            followed.wait(0.001)
-
-    other = threading.Thread(target=follow, daemon=True)
-    frames = new_engine().frames(initial("draw_s"), checkpoint=until_it_is_due)
-    assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
-    other.start()
-    assert next(frames).stage is Stage.FINE
-    assert followed.is_set()
-
-
-def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_turn(new_engine, initial, monkeypatch):
+def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_slot(new_engine, initial, monkeypatch):
     """Else a hand that moves again would wait for all others to rest."""
-    turns, ended = Turns(), threading.Event()
-    monkeypatch.setattr(engine_module, "_turns", turns)
-    frames = new_engine().frames(initial("draw_s"), checkpoint=refuse)
+    cores, ended, unwanted = Cores(1), threading.Event(), threading.Event()
+    monkeypatch.setattr(engine_module, "_cores", cores)
+    frames = new_engine().frames(initial("draw_s"), cancelled=unwanted.is_set)
 
     def refine():
         with pytest.raises(UnwantedError):
@@ -346,31 +322,11 @@ def test_refining_that_is_not_wanted_any_more_does_not_wait_for_its_turn(new_eng
         ended.set()
 
     assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
-    with turns.taken():  # somebody who drags on and on
+    with cores.slot():  # somebody who drags on and on
         threading.Thread(target=refine, daemon=True).start()
+        assert not ended.wait(0.1)
+        unwanted.set()
         assert ended.wait(PATIENCE)
-
-
-@pytest.mark.parametrize("space", ["task", "cspace"])
-def test_engines_that_take_turns_at_every_checkpoint_all_get_their_first_frames(
-    new_engine, initial, monkeypatch, space
-):
-    """Whatever one of them has half computed when it gives its turn away, the others can go on."""
-    monkeypatch.setattr(turns_module, "SLICE", -1.0)
-    monkeypatch.setattr(engine_module, "_turns", Turns())  # a deadlock is this test's own
-    scenario, barrier, done = changed(initial("draw_s"), space=space), threading.Barrier(4), []
-
-    def open_page():
-        engine = new_engine()
-        barrier.wait(PATIENCE)
-        done.append(next(frame for frame in engine.frames(scenario) if frame.stage is Stage.LIVE))
-
-    threads = [threading.Thread(target=open_page, daemon=True) for _ in range(barrier.parties)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(PATIENCE)
-    assert len(done) == len(threads)
 
 
 def random_edit(rng, scenario, initial):

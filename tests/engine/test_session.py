@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, changing, starts_at
 
-from dt_viz import interruption
 from dt_viz.engine import session as session_module
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
 from dt_viz.engine.session import GESTURE_PAUSE, MAX_UNDO, Session
+from dt_viz.errors import end_if, never
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.learning.imitation import ImitationError
 from dt_viz.obstacles.shapes import Box, Sphere
@@ -47,7 +47,7 @@ class FakeEngine:
         self.seen, self.driven, self.drivers = [], [], set()
         self.endless, self.busy = None, threading.Event()
 
-    def frames(self, scenario, progress=None, checkpoint=None):
+    def frames(self, scenario, progress=None, cancelled=never):
         self.asked.append(scenario)
         self.begun.set()
         if self.gate is not None:
@@ -64,7 +64,7 @@ class FakeEngine:
         for stage in Stage:
             while stage is self.endless:
                 self.busy.set()
-                interruption.checkpoint()
+                end_if(cancelled)
                 time.sleep(0.001)
             if stage is Stage.LIVE and scenario.view.generator_layer == -9:
                 raise IndexError("no such flow")

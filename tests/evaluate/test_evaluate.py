@@ -287,8 +287,8 @@ def test_what_is_held_out_is_not_learned_from():
 def test_latency_counts_every_edit_and_reports_both_stages(measured, dragged, monkeypatch):
     recorder, frames = Recorder(), Engine.frames
 
-    def while_dragging(*scenario, **checkpoints):
-        return (frame for frame in frames(*scenario, **checkpoints) if frame.stage <= Stage.LIVE)
+    def while_dragging(*scenario, **others):
+        return (frame for frame in frames(*scenario, **others) if frame.stage <= Stage.LIVE)
 
     monkeypatch.setattr(Engine, "frames", while_dragging)  # what rests is refined, which is not measured
     monkeypatch.setattr(latency, "Recorder", lambda: recorder)

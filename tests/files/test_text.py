@@ -4,7 +4,6 @@ import pytest
 
 from dt_viz.errors import FormatError
 from dt_viz.files.text import MAX_LENGTH, numbered_lines, read_table
-from dt_viz.interruption import UnwantedError, interruptible
 
 HEADERS = (("x", "y"), ("name", "x", "y"))
 
@@ -54,11 +53,3 @@ def test_rows_are_read_when_they_are_asked_for():
     assert next(table) == (2, ["1", "2"])
     with pytest.raises(FormatError, match="line 3"):
         next(table)
-
-
-def test_reading_ends_where_a_checkpoint_says_so():
-    def stop() -> None:
-        raise UnwantedError
-
-    with pytest.raises(UnwantedError), interruptible(stop):
-        rows(b"x,y\n" + b"1,2\n" * 5000, max_rows=5000)

@@ -12,6 +12,7 @@ from dt_viz.arm.tracking import UnreachableError
 from dt_viz.arm.whole_arm import LONG, NUM_CONFIGURATIONS
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
+from dt_viz.errors import UnwantedError
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
 from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
@@ -341,18 +342,14 @@ class TestBlocked:
         for path, ghost in zip(frame.rollouts, frame.ghost, strict=True):
             assert np.linalg.norm(path[:, None] - ghost, axis=-1).min(axis=0).max() < 1e-12
 
-    def test_refining_the_undisturbed_one_ends_where_a_checkpoint_says_so(self, new_engine, initial):
-        class UnwantedError(Exception):
-            pass
-
-        def refuse():
-            raise UnwantedError
-
+    def test_refining_the_undisturbed_one_ends_when_it_is_cancelled(self, new_engine, initial):
         engine, blocked = new_engine(), placed(initial("push_box"), around((0.0, 0.0, 0.1), 0.3))
         blocked = replace(blocked, view=View())
         with pytest.raises(UnwantedError):
-            next(engine.frames(blocked, checkpoint=refuse))
-        assert next(engine.frames(blocked, checkpoint=refuse)).blocked  # what there is so far is shown at the next edit
+            next(engine.frames(blocked, cancelled=lambda: True))
+        assert next(
+            engine.frames(blocked, cancelled=lambda: True)
+        ).blocked  # what there is so far is shown at the next edit
 
     def test_demonstrations_out_of_reach_are_shown_without_an_arm(self, too_far, initial):
         for frame in too_far.frames(placed(initial("push_box"), *initial("push_box").obstacles)):

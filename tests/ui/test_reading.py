@@ -1,17 +1,16 @@
-"""Files are read one at a time over all visitors, and reading ends with its visitor."""
+"""Files are read one at a time over all visitors, and dropped where their visitor has left."""
 
 import threading
 
 import pytest
 from pages import PATIENCE, wait_until
 
-from dt_viz.engine import engine
-from dt_viz.interruption import UnwantedError, checkpoint
+from dt_viz.errors import UnwantedError
 from dt_viz.ui.reading import Reader
 
 
 class Visitor:
-    """Has a file read that goes on until it is let go, passing checkpoints."""
+    """Has a file read that goes on until it is let go."""
 
     def __init__(self) -> None:
         self.waits, self.reads, self.let_go, self.done = (threading.Event() for _ in range(4))
@@ -22,9 +21,8 @@ class Visitor:
         try:
             with self.reader.turn():
                 self.reads.set()
-                while not self.let_go.wait(0.001):
-                    checkpoint()
-                self.end = "read"
+                assert self.let_go.wait(PATIENCE)
+            self.end = "read"
         except UnwantedError:
             self.end = "left"
             raise
@@ -66,9 +64,10 @@ def test_a_second_visitor_is_told_to_wait_and_comes_next(both):
     assert first.end == "read"
 
 
-def test_who_leaves_while_reading_makes_room(both):
+def test_what_was_read_for_a_visitor_who_has_left_is_dropped(both):
     first, second = both
     first.reader.close()
+    first.let_go.set()
     assert first.done.wait(PATIENCE) and first.end == "left"
     assert second.reads.wait(PATIENCE)
 
@@ -85,38 +84,6 @@ def test_each_visitor_has_one_file_under_way(first):
     first.let_go.set()
     assert first.done.wait(PATIENCE)
     first.begin_next(first.read)
-
-
-def test_reading_pauses_at_its_checkpoints_while_others_drag(first, monkeypatch):
-    monkeypatch.setattr("dt_viz.ui.reading.LONGEST_PAUSE", PATIENCE)
-    passed = threading.Event()
-
-    def read() -> None:
-        with first.reader.turn():
-            first.reads.set()
-            checkpoint()
-            passed.set()
-
-    with engine._turns.taken():  # as who follows a hand has it
-        assert first.reader.begin(read) and first.reads.wait(PATIENCE)
-        assert not passed.wait(0.3)
-    assert passed.wait(PATIENCE)
-
-
-def test_reading_does_not_pause_for_who_is_patient_nor_for_ever(first, monkeypatch):
-    def read() -> None:
-        with first.reader.turn():
-            checkpoint()
-        first.done.set()
-
-    with engine._turns.taken(patient=True):
-        monkeypatch.setattr("dt_viz.ui.reading.LONGEST_PAUSE", 1e6)
-        assert first.reader.begin(read) and first.done.wait(PATIENCE)
-    first.done.clear()
-    with engine._turns.taken():
-        monkeypatch.setattr("dt_viz.ui.reading.LONGEST_PAUSE", 0.01)
-        first.begin_next(read)
-        assert first.done.wait(PATIENCE)
 
 
 def test_what_nobody_expects_is_logged_and_the_next_file_is_read(first, caplog):

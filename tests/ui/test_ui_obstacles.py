@@ -10,7 +10,7 @@ import trimesh
 from pages import Bound, frame_of, ignored, painted_at
 from scenes import avoiding, changing
 
-from dt_viz.interruption import UnwantedError
+from dt_viz.errors import UnwantedError
 from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles import solids
 from dt_viz.obstacles.clouds import Cloud

@@ -125,7 +125,7 @@ class Sketches:
     def drive(self, _frame):
         pass
 
-    def frames(self, scenario, progress=None, checkpoint=None):
+    def frames(self, scenario, progress=None, cancelled=None):
         yield frame(scenario)
 
 

@@ -7,6 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import viser
@@ -14,7 +15,6 @@ from scipy.spatial import KDTree
 
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.fields import Array
-from dt_viz.properties import cached_property
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Lines, Picture
 from dt_viz.ui.scene.tubes import Tubes, middles_of
