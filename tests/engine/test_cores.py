@@ -119,12 +119,8 @@ def test_a_slot_ends_with_an_exception(crowd):
 
 @pytest.mark.parametrize("num", [1, 2, 3])
 def test_in_a_storm_no_more_than_the_slots_are_taken_and_all_get_one(num):
-    cores, free, free_to_refine, crowded = (
-        Cores(num),
-        threading.Semaphore(num),
-        threading.Semaphore(max(1, num - 1)),
-        [],
-    )
+    free, free_to_refine = threading.Semaphore(num), threading.Semaphore(max(1, num - 1))
+    cores, crowded = Cores(num), []
 
     def want(refines):
         for _ in range(100):
