@@ -9,7 +9,7 @@ import numpy as np
 from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, placed
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Number, Shapes, Values, distance
-from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, next_step
+from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, is_straight, next_step
 
 
 class Escape(NamedTuple):
@@ -255,10 +255,10 @@ def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, m
         _moved(s, sign * ahead, k[0], end)
         _velocity(escape, end, k[1], work)
         turning = np.abs(k[1] - k[0]).max() / (ahead * speed)
-        h, left = first_step(speed, turning, total, tolerance), total
-        if h < 0:
+        if is_straight(speed, turning, total, tolerance):
             s += duration * k[0]
             continue
+        h, left = first_step(speed, turning, total, tolerance), total
         for _ in range(max_steps):
             for i in range(1, 7):
                 for d in range(n):
