@@ -55,7 +55,10 @@ def is_straight(speed: float, turning: float, total: float, tolerance: float) ->
 
 @compiled
 def first_step(speed: float, turning: float, total: float, tolerance: float) -> float:
-    """Length of the first step at a speed that changes at the relative rate `turning`; the error grows as its fifth power."""
+    """Length of the first step at a speed that changes at the relative rate `turning`.
+
+    The error grows as its fifth power.
+    """
     motion = total * speed
     caution = (allowed_error(motion, tolerance) / max(TURN_ERROR * motion, ROUNDING)) ** 0.2
     return min(total, LONGEST_TURN * caution / max(turning, ROUNDING))

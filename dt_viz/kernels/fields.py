@@ -14,7 +14,7 @@ from dt_viz.kernels.compiled import compiled
 from dt_viz.kernels.distances import Record
 from dt_viz.kernels.gaussians import LANES, Array, GaussianWork, exponential, gaussian_sums, gaussian_work
 
-GRID, OCCUPANCY, REGION, SIDEWAYS = 0, 1, 2, 3
+GRID, OCCUPANCY, REGION, ASIDE = 0, 1, 2, 3
 """Kinds of terms; the first three have weights on a grid of Gaussians."""
 
 TERM = np.dtype(
@@ -44,7 +44,7 @@ class Terms(NamedTuple):
     terms: NDArray[np.void]
     """(T,) of dtype `TERM`."""
     values: Array
-    """Values of all terms: weights, the last axis of the grid fastest, or what `_sideways` says."""
+    """Values of all terms: weights, the last axis of the grid fastest, or what `_aside` says."""
 
 
 FieldWork = tuple[GaussianWork, Array, Array, Array, Array, Array]
@@ -78,18 +78,8 @@ def velocity(field: Terms, s: Array, n: int, order: int, work: FieldWork) -> tup
                 factor, origin, source, into = A[i, j], term.origin[j], s[j], u[i]
                 for p in range(n):
                     into[p] += factor * (source[p] - origin)
-        if term.kind == SIDEWAYS:
-            _sideways(term, field.values, u, n, v, Dv)
-        elif term.kind == REGION and not _any_inside(u, n):
+        if not _own(term, field.values, u, n, order, gaussians, v, Dv):
             continue
-        else:
-            sums = gaussian_sums(term, field.values, u, n, order + int(term.kind == OCCUPANCY), gaussians)
-            if term.kind == OCCUPANCY:
-                _occupancy(term, sums, n, v, Dv)
-            else:
-                _grid(term, sums, n, v, Dv)
-            if term.kind == REGION:
-                _fade(term.plateau, u, n, v, Dv)
         for k in range(3):
             for i in range(d):
                 factor, source, into = B[i, k], v[k], V[i]
@@ -101,6 +91,26 @@ def velocity(field: Terms, s: Array, n: int, order: int, work: FieldWork) -> tup
                     for p in range(n):
                         into[p] += a * x[p] + b * y[p] + c * z[p]
     return V, DV
+
+
+@compiled
+def _own(
+    term: Record, values: Array, u: Array, n: int, order: int, gaussians: GaussianWork, v: Array, Dv: Array
+) -> bool:
+    """Write v and Dv of a term at n points u of its own frame; False where they are 0."""
+    if term.kind == ASIDE:
+        _aside(term, values, u, n, v, Dv)
+        return True
+    if term.kind == REGION and not _any_inside(u, n):
+        return False
+    sums = gaussian_sums(term, values, u, n, order + int(term.kind == OCCUPANCY), gaussians)
+    if term.kind == OCCUPANCY:
+        _occupancy(term, sums, n, v, Dv)
+        return True
+    _grid(term, sums, n, v, Dv)
+    if term.kind == REGION:
+        _fade(term.plateau, u, n, v, Dv)
+    return True
 
 
 @compiled
@@ -124,10 +134,10 @@ def _grid(term: Record, sums: Array, n: int, v: Array, Dv: Array) -> None:
 @compiled
 def _any_inside(u: Array, n: int) -> bool:
     """Return whether a point has ‖u‖ < 1."""
+    nearest = np.inf
     for p in range(n):
-        if u[0, p] * u[0, p] + u[1, p] * u[1, p] + u[2, p] * u[2, p] < 1:
-            return True
-    return False
+        nearest = min(nearest, u[0, p] * u[0, p] + u[1, p] * u[1, p] + u[2, p] * u[2, p])
+    return nearest < 1
 
 
 @compiled
@@ -170,8 +180,8 @@ def _occupancy(term: Record, sums: Array, n: int, v: Array, Dv: Array) -> None:
 
 
 @compiled
-def _sideways(term: Record, values: Array, u: Array, n: int, v: Array, Dv: Array) -> None:
-    """Write (exp(−½‖A(u − c)‖²) Π_e (1 − exp(−½‖u − e‖²/ρ_e²)), 0, 0), with the values c, A, then e, ρ_e of each end."""
+def _aside(term: Record, values: Array, u: Array, n: int, v: Array, Dv: Array) -> None:
+    """Write (exp(−½‖A(u − c)‖²) Π_e (1 − exp(−½‖u − e‖²/ρ_e²)), 0, 0); values are c, A, then e, ρ_e of each end."""
     at = values[term.begin : term.begin + term.size]
     _clear(v, n)
     for k in range(3):

@@ -15,7 +15,7 @@ from dt_viz.kernels.fields import FieldWork, Terms, field_work, velocity
 from dt_viz.kernels.gaussians import LANES, Array
 
 RATE, EULER, RK4, IMPLICIT_EULER, DORMAND_PRINCE = 0, 1, 2, 3, 4
-"""What is done to states: replaced by their rates of change, or carried along in steps, of which the last are adaptive."""
+"""What is done to states: they become their rates of change, or are carried along in steps, last adaptive ones."""
 STAGES_OF = np.array((1, 1, 4))
 """Number of stages of a step of the first of these."""
 TANGENT_TOLERANCE = 3e-4
@@ -29,14 +29,22 @@ TINY = 1e-300
 def _rate(field: Terms, states: Array, n: int, d: int, work: FieldWork, rate: Array) -> None:
     """Write V and DV·U at states (m, L)."""
     V, DV = velocity(field, states, n, int(len(states) > d), work)
-    k = len(states) // d - 1
     for i in range(d):
         _set(0.0, V[i], V[i], n, rate[i])
+    _multiply(DV, states, n, d, rate)
+
+
+@compiled
+def _multiply(M: Array, states: Array, n: int, d: int, into: Array) -> None:
+    """Write M·U of matrices M (d, d, L) and the tangents U of states (m, L)."""
+    k = len(states) // d - 1
+    for i in range(d):
         for c in range(k):
+            row = into[d + i * k + c]
             for j in range(d):
-                slope, tangent, into = DV[i, j], states[d + j * k + c], rate[d + i * k + c]
+                factor, tangent = M[i, j], states[d + j * k + c]
                 for p in range(n):
-                    into[p] = slope[p] * tangent[p] + (into[p] if j > 0 else 0.0)
+                    row[p] = factor[p] * tangent[p] + (row[p] if j > 0 else 0.0)
 
 
 @compiled
@@ -90,59 +98,61 @@ def _invert(h: float, DV: Array, n: int, inverse: Array) -> None:
         inverse[2, 1, p], inverse[2, 2, p] = (b * i - a * j) * scale, (a * e - b * c) * scale
 
 
+@compiled
+def _newton(y: Array, states: Array, n: int, h: float, V: Array, inverse: Array, scale: float, memory: Array) -> bool:
+    """Correct y (d, L) by Newton's method for y − h·V(y) = s; where the residual has grown, go back half the way.
+
+    Returns whether that was the last correction: quadratic convergence makes the next one far below rounding.
+    """
+    best, direction, smallest, length = memory[0], memory[1], memory[2, 0], memory[2, 1]
+    largest, correction, worse = 0.0, 0.0, False
+    for p in range(n):
+        size = 0.0
+        for i in range(len(V)):
+            V[i, p] = y[i, p] - h * V[i, p] - states[i, p]  # the residual
+            size = max(size, abs(V[i, p]))
+        largest = max(largest, size)
+        if size > smallest[p] and size > 1e-13 * scale:
+            length[p] *= 0.5
+            worse = True
+            continue
+        smallest[p], length[p] = size, 1.0
+        for i in range(len(V)):
+            direction[i, p], best[i, p] = 0.0, y[i, p]
+            for j in range(len(V)):
+                direction[i, p] += inverse[i, j, p] * V[j, p]
+            correction = max(correction, abs(direction[i, p]))
+    if largest <= 1e-15 * scale:
+        return True
+    for i in range(len(V)):
+        for p in range(n):
+            y[i, p] = best[i, p] - length[p] * direction[i, p]
+    return not worse and correction <= 1e-8 * scale
+
+
 @inlined
 def _implicit_euler(field: Terms, states: Array, n: int, d: int, h: float, work: FieldWork, memory: Array) -> None:
     """Carry states (m, L) to the y with y − h·V(y) = s, tangents by (I − h·DV(y))⁻¹.
 
-    Newton's method, see `dt_viz.flows.integrators.implicit_euler`.
+    See `dt_viz.flows.integrators.implicit_euler`.
     """
-    y, best, direction, tangents, inverse = memory[0], memory[1], memory[2], memory[3], memory[4:7]
-    smallest, length = memory[7, 0], memory[7, 1]
+    y, tangents, inverse = memory[0], memory[1], memory[2:5]
     V, DV = velocity(field, states, n, 0, work)
     scale = 1.0
     for i in range(d):
+        scale = max(scale, 1 + _largest(states[i], 0, n))
         _set(h, V[i], states[i], n, y[i])
-        for p in range(n):
-            scale, smallest[p] = max(scale, 1 + abs(states[i, p])), np.inf
+    memory[7, 0, :] = np.inf
     for _ in range(MAX_ITERATIONS):
         V, DV = velocity(field, y, n, 1, work)
         _invert(h, DV, n, inverse)
-        largest, correction, worse = 0.0, 0.0, False
-        for p in range(n):
-            size = 0.0
-            for i in range(d):
-                V[i, p] = y[i, p] - h * V[i, p] - states[i, p]  # the residual
-                size = max(size, abs(V[i, p]))
-            largest = max(largest, size)
-            if size > smallest[p] and size > 1e-13 * scale:
-                length[p] *= 0.5
-                worse = True
-                continue
-            smallest[p], length[p] = size, 1.0
-            for i in range(d):
-                direction[i, p], best[i, p] = 0.0, y[i, p]
-                for j in range(d):
-                    direction[i, p] += inverse[i, j, p] * V[j, p]
-                correction = max(correction, abs(direction[i, p]))
-        if largest <= 1e-15 * scale:
+        if _newton(y, states, n, h, V, inverse, scale, memory[5:8]):
             break
-        for i in range(d):
-            for p in range(n):
-                y[i, p] = best[i, p] - length[p] * direction[i, p]
-        if not worse and correction <= 1e-8 * scale:
-            break  # quadratic convergence: the next correction would be far below rounding
     if len(states) > d:
-        k = len(states) // d - 1
         _invert(h, velocity(field, y, n, 1, work)[1], n, inverse)
         for i in range(d, len(states)):
             _set(0.0, states[i], states[i], n, tangents[i])
-        for i in range(d):
-            for c in range(k):
-                into = states[d + i * k + c]
-                for j in range(d):
-                    slope, tangent = inverse[i, j], tangents[d + j * k + c]
-                    for p in range(n):
-                        into[p] = slope[p] * tangent[p] + (into[p] if j > 0 else 0.0)
+        _multiply(inverse, tangents, n, d, states)
     for i in range(d):
         _set(0.0, y[i], y[i], n, states[i])
 
@@ -216,14 +226,26 @@ def _begun(
 
 
 @compiled
-def _combine(coefficients: Array, count: int, k: Array, n: int, into: Array) -> None:
-    """Write the weighted sum (m, L) of the first `count` stages k (7, m, L)."""
+def _error(s: Array, end: Array, defect: Array, p: int, d: int, tolerance: float) -> float:
+    """Estimated error of the step of lane p from s to its end (m, L), relative to what is allowed."""
+    error, motion, bent, largest = 0.0, 0.0, 0.0, TINY
+    for i in range(d):
+        error, motion = max(error, abs(defect[i, p])), max(motion, abs(end[i, p] - s[i, p]))
+    for i in range(d, len(s)):
+        bent, largest = max(bent, abs(defect[i, p])), max(largest, abs(end[i, p]))
+    # beside a rest point a small error is large relative to the motion, and grows with it
+    return max(error / allowed_error(motion, tolerance), bent / (TANGENT_TOLERANCE * largest))
+
+
+@compiled
+def _combine(coefficients: Array, count: int, k: Array, n: int, h: Array, into: Array) -> None:
+    """Write h (L,) times the weighted sum (m, L) of the first `count` stages k (7, m, L)."""
     for i in range(len(into)):
         row = into[i]
         for j in range(count):
             factor, stage = coefficients[j], k[j, i]
             for p in range(n):
-                row[p] = factor * stage[p] + (row[p] if j > 0 else 0.0)
+                row[p] = factor * h[p] * stage[p] + (row[p] if j > 0 else 0.0)
 
 
 @inlined
@@ -251,20 +273,13 @@ def _adaptive(
         if n == 0:
             return num_failed
         for stage in range(1, 7):
-            _combine(STAGES[stage], stage, k, n, end)
+            _combine(STAGES[stage], stage, k, n, h, end)
             for i in range(m):
-                for p in range(n):
-                    end[i, p] = s[i, p] + sign * h[p] * end[i, p]
+                _set(sign, end[i], s[i], n, end[i])
             _rate(field, end, n, d, work, k[stage])
-        _combine(ERROR, 7, k, n, defect)
+        _combine(ERROR, 7, k, n, h, defect)
         for p in range(n - 1, -1, -1):
-            error, motion, bent, largest = 0.0, 0.0, 0.0, TINY
-            for i in range(d):
-                error, motion = max(error, abs(h[p] * defect[i, p])), max(motion, abs(end[i, p] - s[i, p]))
-            for i in range(d, m):
-                bent, largest = max(bent, abs(h[p] * defect[i, p])), max(largest, abs(end[i, p]))
-            # beside a rest point a small error is large relative to the motion, and grows with it
-            error = max(error / allowed_error(motion, tolerance), bent / (TANGENT_TOLERANCE * largest))
+            error = _error(s, end, defect, p, d, tolerance)
             tried[p] += 1
             if error <= 1:
                 left[p] -= h[p]

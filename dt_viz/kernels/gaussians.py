@@ -1,12 +1,11 @@
 """Sums of Gaussians on an equally spaced grid, Σ_i w_i exp(−ℓ‖u − ŝ_i‖²), and their partial derivatives.
 
 A Gaussian is a product of 1-D Gaussians, so a sum is contracted axis by axis. Arrays hold up to `LANES` points at once,
-the last axis, so that the innermost loops become vector instructions. A grid in the plane has a first axis of one node.
+the last axis, so that the innermost loops become vector instructions. A grid in the plane has no nodes along a first
+axis.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,17 +109,17 @@ def gaussian_sums(grid: Record, values: Array, u: Array, n: int, order: int, wor
     """
     along, rows, planes, sums = work
     counts, num, length = grid.counts, grid.num, grid.counts[2] * grid.num
+    in_space = counts[0] > 0
     for axis in range(3):
-        if counts[axis] > 1:
-            _along(u[axis], grid.first[axis], grid.spacing[axis], grid.ell, order, counts[axis], n, along[axis])
-    highest = order if counts[0] > 1 else 0  # nothing depends on the first coordinate in the plane
+        _along(u[axis], grid.first[axis], grid.spacing[axis], grid.ell, order, counts[axis], n, along[axis])
+    highest = order if in_space else 0  # nothing depends on the first coordinate in the plane
     for i in range(highest + 1):
-        if counts[0] > 1:
+        if in_space:
             for m in range(counts[1] * length):
                 _weighted(along[0, i], counts[0], values, grid.begin + m, counts[1] * length, n, rows[i, m])
         for j in range(order + 1 - i):
             for m in range(length):
-                if counts[0] > 1:
+                if in_space:
                     _contracted(along[1, j], counts[1], rows[i], m, length, n, planes[i, j, m])
                 else:
                     _weighted(along[1, j], counts[1], values, grid.begin + m, length, n, planes[i, j, m])
