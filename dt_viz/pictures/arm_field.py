@@ -7,6 +7,7 @@ at y(x). A motion x(t) below becomes y(x(t)), so the arrow ẋ at x becomes ẏ 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,8 +47,8 @@ class LiftedField:
         moving = speed > 0
         points, velocities, seconds = field.points[moving], field.velocities[moving], STEP / speed[moving]
         paths = np.stack([points, points + seconds[:, None] * velocities], axis=1)
-        start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
-        tracked = track(robot, paths, start, reference=start)
+        standing = _standing(robot, points.tobytes(), reference.tobytes())
+        tracked = track(robot, paths, standing, np.repeat(standing[:, None], 2, axis=1), reference)
         reached = tracked.error.max(axis=1) <= MAX_MISS
         return cls(tracked.q[reached], seconds[reached])
 
@@ -64,3 +65,11 @@ class LiftedField:
         begin, end = np.moveaxis(robot.end_effector(p).reshape(-1, 2, 3), 1, 0)
         free = obstacle.signed_distance(begin) > 0
         return FieldPicture(begin[free], ((end - begin) / self.seconds[:, None])[free])
+
+
+@lru_cache(maxsize=8)
+def _standing(robot: Robot, places: bytes, reference: bytes) -> Array:
+    """Postures (N, 6), rad, with the hand at places (N, 3), metres: a drag of what bends motions leaves the lattice."""
+    paths = np.frombuffer(places).reshape(-1, 1, 3)
+    start = np.broadcast_to(np.frombuffer(reference), (len(paths), NUM_JOINTS))
+    return track(robot, paths, start, reference=start).q[:, 0]
