@@ -132,6 +132,22 @@ def _grid(term: Record, sums: Array, n: int, v: Array, Dv: Array) -> None:
 
 
 @compiled
+def at_rest(field: Terms, s: Array, d: int) -> bool:
+    """Return whether the field vanishes around a point, of which the first d coordinates are taken."""
+    for t in range(len(field.terms)):
+        term = field.terms[t]
+        squared = 0.0
+        for i in range(3):
+            u = 0.0
+            for j in range(d):
+                u += term.inward[i, j] * (s[j] - term.origin[j])
+            squared += u * u
+        if term.kind != REGION or squared <= 1:
+            return False
+    return True
+
+
+@compiled
 def _any_inside(u: Array, n: int) -> bool:
     """Return whether a point has ‖u‖ < 1."""
     nearest = np.inf

@@ -8,11 +8,14 @@ to `LANES` states at once, the last axis; n of them are in use.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dt_viz.kernels.compiled import compiled, inlined, kernel
 from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, is_straight, next_step
-from dt_viz.kernels.fields import FieldWork, Terms, field_work, velocity
+from dt_viz.kernels.fields import FieldWork, Terms, at_rest, field_work, velocity
 from dt_viz.kernels.gaussians import LANES, Array
+
+Rows = NDArray[np.int64]
 
 RATE, EULER, RK4, IMPLICIT_EULER, DORMAND_PRINCE = 0, 1, 2, 3, 4
 """What is done to states: they become their rates of change, or are carried along in steps, last adaptive ones."""
@@ -55,19 +58,19 @@ def _set(factor: float, row: Array, start: Array, n: int, into: Array) -> None:
 
 
 @compiled
-def _load(states: Array, begin: int, n: int, block: Array) -> None:
-    """Write n of the states (N, m) to lanes (m, L)."""
+def _load(states: Array, rows: Rows, n: int, block: Array) -> None:
+    """Write n of the states (N, m), `rows` (L,), to lanes (m, L)."""
     for p in range(n):
         for i in range(len(block)):
-            block[i, p] = states[begin + p, i]
+            block[i, p] = states[rows[p], i]
 
 
 @compiled
-def _store(block: Array, begin: int, n: int, states: Array) -> None:
-    """Write lanes (m, L) to n of the states (N, m)."""
+def _store(block: Array, rows: Rows, n: int, states: Array) -> None:
+    """Write lanes (m, L) to n of the states (N, m), `rows` (L,)."""
     for p in range(n):
         for i in range(len(block)):
-            states[begin + p, i] = block[i, p]
+            states[rows[p], i] = block[i, p]
 
 
 @compiled
@@ -162,9 +165,15 @@ def _stepped(field: Terms, states: Array, d: int, method: int, duration: float, 
     """Carry states (N, m) along in equal steps, in place."""
     m, h = states.shape[1], duration / steps
     block, memory = np.empty((m, LANES)), np.empty((8, max(m, 3), LANES))
-    for begin in range(0, len(states), LANES):
-        n = min(LANES, len(states) - begin)
-        _load(states, begin, n, block)
+    rows, begin = np.empty(LANES, np.int64), 0
+    while begin < len(states):
+        n = 0
+        while n < LANES and begin < len(states):
+            if method == RATE or not at_rest(field, states[begin], d):
+                rows[n] = begin
+                n += 1
+            begin += 1
+        _load(states, rows, n, block)
         for _ in range(steps):
             if method == IMPLICIT_EULER:
                 _implicit_euler(field, block, n, d, h, work, memory)
@@ -183,7 +192,7 @@ def _stepped(field: Terms, states: Array, d: int, method: int, duration: float, 
                         _set(ahead, rate[i], block[i], n, there[i])
             for i in range(m):
                 _set(0.0, end[i], end[i], n, block[i])
-        _store(block, begin, n, states)
+        _store(block, rows, n, states)
 
 
 @inlined
@@ -199,9 +208,10 @@ def _begun(
     block, rate = np.empty((m, LANES)), np.empty((m, LANES))
     for begin in range(0, len(states), LANES):
         n = min(LANES, len(states) - begin)
-        _load(states, begin, n, block)
+        rows = np.arange(begin, begin + n)
+        _load(states, rows, n, block)
         _rate(field, block, n, d, work, rate)
-        _store(rate, begin, n, rates)
+        _store(rate, rows, n, rates)
         for p in range(n):
             speed = _largest(rates[begin + p], 0, d)
             ahead = min(total, tolerance / speed) if speed > 0 else 0.0
