@@ -54,7 +54,7 @@ FieldWork = tuple[GaussianWork, Array, Array, Array, Array, Array]
 @compiled
 def field_work(field: Terms, d: int) -> FieldWork:
     """Memory for points of a field in R^d."""
-    counts, num = np.ones(3, np.int64), 1
+    counts, num = np.zeros(3, np.int64), 1
     for t in range(len(field.terms)):
         counts, num = np.maximum(counts, field.terms[t].counts), max(num, field.terms[t].num)
     own = np.empty((3, LANES)), np.empty((3, LANES)), np.empty((3, 3, LANES))

@@ -33,7 +33,7 @@ def _rate(field: Terms, states: Array, n: int, d: int, work: FieldWork, rate: Ar
     """Write V and DV·U at states (m, L)."""
     V, DV = velocity(field, states, n, int(len(states) > d), work)
     for i in range(d):
-        _set(0.0, V[i], V[i], n, rate[i])
+        _copy(V[i], n, rate[i])
     _multiply(DV, states, n, d, rate)
 
 
@@ -55,6 +55,13 @@ def _set(factor: float, row: Array, start: Array, n: int, into: Array) -> None:
     """Write start + factor·row."""
     for p in range(n):
         into[p] = start[p] + factor * row[p]
+
+
+@compiled
+def _copy(row: Array, n: int, into: Array) -> None:
+    """Write a row."""
+    for p in range(n):
+        into[p] = row[p]
 
 
 @compiled
@@ -134,17 +141,28 @@ def _newton(y: Array, states: Array, n: int, h: float, V: Array, inverse: Array,
 
 
 @inlined
-def _implicit_euler(field: Terms, states: Array, n: int, d: int, h: float, work: FieldWork, memory: Array) -> None:
+def _implicit_euler(
+    field: Terms, states: Array, n: int, d: int, h: float, begun: bool, work: FieldWork, memory: Array
+) -> None:
     """Carry states (m, L) to the y with y − h·V(y) = s, tangents by (I − h·DV(y))⁻¹.
 
-    See `dt_viz.flows.integrators.implicit_euler`.
+    See `dt_viz.flows.integrators.implicit_euler`. From the last step, if that is begun, h·V(s) and (I − h·DV(s))⁻¹ are
+    known, so that Newton's method begins with its step from s.
     """
-    y, tangents, inverse = memory[0], memory[1], memory[2:5]
-    V, DV = velocity(field, states, n, 0, work)
+    y, tangents, inverse, change = memory[0], memory[1], memory[2:5], memory[8]
+    if not begun:
+        V, DV = velocity(field, states, n, 0, work)
     scale = 1.0
     for i in range(d):
         scale = max(scale, 1 + _largest(states[i], 0, n))
-        _set(h, V[i], states[i], n, y[i])
+        if not begun:
+            _set(h, V[i], states[i], n, y[i])
+            continue
+        _copy(states[i], n, y[i])
+        for j in range(d):
+            factor, source, into = inverse[i, j], change[j], y[i]
+            for p in range(n):
+                into[p] += factor[p] * source[p]
     memory[7, 0, :] = np.inf
     for _ in range(MAX_ITERATIONS):
         V, DV = velocity(field, y, n, 1, work)
@@ -154,17 +172,18 @@ def _implicit_euler(field: Terms, states: Array, n: int, d: int, h: float, work:
     if len(states) > d:
         _invert(h, velocity(field, y, n, 1, work)[1], n, inverse)
         for i in range(d, len(states)):
-            _set(0.0, states[i], states[i], n, tangents[i])
+            _copy(states[i], n, tangents[i])
         _multiply(inverse, tangents, n, d, states)
     for i in range(d):
-        _set(0.0, y[i], y[i], n, states[i])
+        _set(-1.0, states[i], y[i], n, change[i])
+        _copy(y[i], n, states[i])
 
 
 @inlined
 def _stepped(field: Terms, states: Array, d: int, method: int, duration: float, steps: int, work: FieldWork) -> None:
     """Carry states (N, m) along in equal steps, in place."""
     m, h = states.shape[1], duration / steps
-    block, memory = np.empty((m, LANES)), np.empty((8, max(m, 3), LANES))
+    block, memory = np.empty((m, LANES)), np.empty((9, max(m, 3), LANES))
     rows, begin = np.empty(LANES, np.int64), 0
     while begin < len(states):
         n = 0
@@ -174,9 +193,9 @@ def _stepped(field: Terms, states: Array, d: int, method: int, duration: float, 
                 n += 1
             begin += 1
         _load(states, rows, n, block)
-        for _ in range(steps):
+        for step in range(steps):
             if method == IMPLICIT_EULER:
-                _implicit_euler(field, block, n, d, h, work, memory)
+                _implicit_euler(field, block, n, d, h, step > 0, work, memory)
                 continue
             rate, there, end = memory[0], memory[1], memory[2]
             for stage in range(STAGES_OF[method]):
@@ -184,14 +203,14 @@ def _stepped(field: Terms, states: Array, d: int, method: int, duration: float, 
                 weight, ahead = (h / 6 if stage in (0, 3) else h / 3), (h if stage == 2 else h / 2)
                 for i in range(m):
                     if method == RATE:
-                        _set(0.0, rate[i], rate[i], n, end[i])
+                        _copy(rate[i], n, end[i])
                     elif method == EULER:
                         _set(h, rate[i], block[i], n, end[i])
                     else:
                         _set(weight, rate[i], end[i] if stage > 0 else block[i], n, end[i])
                         _set(ahead, rate[i], block[i], n, there[i])
             for i in range(m):
-                _set(0.0, end[i], end[i], n, block[i])
+                _copy(end[i], n, block[i])
         _store(block, rows, n, states)
 
 

@@ -47,7 +47,8 @@ def exponential(x: float) -> float:
 def gaussian_work(counts: NDArray[np.int64], num: int) -> GaussianWork:
     """Memory for grids of at most `counts` (3,) nodes and sums with at most `num` components."""
     length = counts[2] * num
-    rows, planes = np.empty((3, counts[1] * length, LANES)), np.empty((3, 3, length, LANES))
+    rows = np.empty((3, counts[1] * length if counts[0] > 0 else 0, LANES))
+    planes = np.empty((3, 3, length, LANES))
     return np.empty((3, 3, counts.max(), LANES)), rows, planes, np.zeros((3, 3, 3, num, LANES))
 
 
