@@ -125,10 +125,11 @@ class VelocityFit:
         """Compute Σ_ab left_a·∂²V_a/∂s_b∂s_j·right_b, (N, d)."""
         d = self.grid.dim
         factors, first, bend = self.grid.factors(s, 2), np.eye(d, dtype=int), np.zeros((len(s), d))
+        tables = factors[0] @ weights.reshape(self.grid.shape[0], -1)
         for j in range(d):
             for b in range(j, d):
                 order = first[j] + first[b]
-                table = factors[0][order[0]] @ weights.reshape(self.grid.shape[0], -1)
+                table = tables[order[0]]
                 for axis, n in enumerate(self.grid.shape[1:], start=1):
                     table = np.einsum("na,nar->nr", factors[axis][order[axis]], table.reshape(len(s), n, -1))
                 along = (left * table).sum(axis=1)  # Σ_a left_a·∂²V_a/∂s_b∂s_j
