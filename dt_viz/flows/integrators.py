@@ -13,7 +13,7 @@ import numpy as np
 
 from dt_viz.flows.fields import Array, CompiledField, PointField, VectorField
 from dt_viz.interruption import checkpoint
-from dt_viz.kernels.dormand_prince import ERROR, LONGEST_TURN, ROUNDING, SHORT, STAGES, TURN_ERROR
+from dt_viz.kernels.dormand_prince import ERROR, ROUNDING, SHORT, STAGES, first_step, next_step
 from dt_viz.kernels.flows import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4, TANGENT_TOLERANCE
 
 Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
@@ -35,38 +35,14 @@ def rk4(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array,
     return _split(state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), s, U)
 
 
-def implicit_euler(
-    field: VectorField, s: Array, U: Array | None, h: float, *, max_iterations: int = 200
-) -> tuple[Array, Array | None]:
-    """Implicit Euler: the y with y − h·V(y) = s. First order, and the exact inverse of `euler` with −h.
+def implicit_euler(field: VectorField, s: Array, U: Array | None, h: float) -> tuple[Array, Array | None]:
+    """Implicit Euler, of compiled fields: the y with y − h·V(y) = s. First order, and the exact inverse of `euler`.
 
     Newton's method, point by point going back half the way where the residual has grown. While I − h·DV is regular
     everywhere, which is also when the step is invertible, that leads to the one solution from everywhere.
     """
-    identity = np.eye(field.dim)
-    scale = 1.0 + np.abs(s).max(initial=0.0)
-    y = best = s + h * field(s)
-    direction = np.zeros_like(s)
-    smallest = np.full(len(s), np.inf)  # residual at `best`
-    length = np.ones((len(s), 1))
-    for _ in range(max_iterations):
-        v, DV = field.with_jacobian(y)
-        residual = y - h * v - s
-        size = np.abs(residual).max(axis=1)
-        if size.max(initial=0.0) <= 1e-15 * scale:
-            break
-        update = np.linalg.solve(identity - h * DV, residual[..., None])[..., 0]
-        worse = (size > smallest) & (size > 1e-13 * scale)
-        length = np.where(worse[:, None], 0.5 * length, 1.0)
-        best = np.where(worse[:, None], best, y)
-        direction = np.where(worse[:, None], direction, update)
-        smallest = np.where(worse, smallest, size)
-        y = best - length * direction
-        if not worse.any() and np.abs(update).max(initial=0.0) <= 1e-8 * scale:
-            break  # quadratic convergence: the next correction would be far below rounding
-    if U is None:
-        return y, None
-    return y, np.linalg.solve(identity - h * field.with_jacobian(y)[1], U)
+    assert isinstance(field, PointField)
+    return field.carried(s, U, IMPLICIT_EULER, h)
 
 
 def integrate(
@@ -95,8 +71,8 @@ def integrate_adaptive(
     Every point has its own step length. The estimated error of a step is at most `tolerance` (in the unit of `s`) for
     the points, less in proportion where the motion is shorter than `SHORT`, and at most `TANGENT_TOLERANCE` for the
     tangents. The first step is short where the field changes quickly along it, because the estimated error of a step
-    that is far too long may be small by chance. For fields that have no compiled loop this is a plain one: it asks for
-    all points until the last one has arrived.
+    that is far too long may be small by chance. For fields that have no compiled loop this is a plain one, in which all
+    points take the steps of the strictest.
 
     Raises:
         ArithmeticError: if some point needs more than `max_rounds` steps.
@@ -107,14 +83,19 @@ def integrate_adaptive(
         return field.carried(s, U, DORMAND_PRINCE, duration, max_rounds, tolerance)
     if U is None and isinstance(field, CompiledField):
         return field.dormand_prince(s, duration, tolerance, max_rounds), None
-    total, d = np.abs(duration), s.shape[1]
+    total, d = abs(duration), s.shape[1]
     state, rate = _augment(field, s, U)
-    first, left = rate(state), np.full(len(s), total)
-    h = _first_step(field, state, first[:, :d], duration, tolerance)
+    first, left = rate(state), total
+    # how quickly velocities change is seen at the end of an Euler step, no longer than the tolerance
+    speed = max(float(np.abs(first[:, :d]).max()), ROUNDING)
+    ahead = min(total, tolerance / speed)
+    there = field(state[:, :d] + np.sign(duration) * ahead * first[:, :d])
+    turning = float((np.abs(there - first[:, :d]).max(axis=1) / np.abs(first[:, :d]).max(axis=1).clip(ROUNDING)).max())
+    h = first_step(speed, turning / ahead, total, tolerance)
     for _ in range(max_rounds):
         checkpoint()
-        step = np.sign(duration) * h[:, None]
-        stages, end = np.empty((len(STAGES), *state.shape)), state
+        step, end = np.sign(duration) * h, state
+        stages = np.empty((len(STAGES), *state.shape))
         stages[0] = first
         for i, row in enumerate(STAGES[1:], start=1):
             # the last stage point is the fifth-order result: first same as last
@@ -122,49 +103,28 @@ def integrate_adaptive(
             stages[i] = rate(end)
         defect = step * _combined(ERROR, stages)
         # beside a rest point a small error is large relative to the motion, and grows with it
-        allowed = _allowed(np.abs(end - state)[:, :d].max(axis=1), tolerance)
-        error = np.abs(defect[:, :d]).max(axis=1) / allowed
+        motion = np.abs(end - state)[:, :d].max(axis=1)
+        error = float(
+            (np.abs(defect[:, :d]).max(axis=1) / (tolerance / SHORT * motion).clip(ROUNDING, tolerance)).max()
+        )
         if U is not None:
             largest = np.maximum(np.abs(end[:, d:]).max(axis=1), np.finfo(float).tiny)
-            error = np.maximum(error, np.abs(defect[:, d:]).max(axis=1) / (TANGENT_TOLERANCE * largest))
-        accepted = error <= 1
-        state = np.where(accepted[:, None], end, state)
-        first = np.where(accepted[:, None], stages[-1], first)
-        left = left - accepted * h
-        left[left <= total * 1e-12] = 0  # who has arrived takes steps of length 0
-        if not left.any():
+            error = max(error, float((np.abs(defect[:, d:]).max(axis=1) / (TANGENT_TOLERANCE * largest)).max()))
+        if error <= 1:
+            state, first, left = end, stages[-1], left - h
+        if left <= total * 1e-12:
             return _split(state, s, U)
-        h = np.minimum(h * np.clip(0.9 * np.maximum(error, 1e-10) ** -0.2, 0.1, 5.0), left)
-    text = f"{np.count_nonzero(left)} points need more than {max_rounds} steps: the field is too steep for them"
-    raise ArithmeticError(text)
+        h = min(next_step(h, error), left)
+    raise ArithmeticError(f"some points need more than {max_rounds} steps: the field is too steep for them")
 
 
-METHODS = {euler: EULER, rk4: RK4, implicit_euler: IMPLICIT_EULER}
+METHODS: dict[Step, int] = {euler: EULER, rk4: RK4, implicit_euler: IMPLICIT_EULER}
 """Steps of which compiled fields have loops."""
 
 
 def _combined(coefficients: Array, stages: Array) -> Array:
     """Weighted sum (N, ·) of stages (S, N, ·), as one product."""
     return (coefficients @ stages.reshape(len(stages), -1)).reshape(stages.shape[1:])
-
-
-def _first_step(field: VectorField, state: Array, velocity: Array, duration: float, tolerance: float) -> Array:
-    """Length (N,) of the first step from states (N, ·) with a `velocity` (N, d).
-
-    The error of a step h grows as its fifth power. How quickly the velocity changes is seen at the end of an Euler step
-    over the whole duration, or at the distance `tolerance` in the same direction if that is nearer.
-    """
-    total, speed = np.abs(duration), np.abs(velocity).max(axis=1)
-    ahead = np.minimum(total, tolerance / np.maximum(speed, ROUNDING))
-    there = field(state[:, : field.dim] + (np.sign(duration) * ahead)[:, None] * velocity)
-    turning = np.abs(there - velocity).max(axis=1) / (ahead * np.maximum(speed, ROUNDING))
-    caution = (_allowed(total * speed, tolerance) / np.maximum(TURN_ERROR * total * speed, ROUNDING)) ** 0.2
-    return np.minimum(total, LONGEST_TURN * caution / np.maximum(turning, ROUNDING))
-
-
-def _allowed(motion: Array, tolerance: float) -> Array:
-    """Largest error (N,) allowed for a step of this `motion` (N,)."""
-    return np.clip(tolerance / SHORT * motion, ROUNDING, tolerance)
 
 
 def _augment(field: VectorField, s: Array, U: Array | None) -> tuple[Array, Callable[[Array], Array]]:

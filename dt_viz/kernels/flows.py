@@ -150,9 +150,9 @@ def _implicit_euler(
     known, so that Newton's method begins with its step from s.
     """
     y, tangents, inverse, change = memory[0], memory[1], memory[2:5], memory[8]
+    scale, V = 1.0, work[4]
     if not begun:
-        V, DV = velocity(field, states, n, 0, work)
-    scale = 1.0
+        velocity(field, states, n, 0, work)
     for i in range(d):
         scale = max(scale, 1 + _largest(states[i], 0, n))
         if not begun:
