@@ -26,7 +26,6 @@ from dt_viz.errors import FormatError, check_between
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
-from dt_viz.flows.systems import CONTROLLER_TOLERANCE, DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation, unknown_label
 from dt_viz.learning.choice import State, learn
 from dt_viz.learning.demonstrations import Demonstration
@@ -153,7 +152,7 @@ class Motion:
         """
         points = np.asarray(y, float)
         self._places(points.reshape(-1, points.shape[-1] if points.ndim else 1), "y")
-        system = frozen(self._controlled, self._rest(phase, start, label))
+        system = frozen(self._solution.system, self._rest(phase, start, label))
         velocity = system.velocity(self._in_space(points.reshape(-1, self.dimension)))
         return velocity[:, : self.dimension].reshape(points.shape)
 
@@ -239,10 +238,6 @@ class Motion:
     @property
     def _scenario(self) -> Scenario:
         return Scenario("", self._layers)
-
-    @cached_property
-    def _controlled(self) -> DiffeomorphicSystem:
-        return self._solution.system.at_tolerance(CONTROLLER_TOLERANCE)
 
     @property
     def _augmented(self) -> bool:

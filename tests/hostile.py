@@ -32,7 +32,7 @@ from dt_viz.learning import demonstrations as demos
 from dt_viz.learning.imitation import ImitationSettings, fit
 from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles import files as shapes
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, _solid_map
+from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, _solid_map, unit_sphere_map
 from dt_viz.saving import SavedMotion, save_motion
 from dt_viz.scenario.scenario import Layer
 from dt_viz.transforms.avoidance import Avoidance
@@ -377,6 +377,7 @@ def coarsely() -> Iterator[None]:
 def main() -> None:
     import resource  # not on every system
 
+    unit_sphere_map().logit(np.zeros((1, 3)))  # compiling is not reading
     resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESS_SPACE, MAX_ADDRESS_SPACE))
     with coarsely() if "--coarse" in sys.argv else nullcontext():
         read_what_is_given()

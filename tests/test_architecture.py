@@ -23,7 +23,7 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "files": {"foundation", "flows"},
     "learning": {"foundation", "flows", "files"},
     "obstacles": {"foundation", "kernels", "flows", "files"},
-    "transforms": {"foundation", "flows", "learning", "obstacles"},
+    "transforms": {"foundation", "kernels", "flows", "learning", "obstacles"},
     "arm": {"foundation", "kernels", "flows", "files", "obstacles", "transforms"},
     "scenario": BELOW_SCENARIO - {"files"},
     "motion": BELOW_SCENARIO | {"arm", "scenario"},

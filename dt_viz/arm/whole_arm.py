@@ -230,6 +230,7 @@ class WholeArm:
             lambda: field.rk4(q, 1.0, 1),
             lambda: field.dormand_prince(q, 1.0, TOLERANCE, 1000),
             lambda: field.with_jacobian(q),
+            lambda: obstacle.field("free-space", 1.0)(np.zeros((1, 3))),  # the hand's fields
         )
         for done, call in enumerate(calls, start=1):
             call()

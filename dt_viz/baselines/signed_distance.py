@@ -15,9 +15,10 @@ from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.ours import from_starts
 from dt_viz.baselines.surface import distance_and_normal
 from dt_viz.errors import Cancelled, never
-from dt_viz.flows.fields import Array, InPlane, VectorField
+from dt_viz.flows.fields import Array, VectorField
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.stack import LIVE, Precision, build_stack
+from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Layer
 from dt_viz.transforms.avoidance import Avoidance
@@ -36,6 +37,8 @@ class SignedDistanceField:
     """V(s) = −v·w(d(s))·∇d(s), w(d) = (1 − (d/R)²)² between the surface and the range R, 1 inside, 0 beyond."""
 
     obstacle: Union
+    plane: tuple[Point, Point] | None = None
+    """Two orthonormal vectors, along which the field acts only; None is in space."""
 
     @property
     def dim(self) -> int:
@@ -46,7 +49,8 @@ class SignedDistanceField:
         """V at the points `s` (N, 3), as (N, 3)."""
         distance, normal = distance_and_normal(self.obstacle, s)
         barrier = (1 - np.clip(distance / RANGE, 0, 1) ** 2) ** 2
-        return -SPEED * barrier[:, None] * normal
+        along = np.eye(3) if self.plane is None else axes_of(self.plane)[:, :2]
+        return -SPEED * barrier[:, None] * (normal @ along @ along.T)
 
     def with_jacobian(self, s: Array) -> tuple[Array, Array]:
         """V (N, 3) and DV (N, 3, 3) at the points `s` (N, 3), by central differences."""
@@ -59,8 +63,7 @@ class SignedDistanceAvoidance(Avoidance):
     """Avoidance of the end effector whose generator is `SignedDistanceField`."""
 
     def _field(self) -> VectorField:
-        field = SignedDistanceField(self.avoided)
-        return field if self.plane is None else InPlane(field, axes_of(self.plane)[:, :2])
+        return SignedDistanceField(self.avoided, self.plane)
 
 
 @dataclass(frozen=True, eq=False)

@@ -372,7 +372,7 @@ class Potential(_Field):
 
     def __init__(self, bench: Bench) -> None:
         super().__init__(bench, 2 * TICK)
-        self._hand = bench.solved.stack.system.at_tolerance(1e-5)
+        self._hand = bench.solved.stack.system
 
     def _at(self, q: Array, sphere: Obstacle | None) -> Array:
         velocity = self._hand.velocity(self._bench.robot.end_effector(q))

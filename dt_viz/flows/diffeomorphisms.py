@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +13,8 @@ from typing import Literal, overload
 import numpy as np
 
 from dt_viz.errors import check_between
-from dt_viz.flows.collocation import collocated, implicit_euler_path
 from dt_viz.flows.fields import Array, VectorField
-from dt_viz.flows.integrators import Step, euler, implicit_euler, integrate, integrate_adaptive, rk4
+from dt_viz.flows.integrators import Step, euler, integrate, integrate_adaptive, rk4
 
 
 class Diffeomorphism(ABC):
@@ -41,13 +39,6 @@ class Diffeomorphism(ABC):
         A flow becomes γ(fraction·t, ·), so scaled(a)∘scaled(b) = scaled(a + b). A chain becomes the chain of its scaled
         parts.
         """
-
-    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        """ψ for a controller: integrated to another tolerance (in the unit of the points), at single points quickly.
-
-        Maps without a tolerance stay as they are.
-        """
-        return self
 
     def forward(self, y: Array) -> Array:
         """ψ(y), (*B, d)."""
@@ -100,10 +91,6 @@ class Flow(Diffeomorphism):
     step: Step = rk4
     inverse_step: Step | None = None
     """Integrator for ψ⁻¹; None takes `step`. `implicit_euler` with `euler` gives an inverse exact to rounding."""
-    sparse: bool = False
-    """Whether the field vanishes on much of space; points where it does are left out of the integration."""
-    tolerance: float | None = None
-    """Error that `steps` RK4 steps were chosen for, in the unit of the points; None where the steps define the map."""
 
     @property
     def dim(self) -> int:
@@ -112,19 +99,6 @@ class Flow(Diffeomorphism):
     def scaled(self, fraction: float) -> Flow:
         """See `Diffeomorphism`. The number of steps stays, so an exact inverse stays exact."""
         return replace(self, duration=fraction * self.duration)
-
-    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        """See `Diffeomorphism`. The error of a step of length h is in proportion to h⁴."""
-        if self.tolerance is not None:
-            steps = math.ceil(self.steps * (self.tolerance / tolerance) ** 0.25)
-            return _AtOnce(replace(self, steps=steps, tolerance=tolerance), tolerance)
-        return _AtOnce(self, tolerance) if self.step is implicit_euler else self
-
-    def path(self, s: Array, tolerance: float) -> tuple[Array, Array] | None:
-        """ψ (d,) and its Jacobian (d, d) at the point `s` (d,) from a whole path at once; None where that fails."""
-        if self.step is implicit_euler:
-            return implicit_euler_path(self.field, s, self.duration, self.steps, tolerance)
-        return collocated(self.field, s, self.duration, tolerance)
 
     def min_step_determinant(self, s: Array, *, inverse: bool) -> float:
         """Smallest det of the derivative of a step of ψ from points `s` (N, d), or of ψ⁻¹.
@@ -141,13 +115,6 @@ class Flow(Diffeomorphism):
         return smallest
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
-        if self.sparse and U is None:
-            s, moving = s.copy(), self.field(s).any(axis=1)
-            s[moving], _ = self._integrated(s[moving], None, inverse=inverse)
-            return s, None
-        return self._integrated(s, U, inverse=inverse)
-
-    def _integrated(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         if inverse:
             return integrate(self.inverse_step or self.step, self.field, s, U, -self.duration, self.steps)
         return integrate(self.step, self.field, s, U, self.duration, self.steps)
@@ -173,40 +140,8 @@ class AdaptiveFlow(Diffeomorphism):
     def scaled(self, fraction: float) -> AdaptiveFlow:
         return replace(self, duration=fraction * self.duration)
 
-    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        return _AtOnce(replace(self, tolerance=tolerance), tolerance)
-
-    def path(self, s: Array, tolerance: float) -> tuple[Array, Array] | None:
-        """See `Flow.path`."""
-        return collocated(self.field, s, self.duration, tolerance)
-
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return integrate_adaptive(self.field, s, U, -self.duration if inverse else self.duration, self.tolerance)
-
-
-@dataclass(frozen=True)
-class _AtOnce(Diffeomorphism):
-    """A flow whose ψ and Jacobian at a single point are found by its `path`, and all else as it is."""
-
-    flow: Flow | AdaptiveFlow
-    tolerance: float
-
-    @property
-    def dim(self) -> int:
-        return self.flow.dim
-
-    def scaled(self, fraction: float) -> Diffeomorphism:
-        return replace(self, flow=self.flow.scaled(fraction))
-
-    def at_tolerance(self, tolerance: float) -> Diffeomorphism:
-        return self.flow.at_tolerance(tolerance)
-
-    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
-        if U is not None and len(s) == 1 and not inverse:
-            found = self.flow.path(s[0], self.tolerance)
-            if found is not None:
-                return found[0][None], found[1] @ U
-        return self.flow._map(s, U, inverse=inverse)
 
 
 @dataclass(frozen=True, init=False)
@@ -228,9 +163,6 @@ class Chain(Diffeomorphism):
     def scaled(self, fraction: float) -> Chain:
         return Chain([part.scaled(fraction) for part in self.parts])
 
-    def at_tolerance(self, tolerance: float) -> Chain:
-        return Chain([part.at_tolerance(tolerance) for part in self.parts])
-
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         for part in self.parts if inverse else reversed(self.parts):
             s, U = part._map(s, U, inverse=inverse)
@@ -249,9 +181,6 @@ class Inverse(Diffeomorphism):
 
     def scaled(self, fraction: float) -> Inverse:
         return Inverse(self.of.scaled(fraction))
-
-    def at_tolerance(self, tolerance: float) -> Inverse:
-        return Inverse(self.of.at_tolerance(tolerance))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         return self.of._map(s, U, inverse=not inverse)
@@ -289,9 +218,6 @@ class Conjugated(Diffeomorphism):
 
     def scaled(self, fraction: float) -> Conjugated:
         return replace(self, inner=self.inner.scaled(fraction))
-
-    def at_tolerance(self, tolerance: float) -> Conjugated:
-        return Conjugated(self.inner.at_tolerance(tolerance), self.by.at_tolerance(tolerance))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         s, U = self.by._map(s, U, inverse=False)
@@ -331,9 +257,6 @@ class Placed(Diffeomorphism):
     def scaled(self, fraction: float) -> Placed:
         """See `Diffeomorphism`. Frame and scale stay."""
         return replace(self, inner=self.inner.scaled(fraction))
-
-    def at_tolerance(self, tolerance: float) -> Placed:
-        return replace(self, inner=self.inner.at_tolerance(tolerance / self.scale))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         k = self.inner.dim

@@ -159,9 +159,6 @@ class OnPlaces(Diffeomorphism):
     def scaled(self, fraction: float) -> OnPlaces:
         return replace(self, transform=self.transform.scaled(fraction))
 
-    def at_tolerance(self, tolerance: float) -> OnPlaces:
-        return replace(self, transform=self.transform.at_tolerance(tolerance))
-
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
         d = self.transform.dim
         place, rest = s[:, :d], s[:, d:]

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
-
-CONTROLLER_TOLERANCE = 1e-6
-"""Tolerance (m) of the system that a controller asks for velocities."""
 
 
 @dataclass(frozen=True)
@@ -134,10 +131,6 @@ class DiffeomorphicSystem:
     transform: Diffeomorphism
     """ψ, from the space of the motion to the space of the base attractor."""
     base: Attractor
-
-    def at_tolerance(self, tolerance: float) -> DiffeomorphicSystem:
-        """The system with ψ integrated to another tolerance, metres; see `Diffeomorphism.at_tolerance`."""
-        return replace(self, transform=self.transform.at_tolerance(tolerance))
 
     def velocity(self, y: Array) -> Array:
         """ẏ, (*B, d), m/s, from one pass through ψ that carries its Jacobian along."""

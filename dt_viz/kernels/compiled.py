@@ -34,6 +34,11 @@ def compiled(function: F) -> F:
     return _dispatcher(function)
 
 
+def inlined(function: F) -> F:
+    """Make a function part of those that call it: what calls much else is compiled once only."""
+    return _dispatcher(function, inline="always")
+
+
 def kernel(function: F) -> F:
     """Compile a function that Python calls, and keep its code for the next process; meanwhile other threads go on."""
     return _kept(_dispatcher(function, nogil=True))
@@ -44,8 +49,8 @@ def short_kernel(function: F) -> F:
     return _kept(_dispatcher(function))
 
 
-def _dispatcher(function: Callable[..., Any], *, nogil: bool = False) -> Any:  # noqa: ANN401 - numba's
-    decorator: Any = numba.njit(nogil=nogil, error_model="numpy")
+def _dispatcher(function: Callable[..., Any], **options: Any) -> Any:  # noqa: ANN401 - numba's
+    decorator: Any = numba.njit(error_model="numpy", **options)
     return decorator(function)
 
 

@@ -39,15 +39,27 @@ def allowed_error(motion: float, tolerance: float) -> float:
 
 
 @compiled
+def is_straight(speed: float, turning: float, total: float, tolerance: float) -> bool:
+    """Return whether one Euler step over the whole time `total` is accurate enough.
+
+    A weak field is not enough for that: it is weak beside a rest point, too, where motions grow from nothing.
+
+    Args:
+        speed: of the point.
+        turning: relative rate at which it changes.
+        total: time.
+        tolerance: largest error.
+    """
+    return total * speed <= tolerance and turning * total <= STRAIGHT
+
+
+@compiled
 def first_step(speed: float, turning: float, total: float, tolerance: float) -> float:
     """Length of the first step at a speed that changes at the relative rate `turning`.
 
-    The error grows as its fifth power. Negative where one Euler step over the whole time `total` is accurate enough. A
-    weak field is not enough for that: it is weak beside a rest point, too, where motions grow from nothing.
+    The error grows as its fifth power.
     """
     motion = total * speed
-    if motion <= tolerance and turning * total <= STRAIGHT:
-        return -1.0
     caution = (allowed_error(motion, tolerance) / max(TURN_ERROR * motion, ROUNDING)) ** 0.2
     return min(total, LONGEST_TURN * caution / max(turning, ROUNDING))
 

@@ -10,7 +10,7 @@ from dt_viz.kernels.arm import Array, BodyPoints, Joints
 from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, measure, put
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record, Shapes, Values
-from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, next_step
+from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, is_straight, next_step
 
 BLOCK = block_of(
     ("velocity", (MOST_JOINTS,)),  # V_q, rad per unit of flow time
@@ -370,7 +370,7 @@ def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, m
         for lane in range(LANES):
             if row_of[lane] < 0 and upcoming < len(rows):
                 row = rows[upcoming]
-                if first_steps[upcoming] < 0:  # one Euler step is exact enough
+                if first_steps[upcoming] == 0:  # one Euler step is exact enough
                     q[row] += duration * v[row]
                     upcoming += 1
                     continue
@@ -428,7 +428,7 @@ def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, m
 
 @compiled
 def _first_steps(escape: Escape, q: Array, v: Array, rows: Array, total: float, sign: float, tolerance: float) -> Array:
-    """Lengths of the first steps from the postures q[rows], whose velocities are v[rows]; see `first_step`."""
+    """Lengths of the first steps from postures q[rows] with velocities v[rows]; 0 where one Euler step does."""
     there, speeds, ahead = np.empty((len(rows), q.shape[1])), np.empty(len(rows)), np.empty(len(rows))
     for k in range(len(rows)):
         speeds[k] = np.abs(v[rows[k]]).max()
@@ -437,5 +437,6 @@ def _first_steps(escape: Escape, q: Array, v: Array, rows: Array, total: float, 
     there = velocities(escape, there)
     for k in range(len(rows)):
         turning = np.abs(there[k] - v[rows[k]]).max() / (ahead[k] * speeds[k])
-        ahead[k] = first_step(speeds[k], turning, total, tolerance)
+        straight = is_straight(speeds[k], turning, total, tolerance)
+        ahead[k] = 0.0 if straight else first_step(speeds[k], turning, total, tolerance)
     return ahead

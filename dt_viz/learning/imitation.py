@@ -33,6 +33,7 @@ Objective = Literal["trajectory", "velocity"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 
 MIN_STEP_DETERMINANT = 0.05  # smallest determinant of an Euler step's derivative; at 0 space would fold
+EVEN = 1e-9  # largest difference of successive distances between inducing points, relative to their coordinates
 STEP_LENGTH = 0.8  # longest Euler step of the initial guess, in σ
 MAX_LAYERS = 10
 MAX_ATTEMPTS = 5  # number of fits, each smoother than the one before
@@ -135,6 +136,9 @@ class Imitation:
             ell, steps, forward = _finite(arrays, f"{prefix}ell_steps_forward", 3)
             axes = tuple(_finite(arrays, f"{prefix}axis_{j}", None) for j in range(d))
             grid = GaussianGrid(axes, float(ell))
+            for j, nodes in enumerate(axes):
+                if np.abs(np.diff(nodes, 2)).max(initial=0) > EVEN * np.abs(nodes).max():
+                    raise FormatError(f"{prefix}axis_{j}", "uneven distances", "evenly spaced numbers")
             if not (ell > 0 and 1 <= steps <= MOST_STEPS and forward in (0, 1)):
                 found = f"ℓ = {ell:g} and {steps:g} steps"
                 raise FormatError(f"{prefix}ell_steps_forward", found, f"ℓ above 0 and 1 to {MOST_STEPS} steps")

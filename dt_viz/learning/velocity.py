@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, second_orders, unit_orders
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.systems import Attractor
 
 
@@ -114,7 +114,7 @@ class VelocityFit:
         factors = self.grid.factors(s, 1)
         total = np.zeros((self.grid.num_points, d))
         cotangents = [by_value, *(w[:, [j]] * by_slope for j in range(d))]
-        for order, cotangent in zip([(0,) * d, *unit_orders(d)], cotangents, strict=True):
+        for order, cotangent in zip(np.eye(d + 1, d, -1, dtype=int), cotangents, strict=True):
             table = cotangent
             for axis in reversed(range(1, d)):
                 table = (factors[axis][order[axis]][:, :, None] * table[:, None, :]).reshape(len(s), -1)
@@ -124,18 +124,19 @@ class VelocityFit:
     def _second_derivative(self, weights: Array, s: Array, left: Array, right: Array) -> Array:
         """Compute Σ_ab left_a·∂²V_a/∂s_b∂s_j·right_b, (N, d)."""
         d = self.grid.dim
-        orders = second_orders(d)
-        values = dict(zip(orders, self.grid.contract(s, weights, tuple(orders.values())), strict=True))
-        return np.stack(
-            [
-                sum(
-                    ((left * values[min(b, j), max(b, j)]).sum(axis=1) * right[:, b] for b in range(d)),
-                    np.zeros(len(s)),
-                )
-                for j in range(d)
-            ],
-            axis=1,
-        )
+        factors, first, bend = self.grid.factors(s, 2), np.eye(d, dtype=int), np.zeros((len(s), d))
+        tables = factors[0] @ weights.reshape(self.grid.shape[0], -1)
+        for j in range(d):
+            for b in range(j, d):
+                order = first[j] + first[b]
+                table = tables[order[0]]
+                for axis, n in enumerate(self.grid.shape[1:], start=1):
+                    table = np.einsum("na,nar->nr", factors[axis][order[axis]], table.reshape(len(s), n, -1))
+                along = (left * table).sum(axis=1)  # Σ_a left_a·∂²V_a/∂s_b∂s_j
+                bend[:, j] += along * right[:, b]
+                if b > j:
+                    bend[:, b] += along * right[:, j]
+        return bend
 
 
 def base_derivative(base: Attractor, z: Array) -> Array:

@@ -11,7 +11,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
-from dt_viz.flows.fields import Array, GaussianGrid, Mask, VectorField, second_orders, unit_orders
+from dt_viz.flows.fields import Array, GaussianGrid, Mask, PointField
+from dt_viz.kernels.fields import OCCUPANCY, Terms
+from dt_viz.kernels.flows import RATE, carry
 
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")
@@ -30,30 +32,20 @@ class OccupancyMap:
     bias: float
     """b, the logit far away from every inducing point."""
 
+    @cached_property
+    def sums(self) -> Terms:
+        """The logit without its bias, and its gradient, as a term of compiled fields."""
+        return self.grid.terms(self.weights[:, None])
+
     def logit(self, s: Array) -> Array:
         """Compute the log-odds log p/(1 − p) at the points `s` (N, d), as (N,)."""
-        return self.grid.contract(s, self.weights[:, None], ((0,) * self.grid.dim,))[0][:, 0] + self.bias
+        states = np.array(s, dtype=float, order="C")
+        carry(self.sums, states, self.grid.dim, RATE, 0.0, 1, 0.0)
+        return states[:, 0] + self.bias
 
     def probability(self, s: Array) -> Array:
         """Compute p(o = 1 | s) at the points `s` (N, d), as (N,)."""
         return expit(self.logit(s))
-
-    def logit_gradient(self, s: Array) -> tuple[Array, Array]:
-        """The logit (N,) and its gradient (N, d) at the points `s` (N, d)."""
-        d = self.grid.dim
-        partials = self.grid.contract(s, self.weights[:, None], ((0,) * d, *unit_orders(d)))[..., 0]
-        return partials[0] + self.bias, partials[1:].T
-
-    def logit_hessian(self, s: Array) -> tuple[Array, Array, Array]:
-        """The logit (N,), its gradient (N, d) and its second derivatives (N, d, d) at the points `s` (N, d)."""
-        d = self.grid.dim
-        second = second_orders(d)
-        orders = ((0,) * d, *unit_orders(d), *second.values())
-        partials = self.grid.contract(s, self.weights[:, None], orders)[..., 0]
-        hessian = np.empty((len(s), d, d))
-        for (i, j), column in zip(second, partials[1 + d :], strict=True):
-            hessian[:, i, j] = hessian[:, j, i] = column
-        return partials[0] + self.bias, partials[1 : 1 + d].T, hessian
 
 
 def fit_occupancy(
@@ -116,7 +108,7 @@ def sample_labels(
 
 
 @dataclass(frozen=True)
-class AvoidanceField:
+class AvoidanceField(PointField):
     """Generator V whose reverse flow leaves the occupied region.
 
     - "free-space" (default): V = ∇U with U'(logit) = max(σ(logit/T) − σ(b/T), 0), b the logit far away. Without the
@@ -136,69 +128,9 @@ class AvoidanceField:
         """Dimension d of the space."""
         return self.occupancy.grid.dim
 
-    @cached_property
-    def _gain(self) -> float:
-        return 0.5 / self.occupancy.grid.ell  # the squared kernel width
-
-    @cached_property
-    def _far(self) -> float:
-        return float(expit(self.occupancy.bias / self.temperature))
-
-    def __call__(self, s: Array) -> Array:
-        """Compute V at the points `s` (N, d), as (N, d)."""
-        logit, gradient = self.occupancy.logit_gradient(s)
-        return (self._gain * self._weight(logit)[0])[:, None] * gradient
-
-    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """Compute V (N, d) and DV (N, d, d) at the points `s` (N, d). DV is symmetric: V is a gradient."""
-        logit, gradient, hessian = self.occupancy.logit_hessian(s)
-        weight, slope = self._weight(logit)
-        outer = gradient[:, :, None] * gradient[:, None, :]
-        return (self._gain * weight)[:, None] * gradient, self._gain * (
-            weight[:, None, None] * hessian + slope[:, None, None] * outer
-        )
-
-    def _weight(self, logit: Array) -> tuple[Array, Array]:
-        """dU/dlogit and its derivative."""
-        if self.generator == "probability":
-            p = expit(logit)
-            weight = p * (1 - p)
-            return weight, weight * (1 - 2 * p)
-        p = expit(logit / self.temperature)
-        weight = np.maximum(p - self._far, 0)
-        return weight, (weight > 0) * p * (1 - p) / self.temperature
-
-
-@dataclass(frozen=True)
-class StretchedField:
-    """A vector field under a linear map of space: V_out(s) = M·V(M⁻¹s).
-
-    Its flow is M γ(t, M⁻¹s), which leaves the stretched shape in the time in which γ leaves the original one. A flat or
-    long shape thus gets a field that is as smooth, relative to each of its sizes, as that of a ball.
-    """
-
-    inner: VectorField
-    axes: Array
-    """M, (d, d), invertible."""
-
-    @cached_property
-    def _inverse(self) -> Array:
-        return np.linalg.inv(self.axes)
-
-    @property
-    def dim(self) -> int:
-        """Dimension d of the space."""
-        return self.inner.dim
-
-    def to_frame(self, s: Array) -> Array:
-        """Transform the points `s` (N, d) to the frame of `inner`: M⁻¹s, (N, d)."""
-        return s @ self._inverse.T
-
-    def __call__(self, s: Array) -> Array:
-        """Compute V_out at the points `s` (N, d), as (N, d)."""
-        return self.inner(self.to_frame(s)) @ self.axes.T
-
-    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """Compute V_out (N, d) and its derivative (N, d, d) at the points `s` (N, d)."""
-        v, DV = self.inner.with_jacobian(self.to_frame(s))
-        return v @ self.axes.T, self.axes @ DV @ self._inverse
+    def _terms(self) -> Terms:
+        terms, values = self.occupancy.grid.terms(self.occupancy.weights[:, None], OCCUPANCY)
+        terms["bias"] = self.occupancy.bias
+        terms["temperature"] = 0.0 if self.generator == "probability" else self.temperature
+        terms["outward"] = terms["inward"].transpose(0, 2, 1) * 0.5 / self.occupancy.grid.ell
+        return Terms(terms, values)

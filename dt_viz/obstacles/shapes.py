@@ -17,7 +17,6 @@ from dt_viz.obstacles.occupancy import (
     AvoidanceField,
     Generator,
     OccupancyMap,
-    StretchedField,
     fit_occupancy,
     sample_labels,
 )
@@ -142,8 +141,8 @@ class _Turned:
 
         Metres of the world are `scale` times the units of the own frame.
         """
-        local = StretchedField(AvoidanceField(occupancy, generator, temperature), axes)
-        return PlacedField(local, self._to_world(np.zeros(3) + centre), rotation(self.wxyz), scale)
+        local = AvoidanceField(occupancy, generator, temperature)
+        return PlacedField(local, self._to_world(np.zeros(3) + centre), scale * rotation(self.wxyz) @ axes)
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ class Sphere:
     def field(self, generator: Generator, temperature: float) -> PlacedField:
         """See `Obstacle`: from one occupancy map for all spheres."""
         local = AvoidanceField(unit_sphere_map(), generator, temperature)
-        return PlacedField(local, np.asarray(self.position), np.eye(3), self.radius)
+        return PlacedField(local, np.asarray(self.position), self.radius * np.eye(3))
 
     def cover(self) -> tuple[Array, Array]:
         """See `Obstacle`."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.flows.fields import Array, Repeated, Sum, VectorField
+from dt_viz.flows.fields import Array, Sum
 from dt_viz.obstacles.occupancy import Generator
-from dt_viz.obstacles.shapes import Obstacle, Sphere, golden_spiral
+from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 
 NUM_DIRECTIONS, NUM_STEPS = 500, 200
 """Number of rays along which a way out of overlapping obstacles is searched, and largest number of steps on a ray."""
@@ -62,8 +62,6 @@ class Union:
         centres, radii = zip(*(part.cover() for part in self.parts), strict=True)
         return np.concatenate(centres), np.concatenate(radii)
 
-    def field(self, generator: Generator, temperature: float) -> VectorField:
+    def field(self, generator: Generator, temperature: float) -> Sum:
         """Return the sum of the parts' generators (sec. 4.4)."""
-        spheres = tuple(part.field(generator, temperature) for part in self.parts if isinstance(part, Sphere))
-        others = tuple(part.field(generator, temperature) for part in self.parts if not isinstance(part, Sphere))
-        return Sum((*((Repeated(spheres),) if spheres else ()), *others))
+        return Sum(tuple(part.field(generator, temperature) for part in self.parts))

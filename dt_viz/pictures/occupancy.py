@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array, Mask
-from dt_viz.obstacles.occupancy import AvoidanceField, StretchedField
+from dt_viz.obstacles.occupancy import AvoidanceField
 from dt_viz.obstacles.shapes import CloudObstacle, Obstacle
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.slices import Slice, level_line
@@ -76,8 +76,5 @@ def _known(area: Slice, obstacles: Sequence[Obstacle]) -> tuple[Array, Mask]:
 def learned_occupancy(obstacle: Obstacle, s: Array) -> Array:
     """Compute p(o = 1 | s), (N,), of the map learned from an obstacle, at world points `s` (N, 3)."""
     placed = obstacle.field("free-space", 1.0)
-    own, inner = placed.to_frame(s), placed.inner
-    if isinstance(inner, StretchedField):
-        own, inner = inner.to_frame(own), inner.inner
-    assert isinstance(inner, AvoidanceField)
-    return inner.occupancy.probability(own)
+    assert isinstance(placed.inner, AvoidanceField)
+    return placed.inner.occupancy.probability(placed.to_frame(s))

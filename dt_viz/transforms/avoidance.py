@@ -12,7 +12,7 @@ import numpy as np
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
 from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
-from dt_viz.flows.integrators import integrate_adaptive, rk4
+from dt_viz.flows.integrators import integrate, integrate_adaptive, rk4
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
@@ -406,7 +406,7 @@ def clearing_duration(
     while len(points):
         if duration >= MAX_DURATION:
             return None
-        points, _ = rk4(field, points, None, -SNAPSHOT)
+        points, _ = integrate(rk4, field, points, None, -SNAPSHOT, 1)
         before, clearance = clearance, obstacle.signed_distance(points)
         inside = clearance < margin
         if not inside.any():

@@ -13,8 +13,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, Flow, Integration
-from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, VectorField
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, PointField, VectorField
 from dt_viz.flows.integrators import integrate, rk4
+from dt_viz.kernels.fields import REGION, Terms
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.transforms.base import (
     MOST_DURATION,
@@ -159,7 +160,7 @@ class BiasPoint(Transform):
     def field(self, radius: float) -> PlacedField:
         """The generator whose reverse flow leads to the target, from a regression done once for all targets."""
         unit = unit_field(3 if self.plane is None else 2)
-        return PlacedField(unit, np.asarray(self.position), self.axes(), radius)
+        return PlacedField(unit, np.asarray(self.position), radius * self.axes())
 
     def offsets(self, s: Array) -> Array:
         """Offsets (*B, 2 or 3) from the target of the points `s` (*B, 3), metres, along the axes it acts on."""
@@ -191,8 +192,7 @@ class BiasPoint(Transform):
             text = "a motion has its start or goal nearer to the point than its way: it is not led there"
             warnings.append(_warning(motion, Kind.UNREACHED, text))
         steps = max(1, math.ceil(duration / (STEP * motion.tolerance**0.25)))
-        flow = Flow(field, duration, steps, sparse=True, tolerance=motion.tolerance)
-        flow = point.integration.of(flow)
+        flow = point.integration.of(Flow(field, duration, steps))
         goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
         chosen = {"strength": duration, "radius": radius}
         return Built(flow, duration, goal, hopeless, tuple(warnings), point.integration, chosen)
@@ -291,7 +291,7 @@ def _warning(motion: MotionBelow, kind: Kind, text: str) -> MotionWarning:
 
 
 @dataclass(frozen=True)
-class RegionField:
+class RegionField(PointField):
     """A field on the unit ball (or on the cylinder over the unit disc) that fades out smoothly towards its border.
 
     V(s) = w(‖u‖)·V_fit(u), u the first k coordinates of s; the others are not moved. w falls from 1 at `PLATEAU` to 0
@@ -300,43 +300,16 @@ class RegionField:
 
     directions: GridRBF
     """V_fit, in R^k."""
-    dimension: int = 3
 
     @property
     def dim(self) -> int:
-        """Dimension d of the space."""
-        return self.dimension
+        """Dimension of the space."""
+        return 3
 
-    def __call__(self, s: Array) -> Array:
-        """V at the points `s` (N, d), as (N, d)."""
-        value = np.zeros_like(s)
-        k = self.directions.dim
-        radius = np.sqrt((s[:, :k] ** 2).sum(axis=1))
-        inside = np.flatnonzero(radius < 1)
-        if len(inside):
-            value[inside, :k] = _window(radius[inside])[0][:, None] * self.directions(s[inside, :k])
-        return value
-
-    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """V (N, d) and DV (N, d, d) at the points `s` (N, d)."""
-        value, DV = np.zeros_like(s), np.zeros((*s.shape, s.shape[1]))
-        k = self.directions.dim
-        radius = np.sqrt((s[:, :k] ** 2).sum(axis=1))
-        inside = np.flatnonzero(radius < 1)
-        if len(inside):
-            u, r = s[inside, :k], radius[inside]
-            window, slope = _window(r)
-            fit, D_fit = self.directions.with_jacobian(u)
-            gradient = (slope / np.maximum(r, PLATEAU))[:, None] * u
-            value[inside, :k] = window[:, None] * fit
-            DV[inside, :k, :k] = window[:, None, None] * D_fit + fit[:, :, None] * gradient[:, None, :]
-        return value, DV
-
-
-def _window(radius: Array) -> tuple[Array, Array]:
-    """W and its derivative at the radii (N,) below 1."""
-    x = np.maximum((radius - PLATEAU) / (1 - PLATEAU), 0)
-    return 1 - x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3), -140 * (x * (1 - x)) ** 3 / (1 - PLATEAU)
+    def _terms(self) -> Terms:
+        terms, values = self.directions.grid.terms(self.directions.weights, REGION)
+        terms["plateau"] = PLATEAU
+        return Terms(terms, values)
 
 
 @lru_cache(maxsize=2)
@@ -406,7 +379,7 @@ def pulling_duration(field: VectorField, point: BiasPoint, points: Array, *, at_
     while len(points):
         if duration >= MAX_DURATION:
             return None
-        points, _ = rk4(field, points, None, -SNAPSHOT)
+        points, _ = integrate(rk4, field, points, None, -SNAPSHOT, 1)
         before, distance = distance, np.linalg.norm(point.offsets(points), axis=1)
         away = distance > AIM
         if not away.any():

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
-from dt_viz.flows.fields import Array, Mask
-from dt_viz.obstacles.occupancy import StretchedField
+from dt_viz.flows.fields import Array, Mask, PointField
+from dt_viz.kernels.fields import ASIDE, TERM, Terms
 from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import Way
@@ -60,7 +60,7 @@ TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Sideways:
+class Sideways(PointField):
     """The generator of the flow to a side; it is against n, since motions follow the reverse."""
 
     centre: Array
@@ -79,25 +79,12 @@ class Sideways:
         """Dimension of the space."""
         return 3
 
-    def __call__(self, s: Array) -> Array:
-        """V at the points `s` (N, 3), as (N, 3)."""
-        u = (s - self.centre) @ self.inverse.T
-        weight = np.exp(-0.5 * (u * u).sum(axis=1))
-        for end, radius in zip(self.ends, self.radii, strict=True):
-            weight *= -np.expm1(-0.5 * ((s - end) ** 2).sum(axis=1) / radius**2)
-        return weight[:, None] * -self.velocity
-
-    def with_jacobian(self, s: Array) -> tuple[Array, Array]:
-        """V (N, 3) and DV (N, 3, 3) at the points `s` (N, 3)."""
-        u = (s - self.centre) @ self.inverse.T
-        weight = np.exp(-0.5 * (u * u).sum(axis=1))
-        slope = -weight[:, None] * (u @ self.inverse)
-        for end, radius in zip(self.ends, self.radii, strict=True):
-            offset = (s - end) / radius
-            lost = np.exp(-0.5 * (offset * offset).sum(axis=1))
-            slope = (1 - lost)[:, None] * slope + (weight * lost / radius)[:, None] * offset
-            weight = weight * (1 - lost)
-        return weight[:, None] * -self.velocity, -self.velocity[:, None] * slope[:, None]
+    def _terms(self) -> Terms:
+        term, ends = np.zeros(1, TERM), np.column_stack([self.ends, self.radii])
+        values = np.concatenate([self.centre, self.inverse.ravel(), ends.ravel()]).astype(np.float64)
+        term["kind"], term["size"], term["inward"] = ASIDE, len(values), np.eye(3)
+        term["outward"][0, :, 0] = -self.velocity
+        return Terms(term, values)
 
 
 def held(aside: Aside, outer: Diffeomorphism) -> Aside:
@@ -243,8 +230,7 @@ class Passes:
 def _ellipsoid(obstacle: Obstacle) -> tuple[Array, Array]:
     """Centre (3,) and half axes (3, 3), as columns, metres, of an ellipsoid about as large as an obstacle."""
     placed = obstacle.field("free-space", 1.0)
-    axes = placed.scale * placed.axes
-    return placed.origin, axes @ placed.inner.axes if isinstance(placed.inner, StretchedField) else axes
+    return placed.origin, placed.axes
 
 
 def _unit(direction: Array) -> Array:

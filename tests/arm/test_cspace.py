@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +63,8 @@ class TestFields:
         field, q, u = GRADIENT, near_ready(20), np.random.default_rng(1).normal(size=NUM_JOINTS)
         DV = field.with_jacobian(q)[1]
         for h in (1e3 * COMPLEX_STEP, 1e-20):
-            np.testing.assert_allclose(field(q + 1j * h * u).imag / h, DV @ u, rtol=0, atol=1e-11 * np.abs(DV).max())
+            shifted: Any = q + 1j * h * u
+            np.testing.assert_allclose(field(shifted).imag / h, DV @ u, rtol=0, atol=1e-11 * np.abs(DV).max())
 
     def test_beyond_its_reach_nothing_moves_and_value_and_derivative_fade_towards_there(self, field):
         q = near_ready(1200, spread=0.6)

@@ -26,7 +26,7 @@ Y = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 3))
 
 
 def test_auto_leaves_a_flow_as_it_is_and_others_take_their_steps():
-    for flow in (Flow(field(), 0.7, 13, sparse=True), AdaptiveFlow(field(), 0.7)):
+    for flow in (Flow(field(), 0.7, 13), AdaptiveFlow(field(), 0.7)):
         assert AUTO.of(flow) is flow
         assert Integration("euler", 3).of(flow) == Flow(flow.field, 0.7, 3, euler)
         assert Integration("rk4", 5).of(flow) == Flow(flow.field, 0.7, 5, rk4)

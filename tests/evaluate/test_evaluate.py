@@ -3,7 +3,6 @@
 import argparse
 import json
 from dataclasses import replace
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -305,36 +304,13 @@ def test_latency_counts_every_edit_and_reports_both_stages(measured, dragged, mo
 # --- velocity ---
 
 
-def test_velocity_measures_its_time_and_its_error(lasa, measured, monkeypatch):
+def test_velocity_measures_its_time(lasa, measured, monkeypatch):
     every = velocity._stacks(lasa_tasks(lasa)["Hook"]())
     assert len(every) == len(set(every.values())) == 11
     few = {name: every[name] for name in ("imitation", "bias point and sphere")}
     monkeypatch.setattr(velocity, "_stacks", lambda _task: few)
-    stacks = measured("velocity", "--points 9", "json")[0]["stacks"]
-    for stack in stacks.values():
-        assert 0 < stack["median_ms"] <= stack["p95_ms"] and stack["error_median"] <= stack["error_max"] < 5e-3
-    assert stacks["bias point and sphere"]["error_median"] > 0
-
-
-class Wobbling:
-    """A field whose controller is off by a hundredth of the speed at x = 1, and by a tenth at x = 2."""
-
-    def __init__(self, off=0.0):
-        self.off = off
-
-    def velocity(self, y):
-        x = y[..., 0]
-        aside = self.off * np.select([x == 1, x == 2], [0.03, 0.6])
-        return np.stack([3 * x, aside, 0 * x], axis=-1)
-
-    def at_tolerance(self, _tolerance):
-        return Wobbling(1.0)
-
-
-def test_the_error_of_a_velocity_is_relative_to_its_speed():
-    field: Any = Wobbling()
-    found = velocity._measured(field, np.array([[1.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0]]))
-    assert found["error_median"] == pytest.approx(0.01) and found["error_max"] == pytest.approx(0.1)
+    for stack in measured("velocity", "--points 9", "json")[0]["stacks"].values():
+        assert 0 < stack["median_ms"] <= stack["p95_ms"]
 
 
 # --- avoidance ---

@@ -10,7 +10,7 @@ from dt_viz.kernels.blocks import LANES
 from dt_viz.kernels.tracking import Arm, Postures, settle, walk
 
 ROBOT = load_jaco()
-ARM = Arm(*(np.array(values) for values in (ROBOT.records, ROBOT.end_effector_offset, ROBOT.lower, ROBOT.upper)))
+ARM = Arm(ROBOT.records, np.array(ROBOT.end_effector_offset), np.array(ROBOT.lower), np.array(ROBOT.upper))
 
 
 def postures(num, seed=0):
@@ -21,7 +21,8 @@ def postures(num, seed=0):
     direction = rng.normal(size=(num, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     soft = np.broadcast_to(ROBOT.lower + LIMIT_MARGIN, q.shape), np.broadcast_to(ROBOT.upper - LIMIT_MARGIN, q.shape)
-    objectives = Postures(reference, direction, *(np.array(bound) for bound in soft), rng.uniform(1, 40, num))
+    lower, upper = (np.array(bound) for bound in soft)
+    objectives = Postures(reference, direction, lower, upper, rng.uniform(1, 40, num))
     return objectives, q, ROBOT.end_effector(q) + rng.normal(0, 0.2, (num, 3))
 
 

@@ -26,13 +26,13 @@ from dt_viz.flows.diffeomorphisms import (
     Inverse,
     Placed,
 )
-from dt_viz.flows.fields import GaussianGrid, GridRBF, InPlane, PlacedField, Repeated, Sum, VectorField
+from dt_viz.flows.fields import GaussianGrid, GridRBF, InPlane, PlacedField, Sum, VectorField
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.phased import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
 from dt_viz.flows.systems import Attractor
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.obstacles.clouds import Cloud
-from dt_viz.obstacles.occupancy import AvoidanceField, StretchedField
+from dt_viz.obstacles.occupancy import AvoidanceField
 from dt_viz.obstacles.shapes import (
     Box,
     CloudObstacle,
@@ -215,20 +215,18 @@ def coupling(seed: int = 0) -> Coupling:
 
 EXACT = Flow(bent(2), 0.8, 6, implicit_euler, euler)
 PLANE = Placed(Flow(bent(2), 0.8, 12), np.array([0.1, -0.2, 0.3]), tilted_axes(), 0.7)
-IN_SPACE = AdaptiveFlow(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), tilted_axes(), 0.5), -0.6, 1e-9)
+IN_SPACE = AdaptiveFlow(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), 0.5 * tilted_axes()), -0.6, 1e-9)
 MAPS: dict[str, Map] = {
     "flow rk4": Map(Flow(bent(2), 1.0, 16), 1e-6, 1e-5),
     "flow rk4 in space": Map(Flow(bent(3), 0.7, 16), 1e-6, 1e-5),
     "flow backwards": Map(Flow(bent(2), -1.0, 16), 1e-6, 1e-5),
-    "sparse flow": Map(Flow(unit_field(3), -0.6, 24, sparse=True), 1e-6, 1e-5, step=1e-4),
+    "flow in a region": Map(Flow(unit_field(3), -0.6, 24), 1e-6, 1e-5, step=1e-4),
     "flow euler": Map(Flow(bent(2), 0.5, 50, euler), 2e-2),
     "flow euler, implicit inverse": Map(Flow(bent(2), 0.8, 6, euler, implicit_euler), 1e-13),
     "flow implicit, euler inverse": Map(EXACT, 1e-13),
     "flow implicit in space": Map(Flow(bent(3), 0.8, 6, implicit_euler, euler), 1e-13),
     "adaptive flow": Map(AdaptiveFlow(bent(2), 1.0, 1e-9), 1e-7, 1e-7),
     "adaptive flow of a placed field": Map(IN_SPACE, 1e-7, 1e-7),
-    "flow for a controller": Map(Flow(bent(2), 1.0, 40, tolerance=1e-8).at_tolerance(1e-8), 1e-6, 1e-5),
-    "adaptive flow for a controller": Map(IN_SPACE.at_tolerance(1e-9), 1e-7, 1e-7),
     "chain": Map(Chain([Flow(bent(2, 1), 0.4), Flow(bent(2, 2), -0.5), AdaptiveFlow(bent(2, 3), 0.3)]), 1e-6),
     "chain with a placed": Map(Chain([PLANE, Identity(3), AdaptiveFlow(bent(3, 4), 0.4)]), 1e-6),
     "inverse": Map(Inverse(EXACT), 1e-12),
@@ -272,19 +270,20 @@ def sideways() -> Sideways:
     )
 
 
-PLACES = tuple(PlacedField(bent(3), o, tilted_axes(), c) for o, c in ((np.zeros(3), 0.5), (np.full(3, 0.4), 2.0)))
+PLACES = tuple(PlacedField(bent(3), o, c * tilted_axes()) for o, c in ((np.zeros(3), 0.5), (np.full(3, 0.4), 2.0)))
 BALL_FIELD = AvoidanceField(unit_sphere_map(), "free-space", 3.0)
 FIELDS: dict[str, Generator] = {
     "grid in the plane": Generator(bent(2), uniform(2)),
     "grid in space": Generator(bent(3), uniform(3)),
-    "placed": Generator(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), tilted_axes(), 0.5), uniform(3)),
+    "placed": Generator(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), 0.5 * tilted_axes()), uniform(3)),
     "in a plane": Generator(InPlane(bent(3), tilted_axes()[:, :2]), uniform(3)),
     "sum": Generator(Sum((bent(3), PLACES[1])), uniform(3)),
-    "repeated": Generator(Repeated(PLACES), uniform(3)),
     "free space": Generator(AvoidanceField(unit_sphere_map(), "free-space", 1.0), uniform(3, 2.0), 1e-4, 1e-6),
     "free space, hot": Generator(AvoidanceField(unit_sphere_map(), "free-space", 12.0), uniform(3, 2.0), 1e-4, 1e-6),
     "probability": Generator(AvoidanceField(unit_sphere_map(), "probability"), uniform(3, 2.0), 1e-4, 1e-6),
-    "stretched": Generator(StretchedField(BALL_FIELD, tilted_axes() * [1.0, 0.4, 2.0]), uniform(3), 1e-4, 1e-6),
+    "stretched": Generator(
+        PlacedField(BALL_FIELD, np.zeros(3), tilted_axes() * [1.0, 0.4, 2.0]), uniform(3), 1e-4, 1e-6
+    ),
     "bias": Generator(unit_field(3), uniform(3, 0.7), 1e-4, 1e-6),
     "bias in a plane": Generator(
         BiasPoint((0.1, 0.2, 0.3), plane=(as_point(DRAWING_AXES[:, 0]), as_point(DRAWING_AXES[:, 1]))).field(0.8),

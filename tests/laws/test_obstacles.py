@@ -188,7 +188,7 @@ def test_what_is_resized_is_as_large_as_that_and_keeps_place_shape_and_all_that_
 
 def test_boxes_of_the_same_proportions_share_one_map():
     one, other = (Box(PLACE, sizes).field("free-space", 3.0).inner for sizes in ((0.1, 0.2, 0.3), (0.15, 0.15, 0.1)))
-    assert one.inner.occupancy is other.inner.occupancy  # pyright: ignore[reportAttributeAccessIssue]
+    assert one.occupancy is other.occupancy  # pyright: ignore[reportAttributeAccessIssue]
 
 
 UNIONS = {

@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from dt_viz.errors import FormatError
 from dt_viz.flows.diffeomorphisms import Flow, min_det_jacobian
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
@@ -49,6 +50,12 @@ def test_it_ends_at_the_goal_is_invertible_and_is_saved_as_arrays(learned):
     expected = imitation.system.rollout(imitation.starts, times)
     np.testing.assert_array_equal(again.system.rollout(again.starts, times), expected)
     assert again.warnings == imitation.warnings
+
+
+def test_inducing_points_that_are_not_evenly_spaced_are_refused(learned):
+    arrays = learned[1].to_arrays() | {"layer_1_axis_0": np.array([0.0, 0.1, 0.25])}
+    with pytest.raises(FormatError, match=r"layer_1_axis_0.*uneven"):
+        Imitation.from_arrays(arrays)
 
 
 def test_its_clock_is_known_three_knots_beyond_the_farthest_start(learned):
