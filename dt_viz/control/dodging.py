@@ -16,6 +16,8 @@ from dt_viz.obstacles.shapes import Box
 
 TABLE = Box((0.0, 0.0, -1.0), (10.0, 10.0, 2.0))
 """What is below the table's top."""
+TABLE_DEPTH = 0.02
+"""Depth in it that counts as much as one deviation of an obstacle, metres."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,11 @@ class Dodge:
         if seen.avoidance is None or not len(moving):
             return None
         shapes, values = records((*(seen.avoidance.obstacle.parts[k] for k in moving), TABLE))
-        motion = np.zeros((len(moving) + 1, 5))
-        motion[:-1, :3], motion[:-1, 4] = seen.velocities[moving], settings.doubt * speeds[moving]
-        motion[:-1, 3] = settings.clearance + settings.room * speeds[moving] - OVERSHOOT
-        motion[-1, 3] = min(lowest, settings.clearance) - OVERSHOOT
+        motion = np.zeros((len(moving) + 1, 6))
+        motion[:, 3] = settings.clearance - OVERSHOOT
+        motion[:-1, :3], motion[:-1, 5] = seen.velocities[moving], settings.doubt * speeds[moving]
+        motion[:-1, 4] = settings.unsure * speeds[moving]
+        motion[-1, 3:5] = lowest - OVERSHOOT - TABLE_DEPTH, TABLE_DEPTH
         clear, chosen = dodge(
             robot.records,
             self.arm.links.records,

@@ -40,17 +40,20 @@ class ControllerSettings:
     contact_gain: float = 20.0
     """γ, 1/s, of the distances from the table and between links: large, since neither moves, so that a motion along
     the table is not slowed down."""
-    slow: float = 0.1
+    slow: float = 0.3
     """Speed, m/s, up to which an obstacle is not dodged: joints follow the flow around it."""
     horizon: float = 0.4
     """Time ahead in which the arm dodges, seconds: in much less joints get nowhere, for more nobody knows where the
     obstacle will be."""
     num_ahead: int = 10
     """Number of times in the horizon at which distances are looked at: an obstacle of 1 m/s moves 4 cm between two."""
-    doubt: float = 0.2
-    """Growth of the distance that is needed with the time ahead, m/s per m/s of the obstacle: it may turn."""
-    staying: float = 3e-3
-    """Gain in distance, metres, from which on another way of dodging is taken."""
+    unsure: float = 0.03
+    """Deviation of an obstacle from where it is expected now, m per m/s of its speed: that of about one look."""
+    doubt: float = 0.4
+    """Growth of that deviation with the time ahead, m/s per m/s: a way with bends of some centimetres, as a hand makes,
+    is left by so much where it is thought to be straight."""
+    staying: float = 0.03
+    """Gain in distance, in deviations, from which on another way of dodging is taken."""
     homing_speed: float = 2.0
     """Speed of the way home, relative to that of the learned motion."""
     holding_speed: float = 0.25

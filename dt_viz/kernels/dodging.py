@@ -10,10 +10,12 @@ from dt_viz.kernels.distances import Shapes, Values, distance
 
 AT_ONCE = 3
 """Number of joints whose velocities are chosen together: those that carry the hand, then those that turn it."""
+ENOUGH = 1.0
+"""Distance, in deviations of the obstacle from where it is expected, beyond which more is worth nothing."""
 
 
 @compiled
-def room(
+def _room(
     joints: Joints,
     points: BodyPoints,
     shapes: Shapes,
@@ -27,12 +29,12 @@ def room(
     times: Array,
     least: float,
 ) -> float:
-    """Find the smallest distance, beyond that which is needed, of an arm that turns to velocities `wanted` (n,).
+    """Find the smallest distance, in deviations and at most `ENOUGH`, of an arm that turns to velocities `wanted` (n,).
 
     Each joint changes its velocity as fast as it may and keeps it then. Ends early where it is below `least`. Other
     arguments as in `dodge`.
     """
-    n, smallest = len(joints), 0.0
+    n, smallest = len(joints), ENOUGH
     axes, origins, p = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n)
     for t in times:
         for i in range(n):
@@ -47,8 +49,8 @@ def room(
             z = placed(offset, joint, axes, origins, 2)
             for o in range(len(shapes)):
                 u, v, w = x - t * motion[o, 0], y - t * motion[o, 1], z - t * motion[o, 2]
-                needed = points[k].radius + motion[o, 3] + t * motion[o, 4]
-                smallest = min(smallest, distance(shapes[o], values, u, v, w) - needed)
+                away = distance(shapes[o], values, u, v, w) - points[k].radius - motion[o, 3]
+                smallest = min(smallest, away / (motion[o, 4] + t * motion[o, 5]))
         if smallest < least:
             break
     return smallest
@@ -81,7 +83,8 @@ def dodge(
         points: of its links.
         shapes: (P,) obstacles.
         values: of their grids.
-        motion: (P, 5) velocity of each, m/s, distance from it that is needed, metres, and growth of that, m/s.
+        motion: (P, 6) velocity of each, m/s, distance that is kept, metres, its deviation from where it is expected,
+            metres, and the growth of that, m/s.
         q: angles, rad.
         velocity: rad/s.
         wanted: (n,) rad/s.
@@ -89,18 +92,18 @@ def dodge(
         bounds: (3, n) smallest and largest angles, rad, and largest velocities, rad/s.
         acceleration: largest one, rad/s².
         times: (T,) at which distances are looked at, seconds.
-        gain: metres.
+        gain: in deviations.
 
     Returns:
         Whether what is wanted leads past them, and the velocities.
     """
-    most = room(joints, points, shapes, values, motion, q, velocity, wanted, bounds, acceleration, times, -np.inf)
-    if most >= 0:
+    most = _room(joints, points, shapes, values, motion, q, velocity, wanted, bounds, acceleration, times, -np.inf)
+    if most >= ENOUGH:
         return True, wanted
     chosen = wanted.copy()
-    kept = room(joints, points, shapes, values, motion, q, velocity, before, bounds, acceleration, times, most)
+    kept = _room(joints, points, shapes, values, motion, q, velocity, before, bounds, acceleration, times, most)
     if kept > most:
-        most, chosen = min(kept + gain, 0.0), before.copy()
+        most, chosen = min(kept + gain, ENOUGH), before.copy()
     tried = chosen.copy()
     for first in range(0, len(q), AT_ONCE):
         last, base = min(first + AT_ONCE, len(q)), chosen.copy()
@@ -108,7 +111,7 @@ def dodge(
             tried[:] = base
             for i in range(first, last):
                 tried[i] = (number // 3 ** (i - first) % 3 - 1) * bounds[2, i]
-            left = room(joints, points, shapes, values, motion, q, velocity, tried, bounds, acceleration, times, most)
+            left = _room(joints, points, shapes, values, motion, q, velocity, tried, bounds, acceleration, times, most)
             nearer = ((tried - wanted) ** 2).sum() < ((chosen - wanted) ** 2).sum()
             if left > most or (left == most and nearer):
                 most = left
