@@ -39,6 +39,8 @@ MOVED = 5e-3
 """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
 AT_REST = 1e-3
 """Gap, rad, and velocity, rad/s, of joints that count as at rest."""
+NEARLY = 0.01
+"""Distance from the end of a joint's range, rad, that counts as being there."""
 NUM_CLEAR, NUM_CLEAR_MOVING = 40, 10
 """Numbers of postures of the motion ahead that are to be clear of obstacles, at rest and moving."""
 TOUCHING = 5e-3
@@ -126,6 +128,8 @@ class Controller:
         self._distance = np.inf
         """Distance from the nearest obstacle, about, metres."""
         self._settled = self._released = False
+        self._tick: tuple[Array, Array, Array, list[tuple[Array, Array]]] | None = None
+        """The last posture, the velocity that was wanted, the one that was allowed, and the rows of contacts."""
 
     # --- What it follows ---
 
@@ -273,7 +277,7 @@ class Controller:
         course, q = self._course, self._q
         if course is None or q is None:
             return Phase.RESTING
-        if not self._clearing.cleared or self._distance < -TOUCHING:
+        if not self._clearing.cleared or self.touched:
             return Phase.TOUCHED
         if self._aim is Aim.HAND:
             return Phase.HELD
@@ -282,6 +286,24 @@ class Controller:
         if self._settled and max(np.abs(self._velocity).max(), np.abs(q - self._at).max()) < AT_REST:
             return Phase.RESTING
         return Phase.HOMING if self._aim is Aim.HOME else Phase.MOVING
+
+    @property
+    def touched(self) -> bool:
+        """Whether an obstacle touches it."""
+        return self._distance < -TOUCHING
+
+    @property
+    def held_back(self) -> str:
+        """Which limit keeps it from where it is to go, in words; empty if none does."""
+        if self._tick is None:
+            return ""
+        q, wanted, velocity, contacts = self._tick
+        for limit, (slopes, bounds) in zip(self._contacts, contacts, strict=True):
+            if ((slopes @ wanted < bounds - AT_REST) & (slopes @ velocity < bounds + AT_REST)).any():
+                return f"kept from {limit.name}"
+        room = np.where(wanted < 0, q - self.robot.lower, self.robot.upper - q)
+        (ended,) = np.nonzero((room < NEARLY) & (np.abs(wanted) > AT_REST + np.abs(velocity)))
+        return f"joint {ended[0] + 1} is at its limit" if len(ended) else ""
 
     @property
     def ahead(self) -> Array:
@@ -374,6 +396,7 @@ class Controller:
         seen = self._seen.where(expected)
         *barrier, self._distance = self._barrier.rows(q, seen, dt)
         velocity = _nearest(wanted, lower, upper, [*contacts, barrier])
+        self._tick = q, wanted, velocity, contacts
         lowest = float(self._kept[0].min())
         self._dodging = self._dodge.velocities(q, self._velocity, velocity, self._dodging, seen, lowest)
         return velocity if self._dodging is None else _nearest(self._dodging, lower, upper, contacts)
