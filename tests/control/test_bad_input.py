@@ -65,11 +65,11 @@ def _live(engine, initial):
     return Robot(engine, initial)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 11))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 20))])
 def test_limits_hold_in_random_ticks_whatever_happens(live, seed):
-    """10⁴ ticks a seed: spheres that fly, jump and close in, pushes, holds, other hands, and ticks that come late."""
+    """5,000 ticks a seed: spheres that fly, jump and close in, pushes, holds, other hands, and ticks that come late."""
     rng, places, ways = np.random.default_rng(seed), np.empty((0, 3)), np.empty((0, 3))
-    for k in range(10_000):
+    for k in range(5_000):
         if k % 40 == 0:
             match rng.integers(8):
                 case 0 | 1:  # from up to two sides
@@ -139,8 +139,8 @@ def test_a_robot_that_is_folded_does_not_touch_itself(live):
         for _ in range(20):
             live.run(0.1)
             said.add(live.controller.held_back)
-            closest = min(closest, model.nearest_to_itself(live.q[None]).distance)
-    assert closest > 0
+            closest = min(closest, apart.distance if (apart := model.nearest_to_itself(live.q[None])) else np.inf)
+    assert "kept from itself" in said and closest > 0
     live.goes_on()
 
 
