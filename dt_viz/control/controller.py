@@ -398,7 +398,7 @@ class Controller:
         velocity = _nearest(wanted, lower, upper, [*contacts, barrier])
         self._tick = q, wanted, velocity, contacts
         lowest = float(self._kept[0].min())
-        self._dodging = self._dodge.velocities(q, self._velocity, velocity, self._dodging, seen, lowest)
+        self._dodging = self._dodge.chosen(q, self._velocity, velocity, self._dodging, seen, lowest)
         return velocity if self._dodging is None else _nearest(self._dodging, lower, upper, contacts)
 
     def _settle(self, course: Course) -> None:

@@ -33,7 +33,7 @@ class Dodge:
     arm: WholeArm
     settings: ControllerSettings
 
-    def velocities(
+    def chosen(
         self, q: Array, velocity: Array, wanted: Array, before: Array | None, seen: Sighting, lowest: float
     ) -> Array | None:
         """Choose velocities (6,), rad/s; None where those that are wanted lead past all obstacles that move.
@@ -57,7 +57,7 @@ class Dodge:
         motion[:-1, :3], motion[:-1, 5] = seen.velocities[moving], settings.doubt * speeds[moving]
         motion[:-1, 4] = settings.unsure * speeds[moving]
         motion[-1, 3:5] = lowest - OVERSHOOT - TABLE_DEPTH, TABLE_DEPTH
-        clear, chosen = dodge(
+        clear, velocities = dodge(
             robot.records,
             self.arm.links.records,
             shapes,
@@ -72,4 +72,4 @@ class Dodge:
             np.linspace(0, settings.horizon, settings.num_ahead + 1)[1:],
             settings.staying,
         )
-        return None if clear else chosen
+        return None if clear else velocities

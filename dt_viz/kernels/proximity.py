@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from dt_viz.kernels.compiled import compiled, short_kernel
 from dt_viz.kernels.distances import Shapes, Values, distance
 
 COMPLEX_STEP = 1e-30
+Indices = NDArray[Any]
 Point = tuple[float, float, float]
 
 
@@ -59,7 +62,7 @@ def proximity(
 
 
 @short_kernel
-def contacts(joints: Joints, points: BodyPoints, pairs: NDArray[np.int64], q: Array) -> tuple[Array, Array]:
+def contacts(joints: Joints, points: BodyPoints, pairs: Indices, q: Array) -> tuple[Array, Array]:
     """Find the distances of pairs of body points, or of one and the table z = 0, at the posture q (n,).
 
     Args:
@@ -80,7 +83,7 @@ def contacts(joints: Joints, points: BodyPoints, pairs: NDArray[np.int64], q: Ar
         for c in range(3):
             at[k, c] = offset[c] if joint < 0 else placed(offset, joint, axes, origins, c)
     for m in range(num):
-        a, b = pairs[m]
+        a, b = int(pairs[m, 0]), int(pairs[m, 1])
         place, first, away = (at[b, 0], at[b, 1], at[b, 2]), 0, (0.0, 0.0, 1.0)
         apart[m] = at[b, 2] - points[b].radius
         if a >= 0:  # joints up to that of the first one move both

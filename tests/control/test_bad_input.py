@@ -97,7 +97,7 @@ def test_limits_hold_in_random_ticks_whatever_happens(live, seed):
 
 def test_a_sphere_dropped_on_the_arm_at_rest_is_said_and_left(live):
     live.run(20, until=Phase.RESTING)
-    live.see(live.hand + [0.0, 0.02, 0.03])
+    live.see(np.add(live.hand, [0.0, 0.02, 0.03]))
     live.run(0.1)
     assert live.controller.phase is Phase.TOUCHED and live.controller.touched
     live.run(5)
@@ -108,7 +108,7 @@ def test_a_sphere_dropped_on_the_arm_at_rest_is_said_and_left(live):
 def test_two_spheres_that_close_in_from_both_sides(live):
     live.run(1.5)
     for gap in np.linspace(0.4, 0.1, 60):
-        live.see(live.hand + [gap, 0, 0], live.hand - [gap, 0, 0])
+        live.see(*(np.add(live.hand, [side, 0, 0]) for side in (gap, -gap)))
         live.run(0.03)
     live.goes_on()
 
