@@ -217,23 +217,15 @@ class WholeArm:
         field = WholeArmField(self.robot, self.body, (obstacle,), np.eye(3)[:1], np.empty((0, NUM_JOINTS)))
         points = self.body.of_chain(self.robot.chain(q.T))
         shapes, values = records((obstacle,))
-        joints, links = self.robot.records, self.links.records
+        joints, links, still = self.robot.records, self.links.records, np.zeros(NUM_JOINTS)
+        motion, bounds = np.ones((1, 6)), np.ones((3, NUM_JOINTS))
         calls: tuple[Callable[[], object], ...] = (
             lambda: self.robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy()),
             lambda: dodge(
-                joints,
-                links,
-                shapes,
-                values,
-                np.ones((1, 6)),
-                *np.zeros((4, NUM_JOINTS)),
-                np.ones((3, NUM_JOINTS)),
-                1.0,
-                np.ones(1),
-                0.0,
+                joints, links, shapes, values, motion, still, still, still, still, bounds, 1.0, np.ones(1), 0.0
             ),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
