@@ -10,6 +10,7 @@ takes up its motion where it left it. Home, hold and shove are other courses of 
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from enum import Enum
 
 import daqp
@@ -22,7 +23,8 @@ from dt_viz.arm.robot import NUM_JOINTS
 from dt_viz.arm.tracking import track
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.control.courses import Course, resting, towards
-from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
+from dt_viz.control.dodging import Dodge
+from dt_viz.control.limits import AccelerationLimit, ContactLimit, ObstacleLimit, RangeLimit, VelocityLimit
 from dt_viz.control.obstacle_motion import NOTHING_SEEN, STALE
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
@@ -37,6 +39,8 @@ MOVED = 5e-3
 """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
 AT_REST = 1e-3
 """Gap, rad, and velocity, rad/s, of joints that count as at rest."""
+NEARLY = 0.01
+"""Distance from the end of a joint's range, rad, that counts as being there."""
 NUM_CLEAR, NUM_CLEAR_MOVING = 40, 10
 """Numbers of postures of the motion ahead that are to be clear of obstacles, at rest and moving."""
 TOUCHING = 5e-3
@@ -94,6 +98,13 @@ class Controller:
         self._barrier = ObstacleLimit(
             self._arm, self.settings.clearance, self.settings.barrier_gain, self.settings.barrier_reach
         )
+        self._contacts = tuple(
+            make(robot, follower.body, self.settings.clearance, self.settings.contact_gain)
+            for make in (ContactLimit.table, ContactLimit.itself)
+        )
+        self._kept: tuple[Array, ...] = ()
+        """Distances that are kept, for each of these limits."""
+        self._dodge, self._dodging = Dodge(self._arm, self.settings), None
         self._lock = threading.RLock()
         self._solved = solved
         self._seen = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0)
@@ -117,6 +128,8 @@ class Controller:
         self._distance = np.inf
         """Distance from the nearest obstacle, about, metres."""
         self._settled = self._released = False
+        self._tick: tuple[Array, Array, Array, list[tuple[Array, Array]]] | None = None
+        """The last posture, the velocity that was wanted, the one that was allowed, and the rows of contacts."""
 
     # --- What it follows ---
 
@@ -264,7 +277,7 @@ class Controller:
         course, q = self._course, self._q
         if course is None or q is None:
             return Phase.RESTING
-        if not self._clearing.cleared or self._distance < -TOUCHING:
+        if not self._clearing.cleared or self.touched:
             return Phase.TOUCHED
         if self._aim is Aim.HAND:
             return Phase.HELD
@@ -273,6 +286,24 @@ class Controller:
         if self._settled and max(np.abs(self._velocity).max(), np.abs(q - self._at).max()) < AT_REST:
             return Phase.RESTING
         return Phase.HOMING if self._aim is Aim.HOME else Phase.MOVING
+
+    @property
+    def touched(self) -> bool:
+        """Whether an obstacle touches it."""
+        return self._distance < -TOUCHING
+
+    @property
+    def held_back(self) -> str:
+        """Which limit keeps it from where it is to go, in words; empty if none does."""
+        if self._tick is None:
+            return ""
+        q, wanted, velocity, contacts = self._tick
+        for limit, (slopes, bounds) in zip(self._contacts, contacts, strict=True):
+            if ((slopes @ wanted < bounds - AT_REST) & (slopes @ velocity < bounds + AT_REST)).any():
+                return f"kept from {limit.name}"
+        room = np.where(wanted < 0, q - self.robot.lower, self.robot.upper - q)
+        (ended,) = np.nonzero((room < NEARLY) & (np.abs(wanted) > AT_REST + np.abs(velocity)))
+        return f"joint {ended[0] + 1} is at its limit" if len(ended) else ""
 
     @property
     def ahead(self) -> Array:
@@ -355,29 +386,20 @@ class Controller:
         self._clock = min(self._clock + self._rate * dt, self._begun.end)
 
     def _feasible(self, q: Array, wanted: Array, dt: float) -> Array:
-        """Find the velocity nearest to the wanted one that all limits allow, min ‖q̇ − q̇*‖².
-
-        Bounds of joints are hard, the last one's, of acceleration, first; barriers of obstacles give way to them.
-        """
+        """Find the velocity (6,) nearest to the wanted one that all limits allow, or that dodges what moves."""
         lower, upper = np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
-        for limit in self._limits:
+        for limit in self._limits:  # the last one's bounds, of acceleration, come first
             lowest, highest = limit.bounds(q, self._velocity, dt)
             lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
-        seen = self._seen.expected(min(self._now - self._seen.time, STALE), 0.0)
-        slopes, bounds, self._distance = self._barrier.rows(q, self._seen.where(seen))
-        nearest = _within(wanted, lower, upper)
-        if not len(bounds) or (slopes @ nearest >= bounds).all():
-            return nearest
-        sense = np.repeat(np.array([0, SOFT], np.int32), (NUM_JOINTS, len(bounds)))
-        solution, _, flag, _ = daqp.solve(
-            np.eye(NUM_JOINTS),
-            -wanted,
-            np.ascontiguousarray(slopes),
-            np.concatenate([upper, np.full(len(bounds), 1e30)]),
-            np.concatenate([lower, bounds]),
-            sense,
-        )
-        return _within(solution if flag > 0 else np.zeros(NUM_JOINTS), lower, upper)
+        contacts = [limit.rows(q, kept, dt) for limit, kept in zip(self._contacts, self._kept, strict=True)]
+        expected = self._seen.expected(min(self._now - self._seen.time, STALE), 0.0)
+        seen = self._seen.where(expected)
+        *barrier, self._distance = self._barrier.rows(q, seen, dt)
+        velocity = _nearest(wanted, lower, upper, [*contacts, barrier])
+        self._tick = q, wanted, velocity, contacts
+        lowest = float(self._kept[0].min())
+        self._dodging = self._dodge.chosen(q, self._velocity, velocity, self._dodging, seen, lowest)
+        return velocity if self._dodging is None else _nearest(self._dodging, lower, upper, contacts)
 
     def _settle(self, course: Course) -> None:
         """Take note of the end of a course, and go on from a shove."""
@@ -402,24 +424,27 @@ class Controller:
     def _set_out(self, aim: Aim) -> None:
         with self._lock:
             self._remember()
+            pushed = self._aim is Aim.HAND
             self._aim, self._released = aim, False
             if self._course is not None:
-                self._take(self._to_aim(self._course.at(self._clock)))
+                self._take(self._to_aim(self._course.at(self._clock)), pushed=pushed)
 
     def _hand(self, course: Course, *, released: bool = False) -> None:
         self._remember()
         if self._aim is not Aim.HAND:
             self._then = self._aim
         self._aim, self._released = Aim.HAND, released
-        self._take(course)
+        self._take(course, pushed=True)
 
     def _remember(self) -> None:
         """Take note of phase and condition before the motion to the goal is left."""
         if self._aim is Aim.GOAL and self._course is not None:
             self._rest = self._course.image(self._clock)[3:]
 
-    def _take(self, course: Course) -> None:
-        """Follow a course from its beginning."""
+    def _take(self, course: Course, *, pushed: bool = False) -> None:
+        """Follow a course from its beginning; one that a push leads to comes no nearer to the table than before."""
+        if not pushed or not self._kept:
+            self._kept = tuple(limit.kept(course.q) for limit in self._contacts)
         self._course = course.slowed(self.settings.course_speed * self.robot.velocity_limits)
         self._clock, self._settled, self._changed = 0.0, False, True
 
@@ -437,6 +462,26 @@ class Controller:
         if self._rest is not None and len(self._rest) == len(state) - 3:
             state = base.caught(np.concatenate([hand, self._rest]), stack.stacked.forward(hand))
         return towards(stack.system, self._section, q, state, settings.convergence, z, near)
+
+
+def _nearest(wanted: Array, lower: Array, upper: Array, rows: Sequence[Sequence[Array]]) -> Array:
+    """Find the velocity nearest to a wanted one (6,), min ‖q̇ − q̇*‖².
+
+    Bounds (6,) are hard; rows of slopes s and bounds b, s·q̇ ≥ b, give way where there is no other way.
+    """
+    nearest = _within(wanted, lower, upper)
+    if all((slopes @ nearest >= bounds).all() for slopes, bounds in rows):
+        return nearest
+    slopes, bounds = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    solution, _, flag, _ = daqp.solve(
+        np.eye(NUM_JOINTS),
+        -wanted,
+        np.ascontiguousarray(slopes),
+        np.concatenate([upper, np.full(len(bounds), 1e30)]),
+        np.concatenate([lower, bounds]),
+        np.repeat(np.array([0, SOFT], np.int32), (NUM_JOINTS, len(bounds))),
+    )
+    return _within(solution if flag > 0 else np.zeros(NUM_JOINTS), lower, upper)
 
 
 def _within(values: Array, lower: Array, upper: Array) -> Array:

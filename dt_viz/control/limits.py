@@ -6,19 +6,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dt_viz.arm.body_points import BodyPoints
 from dt_viz.arm.robot import Robot
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
 from dt_viz.control.obstacle_motion import Sighting
-from dt_viz.flows.fields import Array
-from dt_viz.kernels.proximity import proximity
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.kernels.proximity import contacts, proximity
 from dt_viz.obstacles.arrays import records
 
 NUM_POINTS = 8
-"""Number of body points, those nearest to obstacles, that have a barrier."""
+"""Number of body points, those nearest to what they may not touch, that have a barrier."""
 BRAKING_SHARE = 0.8
 """Part of the acceleration limit that braking before a joint limit counts on: ticks are not infinitely short."""
 IMMOBILE = 1e-4
 """Squared slope of a distance, m²/rad², up to which no joint moves the point to speak of."""
+STEADIEST = 0.5
+"""Part of a distance that goes in one tick at most, however long it is."""
+JOINTS_BETWEEN = 3
+"""Number of joints between two parts of the arm from which on they can touch: fewer do not fold them that far."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class ObstacleLimit:
     reach: float
     """Distance from which on a body point has a barrier, metres."""
 
-    def rows(self, q: Array, seen: Sighting) -> tuple[Array, Array, float]:
+    def rows(self, q: Array, seen: Sighting, dt: float) -> tuple[Array, Array, float]:
         """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,), and the distance from the nearest obstacle."""
         if seen.avoidance is None or not seen.avoidance.obstacle.parts:
             return np.empty((0, len(q))), np.empty(0), np.inf
@@ -90,9 +95,60 @@ class ObstacleLimit:
             return slopes, distance, np.inf
         distance = distance + OVERSHOOT
         h = distance - min(self.clearance, seen.avoidance.margin / 2)
-        near = np.argsort(h)[:NUM_POINTS]
-        near = near[(slopes[near] ** 2).sum(axis=1) > IMMOBILE]
+        near, bounds = _barrier(h, slopes, self.gain, dt)
         approach = np.einsum("ki,ki->k", outward[near], seen.velocities[part[near]])
-        # a point that is too near comes out faster than one that is far away may come in
-        bounds = approach - self.gain * np.where(h[near] > 0, h[near], 2 * h[near])
-        return slopes[near], bounds, float(distance.min())
+        return slopes[near], approach + bounds, float(distance.min())
+
+
+@dataclass(frozen=True, eq=False)
+class ContactLimit:
+    """The arm touches neither the table nor itself: a control barrier for pairs of body points, as of obstacles.
+
+    No pair needs to be farther apart than in the undisturbed motion, which may slide along the table.
+    """
+
+    name: str
+    """What is not touched."""
+    robot: Robot
+    body: BodyPoints
+    pairs: Indices
+    """(M, 2) as in `dt_viz.kernels.proximity.contacts`."""
+    clearance: float
+    """Distance that is kept, metres."""
+    gain: float
+    """γ, 1/s."""
+
+    @classmethod
+    def table(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
+        """Limit of the links above the table z = 0."""
+        (links,) = np.nonzero(body.joint > 0)
+        return cls("the table", robot, body, np.stack([np.full(len(links), -1), links], axis=1), clearance, gain)
+
+    @classmethod
+    def itself(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
+        """Limit of the links' distances from each other and the base."""
+        a, b = np.nonzero(body.joint[:, None] + JOINTS_BETWEEN <= body.joint)
+        return cls("itself", robot, body, np.stack([a, b], axis=1), clearance, gain)
+
+    def kept(self, q: Array) -> Array:
+        """Distances (M,) to keep in a motion whose undisturbed postures are q (N, 6), metres."""
+        apart = np.min([self._contacts(posture)[0] for posture in q], axis=0)
+        return np.minimum(self.clearance, apart)
+
+    def rows(self, q: Array, kept: Array, dt: float) -> tuple[Array, Array]:
+        """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,) where distances (M,) are kept."""
+        apart, slopes = self._contacts(q)
+        near, bounds = _barrier(apart - kept, slopes, self.gain, dt)
+        return slopes[near], bounds
+
+    def _contacts(self, q: Array) -> tuple[Array, Array]:
+        apart, slopes = contacts(self.robot.records, self.body.records, self.pairs, q)
+        return apart + OVERSHOOT, slopes
+
+
+def _barrier(h: Array, slopes: Array, gain: float, dt: float) -> tuple[Indices, Array]:
+    """Choose the pairs (K,) that are nearest, of those that joints move, and the least rates of their distances h."""
+    near = np.flatnonzero((slopes**2).sum(axis=1) > IMMOBILE)
+    near = near[np.argsort(h[near])[:NUM_POINTS]]
+    # what is too near parts faster than what is apart may approach
+    return near, -min(gain, STEADIEST / dt) * np.where(h[near] > 0, h[near], 2 * h[near])

@@ -12,7 +12,7 @@ from dt_viz.obstacles.shapes import Obstacle, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import ArmAvoidance
 
-SMOOTHING = 0.08
+SMOOTHING = 0.02
 """Time constant of the measured velocity, seconds."""
 FASTEST = 1.5
 """Speed, m/s, from which on an obstacle counts as put elsewhere, not as moving."""

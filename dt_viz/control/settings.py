@@ -23,7 +23,7 @@ class ControllerSettings:
     lead: float = 0.15
     """Time by which moving obstacles are anticipated, seconds: that until the joints have followed."""
     room: float = 0.06
-    """Growth of the margin with an obstacle's speed, m per m/s."""
+    """Growth of the distance that is asked for with an obstacle's speed, m per m/s."""
     window: float = 1.2
     """Time of the motion ahead that is to be clear of moving obstacles, seconds; of obstacles at rest all is."""
     turning: float = 3.0
@@ -37,6 +37,23 @@ class ControllerSettings:
     """γ, 1/s: the distance beyond that clearance falls at most at this rate."""
     barrier_reach: float = 0.25
     """Distance from which on an obstacle slows the arm down, metres."""
+    contact_gain: float = 20.0
+    """γ, 1/s, of the distances from the table and between links: large, since neither moves, so that a motion along
+    the table is not slowed down."""
+    slow: float = 0.3
+    """Speed, m/s, up to which an obstacle is not dodged: joints follow the flow around it."""
+    horizon: float = 0.4
+    """Time ahead in which the arm dodges, seconds: in much less joints get nowhere, for more nobody knows where the
+    obstacle will be."""
+    num_ahead: int = 10
+    """Number of times in the horizon at which distances are looked at: an obstacle of 1 m/s moves 4 cm between two."""
+    unsure: float = 0.03
+    """Deviation of an obstacle from where it is expected now, m per m/s of its speed: that of about one look."""
+    doubt: float = 0.4
+    """Growth of that deviation with the time ahead, m/s per m/s: a way with bends of some centimetres, as a hand makes,
+    is left by so much where it is thought to be straight."""
+    staying: float = 0.03
+    """Gain in distance, in deviations, from which on another way of dodging is taken."""
     homing_speed: float = 2.0
     """Speed of the way home, relative to that of the learned motion."""
     holding_speed: float = 0.25

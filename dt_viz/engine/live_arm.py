@@ -104,16 +104,23 @@ class LiveArm:
     @property
     def note(self) -> str:
         """What is unusual about where it is, in words; empty if nothing is."""
-        phase, place, q, solved = self.phase, self._held, self._q, self._solved
+        controller, phase = self._controller, self.phase
+        if controller is None:
+            return ""
         if phase is Phase.TOUCHED:
-            return "touched"
+            return "touched" if controller.touched else "no way around the obstacle"
         if phase is Phase.ASIDE:
             return "stepped aside"
-        if phase is not Phase.HELD or place is None or q is None or solved is None:
+        return self._beside or controller.held_back
+
+    @property
+    def _beside(self) -> str:
+        """Why the hand is not where it is held, in words; empty if it is."""
+        place, q, solved, below = self._held, self._q, self._solved, self.undisturbed
+        if self.phase is not Phase.HELD or place is None or q is None or solved is None or below is None:
             return ""
-        robot, below = self._follower.robot, self.undisturbed
-        on_its_way = len(self.ahead) > 1
-        if on_its_way or below is None or np.linalg.norm(robot.end_effector(q) - place) < BESIDE:
+        robot = self._follower.robot
+        if len(self.ahead) > 1 or np.linalg.norm(robot.end_effector(q) - place) < BESIDE:
             return ""
         if solved.scenario.obstacle.signed_distance(place) < 0:
             return "inside the obstacle"

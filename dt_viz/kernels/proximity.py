@@ -1,15 +1,31 @@
-"""Distances of an arm's body points from obstacles, and how joints change them."""
+"""Distances of an arm's body points from obstacles, each other and the table, and how joints change them."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, placed
-from dt_viz.kernels.compiled import short_kernel
+from dt_viz.kernels.compiled import compiled, short_kernel
 from dt_viz.kernels.distances import Shapes, Values, distance
 
 COMPLEX_STEP = 1e-30
+Indices = NDArray[Any]
+Point = tuple[float, float, float]
+
+
+@compiled
+def _slopes(axes: Array, origins: Array, first: int, last: int, place: Point, away: Point, slopes: Array) -> None:
+    """Write how joints `first` to `last` move what is at a place (3,) along `away` (3,), to `slopes` (n,), m/rad."""
+    x, y, z = place
+    for i in range(first, last + 1):  # what joint i turns moves along its axis times the lever
+        u, v, w = x - origins[i, 0], y - origins[i, 1], z - origins[i, 2]
+        along_x = axes[i, 2, 1] * w - axes[i, 2, 2] * v
+        along_y = axes[i, 2, 2] * u - axes[i, 2, 0] * w
+        along_z = axes[i, 2, 0] * v - axes[i, 2, 1] * u
+        slopes[i] = away[0] * along_x + away[1] * along_y + away[2] * along_z
 
 
 @short_kernel
@@ -38,13 +54,42 @@ def proximity(
             a = distance(shapes[k], values, x + step, y + 0j, z + 0j).imag / COMPLEX_STEP
             b = distance(shapes[k], values, x + 0j, y + step, z + 0j).imag / COMPLEX_STEP
             c = distance(shapes[k], values, x + 0j, y + 0j, z + step).imag / COMPLEX_STEP
-            for i in range(joint + 1):  # what joint i turns moves along its axis times the lever
-                u, v, w = x - origins[i, 0], y - origins[i, 1], z - origins[i, 2]
-                along_x = axes[i, 2, 1] * w - axes[i, 2, 2] * v
-                along_y = axes[i, 2, 2] * u - axes[i, 2, 0] * w
-                along_z = axes[i, 2, 0] * v - axes[i, 2, 1] * u
-                slopes[found, i] = a * along_x + b * along_y + c * along_z
+            _slopes(axes, origins, 0, joint, (x, y, z), (a, b, c), slopes[found])
             part[found], nearest[found] = k, away
             outward[found, 0], outward[found, 1], outward[found, 2] = a, b, c
             found += 1
     return part[:found], nearest[:found], slopes[:found], outward[:found]
+
+
+@short_kernel
+def contacts(joints: Joints, points: BodyPoints, pairs: Indices, q: Array) -> tuple[Array, Array]:
+    """Find the distances of pairs of body points, or of one and the table z = 0, at the posture q (n,).
+
+    Args:
+        joints: of the arm.
+        points: those of joint −1 are fixed to the base.
+        pairs: (M, 2) indices of points, that nearer to the base first; where that is −1 it is the table.
+        q: angles, rad.
+
+    Returns:
+        The distances (M,) of their spheres, metres, and their slopes by the joints (M, n), m/rad.
+    """
+    n, num = len(joints), len(pairs)
+    axes, origins, at = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((len(points), 3))
+    apart, slopes = np.empty(num), np.zeros((num, n))
+    chain(joints, q, axes, origins)
+    for k in range(len(points)):
+        offset, joint = points[k].offset, points[k].joint
+        for c in range(3):
+            at[k, c] = offset[c] if joint < 0 else placed(offset, joint, axes, origins, c)
+    for m in range(num):
+        a, b = int(pairs[m, 0]), int(pairs[m, 1])
+        place, first, away = (at[b, 0], at[b, 1], at[b, 2]), 0, (0.0, 0.0, 1.0)
+        apart[m] = at[b, 2] - points[b].radius
+        if a >= 0:  # joints up to that of the first one move both
+            u, v, w = at[b, 0] - at[a, 0], at[b, 1] - at[a, 1], at[b, 2] - at[a, 2]
+            length = np.sqrt(u * u + v * v + w * w)
+            away, first = (u / length, v / length, w / length), points[a].joint + 1
+            apart[m] = length - points[a].radius - points[b].radius
+        _slopes(axes, origins, first, points[b].joint, place, away, slopes[m])
+    return apart, slopes

@@ -254,6 +254,7 @@ class TestDisturbances:
             """The arm, staying near another posture."""
 
             robot, whole_arm = scene.engine.follower.robot, scene.engine.follower.whole_arm
+            body = scene.engine.follower.body
 
             def reference(self, nominal):
                 return scene.engine.follower.reference(nominal) + offset

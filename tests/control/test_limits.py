@@ -55,7 +55,7 @@ def test_rows_are_the_rates_at_which_distances_change(arm, barrier):
     """With the slope s by the joints and the obstacle's own velocity: ḣ = s·q̇ − n·v ≥ −γh is s·q̇ ≥ b."""
     rng = np.random.default_rng(1)
     for q, seen in scenes(arm, 40):
-        slopes, bounds, nearest = barrier.rows(q, seen)
+        slopes, bounds, nearest = barrier.rows(q, seen, TICK)
         h = distances(arm, q, seen)
         assert nearest == pytest.approx(h.min() + KEPT)
         for velocity in rng.normal(size=(3, 6)):
@@ -69,12 +69,12 @@ def test_less_is_kept_where_less_is_asked_for_and_nothing_without_obstacles(arm,
     q, seen = next(scenes(arm, 1))
     assert seen.avoidance is not None
     closer = replace(seen, avoidance=replace(seen.avoidance, margin=0.0))
-    (slopes, bounds, nearest), (same, lower, as_near) = barrier.rows(q, seen), barrier.rows(q, closer)
+    (slopes, bounds, nearest), (same, lower, as_near) = barrier.rows(q, seen, TICK), barrier.rows(q, closer, TICK)
     assert nearest == as_near
     np.testing.assert_array_equal(slopes, same)
     np.testing.assert_allclose(bounds - lower, GAIN * KEPT, atol=1e-12)
     for nothing in (None, ArmAvoidance(Union(()))):
-        slopes, bounds, nearest = barrier.rows(q, replace(seen, avoidance=nothing, velocities=np.empty((0, 3))))
+        slopes, bounds, nearest = barrier.rows(q, replace(seen, avoidance=nothing, velocities=np.empty((0, 3))), TICK)
         assert slopes.shape == (0, 6) and not len(bounds) and nearest == np.inf
 
 
