@@ -11,7 +11,8 @@ from dt_viz.arm.tracking import DIRECTION_WEIGHT
 def velocities(field: WholeArmField, q: np.ndarray) -> np.ndarray:
     """V_q (N, 6) at postures q (N, 6), real or complex, in the notation of `WholeArmField`."""
     parts = zip(field.obstacles, field.directions, strict=True)
-    freedom = np.prod(1 - np.exp(-cspace.squared_lengths(q, field.pins) / (2 * cspace.PIN**2)), axis=1)
+    squared = (((q[:, None] - field.pins) * cspace.LEVERS) ** 2).sum(axis=2)
+    freedom = np.prod(1 - np.exp(-squared / (2 * cspace.PIN**2)), axis=1)
     return freedom[:, None] * sum(_without_pins(field, q, obstacle, direction) for obstacle, direction in parts)
 
 

@@ -236,12 +236,6 @@ class JointLimits(Diffeomorphism):
         return mapped, None if U is None else (factor**3)[..., None] * U
 
 
-def squared_lengths(q: Array, pins: Array) -> Array:
-    """Compute squared distances (N, K), m², of postures `q` (N, 6) from `pins` (K, 6), by `LEVERS`."""
-    offset = (q * LEVERS).T[:, None] - (pins * LEVERS).T[..., None]  # the batch last, for long inner loops
-    return (offset * offset).sum(axis=0).T
-
-
 def _unit_interval(u: Array) -> Array:
     """Clip u, which may be complex, to the interval from 0 to 1."""
     return np.where(u.real <= 0, 0.0, np.where(u.real >= 1, 1.0, u))

@@ -579,17 +579,7 @@ class _Solver:
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
         assert self._generator is not None
-        limits, duration = self._arm.limits, 0.0
-        state, lack = limits.forward(p), self._lack(p)
-        while len(state):
-            if duration >= self._longest:
-                return self._longest
-            state, _ = integrate(rk4, self._generator, state, None, -SNAPSHOT, 1)
-            before, lack = lack, self._lack(limits.inverse(state))
-            if (lack <= 0).all():
-                return duration + SNAPSHOT * _crossing(before, lack)
-            state, lack, duration = state[lack > 0], lack[lack > 0], duration + SNAPSHOT
-        return duration
+        return clearing_duration(self._generator, self._arm.limits, p, self._lack, SNAPSHOT, self._longest)
 
     def _extension(self, p: Array) -> float:
         """The shortest duration after which the flow has carried the meshes of configurations (N, 6) clear.
@@ -609,6 +599,30 @@ class _Solver:
             if not len(state):
                 break
         return float(duration)
+
+
+def clearing_duration(
+    field: VectorField, limits: JointLimits, p: Array, lack: Callable[[Array], Array], step: float, longest: float
+) -> float:
+    """The shortest time after which the reverse flow of a field has carried postures clear, or the longest.
+
+    Args:
+        field: generator of the flow.
+        limits: the flow acts in its coordinates.
+        p: (N, 6) rad.
+        lack: distances (N,), metres, by which postures (N, 6) miss the clearance that is asked for.
+        step: flow time between two looks at the clearance.
+        longest: flow time.
+    """
+    duration, state, lacking = 0.0, limits.forward(p), lack(p)
+    while (lacking > 0).any():
+        if duration >= longest:
+            return longest
+        before = lacking[lacking > 0]
+        state, _ = integrate(rk4, field, state[lacking > 0], None, -step, 1)
+        lacking = lack(limits.inverse(state))
+        duration += step * (_crossing(before, lacking) if (lacking <= 0).all() else 1.0)
+    return duration
 
 
 def _way(obstacle: Obstacle, side: Array, before: Way | None) -> Way:

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from dt_viz.arm.cspace import REACH_PER_TEMPERATURE, WholeArmField, squared_lengths
+from dt_viz.arm.cspace import LEVERS, REACH_PER_TEMPERATURE, WholeArmField
 from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS
-from dt_viz.arm.whole_arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm
+from dt_viz.arm.whole_arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm, clearing_duration
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array
+from dt_viz.kernels.blocks import room_asked
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.ways import OPPOSITE, turned
 from dt_viz.transforms.base import ArmAvoidance
@@ -94,7 +96,8 @@ def clearing(
     obstacles, ways = zip(*met, strict=True)
     reach = max(REACH_PER_TEMPERATURE * avoidance.temperature, avoidance.margin + BEYOND)
     field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), NO_PINS, reach)
-    return Clearing(field, directions, _duration(arm, field, q, avoidance, end))
+    lacking = partial(lack, arm, avoidance=avoidance, end=end)
+    return Clearing(field, directions, clearing_duration(field, arm.limits, q, lacking, STEP, MAX_DURATION))
 
 
 def _direction(
@@ -127,28 +130,13 @@ def _direction(
     return turned(before, best, turn)
 
 
-def _duration(arm: WholeArm, field: WholeArmField, q: Array, avoidance: ArmAvoidance, end: Array | None) -> float:
-    """Find the shortest flow time after which the postures (N, 6) are clear, or `MAX_DURATION`."""
-    duration, state = 0.0, arm.limits.forward(q)
-    lacking = lack(arm, q, avoidance, end)
-    while (lacking > 0).any():
-        if duration >= MAX_DURATION:
-            return MAX_DURATION
-        state, before = field.rk4(state[lacking > 0], -STEP, 1), lacking[lacking > 0]
-        lacking = lack(arm, arm.limits.inverse(state), avoidance, end)
-        part = 1.0
-        if (lacking <= 0).all():
-            part = float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
-        duration += part * STEP
-    return duration
-
-
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) -> Array:
     """Distances (N,), metres, by which postures p (N, 6) miss the clearance that is asked for.
 
     That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
     """
-    asked: Array | float = avoidance.margin - OVERSHOOT
-    if end is not None and (room := float(arm.clearance(end[None], avoidance.obstacle)[0]) - ROUNDING) > 0:
-        asked = np.minimum(asked, room + SLOPE * np.sqrt(squared_lengths(p, end[None])[:, 0]))
+    pins = NO_PINS if end is None else end[None]
+    room = arm.clearance(pins, avoidance.obstacle) - ROUNDING
+    pins, room = pins[room > 0], room[room > 0]
+    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin - OVERSHOOT))
     return asked - arm.clearance(p, avoidance.obstacle)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -184,6 +185,7 @@ class ArmAvoidance:
     integration: Integration = AUTO
 
 
+@lru_cache(maxsize=64)
 def axes_of(plane: tuple[Point, Point] | None) -> Array:
     """Return orthonormal columns (3, 3), those of a plane first, if there is one."""
     if plane is None:
