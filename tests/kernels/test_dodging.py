@@ -1,0 +1,87 @@
+"""The compiled look ahead: the same room as array operations, and no candidate that leaves more."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from dt_viz.arm.body_points import load_body_points
+from dt_viz.arm.robot import load_jaco
+from dt_viz.kernels.dodging import ENOUGH, dodge
+from dt_viz.obstacles.arrays import records
+from dt_viz.obstacles.shapes import Box, Sphere, as_point
+
+ROBOT = load_jaco()
+LINKS = load_body_points().on_moving_links
+BOUNDS = np.stack([ROBOT.lower, ROBOT.upper, ROBOT.velocity_limits])
+UP = np.array([0.0, 0.0, 1.0])
+ACCELERATION, TIMES = 4.0, np.linspace(0, 0.4, 9)[1:]
+
+
+def room(parts, motion, q, velocity, wanted):
+    """Smallest distance in deviations, at most `ENOUGH`, with joints that turn to `wanted` as fast as they may."""
+    smallest = ENOUGH
+    for t in TIMES:
+        steps = np.linspace(0, t, 4001)
+        ramped = velocity + np.clip(wanted - velocity, -ACCELERATION * steps[:, None], ACCELERATION * steps[:, None])
+        p = np.clip(q + t * (ramped[1:] + ramped[:-1]).mean(axis=0) / 2, ROBOT.lower, ROBOT.upper)
+        points = LINKS.positions(ROBOT, p)
+        for part, (u, v, w, kept, unsure, doubt) in zip(parts, motion, strict=True):
+            away = part.signed_distance(points - t * np.array([u, v, w])) - LINKS.radius - kept
+            smallest = min(smallest, away.min() / (unsure + t * doubt))
+    return smallest
+
+
+def candidates(chosen):
+    """Velocities with some joints, the first three or the last, at a standstill or their limits."""
+    for first in (0, 3):
+        for senses in product((-1, 0, 1), repeat=3):
+            tried = chosen.copy()
+            tried[first : first + 3] = senses * BOUNDS[2, first : first + 3]
+            yield tried
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_chosen_leaves_most_room_of_what_is_tried(seed):
+    rng = np.random.default_rng(seed)
+    q = ROBOT.clip(ROBOT.home + rng.normal(0, 0.3, 6))
+    velocity, wanted = rng.uniform(-0.5, 0.5, (2, 6))
+    hand = ROBOT.end_effector(q)
+    coming = rng.normal(size=3)
+    coming /= np.linalg.norm(coming)
+    parts = (Sphere(as_point(hand - 0.3 * coming), 0.15), Box(as_point(hand + 0.4 * UP), (0.2, 0.2, 0.2)))
+    motion = np.array([[*coming, 0.01, 0.03, 0.4], [0, 0, -0.5, 0.01, 0.02, 0.2]])
+    shapes, values = records(parts)
+    given = (
+        ROBOT.records,
+        LINKS.records,
+        shapes,
+        values,
+        motion,
+        q,
+        velocity,
+        wanted,
+        wanted,
+        BOUNDS,
+        ACCELERATION,
+        TIMES,
+    )
+    clear, chosen = dodge(*given, 0.0)
+    assert clear == (room(parts, motion, q, velocity, wanted) >= ENOUGH)
+    if clear:
+        np.testing.assert_array_equal(chosen, wanted)
+        return
+    best = room(parts, motion, q, velocity, chosen)
+    assert best >= room(parts, motion, q, velocity, wanted) - 1e-6
+    last = [tried for tried in candidates(chosen) if (tried[:3] == chosen[:3]).all()]
+    assert best >= max(room(parts, motion, q, velocity, tried) for tried in last) - 1e-6
+
+
+def test_what_is_far_away_changes_nothing():
+    q, wanted = np.array(ROBOT.home), np.full(6, 0.3)
+    shapes, values = records((Sphere((3.0, 3.0, 3.0), 0.15),))
+    motion = np.array([[0.1, 0, 0, 0.01, 0.03, 0.4]])
+    given = ROBOT.records, LINKS.records, shapes, values, motion, q, wanted, wanted, wanted, BOUNDS, ACCELERATION, TIMES
+    clear, chosen = dodge(*given, 0.0)
+    assert clear
+    np.testing.assert_array_equal(chosen, wanted)
