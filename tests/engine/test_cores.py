@@ -14,8 +14,8 @@ PATIENCE = 30
 class Crowd:
     """Threads that want slots, and the order in which they get them; each keeps its own until it is let go."""
 
-    def __init__(self, num):
-        self.cores, self.order, self.threads, self.let_go = Cores(num), [], {}, {}
+    def __init__(self, num, num_hands=None):
+        self.cores, self.order, self.threads, self.let_go = Cores(num, num_hands or num), [], {}, {}
         self._got = threading.Condition()
 
     def come(self, name, cancelled=None):
@@ -60,12 +60,12 @@ class Crowd:
 
 @pytest.fixture(name="crowd")
 def _crowd(request):
-    crowd = Crowd(getattr(request, "param", 2))
+    crowd = Crowd(*getattr(request, "param", [2]))
     yield crowd
     crowd.close()
 
 
-@pytest.mark.parametrize("crowd", [1], indirect=True)
+@pytest.mark.parametrize("crowd", [[1]], indirect=True)
 def test_who_follows_a_hand_goes_first_and_else_who_came_first(crowd):
     for name in "xAbCd":
         crowd.come(name)
@@ -73,7 +73,7 @@ def test_who_follows_a_hand_goes_first_and_else_who_came_first(crowd):
     assert crowd.order == ["x", "b", "d", "A", "C"]
 
 
-@pytest.mark.parametrize("crowd", [2, 3], indirect=True)
+@pytest.mark.parametrize("crowd", [[2], [3]], indirect=True)
 def test_refinements_leave_a_slot_to_who_follows_a_hand(crowd):
     num = crowd.cores._free
     for name in "ABC":
@@ -87,14 +87,24 @@ def test_refinements_leave_a_slot_to_who_follows_a_hand(crowd):
     assert crowd.order[-1] == "e"  # though a refinement came before it
 
 
-@pytest.mark.parametrize("crowd", [2], indirect=True)
+@pytest.mark.parametrize("crowd", [[2]], indirect=True)
 def test_all_slots_serve_hands(crowd):
     for name in "abc":
         crowd.come(name)
     assert crowd.order == ["a", "b"]
 
 
-@pytest.mark.parametrize("crowd", [1, 2], indirect=True)
+@pytest.mark.parametrize("crowd", [[2, 1]], indirect=True)
+def test_hands_may_have_fewer_slots_and_then_keep_no_refinement_waiting(crowd):
+    for name in "abC":
+        crowd.come(name)
+    assert crowd.order == ["a", "C"]
+    crowd.come("D")
+    crowd.go("a", "b", "C")
+    assert crowd.order == ["a", "C", "b", "D"]
+
+
+@pytest.mark.parametrize("crowd", [[1], [2]], indirect=True)
 def test_a_refinement_that_is_cancelled_leaves_the_queue_and_takes_nobodys_slot(crowd):
     unwanted = threading.Event()
     crowd.come("A")
@@ -120,7 +130,7 @@ def test_a_slot_ends_with_an_exception(crowd):
 @pytest.mark.parametrize("num", [1, 2, 3])
 def test_in_a_storm_no_more_than_the_slots_are_taken_and_all_get_one(num):
     free, free_to_refine = threading.Semaphore(num), threading.Semaphore(max(1, num - 1))
-    cores, crowded = Cores(num), []
+    cores, crowded = Cores(num, num), []
 
     def want(refines):
         for _ in range(100):

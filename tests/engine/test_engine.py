@@ -300,7 +300,7 @@ def test_a_hand_is_followed_while_all_others_refine(new_engine, initial, monkeyp
         with cores.slot(never):
             assert [next(frames).stage, next(frames).stage] == [Stage.ROLLOUTS, Stage.LIVE]
     else:
-        next(frames), next(frames)
+        assert next(frames).stage is not next(frames).stage
         with cores.slot(never):
             refining = threading.Thread(target=lambda: next(frames), daemon=True)
             refining.start()
