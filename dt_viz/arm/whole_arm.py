@@ -71,8 +71,8 @@ MAX_EXTENSION = 0.15
 """Longest flow time that is added for the meshes: they are at most three centimetres nearer than asked for."""
 NUM_EXTENDED_FOR = 40
 """Number of samples, those that lack most, that this time is chosen for."""
-COARSE_STEP = 0.2
-"""Length of a coarse RK4 step, in flow time: off by at most 0.4 mm at the hand in drags around Draw S."""
+COARSE_STEP = 0.25
+"""Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
 COARSE_SPACING = 0.025
 """Distance, metres at the hand, about, up to which neighbouring samples of coarse motions may be apart."""
 TOLERANCE = 3e-9

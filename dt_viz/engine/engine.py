@@ -84,6 +84,8 @@ class Engine:
         self.comparison = Comparison(self.follower, self.memo)
         """Other methods beside ours."""
         self._shown: dict[str, _Shown] = {}
+        self._seconds = 0.0
+        """Time that the frames of a scenario have taken so far, seconds."""
         self._yielded: Solved | None = None
         """The motion of the frame that was yielded last; where that is blocked, the one before."""
 
@@ -114,9 +116,11 @@ class Engine:
         for panel in scenario.view.panels:
             if panel.task:
                 self._imitated(panel, progress)
-        began = time.perf_counter()
+        self._seconds, began = 0.0, time.perf_counter()
         for frame in self._stages(scenario, cancelled):
-            yield replace(frame, seconds=time.perf_counter() - began)
+            self._seconds += time.perf_counter() - began
+            yield replace(frame, seconds=self._seconds)
+            began = time.perf_counter()
 
     def nominal(self, scenario: Scenario, progress: Progress | None = None) -> Nominal:
         """The undisturbed motion of a scenario, from all of its starts; see `frames`."""
@@ -190,7 +194,7 @@ class Engine:
 
         Where that is blocked it stays with the motion that is shown, and gives way to what is in its way now.
         """
-        solved = self._yielded
+        began, solved = time.perf_counter(), self._yielded
         if frame.blocked:
             solved = replace(self._shown[frame.scenario.task].newest, scenario=frame.scenario.motion)
         assert solved is not None
@@ -198,6 +202,7 @@ class Engine:
             self.arm.follow(solved, frame.chosen)
         except UnreachableError:
             self.arm.stop()
+        self._seconds += time.perf_counter() - began
 
     def _learned(self, scenario: Scenario, progress: Progress | None) -> Learned:
         task = self.task(scenario.task)

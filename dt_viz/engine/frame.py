@@ -117,7 +117,7 @@ class Frame:
     comparison: tuple[Compared, ...] = ()
     """Ours and the methods beside it, as far as the view shows any; none before stage LIVE."""
     seconds: float = 0.0
-    """Time from the start of the rebuild until this frame."""
+    """Time that it took to compute, with the frames before it and what the robot was given, without waits, seconds."""
 
     @property
     def slice(self) -> Slice:
