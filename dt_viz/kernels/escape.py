@@ -319,8 +319,10 @@ def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
     n, h, at, start, slopes = q.shape[1], duration / steps, block.q, block.start, block.sum
     velocity = block.velocity
     for first in range(0, len(rows), LANES):
-        num = load(block, q, rows, first)
+        num, moves = load(block, q, rows, first), True
         for step in range(steps):
+            if not moves:
+                break
             for i in range(n):
                 for lane in range(LANES):
                     start[i, lane] = at[i, lane]
@@ -331,7 +333,7 @@ def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
                         for i in range(n):
                             velocity[i, lane] = v[rows[first + min(lane, num - 1)], i]
                 else:
-                    _find_velocity(escape, block)
+                    moves = _find_velocity(escape, block)
                 for i in range(n):
                     for lane in range(LANES):
                         slopes[i, lane] += weight * velocity[i, lane]
