@@ -66,5 +66,5 @@ class Cores:
         self._free, self._free_for[refines] = self._free - num, self._free_for[refines] - num
 
     def _is_next(self, place: tuple[bool, int]) -> bool:
-        able = (other for other in self.queue if self._free_for[other[0]] > 0)
-        return self._free > 0 and place == min(able, default=None)
+        refines, _ = place
+        return place == min(self.queue) and self._free > 0 and self._free_for[refines] > 0
