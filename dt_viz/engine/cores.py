@@ -11,8 +11,7 @@ from contextlib import contextmanager
 from dt_viz.errors import Cancelled, end_if, never
 
 NUM_HANDS = 1
-"""Number of hands that are followed at once. Two fight for the interpreter: eight tabs on two cores get 5.2 pictures a
-second each instead of 7.1."""
+"""Number of hands that are followed at once."""
 LOOK = 0.02
 """Interval at which a refinement that waits asks whether it is still wanted, seconds."""
 
