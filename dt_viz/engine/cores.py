@@ -11,8 +11,7 @@ from contextlib import contextmanager
 from dt_viz.errors import Cancelled, end_if, never
 
 NUM_HANDS = 1
-"""Number of hands that are followed at once. Two fight for the interpreter: eight tabs on two cores get 5.2 pictures a
-second each instead of 7.1."""
+"""Number of hands that are followed at once."""
 LOOK = 0.02
 """Interval at which a refinement that waits asks whether it is still wanted, seconds."""
 
@@ -66,5 +65,5 @@ class Cores:
         self._free, self._free_for[refines] = self._free - num, self._free_for[refines] - num
 
     def _is_next(self, place: tuple[bool, int]) -> bool:
-        able = (other for other in self.queue if self._free_for[other[0]] > 0)
-        return self._free > 0 and place == min(able, default=None)
+        refines, _ = place
+        return place == min(self.queue) and self._free > 0 and self._free_for[refines] > 0

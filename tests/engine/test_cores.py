@@ -95,13 +95,15 @@ def test_all_slots_serve_hands(crowd):
 
 
 @pytest.mark.parametrize("crowd", [[2, 1]], indirect=True)
-def test_hands_may_have_fewer_slots_and_then_keep_no_refinement_waiting(crowd):
+def test_a_refinement_begins_beside_a_hand_but_not_while_another_one_waits(crowd):
     for name in "abC":
         crowd.come(name)
-    assert crowd.order == ["a", "C"]
-    crowd.come("D")
-    crowd.go("a", "b", "C")
-    assert crowd.order == ["a", "C", "b", "D"]
+    assert crowd.order == ["a"]
+    crowd.go("a")
+    assert crowd.order == ["a", "b", "C"]
+    crowd.go("b")
+    crowd.come("d")
+    assert crowd.order[-1] == "d"  # beside the refinement
 
 
 @pytest.mark.parametrize("crowd", [[1], [2]], indirect=True)
