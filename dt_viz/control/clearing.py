@@ -28,7 +28,7 @@ NUM_COMPARED = 16
 each is then compared with several places of the obstacle."""
 STEP = 0.05
 """Flow time between two looks at the clearance."""
-COARSE_STEP = 0.1
+COARSE_STEP = 0.2
 """Length of a Runge–Kutta step, in flow time."""
 BEYOND = 0.03
 """Reach of the field beyond the margin, metres, at least."""

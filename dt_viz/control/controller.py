@@ -27,7 +27,6 @@ from dt_viz.control.dodging import Dodge
 from dt_viz.control.limits import AccelerationLimit, ContactLimit, ObstacleLimit, RangeLimit, VelocityLimit
 from dt_viz.control.obstacle_motion import NOTHING_SEEN, STALE
 from dt_viz.control.settings import ControllerSettings
-from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
@@ -122,6 +121,8 @@ class Controller:
         """Where the robot was sent."""
         self._at = self._velocity = np.zeros(NUM_JOINTS)
         """Where it was to be, rad, and its velocity, rad/s."""
+        self._made_for: tuple[Course, Clearing, float, float] | None = None
+        """Course, flow, duration and clock that it was to be there for."""
         self._clearing, self._duration = Clearing(), 0.0
         self._looked, self._changed = -np.inf, True
         """Time of the last look at obstacles, and whether something has changed since."""
@@ -254,10 +255,9 @@ class Controller:
                 self._moved_to(q)
             self._watch()
             self._ease(dt)
-            course, transform = self._begun, self._clearing.transform(self._arm, self._duration)
-            now = self._target(transform)
+            course, now = self._begun, self._target()
             self._advance(float(np.abs(now - q).max()), dt)
-            self._at = then = self._target(transform)
+            then = self._target()
             self._velocity = self._feasible(q, (then - now) / dt + min(self.settings.gain, 0.5 / dt) * (now - q), dt)
             self._q = q + dt * self._velocity
             self._settle(course)
@@ -374,10 +374,14 @@ class Controller:
         rise = self._clearing.duration - self._duration
         self._duration += min(max(rise, -self.settings.easing * dt), 2 * self.settings.easing * dt)
 
-    def _target(self, transform: Diffeomorphism) -> Array:
+    def _target(self) -> Array:
         """The posture (6,) where the robot is to be at this time of the course."""
-        q = self._begun.at(self._clock)
-        return transform.inverse(self._arm.limits.inside(q)[None])[0] if self._duration > 0 else q
+        made_for = self._begun, self._clearing, self._duration, self._clock
+        if made_for != self._made_for:
+            q, transform = self._begun.at(self._clock), self._clearing.transform(self._arm, self._duration)
+            self._at = transform.inverse(self._arm.limits.inside(q)[None])[0] if self._duration > 0 else q
+            self._made_for = made_for
+        return self._at
 
     def _advance(self, gap: float, dt: float) -> None:
         """Move the clock on, at a rate that falls with the gap (rad) between the robot and its target."""

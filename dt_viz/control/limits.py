@@ -138,8 +138,13 @@ class ContactLimit:
     def rows(self, q: Array, kept: Array, dt: float) -> tuple[Array, Array]:
         """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,) where distances (M,) are kept."""
         apart, slopes = self._contacts(q)
-        near, bounds = _barrier(apart - kept, slopes, self.gain, dt)
-        return slopes[near], bounds
+        h = apart - kept
+        # the others do not come near enough, however fast the joints are
+        (able,) = (min(self.gain, STEADIEST / dt) * h < np.abs(slopes) @ self.robot.velocity_limits).nonzero()
+        if not len(able):
+            return slopes[able], h[able]
+        near, bounds = _barrier(h[able], slopes[able], self.gain, dt)
+        return slopes[able[near]], bounds
 
     def _contacts(self, q: Array) -> tuple[Array, Array]:
         apart, slopes = contacts(self.robot.records, self.body.records, self.pairs, q)
