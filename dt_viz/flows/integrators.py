@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dt_viz.flows.fields import Array, CompiledField, PointField, VectorField
-from dt_viz.kernels.dormand_prince import ERROR, ROUNDING, SHORT, STAGES, first_step, next_step
+from dt_viz.kernels.dormand_prince import ERROR, ROUNDING, SHORT, STAGES, first_step
 from dt_viz.kernels.flows import DORMAND_PRINCE, EULER, IMPLICIT_EULER, RK4, TANGENT_TOLERANCE
 
 Step = Callable[[VectorField, Array, "Array | None", float], "tuple[Array, Array | None]"]
@@ -69,8 +69,7 @@ def integrate_adaptive(
     Every point has its own step length. The estimated error of a step is at most `tolerance` (in the unit of `s`) for
     the points, less in proportion where the motion is shorter than `SHORT`, and at most `TANGENT_TOLERANCE` for the
     tangents. The first step is short where the field changes quickly along it, because the estimated error of a step
-    that is far too long may be small by chance. For fields that have no compiled loop this is a plain one, in which all
-    points take the steps of the strictest.
+    that is far too long may be small by chance.
 
     Raises:
         ArithmeticError: if some point needs more than `max_rounds` steps.
@@ -81,38 +80,44 @@ def integrate_adaptive(
         return field.carried(s, U, DORMAND_PRINCE, duration, max_rounds, tolerance)
     if U is None and isinstance(field, CompiledField):
         return field.dormand_prince(s, duration, tolerance, max_rounds), None
-    total, d = abs(duration), s.shape[1]
+    total, sign, d = abs(duration), np.sign(duration), s.shape[1]
     state, rate = _augment(field, s, U)
-    first, left = rate(state), total
+    result, first = state.copy(), rate(state)
+    # of each point that has not arrived: its row, state, rate, time left, and length of the next step
+    active = np.flatnonzero(first.any(axis=1))
+    start, first, left = state[active], first[active], np.full(len(active), total)
     # how quickly velocities change is seen at the end of an Euler step, no longer than the tolerance
-    speed = max(float(np.abs(first[:, :d]).max()), ROUNDING)
-    ahead = min(total, tolerance / speed)
-    there = field(state[:, :d] + np.sign(duration) * ahead * first[:, :d])
-    turning = float((np.abs(there - first[:, :d]).max(axis=1) / np.abs(first[:, :d]).max(axis=1).clip(ROUNDING)).max())
-    h = first_step(speed, turning / ahead, total, tolerance)
+    speed = np.abs(first[:, :d]).max(axis=1, initial=0).clip(ROUNDING)
+    ahead = np.minimum(total, tolerance / speed)
+    there = field(start[:, :d] + sign * ahead[:, None] * first[:, :d])
+    turning = np.abs(there - first[:, :d]).max(axis=1, initial=0) / (ahead * speed)
+    h = np.array([first_step(v, w, total, tolerance) for v, w in zip(speed, turning, strict=True)])
     for _ in range(max_rounds):
-        step, end = np.sign(duration) * h, state
-        stages = np.empty((len(STAGES), *state.shape))
+        if not len(active):
+            return _split(result, s, U)
+        step, end = sign * h[:, None], start
+        stages = np.empty((len(STAGES), *start.shape))
         stages[0] = first
         for i, row in enumerate(STAGES[1:], start=1):
             # the last stage point is the fifth-order result: first same as last
-            end = state + step * _combined(row[:i], stages[:i])
+            end = start + step * _combined(row[:i], stages[:i])
             stages[i] = rate(end)
         defect = step * _combined(ERROR, stages)
         # beside a rest point a small error is large relative to the motion, and grows with it
-        motion = np.abs(end - state)[:, :d].max(axis=1)
-        error = float(
-            (np.abs(defect[:, :d]).max(axis=1) / (tolerance / SHORT * motion).clip(ROUNDING, tolerance)).max()
-        )
+        motion = np.abs(end - start)[:, :d].max(axis=1)
+        error = np.abs(defect[:, :d]).max(axis=1) / (tolerance / SHORT * motion).clip(ROUNDING, tolerance)
         if U is not None:
             largest = np.maximum(np.abs(end[:, d:]).max(axis=1), np.finfo(float).tiny)
-            error = max(error, float((np.abs(defect[:, d:]).max(axis=1) / (TANGENT_TOLERANCE * largest)).max()))
-        if error <= 1:
-            state, first, left = end, stages[-1], left - h
-        if left <= total * 1e-12:
-            return _split(state, s, U)
-        h = min(next_step(h, error), left)
-    raise ArithmeticError(f"some points need more than {max_rounds} steps: the field is too steep for them")
+            error = np.maximum(error, np.abs(defect[:, d:]).max(axis=1) / (TANGENT_TOLERANCE * largest))
+        accepted = error <= 1
+        start = np.where(accepted[:, None], end, start)
+        first = np.where(accepted[:, None], stages[-1], first)
+        left = left - accepted * h
+        h = np.minimum(h * np.clip(0.9 * np.maximum(error, 1e-10) ** -0.2, 0.1, 5.0), left)
+        going = left > total * 1e-12
+        result[active[~going]] = start[~going]
+        active, start, first, left, h = (values[going] for values in (active, start, first, left, h))
+    raise ArithmeticError(f"{len(active)} points need more than {max_rounds} steps: the field is too steep for them")
 
 
 METHODS: dict[Step, int] = {euler: EULER, rk4: RK4, implicit_euler: IMPLICIT_EULER}
