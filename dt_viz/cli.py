@@ -13,10 +13,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from dt_viz.evaluate.__main__ import main as evaluate
 from dt_viz.ui.logs import Terse
 from dt_viz.ui.origins import Origin, OriginError
+
+if TYPE_CHECKING:
+    from dt_viz.learning.store import FitStore
+    from dt_viz.scenario.tasks import Task
 
 MAX_PORT = 65535
 PROG = "dt-viz"
@@ -48,7 +53,6 @@ def _serve(options: argparse.Namespace) -> int:
     from dt_viz.folders import default_cache_folder  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
     from dt_viz.learning.store import FitStore  # noqa: PLC0415
-    from dt_viz.obstacles.shapes import unit_sphere_map  # noqa: PLC0415
     from dt_viz.scenario.tasks import known_tasks  # noqa: PLC0415
     from dt_viz.ui.gate import GateError  # noqa: PLC0415
     from dt_viz.ui.server import AddressError, Server  # noqa: PLC0415
@@ -62,13 +66,12 @@ def _serve(options: argparse.Namespace) -> int:
             print(f"{PROG}: --task: found {options.task!r}; accepted: {', '.join(tasks)}", file=sys.stderr)
             return 2
         fits = FitStore(default_cache_folder())
-        for name in tasks if options.prepare_all else (options.task,):
-            task = tasks[name]()
-            fits.get(task.demonstrations, progress=_Bar(f"Learning {task.title}"))
-            if options.prepare_all:
-                print(f"Ready: {task.title}", flush=True)
-        unit_sphere_map()
+        first = tasks[options.task]()
         if options.prepare_all:
+            for name in tasks:
+                task = tasks[name]()
+                fits.get(task.demonstrations, progress=_Bar(f"Learning {task.title}"))
+                print(f"Ready: {task.title}", flush=True)
             _compile(threading.Event())
         server = Server(
             tasks,
@@ -85,14 +88,14 @@ def _serve(options: argparse.Namespace) -> int:
     host = f"[{server.host}]" if ":" in server.host else server.host
     print(f"DT-Viz is at http://{host}:{server.port} (Ctrl-C stops it)", flush=True)
     leaving = threading.Event()
-    compiling = threading.Thread(target=_compile, args=(leaving,), name="compiling")
-    compiling.start()
+    preparing = threading.Thread(target=_prepare, args=(fits, first, leaving), name="preparing")
+    preparing.start()
     try:
         server.wait()
     finally:
         leaving.set()
         server.close()
-        compiling.join()
+        preparing.join()
 
 
 @contextmanager
@@ -177,6 +180,27 @@ class _Bar:
         print(f"\r{self._title}: {100 * fraction:3.0f} % {message:<40}", end="", flush=True)
         if fraction >= 1:
             print()
+
+
+def _prepare(fits: FitStore, task: Task, leaving: threading.Event) -> None:
+    """Learn the first task and compile what a drag repeats, beside the server, which answers meanwhile."""
+    from dt_viz.errors import UnwantedError  # noqa: PLC0415
+    from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
+
+    bar = _Bar(f"Learning {task.title}")
+
+    def progress(fraction: float, message: str) -> None:
+        if leaving.is_set():
+            raise UnwantedError
+        bar(fraction, message)
+
+    try:
+        fits.get(task.demonstrations, progress=progress)
+        _compile(leaving)
+    except UnwantedError:
+        pass
+    except ImitationError as error:
+        print(f"{PROG}: {error}", file=sys.stderr)
 
 
 def _compile(leaving: threading.Event) -> None:

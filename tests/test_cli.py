@@ -88,6 +88,7 @@ def test_a_signal_ends_it_cleanly_while_visitors_drag(cache, number):
 
 def test_a_signal_ends_it_cleanly_while_it_learns(tmp_path):
     with started(tmp_path) as process:
+        address(process)  # it answers meanwhile
         assert process.stdout is not None
         assert "Learn" in process.stdout.read(8)
         process.terminate()
