@@ -130,16 +130,24 @@ def put(offset: Array, joint: int, block: Record) -> None:
 
 
 @compiled
-def measure(shape: Record, values: Values, radius: float, block: Record) -> None:
-    """Find the distance of a sphere about the place from an obstacle."""
+def measure(shape: Record, values: Values, radius: float, enough: float, block: Record) -> None:
+    """Find the distance of a sphere about the place from an obstacle; from `enough` on, any not larger one will do."""
     place, away, kind = block.place, block.away, shape.kind
-    if kind == GRID:
-        for lane in range(LANES):
-            away[lane] = distance(shape, values, place[0, lane], place[1, lane], place[2, lane]) - radius
-        return
     X, Y, Z = shape.position
     half_u, half_v, half_w = shape.half
     axes = shape.axes
+    if kind == GRID:
+        u, v, w = shape.scale * shape.centre[0], shape.scale * shape.centre[1], shape.scale * shape.centre[2]
+        X += axes[0, 0] * u + axes[0, 1] * v + axes[0, 2] * w
+        Y += axes[1, 0] * u + axes[1, 1] * v + axes[1, 2] * w
+        Z += axes[2, 0] * u + axes[2, 1] * v + axes[2, 2] * w
+        for lane in range(LANES):  # from the ball that holds what the grid encloses
+            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
+            away[lane] = np.sqrt(x * x + y * y + z * z) - shape.scale * shape.radius - radius
+        for lane in range(LANES):
+            if away[lane] < enough:
+                away[lane] = distance(shape, values, place[0, lane], place[1, lane], place[2, lane]) - radius
+        return
     a, b, c, d, e, f = axes[0, 0], axes[1, 0], axes[2, 0], axes[0, 1], axes[1, 1], axes[2, 1]
     g, h, i = axes[0, 2], axes[1, 2], axes[2, 2]
     if kind == SPHERE:
@@ -189,7 +197,10 @@ def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values
         for p in range(len(points)):
             put(points[p].offset, points[p].joint, block)
             for k in range(len(shapes)):
-                measure(shapes[k], values, points[p].radius, block)
+                most = nearest[0]
+                for lane in range(LANES):
+                    most = nearest[lane] if nearest[lane] > most else most
+                measure(shapes[k], values, points[p].radius, most, block)
                 for lane in range(LANES):
                     nearest[lane] = away[lane] if away[lane] < nearest[lane] else nearest[lane]
         for lane in range(num):

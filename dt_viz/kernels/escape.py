@@ -107,7 +107,7 @@ def _touch(escape: Escape, k: int, block: Record) -> bool:
     for p in range(len(points)):
         joint = points[p].joint
         put(points[p].offset, joint, block)
-        measure(shape, escape.values, points[p].radius, block)
+        measure(shape, escape.values, points[p].radius, reach, block)
         num_near = 0
         for lane in range(LANES):
             num_near += away[lane] < reach
