@@ -13,7 +13,7 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
-from dt_viz.obstacles.ways import remembered
+from dt_viz.obstacles.ways import remembered, travel
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.transforms.base import start_warnings
 from dt_viz.warning import ARM, Kind, MotionWarning
@@ -75,7 +75,7 @@ def solve(
     scenario, avoidance = replace(scenario, warp=1.0), scenario.arm_avoidance
     if avoidance is None or avoidance.duration is not None:
         return _solved(scenario, nominal, precision, follower, before)
-    if precision is LIVE and before is not None and goes_on(scenario, before):
+    if precision is LIVE and before is not None and _is_dragged(scenario, before):
         return _solved(scenario, _as_many(nominal, before), precision, follower, before, follows=True)
     solved = _with_a_way(scenario, nominal, follower, before)
     if precision is not LIVE:
@@ -123,6 +123,15 @@ def goes_on(scenario: Scenario, before: Solved) -> bool:
     if before.arm is None or scenario.arm_avoidance is None:
         return False
     return any(remembered(before.arm.ways, scenario.arm_avoidance.obstacle.parts))
+
+
+def _is_dragged(scenario: Scenario, before: Solved) -> bool:
+    """Whether an obstacle that the arm was avoiding has moved a little since."""
+    if not goes_on(scenario, before) or before.arm is None or scenario.arm_avoidance is None:
+        return False
+    parts = scenario.arm_avoidance.obstacle.parts
+    known = zip(remembered(before.arm.ways, parts), parts, strict=True)
+    return any(way is not None and travel(way.obstacle, part) > 0 for way, part in known)
 
 
 def _as_many(nominal: Nominal, before: Solved) -> Nominal:

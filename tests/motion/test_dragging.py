@@ -208,3 +208,18 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
                 if way is not None and last is not None:
                     assert way.direction @ last.direction > np.cos(1.1 * TURNING * 1e-3 / ball.radius)
         before, stance = arm, engine.solved(scenario, LIVE).nominal.stance
+
+
+def test_after_a_drag_other_settings_act_at_once(new_engine, initial):
+    engine, task = new_engine(), "push_box"
+    through = engine.task(task).mean_path[45]
+    for step in (0.0, 1e-3):
+        ball = Sphere(as_point(through + np.array([0, 0, step])), 0.15)
+        scenario = changed(initial(task), obstacles=ball, space="cspace", view=NOTHING_DRAWN)
+        frame_at(engine, scenario, Stage.LIVE)
+    wider = changed(scenario, margin=0.04)
+    before = engine.solved(scenario, LIVE).arm
+    frame_at(engine, wider, Stage.LIVE)
+    after = engine.solved(wider, LIVE).arm
+    assert ways(engine.solved(scenario, LIVE)).kept and after.cleared
+    assert after.duration > before.duration + 0.05
