@@ -187,11 +187,13 @@ class ArmAvoidance:
 
 @lru_cache(maxsize=64)
 def axes_of(plane: tuple[Point, Point] | None) -> Array:
-    """Return orthonormal columns (3, 3), those of a plane first, if there is one."""
-    if plane is None:
-        return np.eye(3)
-    u, v = np.asarray(plane)
-    return np.stack([u, v, np.cross(u, v)], axis=1)
+    """Return orthonormal columns (3, 3), read only, those of a plane first, if there is one."""
+    axes = np.eye(3)
+    if plane is not None:
+        axes[:, 0], axes[:, 1] = plane
+        axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    axes.flags.writeable = False
+    return axes
 
 
 _Transform = TypeVar("_Transform", bound="Transform")
