@@ -8,7 +8,6 @@ import pytest
 from pages import all_of
 
 from dt_viz.scenario.scenario import Scenario, View
-from dt_viz.ui.scene.camera import window
 from dt_viz.ui.visitor import Visitor
 
 PATIENCE = 240.0
@@ -93,8 +92,11 @@ def begin(visitor: Visitor, scenario: Scenario) -> None:
     assert visitor.shown is not None and visitor.shown.scenario.moves_like(scenario)
 
 
-def project(visitor: Visitor, point) -> tuple[float, float]:
-    """CSS pixels of a world point: the camera looks along its z axis, y down, vertical field of view."""
+def project(page, visitor: Visitor, point) -> tuple[float, float]:
+    """CSS pixels of a world point: the camera looks along its z axis, y down, vertical field of view.
+
+    The window's size is the browser's own: viser's page tells that of its picture, which is smaller while it is slow.
+    """
     camera = visitor.client.camera
     w, x, y, z = camera.wxyz
     rotation = np.array(
@@ -105,7 +107,7 @@ def project(visitor: Visitor, point) -> tuple[float, float]:
         ]
     )
     seen = rotation.T @ (np.asarray(point) - camera.position)
-    width, height = window(camera)
+    width, height = page.viewport_size["width"], page.viewport_size["height"]
     focal = height / 2 / np.tan(camera.fov / 2)
     return width / 2 + focal * seen[0] / seen[2], height / 2 + focal * seen[1] / seen[2]
 

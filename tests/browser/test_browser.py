@@ -101,9 +101,9 @@ def camera_rests(visitor: Visitor) -> bool:
     return bool(np.abs(np.asarray(camera.position) - wanted).max() < 1e-3)
 
 
-def seen_at(visitor: Visitor) -> tuple[float, float]:
+def seen_at(page, visitor: Visitor) -> tuple[float, float]:
     """CSS pixels of the obstacle."""
-    return project(visitor, visitor.session.scenario.obstacles[0].position)
+    return project(page, visitor, visitor.session.scenario.obstacles[0].position)
 
 
 def drag_until(page, visitor, done, reset, ends):
@@ -139,7 +139,7 @@ def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
     before = visitor.shown
     centre = np.array(visitor.session.scenario.obstacles[0].position)
     tip = centre + np.array([0, 0, 0.8 * visitor.pictures.obstacles.items[0].gizmo.scale])
-    drag(page, project(visitor, tip), project(visitor, tip + np.array([0, 0, 0.06])))
+    drag(page, project(page, visitor, tip), project(page, visitor, tip + np.array([0, 0, 0.06])))
     wait_until(lambda: visitor.session.scenario.obstacles[0].position[2] > centre[2] + 0.03, "the drag to arrive")
     assert visitor.session.wait_idle(PATIENCE)
     moved = np.array(visitor.session.scenario.obstacles[0].position) - centre
@@ -157,7 +157,7 @@ def test_dragging_the_gizmo_moves_the_rollouts_clear_of_the_obstacle(visit):
 def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_pose_is_shown(visit):
     page, visitor = visit
     centre = np.array(visitor.session.scenario.obstacles[0].position)
-    x, y = project(visitor, centre)
+    x, y = project(page, visitor, centre)
     session = visitor.session
     for target in ((x + 40, y - 30), (x - 50, y + 20)):
         (here,) = session.scenario.obstacles
@@ -171,7 +171,7 @@ def test_dragging_the_sphere_itself_moves_it_in_the_drawing_plane_and_the_last_p
             return np.linalg.norm(shift) > 0.02 and abs(shift[1]) < 1e-6
 
         def ends(target=target):
-            return np.add(seen_at(visitor), (-18, 14)), target
+            return np.add(seen_at(page, visitor), (-18, 14)), target
 
         drag_until(page, visitor, followed, put_back, ends)
     assert session.wait_idle(PATIENCE)
@@ -222,7 +222,7 @@ def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
     def along_the_arc():
         grabbed = next(angles)
         turns = [np.array([np.cos(angle), 0.0, np.sin(angle)]) for angle in (grabbed, grabbed - 0.7)]
-        return [project(visitor, mesh.position + arc * turn) for turn in turns]
+        return [project(page, visitor, mesh.position + arc * turn) for turn in turns]
 
     def turn_back():
         session.edit("test", **changing(session.scenario, obstacles=(mesh,)))
@@ -356,7 +356,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
     before = visitor._hand()
 
     def from_the_ball():
-        x, y = project(visitor, before)
+        x, y = project(page, visitor, before)
         return (x, y), (x - 50, y - 40)
 
     drag_until(page, visitor, lambda: np.linalg.norm(visitor._hand() - before) > 0.02, lambda: None, from_the_ball)
@@ -365,7 +365,7 @@ def test_the_hand_is_dragged_in_a_pause_and_goes_on_to_the_goal_when_it_is_let_g
     hand = visitor._hand()
     assert np.linalg.norm(hand - before) > 0.05
     assert abs(hand[1] - before[1]) < 5e-3  # parallel to the drawing plane, y = const
-    np.testing.assert_allclose(project(visitor, hand), from_the_ball()[1], atol=12)
+    np.testing.assert_allclose(project(page, visitor, hand), from_the_ball()[1], atol=12)
     assert np.linalg.norm(live.ahead[0] - hand) < 0.02  # from here on
     session.edit("play", view=replace(LIGHT, arm=True, playing=True, speed=3.0))
     wait_until(lambda: np.linalg.norm(visitor._hand() - visitor.shown.goal) < 5e-3, "the goal")

@@ -92,7 +92,7 @@ def test_methods_are_ticked_followed_and_shown_with_their_arm(opened, initial):
 
     for _ in range(TRIES):  # a page drawn by software may not show the sphere in its place yet
         until_drawn(visitor)
-        x, y = project(visitor, visitor.session.scenario.obstacles[0].position)
+        x, y = project(page, visitor, visitor.session.scenario.obstacles[0].position)
         drag(page, (x, y), (x, y - SIZE[1] / 6))
         time.sleep(0.5)
         if np.ptp([visitor.session.scenario.obstacles[0].position[2], sphere.position[2]]) > 0.05:
