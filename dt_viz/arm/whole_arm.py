@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.sparse.csgraph import connected_components
 
 from dt_viz.arm.body_points import BodyPoints
@@ -36,6 +35,7 @@ from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import dodge
 from dt_viz.kernels.proximity import contacts, proximity
+from dt_viz.kernels.splines import cubics
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
@@ -116,8 +116,8 @@ class Lift:
     @cached_property
     def _splines(self) -> tuple[Array, Array]:
         """Fractions (R, T − 1) at which the cubics begin, and their coefficients (4, R·(T − 1), 6)."""
-        curves = [CubicSpline(u, q) for u, q in zip(self.fractions, self.tracked.q, strict=True)]
-        return self.fractions[:, :-1], np.concatenate([curve.c for curve in curves], axis=1)
+        coefficients = cubics(np.array(self.fractions, order="C"), np.array(self.tracked.q, order="C"))
+        return self.fractions[:, :-1], coefficients.reshape(4, -1, NUM_JOINTS)
 
     def at(self, index: Indices, fraction: Array) -> Array:
         """Configurations (N, 6), rad, of the rollouts `index` (N,) at the fractions `fraction` (N,)."""
@@ -226,6 +226,7 @@ class WholeArm:
             lambda: self.robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
             lambda: track(self.robot, self.robot.end_effector(q)[:, None], q, reference=q),
+            lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, NUM_JOINTS))),
             lambda: room_asked(q, q, np.zeros(1), LEVERS, SLOPE, 0.0),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy()),

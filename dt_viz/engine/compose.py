@@ -28,7 +28,6 @@ from dt_viz.pictures.panels import PanelPicture, generator_panel, system_panel
 from dt_viz.pictures.sketchbook import BASE_TITLE, Pictures, Sketchbook, in_frame
 from dt_viz.pictures.slice_fields import (
     ARROW_SPACING,
-    FieldPicture,
     Samples,
     arrows_and_colour,
     streamlines,
@@ -211,11 +210,19 @@ def rest(scenario: Scenario, solved: Solved) -> Array:
     return held
 
 
-def field(scenario: Scenario, solved: Solved) -> FieldPicture:
-    """The hand's velocities on the view's slice, of the whole stack below the arm's avoidance."""
+def lattice(scenario: Scenario, solved: Solved) -> Array:
+    """Places (M, 3) of the arrows on the view's slice, metres."""
+    return solved.below.task.slice.posed(scenario.view.slice).grid(ARROW_SPACING).reshape(-1, 3)
+
+
+def velocities(scenario: Scenario, solved: Solved) -> Array:
+    """The hand's velocities (M, 3) at the lattice, m/s, of the whole stack below the arm's avoidance; else NaN."""
     area = solved.below.task.slice.posed(scenario.view.slice)
     clearance = _avoided(solved.stack.built).signed_distance
-    return Samples(solved.stack.at_phase(rest(scenario, solved)), area, clearance, ARROW_SPACING, jacobian=False).field
+    samples = Samples(solved.stack.at_phase(rest(scenario, solved)), area, clearance, ARROW_SPACING, jacobian=False)
+    spread = np.full(samples.grid.shape, np.nan)
+    spread[samples.free] = samples.velocities
+    return spread.reshape(-1, 3)
 
 
 def _panels(

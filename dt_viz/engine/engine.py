@@ -28,7 +28,7 @@ from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower
 from dt_viz.motion.nominal import Learned, Nominal
 from dt_viz.motion.solve import Solved, goes_on, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
-from dt_viz.pictures.arm_field import LiftedField
+from dt_viz.pictures.arm_field import Lattice
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
 from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.scenario import Layer, Scenario
@@ -352,20 +352,22 @@ class Engine:
         pictures = compose.pictures(scenario, solved, books, arrows=view.field and not carried, coarse=coarse)
         if arm is None or not carried:
             return pictures
-        robot, reference, rest = (
-            self.follower.robot,
-            self.follower.reference(solved.nominal),
-            compose.rest(scenario, solved),
-        )
+        robot, reference = self.follower.robot, self.follower.reference(solved.nominal)
+        rest, layers = compose.rest(scenario, solved), tuple(layer for _, layer in scenario.active)
         made_for = solved.below if solved.stack.built or scenario.warp < 1 else solved.below.learned
-        layers = tuple(layer for _, layer in scenario.active)
-        lifted = self.memo(
-            "lifted field",
-            (made_for, layers, view.slice, rest.tobytes(), reference.tobytes()),
-            lambda: LiftedField.of(compose.field(scenario, solved), robot, reference),
+        lattice = self.memo(
+            "lattice",
+            (scenario.task, view.slice, reference.tobytes()),
+            lambda: Lattice.of(compose.lattice(scenario, solved), robot, reference),
             newest=2,
         )
-        return replace(pictures, field=lifted.around(arm.transform, robot, scenario.obstacle))
+        velocities = self.memo(
+            "velocities",
+            (made_for, layers, view.slice, rest.tobytes()),
+            lambda: compose.velocities(scenario, solved),
+            newest=2,
+        )
+        return replace(pictures, field=lattice.carried(velocities, arm.transform, robot, scenario.obstacle))
 
     def _book(self, learned: Learned, rest: Array) -> Sketchbook:
         """The maker of pictures of ψ, at one phase and for one condition."""

@@ -14,53 +14,58 @@ from dt_viz.arm.cspace import JointLimits
 from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.arm.tracking import track
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.slice_fields import FieldPicture
 
 STEP = 4e-3
-"""Length of the step along an arrow that its derivative is taken from, metres."""
+"""Length of the steps that derivatives are taken from, metres at the hand."""
 MAX_MISS = 1e-3
 """Distance by which the hand may miss a place that still has an arrow, metres."""
 
 
 @dataclass(frozen=True, eq=False)
-class LiftedField:
-    """A field of the hand, and the joints that follow its arrows; it does not depend on what the arm avoids."""
+class Lattice:
+    """Postures that hold the hand at the places where arrows begin: they depend on no motion, and on no obstacle."""
 
+    reached: Mask
+    """(M,) which of the places are within the arm's reach."""
     postures: Array
-    """(N, 2, 6) with the hand at the beginning of each arrow, and a step along it, rad."""
-    seconds: Array
-    """(N,) durations of these steps."""
+    """(N, 6) Q at the reached ones, rad."""
+    derivatives: Array
+    """(N, 6, 3) DQ there, rad/m."""
 
     @classmethod
-    def of(cls, field: FieldPicture, robot: Robot, reference: Array) -> LiftedField:
-        """Follow the arrows that are within the arm's reach.
+    def of(cls, points: Array, robot: Robot, reference: Array) -> Lattice:
+        """Find the postures.
 
         Args:
-            field: the field of the motion below the arm's avoidance.
+            points: (M, 3) places of the hand, metres.
             robot: the arm.
             reference: (6,) posture that it stays near to, rad.
         """
-        speed = np.linalg.norm(field.velocities, axis=1)
-        moving = speed > 0
-        points, velocities, seconds = field.points[moving], field.velocities[moving], STEP / speed[moving]
-        paths = np.stack([points, points + seconds[:, None] * velocities], axis=1)
+        paths = points[:, None] + np.concatenate([np.zeros((1, 3)), STEP * np.eye(3)])
         start = np.broadcast_to(reference, (len(paths), NUM_JOINTS))
         tracked = track(robot, paths, start, reference=start)
         reached = tracked.error.max(axis=1) <= MAX_MISS
-        return cls(tracked.q[reached], seconds[reached])
+        q = tracked.q[reached]
+        return cls(reached, q[:, 0], np.moveaxis(q[:, 1:] - q[:, :1], 1, 2) / STEP)
 
-    def around(self, transform: Diffeomorphism, robot: Robot, obstacle: Union) -> FieldPicture:
-        """Carry the arrows along by the whole arm's avoidance.
+    def carried(self, velocities: Array, transform: Diffeomorphism, robot: Robot, obstacle: Union) -> FieldPicture:
+        """Carry a field's arrows along by the whole arm's avoidance.
 
         Args:
+            velocities: (M, 3) of the motion below the arm's avoidance, m/s; rows of NaN have no arrow.
             transform: ψ_q.
             robot: the arm.
             obstacle: what is avoided: ψ_q was made for the motions, and may leave arrows far from them in it.
         """
-        limits = JointLimits(robot.lower, robot.upper)
-        p = transform.inverse(limits.inside(self.postures.reshape(-1, NUM_JOINTS)))
-        begin, end = np.moveaxis(robot.end_effector(p).reshape(-1, 2, 3), 1, 0)
+        limits, speed = JointLimits(robot.lower, robot.upper), np.linalg.norm(velocities[self.reached], axis=1)
+        moving = speed > 0
+        seconds, ahead = STEP / speed[moving], velocities[self.reached][moving]
+        q = self.postures[moving]
+        step = (self.derivatives[moving] @ (seconds[:, None] * ahead)[..., None])[..., 0]
+        p = transform.inverse(limits.inside(np.concatenate([q, q + step])))
+        begin, end = robot.end_effector(p).reshape(2, -1, 3)
         free = obstacle.signed_distance(begin) > 0
-        return FieldPicture(begin[free], ((end - begin) / self.seconds[:, None])[free])
+        return FieldPicture(begin[free], ((end - begin) / seconds[:, None])[free])

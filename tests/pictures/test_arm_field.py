@@ -9,8 +9,7 @@ from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.union import Union
-from dt_viz.pictures.arm_field import LiftedField
-from dt_viz.pictures.slice_fields import FieldPicture
+from dt_viz.pictures.arm_field import Lattice
 
 
 @pytest.fixture(scope="module", name="scene", params=["draw_s", "lift_box"])
@@ -34,11 +33,10 @@ def test_arrows_are_the_hand_s_velocities_of_the_pulled_back_system(scene):
     engine, scenario, below, _ = scene
     solved, robot = engine.solved(scenario, FINE), engine.follower.robot
     reference = engine.follower.reference(solved.nominal)
-    some = FieldPicture(below.points[::37], below.velocities[::37])
-    lifted = LiftedField.of(some, robot, reference)
-    found = lifted.around(solved.arm.transform, robot, Union(()))
+    lattice = Lattice.of(below.points[::37], robot, reference)
+    found = lattice.carried(below.velocities[::37], solved.arm.transform, robot, Union(()))
     system = ArmSystem(solved.stack.system, Section(robot, reference), solved.arm.transform)
-    p = system.transform.inverse(lifted.postures[:, 0])
+    p = system.transform.inverse(lattice.postures)
     step = 1e-5
     hand = [robot.end_effector(p + sign * step * system.velocity(p)) for sign in (1, -1)]
     expected = (hand[0] - hand[1]) / (2 * step)
@@ -51,11 +49,19 @@ def test_arrows_are_the_hand_s_velocities_of_the_pulled_back_system(scene):
 def test_without_avoidance_the_field_is_the_one_below_where_the_arm_reaches(scene):
     engine, scenario, below, _ = scene
     robot, reference = engine.follower.robot, engine.follower.reference(engine.nominal(scenario))
-    same = LiftedField.of(below, robot, reference).around(Identity(6), robot, Union(()))
+    same = Lattice.of(below.points, robot, reference).carried(below.velocities, Identity(6), robot, Union(()))
     assert len(same.points) == len(below.points)
     np.testing.assert_allclose(same.points, below.points, atol=1e-4)
     np.testing.assert_allclose(same.velocities, below.velocities, atol=0.05 * np.abs(below.velocities).max())
-    away = FieldPicture(np.array([[0.0, -0.5, 0.4], [0.0, -3.0, 0.4]]), np.array([[0.1, 0.0, 0.0]] * 2))
-    assert len(LiftedField.of(away, robot, reference).seconds) == 1
-    still = FieldPicture(below.points[:2], np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
-    assert len(LiftedField.of(still, robot, reference).seconds) == 1
+
+
+def test_there_is_an_arrow_where_the_hand_moves_and_the_arm_reaches(scene):
+    engine, scenario, below, _ = scene
+    robot, reference = engine.follower.robot, engine.follower.reference(engine.nominal(scenario))
+    places = np.array([[0.0, -0.5, 0.4], [0.0, -3.0, 0.4], *below.points[:3]])
+    lattice = Lattice.of(places, robot, reference)
+    assert lattice.reached.tolist() == [True, False, True, True, True]
+    velocities = np.array([[0.1, 0, 0], [0.1, 0, 0], [0, 0, 0], [np.nan] * 3, [0, 0, 0.1]])
+    carried = lattice.carried(velocities, Identity(6), robot, Union(()))
+    np.testing.assert_allclose(carried.points, places[[0, 4]], atol=1e-3)
+    np.testing.assert_allclose(carried.velocities, velocities[[0, 4]], atol=1e-3)
