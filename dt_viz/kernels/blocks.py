@@ -21,13 +21,15 @@ from dt_viz.kernels.distances import (
     Values,
     beyond_edge,
     beyond_faces,
-    distance,
+    weight,
 )
 
 LANES = 16
 """Number of postures in a block."""
 MOST_JOINTS = 8
 """Largest number of joints of an arm."""
+SPREAD = 2.0
+"""Largest difference between a distance on a grid and its nearest node's, in cells, with room to spare."""
 
 
 def block_of(*rows: tuple[str, tuple[int, ...]]) -> np.dtype:
@@ -40,6 +42,11 @@ def block_of(*rows: tuple[str, tuple[int, ...]]) -> np.dtype:
         ("cosine", ()),
         ("place", (3,)),  # of a body point, metres
         ("away", ()),  # its distance from an obstacle, metres
+        ("own", (3,)),  # and place in the frame of a grid, cells
+        ("beyond", (3,)),  # how far that is beyond the grid, cells
+        ("sums", ()),  # weighted sum of its nodes' distances
+        ("corners", (3,)),  # and three of these
+        ("node", ()),  # index of the nearest inner node's first neighbour
     )
     return np.dtype([(name, np.float64, (*shape, LANES)) for name, shape in (*kinematics, *rows)])
 
@@ -137,16 +144,7 @@ def measure(shape: Record, values: Values, radius: float, enough: float, block: 
     half_u, half_v, half_w = shape.half
     axes = shape.axes
     if kind == GRID:
-        u, v, w = shape.scale * shape.centre[0], shape.scale * shape.centre[1], shape.scale * shape.centre[2]
-        X += axes[0, 0] * u + axes[0, 1] * v + axes[0, 2] * w
-        Y += axes[1, 0] * u + axes[1, 1] * v + axes[1, 2] * w
-        Z += axes[2, 0] * u + axes[2, 1] * v + axes[2, 2] * w
-        for lane in range(LANES):  # from the ball that holds what the grid encloses
-            x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
-            away[lane] = np.sqrt(x * x + y * y + z * z) - shape.scale * shape.radius - radius
-        for lane in range(LANES):
-            if away[lane] < enough:
-                away[lane] = distance(shape, values, place[0, lane], place[1, lane], place[2, lane]) - radius
+        _measure_on_grid(shape, values, radius, enough, block)
         return
     a, b, c, d, e, f = axes[0, 0], axes[1, 0], axes[2, 0], axes[0, 1], axes[1, 1], axes[2, 1]
     g, h, i = axes[0, 2], axes[1, 2], axes[2, 2]
@@ -164,6 +162,80 @@ def measure(shape: Record, values: Values, radius: float, enough: float, block: 
             x, y, z = place[0, lane] - X, place[1, lane] - Y, place[2, lane] - Z
             u, v, w = a * x + b * y + c * z, d * x + e * y + f * z, abs(g * x + h * y + i * z)
             away[lane] = beyond_edge(np.sqrt(u * u + v * v) - half_u, w - half_w) - radius
+
+
+@compiled
+def _measure_on_grid(shape: Record, values: Values, radius: float, enough: float, block: Record) -> None:
+    """Do the same for a distance grid; see `dt_viz.kernels.distances`.
+
+    A weighted mean of 27 nodes is read only where neither the ball around the grid's content nor the nearest node tells
+    that the distance is `enough`: distances of nodes change by at most their distance.
+    """
+    place, away, own, beyond, nodes = block.place, block.away, block.own, block.beyond, block.node
+    sums, corners = block.sums, block.corners
+    scale, cell, margin, ball, counts = shape.scale, shape.cell, shape.margin, shape.radius, shape.counts
+    limit, stride = (enough + radius) / scale, counts[2]
+    X, Y, Z = shape.position
+    for k in range(3):
+        a, b, c = shape.axes[0, k] / scale, shape.axes[1, k] / scale, shape.axes[2, k] / scale
+        for lane in range(LANES):
+            own[k, lane] = a * (place[0, lane] - X) + b * (place[1, lane] - Y) + c * (place[2, lane] - Z)
+    X, Y, Z = shape.centre
+    for lane in range(LANES):  # from the ball
+        x, y, z = own[0, lane] - X, own[1, lane] - Y, own[2, lane] - Z
+        away[lane] = np.sqrt(x * x + y * y + z * z) - ball
+    if _least(away) < limit:
+        for lane in range(LANES):
+            nodes[lane] = shape.begin
+        for k in range(3):
+            step = stride if k == 1 else (counts[1] * stride if k == 0 else 1)
+            first, last = shape.first[k], counts[k] - 1.5
+            for lane in range(LANES):
+                t = (own[k, lane] - first) / cell
+                clipped = min(max(t, 0.5), last)
+                node = min(np.floor(clipped + 0.5), last - 0.5)
+                own[k, lane], beyond[k, lane] = clipped - node, t - clipped
+                nodes[lane] += (node - 1) * step
+        middle = (counts[1] + 1) * stride + 1
+        for lane in range(LANES):
+            sums[lane] = values[np.int64(nodes[lane]) + middle]
+        for lane in range(LANES):
+            away[lane] = max(away[lane], sums[lane] - SPREAD * cell)
+    if _least(away) < limit:
+        for lane in range(LANES):
+            sums[lane] = 0
+        for p in range(3):
+            for q in range(3):
+                at = (p * counts[1] + q) * stride
+                for lane in range(LANES):
+                    node = np.int64(nodes[lane]) + at
+                    corners[0, lane], corners[1, lane], corners[2, lane] = (
+                        values[node],
+                        values[node + 1],
+                        values[node + 2],
+                    )
+                for lane in range(LANES):
+                    c = own[2, lane]
+                    row = 0.5 * (0.5 - c) ** 2 * corners[0, lane] + (0.75 - c * c) * corners[1, lane]
+                    row += 0.5 * (0.5 + c) ** 2 * corners[2, lane]
+                    sums[lane] += weight(own[0, lane], p) * weight(own[1, lane], q) * row
+        for lane in range(LANES):
+            value = sums[lane]
+            x, y, z = cell * abs(beyond[0, lane]), cell * abs(beyond[1, lane]), cell * abs(beyond[2, lane])
+            outside, far = x + y + z, max(value, margin)
+            far = np.sqrt(far * far + x * x + y * y + z * z + 2 * margin * outside)
+            away[lane] = max(away[lane], far if outside > 0 else value)
+    for lane in range(LANES):
+        away[lane] = scale * away[lane] - radius
+
+
+@compiled
+def _least(values: Array) -> float:
+    """Smallest of the lanes' values."""
+    least = values[0]
+    for lane in range(LANES):
+        least = values[lane] if values[lane] < least else least
+    return least
 
 
 @short_kernel

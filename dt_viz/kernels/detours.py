@@ -30,26 +30,25 @@ def detours(
         near a ball, each shifted as far as it needs itself, metres.
     """
     shifts, depths = np.zeros(len(directions)), np.zeros(len(directions))
+    u, v, w = directions[:, 0].copy(), directions[:, 1].copy(), directions[:, 2].copy()
     for b in range(len(centres)):
         for p in range(len(points)):
             apart = radii[b] + margin + radius[p]
             for m in range(points.shape[2]):
                 x, y = points[p, 0, m] - centres[b, 0], points[p, 1, m] - centres[b, 1]
                 z = points[p, 2, m] - centres[b, 2]
-                squared = x * x + y * y + z * z
-                if squared >= (apart + 2 * length) ** 2:
+                room = x * x + y * y + z * z - apart * apart
+                if room >= 4 * length * (apart + length):
                     continue
                 lowest = points[p, 2, m] - radius[p]
-                for d in range(len(directions)):
+                for d in range(len(u)):
                     # along the direction it meets the ball, grown by `apart`, at −along ± root
-                    along = directions[d, 0] * x + directions[d, 1] * y + directions[d, 2] * z
-                    under_root, shift = along * along - squared + apart * apart, 0.0
-                    if under_root > 0:
-                        root = np.sqrt(under_root)
-                        if root > along and -along - root < length:
-                            shift = root - along
+                    along = u[d] * x + v[d] * y + w[d] * z
+                    root = np.sqrt(max(along * along - room, 0.0))
+                    in_the_way = (root > along) & (along + root > -length) & (along * along > room)
+                    shift = root - along if in_the_way else 0.0
                     shifts[d] = max(shifts[d], shift)
-                    depths[d] = max(depths[d], -lowest - shift * directions[d, 2])
+                    depths[d] = max(depths[d], -lowest - shift * w[d])
     return shifts, depths
 
 

@@ -95,8 +95,8 @@ def _on_grid(shape: Record, values: Values, u: Number, v: Number, w: Number) -> 
     for p in range(3):
         for q in range(3):
             at = node + (p * counts[1] + q) * stride
-            row = _weight(c, 0) * values[at] + _weight(c, 1) * values[at + 1]
-            value += _weight(a, p) * _weight(b, q) * (row + _weight(c, 2) * values[at + 2])
+            row = weight(c, 0) * values[at] + weight(c, 1) * values[at + 1]
+            value += weight(a, p) * weight(b, q) * (row + weight(c, 2) * values[at + 2])
     if beyond_x != 0 or beyond_y != 0 or beyond_z != 0:
         x, y, z, margin = cell * beyond_x, cell * beyond_y, cell * beyond_z, shape.margin
         value = _larger(value, margin + 0 * value)
@@ -119,7 +119,7 @@ def _within(t: Number, count: int) -> tuple[Number, int, Number]:
 
 
 @compiled
-def _weight(f: Number, k: int) -> Number:
+def weight(f: Number, k: int) -> Number:
     """Weight of the k-th of three nodes at an offset from the middle one, of the quadratic B-spline."""
     if k == 0:
         return 0.5 * (0.5 - f) ** 2

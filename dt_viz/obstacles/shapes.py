@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -35,6 +36,8 @@ FLATTEST = 0.3
 """Smallest half size, relative to the largest, that the kernel adapts to: a thinner field turns motions sharply."""
 MAX_BALLS, NUM_BALLS = 12, 10
 """Largest number of balls of a cover, and the number for a mesh."""
+CUTS = np.array([cut for cut in itertools.product(range(1, MAX_BALLS + 1), repeat=3) if math.prod(cut) <= MAX_BALLS])
+"""(C, 3) numbers of parts along its axes that a box may be cut into."""
 SMALLEST, LARGEST = 1e-6, 100.0
 """Bounds of sizes, metres."""
 NUM_STEPS = 10
@@ -525,12 +528,10 @@ def _beyond_faces(*excess: Array) -> Array:
 
 def _blocks(half: Array) -> tuple[Array, float]:
     """Cut a box into equal parts; return their centres (K, 3) and half the diagonal of a part."""
-    limit = range(1, MAX_BALLS + 1)
-    cuts = np.array([cut for cut in itertools.product(limit, repeat=3) if np.prod(cut) <= MAX_BALLS])
-    radius = np.linalg.norm(half / cuts, axis=1)
+    radius = np.linalg.norm(half / CUTS, axis=1)
     good = np.flatnonzero(radius <= 1.15 * radius.min())  # the fewest parts that are nearly as small as can be
-    best = good[np.prod(cuts[good], axis=1).argmin()]
-    sides = [size * ((2 * np.arange(num) + 1) / num - 1) for size, num in zip(half, cuts[best], strict=True)]
+    best = good[np.prod(CUTS[good], axis=1).argmin()]
+    sides = [size * ((2 * np.arange(num) + 1) / num - 1) for size, num in zip(half, CUTS[best], strict=True)]
     return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3), float(radius[best])
 
 
