@@ -249,12 +249,12 @@ class PlacedField(PointField):
 
 
 @dataclass(frozen=True)
-class InPlane(PointField):
-    """A field of R³ of which only the part along a plane is left, so that its flow stays at every depth."""
+class Projected(PointField):
+    """The part M·V of a field that a matrix leaves, such as that along a plane: its flow then stays at every depth."""
 
     inner: PointField
-    axes: Array
-    """(3, 2) orthonormal columns along the plane."""
+    matrix: Array
+    """M, (d, d)."""
 
     @property
     def dim(self) -> int:
@@ -263,7 +263,7 @@ class InPlane(PointField):
 
     def _terms(self) -> Terms:
         terms = self.inner.terms.terms.copy()
-        terms["outward"] = self.axes @ self.axes.T @ terms["outward"]
+        terms["outward"] = self.matrix @ terms["outward"]
         return Terms(terms, self.inner.terms.values)
 
 

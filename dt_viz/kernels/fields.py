@@ -14,7 +14,7 @@ from dt_viz.kernels.compiled import compiled
 from dt_viz.kernels.distances import Record
 from dt_viz.kernels.gaussians import LANES, Array, GaussianWork, exponential, gaussian_sums, gaussian_work
 
-GRID, OCCUPANCY, REGION, ASIDE = 0, 1, 2, 3
+GRID, OCCUPANCY, REGION, ASIDE, SHIFT = 0, 1, 2, 3, 4
 """Kinds of terms; the first three have weights on a grid of Gaussians."""
 
 TERM = np.dtype(
@@ -32,7 +32,6 @@ TERM = np.dtype(
         ("size", np.int64),  # number of its values
         ("bias", np.float64),  # of an occupancy map: the logit far away
         ("temperature", np.float64),  # T, 0 for the paper's generator
-        ("plateau", np.float64),  # of a region: radius beyond which the field fades out
     ]
 )
 """A term; what a kind does not have is zero."""
@@ -101,15 +100,19 @@ def _own(
     if term.kind == ASIDE:
         _aside(term, values, u, n, v, Dv)
         return True
-    if term.kind == REGION and not _any_inside(u, n):
+    if (term.kind == REGION or term.kind == SHIFT) and not _any_inside(u, n):
         return False
+    if term.kind == SHIFT:
+        _first(n, v, Dv)
+        _fade(u, n, v, Dv)
+        return True
     sums = gaussian_sums(term, values, u, n, order + int(term.kind == OCCUPANCY), gaussians)
     if term.kind == OCCUPANCY:
         _occupancy(term, sums, n, v, Dv)
         return True
     _grid(term, sums, n, v, Dv)
     if term.kind == REGION:
-        _fade(term.plateau, u, n, v, Dv)
+        _fade(u, n, v, Dv)
     return True
 
 
@@ -142,9 +145,18 @@ def at_rest(field: Terms, s: Array, d: int) -> bool:
             for j in range(d):
                 u += term.inward[i, j] * (s[j] - term.origin[j])
             squared += u * u
-        if term.kind != REGION or squared <= 1:
+        if (term.kind != REGION and term.kind != SHIFT) or squared <= 1:
             return False
     return True
+
+
+@compiled
+def _first(n: int, v: Array, Dv: Array) -> None:
+    """Write the first unit vector."""
+    for k in range(3):
+        for p in range(n):
+            v[k, p] = 1.0 if k == 0 else 0.0
+        _clear(Dv[k], n)
 
 
 @compiled
@@ -157,13 +169,11 @@ def _any_inside(u: Array, n: int) -> bool:
 
 
 @compiled
-def _fade(plateau: float, u: Array, n: int, v: Array, Dv: Array) -> None:
-    """Multiply v by w(‖u‖) = 1 − x⁴(35 − 84x + 70x² − 20x³), x from 0 at the plateau to 1 at the border ‖u‖ = 1."""
+def _fade(u: Array, n: int, v: Array, Dv: Array) -> None:
+    """Multiply v by (1 − ‖u‖²)³, up to the border ‖u‖ = 1, and by 0 beyond it."""
     for p in range(n):
-        r = np.sqrt(u[0, p] * u[0, p] + u[1, p] * u[1, p] + u[2, p] * u[2, p])
-        x = min(max((r - plateau) / (1 - plateau), 0.0), 1.0)
-        window = 1 - x * x * x * x * (35 - 84 * x + 70 * x * x - 20 * x * x * x) if r < 1 else 0.0
-        slope = -140 * (x * (1 - x)) ** 3 / ((1 - plateau) * max(r, plateau))
+        room = max(1 - (u[0, p] * u[0, p] + u[1, p] * u[1, p] + u[2, p] * u[2, p]), 0.0)
+        window, slope = room * room * room, -6 * room * room
         for k in range(3):
             for j in range(3):
                 Dv[k, j, p] = window * Dv[k, j, p] + v[k, p] * slope * u[j, p]

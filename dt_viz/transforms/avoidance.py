@@ -11,7 +11,7 @@ import numpy as np
 
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
-from dt_viz.flows.fields import Array, InPlane, Mask, VectorField
+from dt_viz.flows.fields import Array, Mask, Projected, VectorField
 from dt_viz.flows.integrators import integrate, integrate_adaptive, rk4
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle, Point
@@ -177,7 +177,10 @@ class Avoidance(Transform):
 
     def _field(self) -> VectorField:
         field = self.avoided.field(self.generator, self.temperature)
-        return field if self.plane is None else InPlane(field, axes_of(self.plane)[:, :2])
+        if self.plane is None:
+            return field
+        along = axes_of(self.plane)[:, :2]
+        return Projected(field, along @ along.T)
 
     def _nearest_free(self, goal: Array) -> Array:
         """Return the nearest free place (3,) to a covered goal (3,), metres; in the plane, if the flow acts there."""

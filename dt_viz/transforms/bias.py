@@ -1,4 +1,9 @@
-"""Biasing a motion towards a point: the reverse flow of a field of unit vectors away from it (sec. 4.6)."""
+"""Biasing a motion towards a point: the reverse flow of a field of unit vectors away from it (sec. 4.6).
+
+That flow gathers motions at the point, which they enter and leave in other directions: a corner. So they are shifted
+first, all alike in the middle of the region, by the flow of a field that has one direction, and only what then is left
+between them is gathered, by the field of unit vectors without its part along the motions: they have a waist there.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +14,14 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
+from scipy.integrate import simpson
 from scipy.linalg import cho_factor, cho_solve
 
 from dt_viz.errors import check_between
-from dt_viz.flows.diffeomorphisms import AUTO, Flow, Integration
-from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, PointField, VectorField
+from dt_viz.flows.diffeomorphisms import AUTO, Chain, Diffeomorphism, Flow, Identity, Integration
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, PointField, Projected, VectorField
 from dt_viz.flows.integrators import integrate, rk4
-from dt_viz.kernels.fields import REGION, Terms
+from dt_viz.kernels.fields import REGION, SHIFT, TERM, Terms
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.transforms.base import (
     MOST_DURATION,
@@ -37,22 +43,22 @@ KERNEL_WIDTH = 0.4
 """Kernel width of the regression, in radii; about the size of the core in which it smooths the unit vectors, which are
 singular at the target."""
 REGULARISATION = 1e-3
-PLATEAU = 0.5
-"""Part of the radius beyond which the field fades out."""
 
-AIM = 0.009
+AIM = 0.0012
 """Largest distance from the target at which `auto` lets the motions pass, metres, at the checked samples."""
-ACCEPTED = 0.010
+ACCEPTED = 0.002
 """Largest accepted distance from the target, metres, also between those samples."""
+SAME_PLACE = 0.010
+"""Distance up to which the target is at a start, at the goal or in the plane of the motions, metres."""
 MAX_DURATION = 4.0
 """Longest flow time that is tried: a point that has not arrived by then hardly lies in the region."""
-LONG = 1.5
-"""Flow time by which a motion arrives, or never does if its start or goal is still nearest to the target."""
+NUM_DEPTHS, DEEPEST = 101, 0.9
+"""Number of depths in the region at which the speed of a shift is looked at, and depth from which it takes too long."""
 SNAPSHOT = 0.1
 """Interval of flow time between two checks of the distance: less than half of the time that halves it."""
-LARGE, SMALL = 2.5, 1.5
+LARGE, SMALL = 3.2, 1.5
 """Largest and smallest `auto` radius, relative to the distance of the farthest motion; it shrinks to leave starts and
-goal outside. On a straight path, these turn the motion by up to 30° and 90° on two centimetres."""
+goal outside. On a straight path at 5 cm, these turn the motion by 10° and 40° on a centimetre."""
 MIN_RADIUS = 0.10
 """Lower bound of the `auto` radius, metres."""
 SMALLER = 1.25
@@ -95,8 +101,8 @@ class BiasPoint(Transform):
     """Radius of the region S around it in which the field acts, metres; None chooses it by the distance of the motion.
     """
     strength: float | None = None
-    """t of the flow, in which a point far from target and border moves by t radii; None is the shortest after which
-    every motion passes within a centimetre."""
+    """t of the two flows, in which a point in the middle of the region moves by about t radii; None is the shortest
+    after which every motion passes within two millimetres."""
     plane: tuple[Point, Point] | None = None
     """Two orthonormal vectors: the field acts along these only, and alike at every depth. None is in space."""
     moves_goal: bool = False
@@ -171,31 +177,70 @@ class BiasPoint(Transform):
         point, motion, at_least = self, motion.demonstrated, motion.at_least
         if motion.above is not None:  # what is above must not lead the motion past the target again
             point = replace(point, position=as_point(motion.above.forward(np.asarray(point.position))))
-        nearest, at_end = closest_points(point, motion)
+        nearest, tangents, at_end = closest_points(point, motion)
         if point.moves_goal:
-            nearest = motion.goal[None]
+            nearest, tangents = motion.goal[None], np.zeros((1, 3))
         distance = float(np.linalg.norm(point.offsets(nearest), axis=1).max())
         radius = point.radius or self._auto_radius(motion, (SMALL if at_least == 0 else SMALLER) * distance, distance)
-        field, duration = point.field(radius), point.strength
         warnings = self._misplaced(motion, nearest, radius)
-        if duration is None:
-            duration = pulling_duration(field, point, nearest, at_least=at_least)
-            if duration is not None and at_least > 0:
-                # starts and goal in the region move the motion below the farther, the longer the flow: converge sooner
-                duration = min(at_least + OVERSHOOT * (duration - at_least), MAX_DURATION)
-        hopeless = duration is None
-        if duration is None:
-            duration = MAX_DURATION
+
+        along = tangents.mean(axis=0)
+        passing = point._passing(nearest, tangents, along)
+        longest = MAX_DURATION if point.strength is None else point.strength
+        shift, shifting = point._shift(passing.mean(axis=0), radius)
+        duration = min(shifting, longest)
+        flows = [self._flow(shift, duration, motion.tolerance)] if duration > 0 else []
+        passing = flows[0].inverse(passing) if flows else passing
+        spread = float(np.linalg.norm(point.offsets(passing), axis=1).max())
+        across = np.eye(3) - np.outer(along, along)
+        waist = Projected(point.field(min(radius, max(MIN_RADIUS, LARGE * spread))), across)
+        gathering, hopeless = longest - duration, False
+        if point.strength is None:
+            least = max(at_least - duration, 0.0)
+            found = pulling_duration(waist, point, passing, longest=gathering, at_least=least)
+            hopeless = found is None
+            if found is not None:
+                # starts and goal in the region move the motion below, the farther the longer: converge sooner
+                gathering = min(least + OVERSHOOT * (found - least), gathering) if least > 0 else found
+        if gathering > 0:
+            flows.append(self._flow(waist, gathering, motion.tolerance))
+        duration += gathering
+        if hopeless:
             warnings.append(_warning(motion, Kind.UNREACHED, _too_small(radius, distance)))
-        elif point.strength is None and at_least > LONG and at_end.any() and not point.moves_goal:
+        elif point.strength is None and at_least > 0 and at_end.any() and not point.moves_goal:
             hopeless = True  # its ends stay where they are, and no other place of it will be nearer
             text = "a motion has its start or goal nearer to the point than its way: it is not led there"
             warnings.append(_warning(motion, Kind.UNREACHED, text))
-        steps = max(1, math.ceil(duration / (STEP * motion.tolerance**0.25)))
-        flow = point.integration.of(Flow(field, duration, steps))
-        goal = flow.inverse(motion.goal) if point.moves_goal else motion.goal
+        transform = Chain(flows) if flows else Identity(3)
+        goal = transform.inverse(motion.goal) if point.moves_goal else motion.goal
         chosen = {"strength": duration, "radius": radius}
-        return Built(flow, duration, goal, hopeless, tuple(warnings), point.integration, chosen)
+        return Built(transform, duration, goal, hopeless, tuple(warnings), point.integration, chosen)
+
+    def _passing(self, nearest: Array, tangents: Array, along: Array) -> Array:
+        """Find where motions pass beside the target, (R, 3) metres: straight on from where they are nearest to it.
+
+        Args:
+            nearest: (R, 3) where they are nearest, metres.
+            tangents: (R, 3) unit vectors, their directions there.
+            along: (3,) mean of these directions.
+        """
+        speed = tangents @ along
+        behind = (np.asarray(self.position) - nearest) @ along
+        ahead = np.divide(behind, speed, out=np.zeros_like(speed), where=speed > 0.5)
+        return nearest + ahead[:, None] * tangents
+
+    def _shift(self, place: Array, radius: float) -> tuple[VectorField, float]:
+        """Make the field whose reverse flow shifts a place (3,) to the target, straight, and the flow time it takes."""
+        offset = self.offsets(place)
+        distance = float(np.linalg.norm(offset))
+        direction = np.pad(offset, (0, 3 - len(offset))) / max(distance, 1e-12)
+        field = PlacedField(Shift(direction, len(offset)), np.asarray(self.position), radius * self.axes())
+        depth = np.linspace(0, distance / radius, NUM_DEPTHS)
+        return field, MAX_DURATION if depth[-1] >= DEEPEST else float(simpson(1 / (1 - depth**2) ** 3, x=depth))
+
+    def _flow(self, field: VectorField, duration: float, tolerance: float) -> Diffeomorphism:
+        steps = max(1, math.ceil(duration / (STEP * tolerance**0.25)))
+        return self.integration.of(Flow(field, duration, steps))
 
     def satisfied(self, motion: MotionBelow) -> bool:
         """Whether every motion passes close to the target, where that is to be seen to."""
@@ -271,15 +316,15 @@ class BiasPoint(Transform):
     def _misplaced(self, motion: MotionBelow, nearest: Array, radius: float) -> list[MotionWarning]:
         """Warnings about the place of the bias point."""
         texts = []
-        if np.linalg.norm(self.offsets(motion.goal)) < ACCEPTED:
+        if np.linalg.norm(self.offsets(motion.goal)) < SAME_PLACE:
             texts.append("the point is on the goal, where the motions end anyway")
-        if (np.linalg.norm(self.offsets(motion.starts), axis=1) < ACCEPTED).any():
+        if (np.linalg.norm(self.offsets(motion.starts), axis=1) < SAME_PLACE).any():
             texts.append("the point is on a start, where the motion is anyway")
         if any(np.linalg.norm(self.offsets(np.asarray(other))) < 0.9 * radius for other in motion.targets):
             texts.append("the region covers a bias point below it in the stack: motions are pulled away from that")
         warnings = [_warning(motion, Kind.MISPLACED, text) for text in texts]
         depth = float(np.abs((nearest - self.position) @ self.axes()[:, 2]).max()) if self.plane else 0.0
-        if depth > ACCEPTED:
+        if depth > SAME_PLACE:
             text = f"the point lies {100 * depth:.0f} cm before or behind the plane: motions are not led to it"
             warnings.append(_warning(motion, Kind.OFF_PLANE, text))
         return warnings
@@ -294,8 +339,7 @@ def _warning(motion: MotionBelow, kind: Kind, text: str) -> MotionWarning:
 class RegionField(PointField):
     """A field on the unit ball (or on the cylinder over the unit disc) that fades out smoothly towards its border.
 
-    V(s) = w(‖u‖)·V_fit(u), u the first k coordinates of s; the others are not moved. w falls from 1 at `PLATEAU` to 0
-    at the border, three times continuously differentiable.
+    V(s) = (1 − ‖u‖²)³·V_fit(u), u the first k coordinates of s; the others are not moved.
     """
 
     directions: GridRBF
@@ -307,9 +351,28 @@ class RegionField(PointField):
         return 3
 
     def _terms(self) -> Terms:
-        terms, values = self.directions.grid.terms(self.directions.weights, REGION)
-        terms["plateau"] = PLATEAU
-        return Terms(terms, values)
+        return self.directions.grid.terms(self.directions.weights, REGION)
+
+
+@dataclass(frozen=True, eq=False)
+class Shift(PointField):
+    """A field of one direction on the unit ball (or on the cylinder over the unit disc): V(s) = (1 − ‖u‖²)³·n."""
+
+    direction: Array
+    """n, (3,), a unit vector."""
+    dim_of_region: int
+    """3 for the ball, 2 for the cylinder."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the space."""
+        return 3
+
+    def _terms(self) -> Terms:
+        term = np.zeros(1, TERM)
+        term["kind"], term["inward"] = SHIFT, np.diag([1.0, 1.0, self.dim_of_region - 2.0])
+        term["outward"][0, :, 0] = self.direction
+        return Terms(term, np.empty(0))
 
 
 @lru_cache(maxsize=2)
@@ -336,24 +399,26 @@ def _too_small(radius: float, distance: float) -> str:
     return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
 
 
-def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Mask]:
+def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array, Mask]:
     """Find where each rollout, as a polyline, comes closest to the target.
 
     Returns:
-        (R, 3) these places, metres, and (R,) whether they are the rollout's start or goal.
+        (R, 3) these places, metres, (R, 3) its directions there, unit vectors along the axes that the bias acts on, and
+        (R,) whether they are the rollout's start or goal.
     """
     offset = point.offsets(motion.positions)
     start, step = offset[:-1], np.diff(offset, axis=0)
     squared = (step * step).sum(axis=1)
     same = np.diff(motion.index) == 0
-    along = np.clip(-(start * step).sum(axis=1) / np.maximum(squared, 1e-300), 0, 1) * same
-    miss = start + along[:, None] * step
+    part = np.clip(-(start * step).sum(axis=1) / np.maximum(squared, 1e-300), 0, 1) * same
+    miss = start + part[:, None] * step
     miss = np.where(same, (miss * miss).sum(axis=1), np.inf)
     first = np.flatnonzero(np.r_[True, ~same])
     last = np.r_[first[1:], len(offset)] - 1
     k = np.array([low + np.argmin(miss[low:high]) for low, high in zip(first, last, strict=True)])
-    nearest = motion.positions[k] + along[k, None] * (motion.positions[k + 1] - motion.positions[k])
-    return nearest, ((k == first) & (along[k] == 0)) | ((k + 1 == last) & (along[k] == 1))
+    nearest = motion.positions[k] + part[k, None] * (motion.positions[k + 1] - motion.positions[k])
+    tangents = step[k] @ point.axes()[:, : step.shape[1]].T / np.sqrt(np.maximum(squared[k], 1e-300))[:, None]
+    return nearest, tangents, ((k == first) & (part[k] == 0)) | ((k + 1 == last) & (part[k] == 1))
 
 
 def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
@@ -361,14 +426,15 @@ def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
     return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)
 
 
-def pulling_duration(field: VectorField, point: BiasPoint, points: Array, *, at_least: float = 0.0) -> float | None:
+def pulling_duration(
+    field: VectorField, point: BiasPoint, points: Array, *, longest: float, at_least: float = 0.0
+) -> float | None:
     """The shortest duration after which the reverse flow has carried all `points` (N, 3) to the target.
 
-    γ is a one-parameter group, so one integration with snapshots passes every duration on its way. The field is
-    nearly radial, so the place where a rollout is closest to the target stays, nearly, where it is closest.
+    γ is a one-parameter group, so one integration with snapshots passes every duration on its way.
 
     Returns:
-        The duration, or None where some point has not arrived after `MAX_DURATION`.
+        The duration, or None where some point has not arrived after the `longest`.
     """
     duration = at_least
     if duration > 0:
@@ -377,7 +443,7 @@ def pulling_duration(field: VectorField, point: BiasPoint, points: Array, *, at_
     away = distance > AIM
     points, distance = points[away], distance[away]
     while len(points):
-        if duration >= MAX_DURATION:
+        if duration >= longest:
             return None
         points, _ = integrate(rk4, field, points, None, -SNAPSHOT, 1)
         before, distance = distance, np.linalg.norm(point.offsets(points), axis=1)

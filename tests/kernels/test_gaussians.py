@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.special import eval_hermite, expit
 
-from dt_viz.flows.fields import GaussianGrid, GridRBF, InPlane, PlacedField, PointField, Sum
+from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, PointField, Projected, Sum
 from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4
 from dt_viz.kernels.gaussians import LANES, exponential
 from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, OccupancyMap
-from dt_viz.transforms.bias import PLATEAU, RegionField
+from dt_viz.transforms.bias import RegionField, Shift
 from dt_viz.transforms.sides import Sideways
 
 COUNTS = [1, 2, 5, LANES, 2 * LANES + 7]
@@ -62,6 +62,17 @@ class PlainOccupancy:
         return weight[:, None] * gradient * 0.5 / self.grid.ell, DV * 0.5 / self.grid.ell
 
 
+def unit_vector(rng):
+    vector = rng.normal(size=3)
+    return vector / np.linalg.norm(vector)
+
+
+def faded(u):
+    """(1 − ‖u‖²)³ (N,) at points u (N, k), 0 beyond ‖u‖ = 1, and its derivative (N, k)."""
+    room = np.maximum(1 - (u * u).sum(axis=1), 0)
+    return room**3, -6 * room[:, None] ** 2 * u
+
+
 class PlainRegion:
     dim = 3
 
@@ -73,14 +84,28 @@ class PlainRegion:
 
     def with_jacobian(self, s):
         k = self.inner.dim
-        u, radius = s[:, :k], np.linalg.norm(s[:, :k], axis=1)
-        x = np.clip((radius - PLATEAU) / (1 - PLATEAU), 0, 1)
-        window, slope = 1 - x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3), -140 * (x * (1 - x)) ** 3 / (1 - PLATEAU)
+        u, (window, slope) = s[:, :k], faded(s[:, :k])
         V, DV = np.zeros_like(s), np.zeros((*s.shape, 3))
         fit, D_fit = self.inner.with_jacobian(u)
         V[:, :k] = window[:, None] * fit
-        DV[:, :k, :k] = window[:, None, None] * D_fit + fit[:, :, None] * ((slope / radius)[:, None] * u)[:, None]
+        DV[:, :k, :k] = window[:, None, None] * D_fit + fit[:, :, None] * slope[:, None]
         return V, DV
+
+
+class PlainShift:
+    dim = 3
+
+    def __init__(self, field):
+        self.direction, self.k = field.direction, field.dim_of_region
+
+    def __call__(self, s):
+        return self.with_jacobian(s)[0]
+
+    def with_jacobian(self, s):
+        window, slope = faded(s[:, : self.k])
+        DV = np.zeros((*s.shape, 3))
+        DV[:, :, : self.k] = self.direction[:, None] * slope[:, None]
+        return window[:, None] * self.direction, DV
 
 
 class PlainSideways:
@@ -150,6 +175,8 @@ def cases():
         unit = GaussianGrid(tuple(np.linspace(-1, 1, 5) for _ in range(dim)), 3.0)
         region = RegionField(GridRBF(unit, rng.normal(size=(unit.num_points, dim))))
         yield f"region {dim}", region, PlainRegion(region)
+        shift = Shift(unit_vector(rng), dim)
+        yield f"shift {dim}", shift, PlainShift(shift)
     ends, radii = rng.uniform(-0.5, 0.5, (3, 3)), np.array([0.2, 0.3, 1e-3])
     aside = Sideways(rng.normal(size=3), rng.normal(size=(3, 3)), rng.normal(size=3), ends, radii)
     yield "sideways", aside, PlainSideways(aside)
@@ -226,7 +253,7 @@ def test_placed_cut_and_summed_fields_are_those_of_plain_formulas(name):
     o, M, along = rng.normal(size=3), rng.normal(size=(3, 3)), np.linalg.qr(rng.normal(size=(3, 2)))[0]
     other: PointField = CASES["probability 3"][0]
     s = points(3)
-    made = Sum((InPlane(PlacedField(field, o, M), along), other))
+    made = Sum((Projected(PlacedField(field, o, M), along @ along.T), other))
     V, DV = plain.with_jacobian((s - o) @ np.linalg.inv(M).T)
     expected = V @ M.T @ along @ along.T + other(s)
     np.testing.assert_allclose(made(s), expected, rtol=0, atol=1e-11 * max(1, np.abs(expected).max()))

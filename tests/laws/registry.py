@@ -26,7 +26,7 @@ from dt_viz.flows.diffeomorphisms import (
     Inverse,
     Placed,
 )
-from dt_viz.flows.fields import GaussianGrid, GridRBF, InPlane, PlacedField, Sum, VectorField
+from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, Projected, Sum, VectorField
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.phased import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
 from dt_viz.flows.systems import Attractor
@@ -49,7 +49,7 @@ from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import DRAWING_AXES
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import Transform
-from dt_viz.transforms.bias import BiasPoint, unit_field
+from dt_viz.transforms.bias import BiasPoint, Shift, unit_field
 from dt_viz.transforms.sides import Sideways
 
 Points = Callable[[int], np.ndarray]
@@ -276,7 +276,7 @@ FIELDS: dict[str, Generator] = {
     "grid in the plane": Generator(bent(2), uniform(2)),
     "grid in space": Generator(bent(3), uniform(3)),
     "placed": Generator(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), 0.5 * tilted_axes()), uniform(3)),
-    "in a plane": Generator(InPlane(bent(3), tilted_axes()[:, :2]), uniform(3)),
+    "in a plane": Generator(Projected(bent(3), tilted_axes()[:, :2] @ tilted_axes()[:, :2].T), uniform(3)),
     "sum": Generator(Sum((bent(3), PLACES[1])), uniform(3)),
     "free space": Generator(AvoidanceField(unit_sphere_map(), "free-space", 1.0), uniform(3, 2.0), 1e-4, 1e-6),
     "free space, hot": Generator(AvoidanceField(unit_sphere_map(), "free-space", 12.0), uniform(3, 2.0), 1e-4, 1e-6),
@@ -291,6 +291,7 @@ FIELDS: dict[str, Generator] = {
         1e-4,
         1e-6,
     ),
+    "shift": Generator(Shift(np.array([0.6, 0.0, 0.8]), 3), uniform(3, 0.7), 1e-4, 1e-6),
     "sideways": Generator(sideways(), uniform(3, 0.5)),
     "signed distance": Generator(SignedDistanceField(Union((HAND,))), around_hand, 1e-5, 1e-4),
     "escape of the hand": Generator(WholeArmField(ROBOT, BODY, (HAND,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5),
