@@ -134,7 +134,7 @@ class Visit:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
+    """Define the command's arguments."""
     parser.add_argument("--task", default="draw_s", help="that the server begins with (default: %(default)s)")
     add_lasa(parser)
     modes = tuple(mode.lower() for mode in (*SPACES, OFF))
@@ -149,7 +149,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
+    """Run the command; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
     _, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, ".json")
     unit = unit_ms()
