@@ -1,5 +1,7 @@
 """Obstacles in the way of motions: what is measured around them, and where they are."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hook import NUM_DEMONSTRATIONS, apart, hook
@@ -128,7 +130,7 @@ def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured
 def rollout(**changes):
     """Measurements of a rollout that gives way to a sphere."""
     values = {"hand": 0.03, "arm": 0.012, "hand_without": -0.04, "arm_without": -0.06, "frechet": 0.08, "detour": 0.07}
-    rest = {"turn": 20.0, "turn_without": 10.0, "num_outside": 0, "goal_miss": 1e-6}
+    rest: dict[str, Any] = {"turn": 20.0, "turn_without": 10.0, "num_outside": 0, "goal_miss": 1e-6}
     return Rollout(**(values | rest | changes))
 
 
