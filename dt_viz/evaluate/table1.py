@@ -73,8 +73,6 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 
 PAPER_TASKS = ("push_box", "lift_box", "draw_s")
-DIAMETER = 0.15
-"""Diameter of the sphere, metres."""
 ALONG, WITHIN = (0.2, 0.8), 0.05
 """Part of the mean demonstration that spheres are drawn along, and largest distance from it, metres."""
 MAX_DRAWN = 2000
@@ -85,8 +83,6 @@ REACHED = 0.01
 """Distance from the goal at which a motion counts as having reached it, metres."""
 NUM_WARPED = 200
 """Number of points of each path that are matched by dynamic time warping."""
-INTERVAL = 0.05
-"""Interval of the jerk's differences, seconds: the paper's 20 Hz."""
 SMALLEST = ("clearance", "reached")
 """Columns whose worst value is the smallest."""
 UNITS = {"turn": (1.0, "°"), "reached": (100.0, "%"), "seconds": (1.0, "s"), "jerk": (1.0, "m/s³")}
@@ -102,8 +98,6 @@ PAPER: Mapping[str, Sequence[tuple[float, float]]] = {
 }
 """The paper's Table 1: Fréchet and maximum collision distance, metres, by method, for each of `PAPER_TASKS`; it has no
 drawing of the planners."""
-FAILED = 1
-"""Exit status if a method needs what is not installed, or was not trained."""
 
 
 @dataclass(frozen=True)
@@ -148,13 +142,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command; 1 if a method needs what is not there."""
+    """Run the command; 1 if a method needs what is not installed, or was not trained."""
     folder, methods = ready_folder(options.out), [METHODS[name] for name in options.methods]
     for method in methods:
         if method.missing:
             print(f"{method.title} needs {', '.join(method.missing)}: {INSTALL}; or leave it out", file=sys.stderr)
     if any(method.missing for method in methods):
-        return FAILED
+        return 1
     engine, draws = new_engine(TASKS), figures.can_draw()
     table: dict[str, dict[str, Any]] = {method.name: {} for method in methods}
     for name in options.tasks:
@@ -166,7 +160,7 @@ def run(options: argparse.Namespace) -> int:
                 planner = method.fit(problem)
             except NotFittedError as error:
                 print(f"{method.title}, {problem.task.title}: {error}", file=sys.stderr)
-                return FAILED
+                return 1
             arrays = measured(planner, problem, places)
             write_npz(folder / f"{method.name}_{name}.npz", **arrays)
             table[method.name][name] = cells(method.name, name, arrays)
@@ -197,7 +191,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[P
         if len(places) == count:
             return places
         centre = mean[round(rng.uniform(*ALONG) * (len(mean) - 1))] + _in_ball(rng, WITHIN)
-        sphere = Sphere(as_point(centre), DIAMETER)
+        sphere = Sphere(as_point(centre), 0.15)
         if any(sphere.signed_distance(path).min() >= 0 for path in undisturbed):
             continue
         if model.obstacle_distance(at_ends, sphere)[0].min() <= 0:
@@ -279,7 +273,7 @@ def measure(x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obs
         clearance=nearest.distance,
         goal_error=float(np.linalg.norm(x[-1] - goal)),
         turn=sharpest_turn(x, TURN_ARC),
-        jerk=rms_jerk(t, x, INTERVAL),
+        jerk=rms_jerk(t, x, 0.05),  # the paper's 20 Hz
     )
 
 

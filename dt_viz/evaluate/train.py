@@ -34,9 +34,6 @@ from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import TASKS, Task, lasa_tasks
 
-FAILED = 1
-"""Exit status if something is not installed, or cannot be trained."""
-
 
 @dataclass(frozen=True)
 class Row:
@@ -96,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
                 rows.append(_row(task, method, splits, problems, options))
             except ModuleNotFoundError as error:
                 print(f"{method} is trained with {error.name}, which is not installed: {INSTALL}", file=sys.stderr)
-                return FAILED
+                return 1
             except NotFittedError as error:
                 print(f"{method}, {name}: {error}", file=sys.stderr)
     report([asdict(row) for row in rows])
@@ -104,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
     for method in dict.fromkeys(row.method for row in rows):
         mean = np.mean([row.frechet_mm for row in rows if row.method == method])
         print(f"{method}: Fréchet mean {mean:.2f} mm {compared}")
-    return 0 if len(rows) == len(names) * len(options.method) else FAILED
+    return 0 if len(rows) == len(names) * len(options.method) else 1
 
 
 def _splits(num: int, folds: int | None, folder: Path) -> list[Split]:

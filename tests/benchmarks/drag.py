@@ -1,7 +1,6 @@
 """Drag a sphere straight through a motion in small steps, and measure where rollouts jump from one frame to the next.
 
-Every step is a frame of precision LIVE from one engine, as while a visitor drags; after the last one the sphere rests,
-and the frame of stage FINE is compared with that of an engine that has seen nothing of the drag. A jump is a discrete
+Every step is a frame of precision LIVE from one engine, as while a visitor drags. A jump is a discrete
 Fréchet distance of more than `JUMP` between one rollout in two successive frames, both at N points evenly spaced by arc
 length. While the motion is blocked the last one is shown, as on the page. Drags are random: through a point of the
 middle of the mean demonstration, every second one in the plane of the task's slice, from outside the motion to anywhere
@@ -19,8 +18,6 @@ The npz file holds for each step, drag after drag:
     Fréchet distance from the frame before, metres; NaN for the first of a drag.
 ``blocked`` (S,), ``seconds`` (S,)
     whether there was no motion, and the time until the rollouts were ready.
-``rested`` (D, R, N, 3), ``fresh`` (D, R, N, 3)
-    the rollouts at the end of each drag, refined, and those of an engine that has not seen the drag.
 """
 
 from __future__ import annotations
@@ -48,9 +45,9 @@ from dt_viz.evaluate.options import (
 )
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
-from dt_viz.motion.stack import FINE, LIVE, Precision
+from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance, Space
 
@@ -76,10 +73,6 @@ class Drag:
     """(S,) bool."""
     seconds: Array
     """(S,) until the rollouts were ready."""
-    rested: Array
-    """(R, N, 3) after the drag, refined, metres."""
-    fresh: Array
-    """(R, N, 3) the same where nothing was dragged, metres."""
 
     @property
     def moved(self) -> Array:
@@ -103,8 +96,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the command."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".npz")
-    engines = ((new_engine(tasks), new_engine(tasks), places) for places in paths(task, options))
-    drags = [_measured(dragged, fresh, task, places, options) for dragged, fresh, places in engines]
+    drags = [_measured(new_engine(tasks), task, places, options) for places in paths(task, options)]
     moved = [drag.moved for drag in drags]
     write_npz(
         out,
@@ -112,8 +104,6 @@ def run(options: argparse.Namespace) -> int:
         seconds=np.concatenate([d.seconds for d in drags]),
         drag=np.repeat(np.arange(len(drags)), [len(d.places) for d in drags]),
         moved=np.concatenate(moved),
-        rested=np.stack([d.rested for d in drags]),
-        fresh=np.stack([d.fresh for d in drags]),
     )
     print(f"{task.name}, {options.avoid} avoids, sphere of {options.diameter:g} m in steps of {options.step:g} m")
     by_name = {str(k): ([drag], [by]) for k, (drag, by) in enumerate(zip(drags, moved, strict=True))}
@@ -136,49 +126,23 @@ def paths(task: Task, options: argparse.Namespace) -> Iterator[Array]:
         yield through + np.linspace(-REACH, length - REACH, max(num, 2))[:, None] * direction
 
 
-def _measured(dragged: Engine, fresh: Engine, task: Task, places: Array, options: argparse.Namespace) -> Drag:
-    """Drag the sphere with one engine, and look at its last place with another one, too."""
-    space = SPACE[options.avoid]
-    spheres = [Sphere(as_point(place), options.diameter) for place in places]
-    scenarios = [_scenario(task, Avoidance(sphere, space=space)) for sphere in spheres]
-    rollouts, blocked, seconds = [], [], []
-    undisturbed = _by_number(next(fresh.frames(_scenario(task, Avoidance()))), range(len(task.paths)), task)
-    for scenario in scenarios:
-        first, frame = _frames(dragged, scenario, Stage.LIVE)
+def _measured(engine: Engine, task: Task, places: Array, options: argparse.Namespace) -> Drag:
+    """Drag the sphere through places (S, 3), metres."""
+    without = replace(avoiding(task, Avoidance()), view=View(field=False))
+    rollouts = [_by_number(next(engine.frames(without)), range(len(task.paths)), task)]
+    blocked, seconds = [], []
+    for place in places:
+        avoidance = Avoidance(Sphere(as_point(place), options.diameter), space=SPACE[options.avoid])
+        scenario = replace(avoiding(task, avoidance), view=View(field=False))
+        frames = engine.frames(scenario)
+        first = frame = next(frames)
+        while frame.stage < Stage.LIVE:
+            frame = next(frames)
         blocked.append(bool(frame.blocked))
         seconds.append(first.seconds)
-        shown = rollouts[-1] if rollouts else undisturbed
-        rollouts.append(shown if frame.blocked else _numbered(dragged, scenario, LIVE, frame))
-    _, rest = _frames(dragged, scenarios[-1], Stage.FINE)
-    _, alone = _frames(fresh, scenarios[-1], Stage.FINE)
-    shown = rollouts[-1]
-    return Drag(
-        places,
-        np.stack(rollouts),
-        np.array(blocked),
-        np.array(seconds),
-        shown if rest.blocked else _numbered(dragged, scenarios[-1], FINE, rest),
-        shown if alone.blocked else _numbered(fresh, scenarios[-1], FINE, alone),
-    )
-
-
-def _scenario(task: Task, avoidance: Avoidance) -> Scenario:
-    """The scenario of an avoidance, without pictures on the slice."""
-    return replace(avoiding(task, avoidance), view=View(field=False))
-
-
-def _frames(engine: Engine, scenario: Scenario, last: Stage) -> tuple[Frame, Frame]:
-    """The first frame of a scenario, and that of the last stage that is wanted."""
-    frames = engine.frames(scenario)
-    first = frame = next(frames)
-    while frame.stage < last:
-        frame = next(frames)
-    return first, frame
-
-
-def _numbered(engine: Engine, scenario: Scenario, precision: Precision, frame: Frame) -> Array:
-    """The rollouts of a frame that is not blocked, see `_by_number`."""
-    return _by_number(frame, engine.solved(scenario, precision).nominal.numbers, frame.task)
+        numbers = [] if frame.blocked else engine.solved(scenario, LIVE).nominal.numbers
+        rollouts.append(rollouts[-1] if frame.blocked else _by_number(frame, numbers, task))
+    return Drag(places, np.stack(rollouts[1:]), np.array(blocked), np.array(seconds))
 
 
 def _by_number(frame: Frame, numbers: Sequence[int], task: Task) -> Array:
@@ -187,11 +151,6 @@ def _by_number(frame: Frame, numbers: Sequence[int], task: Task) -> Array:
     for rollout, path in zip(numbers, frame.rollouts, strict=True):
         rollouts[rollout] = resample_by_arc_length(path, NUM_POINTS)
     return rollouts
-
-
-def _off_at_rest(drag: Drag) -> float:
-    """Largest distance of a rollout at rest from that without the drag, metres."""
-    return float(np.nanmax(discrete_frechet(drag.rested, drag.fresh), initial=0.0))
 
 
 def _row(name: str, drags: Sequence[Drag], moved: Sequence[Array]) -> Row:
@@ -205,6 +164,5 @@ def _row(name: str, drags: Sequence[Drag], moved: Sequence[Array]) -> Row:
         "frames in which a rollout jumps": jumps,
         "% of frames": 100 * jumps / frames,
         "largest step mm": 1e3 * float(np.nanmax(of_all, initial=0.0)),
-        "at rest, off what was never dragged mm": 1e3 * max(_off_at_rest(drag) for drag in drags),
         "median ms": 1e3 * float(np.median(np.concatenate([drag.seconds for drag in drags]))),
     }

@@ -46,8 +46,7 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.stack import FINE, build_stack
 from dt_viz.obstacles.clouds import Cloud
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Point, Sphere, as_point
-from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.shapes import CloudObstacle, Point, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import Task
@@ -236,18 +235,12 @@ def stacks(task: Task) -> Mapping[str, tuple[Transform, ...]]:
     def at(percent: int) -> Point:
         return as_point(task.mean_path[percent])
 
-    ball, cube = Sphere(at(50), 0.12), Box(at(50), (0.1, 0.1, 0.1))
     cloud = Cloud(np.random.default_rng(0).uniform(-0.05, 0.05, (2000, 3)))
-    beside = as_point(task.mean_path[75] + 0.03 * task.slice.axes[:, 1])
-    point = BiasPoint(beside, plane=plane_of(task))
-    mixed = (Sphere(at(30), 0.07), Box(at(50), (0.06, 0.06, 0.06)), Cylinder(at(70), 0.06, 0.06))
+    bias = BiasPoint(as_point(task.mean_path[75] + 0.03 * task.slice.axes[:, 1]), plane=plane_of(task))
     return {
         "imitation": (),
-        "sphere": (Avoidance(ball),),
-        "sphere, box and cylinder": (Avoidance(mixed),),
-        "bias point": (point,),
-        "bias point and sphere": (point, Avoidance(Sphere(at(30), 0.12))),
-        "mesh": (Avoidance(MeshObstacle(at(50), Solid(*cube.surface()))),),
+        "sphere": (Avoidance(Sphere(at(50), 0.12)),),
+        "bias point and sphere": (bias, Avoidance(Sphere(at(30), 0.12))),
         "cloud": (Avoidance(CloudObstacle(at(50), cloud)),),
     }
 

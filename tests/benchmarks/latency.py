@@ -19,8 +19,6 @@ The JSON file holds, in milliseconds, the median and the 95 % of
 from __future__ import annotations
 
 import argparse
-import os
-import platform
 import sys
 import time
 from collections.abc import Callable
@@ -30,7 +28,6 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Display, Pace, Session
 from dt_viz.evaluate.options import (
@@ -46,7 +43,6 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_json,
 )
-from dt_viz.motion.nominal import NUM_SAMPLES
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
@@ -66,12 +62,11 @@ class Recorder(Display):
     """Stage, seconds from the edit until the frame was ready, and seconds of computing alone, of each frame."""
     num_skipped: int = 0
     """Number of skipped edits since the session began."""
-    num_rollouts: int = 0
     error: Exception | None = None
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         self.frames.append((frame.stage, pace.latency, frame.seconds))
-        self.num_skipped, self.num_rollouts = pace.num_skipped, len(frame.rollouts)
+        self.num_skipped = pace.num_skipped
 
     def fail(self, error: Exception) -> None:
         self.error = error
@@ -125,14 +120,8 @@ def run(options: argparse.Namespace) -> int:
             "space": options.space,
             "seconds": options.seconds,
             "edits": num_edits,
-            "edits_per_second": num_edits / elapsed,
-            "rollouts": shown.num_rollouts,
-            "points_a_rollout": NUM_SAMPLES if options.space == "task" else NUM_CONFIGURATIONS,
             "drag": options.drag,
             "obstacles": options.obstacles,
-            "cores": os.cpu_count(),
-            "python": platform.python_version(),
-            "numpy": np.__version__,
         },
     }
     write_json(out, figures)
@@ -192,5 +181,6 @@ def _drag(
 
 
 def _settle(session: Session) -> None:
+    """Wait until nothing is left to compute."""
     if not session.wait_idle(timeout := 120.0):
         raise InputError("--task", f"frames that take more than {timeout:g} s", "a task that can be shown live")

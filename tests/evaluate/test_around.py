@@ -129,8 +129,15 @@ def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured
 
 def rollout(**changes):
     """Measurements of a rollout that gives way to a sphere."""
-    values = {"hand": 0.03, "arm": 0.012, "hand_without": -0.04, "arm_without": -0.06, "frechet": 0.08, "detour": 0.07}
-    rest: dict[str, Any] = {"turn": 20.0, "turn_without": 10.0, "num_outside": 0, "goal_miss": 1e-6}
+    values: dict[str, Any] = {
+        "hand": 0.03,
+        "arm": 0.012,
+        "hand_without": -0.04,
+        "arm_without": -0.06,
+        "frechet": 0.08,
+        "detour": 0.07,
+    }
+    rest = {"turn": 20.0, "turn_without": 10.0, "num_outside": 0, "goal_miss": 1e-6}
     return Rollout(**(values | rest | changes))
 
 

@@ -3,6 +3,7 @@
 import argparse
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -41,10 +42,13 @@ def test_latency_counts_every_edit_and_reports_both_stages(measured, dragged, mo
     figures, (rows,) = measured("latency", f"--drag {dragged} --seconds 0.3", "json")
     assert figures["settings"]["edits"] == 18 == figures["frames"] + figures["skipped"]
     assert 0 < figures["rebuild_median_ms"] <= figures["median_ms"] <= figures["p95_ms"]
-    assert figures["rebuild_median_ms"] < figures["whole_median_ms"] <= figures["whole_p95_ms"]
-    live = [1e3 * seconds for stage, seconds, _ in recorder.frames if stage is Stage.LIVE]
-    assert 0 < np.median(live) == figures["live_median_ms"] <= figures["live_p95_ms"]
-    assert figures["settings"]["rollouts"] == NUM_DEMONSTRATIONS
+    live = [frame for frame in recorder.frames if frame[0] is Stage.LIVE]
+    for name, column in {"live": 1, "whole": 2}.items():
+        expected = 1e3 * np.percentile([frame[column] for frame in live], [50, 95])
+        assert [figures[f"{name}_median_ms"], figures[f"{name}_p95_ms"]] == pytest.approx(expected)
+    pairs = [pair for pair in pairwise(recorder.frames) if pair[1][0] is Stage.LIVE]
+    assert pairs and all(before[2] < after[2] for before, after in pairs)  # seconds of the rollouts, of all of a frame
+    assert figures["settings"]["task"] == "Hook" and figures["settings"]["drag"] == dragged.split()[0]
     assert rows[-1]["median ms"] == figures["whole_median_ms"]
     assert rows[-1]["in units"] == pytest.approx(figures["whole_median_ms"] / figures["unit_ms"])
 
@@ -62,8 +66,6 @@ def test_a_drag_writes_every_step_and_counts_its_jumps(measured, monkeypatch):
     assert rows[-1]["frames in which a rollout jumps"] == (moved > 0.015).any(axis=1).sum() > 0
     assert rows[-1]["largest step mm"] == pytest.approx(1e3 * moved.max())
     assert rows[-1]["frames"] == len(places) - 1 and rows[-1]["blocked"] == arrays["blocked"].sum()
-    off = discrete_frechet(arrays["rested"], arrays["fresh"]).max()
-    assert rows[-1]["at rest, off what was never dragged mm"] == pytest.approx(1e3 * off, abs=1e-6)
 
 
 def test_random_drags_go_through_the_motion_and_repeat(lasa):
