@@ -52,7 +52,13 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     from dt_viz.errors import DataError  # noqa: PLC0415
-    from dt_viz.evaluate.options import PRINTED, InputError, with_negative_values, write_tables  # noqa: PLC0415
+    from dt_viz.evaluate.options import (  # noqa: PLC0415
+        PRINTED,
+        InputError,
+        ready_to_write,
+        with_negative_values,
+        write_tables,
+    )
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
 
     parser = argparse.ArgumentParser(prog=prog, description="Measure DT-Viz.")
@@ -67,9 +73,10 @@ def run_command(package: str, commands: Sequence[str], arguments: Sequence[str],
     options = parser.parse_args(with_negative_values(arguments))
     PRINTED.clear()
     try:
+        tables = None if options.tables is None else ready_to_write(options.tables, ".json")
         status = options.run(options)
-        if options.tables is not None:
-            write_tables(options.tables)
+        if tables is not None:
+            write_tables(tables)
         return status
     except (DataError, ImitationError, InputError) as error:
         print(f"{prog} {options.command}: {error}", file=sys.stderr)

@@ -86,7 +86,6 @@ SUBJECTS: Mapping[str, Subject] = {
             "imitation LASA --objective velocity",
         ),
         "",
-        3,
     ),
     "learning": Subject("Off the demonstrations", ("learning LASA", "learning LASA --state augmented"), ".json", 3),
     "around": Subject(

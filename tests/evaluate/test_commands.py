@@ -45,6 +45,7 @@ def status_of(main, arguments):
         ("around --task draw_s --along 0,1.1", "--along: found '0,1.1'; accepted: a number"),
         ("around --task draw_s --spread -1", "--spread: found '-1'; accepted: metres, at"),
         ("around --task draw_s --count many", "argument --count: found 'many'; accepted: a whole number, 0 or more"),
+        ("around --task draw_s --out a.npz --tables file/b.json", "'file/b.json', which cannot be written"),
         ("load --seconds 0", "argument --seconds: found '0'; accepted: seconds, more than 0"),
         ("load --seconds nan", "argument --seconds: found 'nan'"),
         ("", "the following arguments are required: COMMAND"),
