@@ -66,11 +66,9 @@ SUBJECTS: Mapping[str, Subject] = {
     "reactive": Subject(
         "The robot in the loop",
         (
-            *(
-                line
-                for v in (0.2, 0.5, 1.0)
-                for line in _for_tasks(f"reactive --task {{}} --speed {v} --runs 20 --seed 201")
-            ),
+            *_for_tasks("reactive --task {} --speed 0.2 --runs 10 --seed 201"),
+            *_for_tasks("reactive --task {} --speed 0.5 --runs 10 --seed 201"),
+            *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --seed 201"),
             *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --obstacles 2 --seed 102"),
             *_for_tasks("reactive --task {} --speed 1.0 --runs 20 --boxes --seed 103"),
         ),
@@ -91,8 +89,11 @@ SUBJECTS: Mapping[str, Subject] = {
     "around": Subject(
         "Avoidance",
         (
+            "around --task draw_s --obstacle -0.004,-0.5,0.412 --space task",
+            "around --task draw_s --obstacle -0.004,-0.5,0.412 --space task --no-avoidance",
             *_for_tasks("around --task {} --count 20 --seed 0"),
             *_for_tasks("around --task {} --count 11 --along 0,1 --shape any --size 0.06,0.25 --seed 2"),
+            *_for_tasks("around --task {} --count 6 --along 0,1 --shape any --size 0.06,0.25 --number 2 --seed 7"),
             *_for_tasks("around --task {} --count 12 --along 0,1 --shape any --size 0.06,0.25 --seed 2 --space task"),
         ),
         ".npz",
@@ -133,11 +134,12 @@ def measured(name: str, subject: Subject, out: Path, files: Sequence[Path]) -> i
     """
     results, began = [], time.monotonic()
     for k, command in enumerate(subject.commands):
-        if LASA in command and not files:
+        words = command.split()
+        if LASA in words and not files:
             continue
         written = out / "arrays" / f"{name}-{k}{subject.suffix}"
-        result = ran(command.replace(LASA, " ".join(map(str, files))), written)
-        result["command"] = f"python -m {_package(command)} {command} --out {written.name}"
+        result = ran([part for word in words for part in (map(str, files) if word == LASA else [word])], written)
+        result["command"] = f"python -m {package_of(words[0])} {command} --out {written.name}"
         result["rows"] = [row for table in result.pop("tables") for row in table][-subject.num_rows :]
         results.append(result)
         print(f"{result['command']}: {result['seconds']:.0f} s", flush=True)
@@ -152,12 +154,13 @@ def measured(name: str, subject: Subject, out: Path, files: Sequence[Path]) -> i
     return int(any(result["status"] for result in results))
 
 
-def _package(command: str) -> str:
-    return "dt_viz.evaluate" if command.split(maxsplit=1)[0] in COMMANDS else "tests.benchmarks"
+def package_of(name: str) -> str:
+    """Package whose `__main__` runs a command of this name."""
+    return "dt_viz.evaluate" if name in COMMANDS else "tests.benchmarks"
 
 
-def ran(command: str, out: Path) -> dict[str, Any]:
-    """Run a command in a process of its own.
+def ran(words: Sequence[str], out: Path) -> dict[str, Any]:
+    """Run a command, its name and options, in a process of its own.
 
     Returns:
         Its exit ``status``, the ``seconds`` that it took, and the ``tables`` that it printed, lists of rows.
@@ -166,16 +169,20 @@ def ran(command: str, out: Path) -> dict[str, Any]:
     tables.parent.mkdir(parents=True, exist_ok=True)
     tables.unlink(missing_ok=True)
     began = time.monotonic()
-    arguments = [*command.split(), "--out", str(out), "--tables", str(tables)]
-    done = subprocess.run([sys.executable, "-m", _package(command), *arguments], stdout=subprocess.DEVNULL, check=False)
-    found = json.loads(tables.read_text(encoding="utf-8"))["tables"] if tables.exists() else []
+    program = [sys.executable, "-m", package_of(words[0]), *words, "--out", str(out), "--tables", str(tables)]
+    done = subprocess.run(program, stdout=subprocess.DEVNULL, check=False)
+    text = tables.read_text(encoding="utf-8") if tables.exists() else ""
     tables.unlink(missing_ok=True)
-    return {"status": done.returncode, "seconds": time.monotonic() - began, "tables": found}
+    return {
+        "status": done.returncode,
+        "seconds": time.monotonic() - began,
+        "tables": json.loads(text)["tables"] if text else [],
+    }
 
 
 def markdown(table: Mapping[str, Any]) -> str:
     """The document of a table: one table of Markdown for successive rows of the same columns."""
-    from dt_viz.evaluate.options import as_text
+    from dt_viz.evaluate.options import as_text  # with numpy, which a benchmark imports once its threads are limited
 
     lines = [f"# {table['title']}", "", f"{table['date']}, {table['cores']} cores, Python {table['python']}"]
     for result in table["results"]:

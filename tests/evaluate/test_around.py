@@ -8,8 +8,8 @@ from hook import NUM_DEMONSTRATIONS, apart, hook
 
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.around import Place, Rollout
-from dt_viz.metrics import distance_from_path
+from dt_viz.evaluate.around import TURN_ARC, Place, Rollout
+from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import lasa_tasks
@@ -50,6 +50,8 @@ def test_angles_end_effector_and_demonstration_belong_together_and_the_figures_a
         assert arrays["hand"][0, i] == pytest.approx(np.linalg.norm(x - middle, axis=1).min() - 0.05, abs=1e-6)
         assert arrays["arm"][0, i] == pytest.approx(model.obstacle_distance(q, ball)[0].min(), abs=1e-3)
         assert arrays["frechet"][0, i] == pytest.approx(apart(x, demo), abs=1e-9)
+        assert arrays["turn"][0, i] == pytest.approx(sharpest_turn(x, TURN_ARC)) != arrays["turn_without"][0, i]
+        assert arrays["goal_miss"][0, i] == pytest.approx(np.linalg.norm(x[-1] - arrays["demo_0"][-1]), abs=1e-4)
         assert rows[f"start {i}"]["hand mm"] == pytest.approx(1e3 * arrays["hand"][0, i])
     assert rows["all"]["F.D. mm"] == pytest.approx(1e3 * arrays["frechet"].max())
     assert rows["all"]["arm mm"] == pytest.approx(1e3 * arrays["arm"].min())

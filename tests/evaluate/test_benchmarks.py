@@ -232,10 +232,10 @@ def ran(monkeypatch):
     """Commands that were run, with the files that they were to write; each prints two tables, one of them fails."""
     commands = []
 
-    def run(command, out):
-        commands.append((command, out))
+    def run(words, out):
+        commands.append((words, out))
         rows = [{"task": "a", "mm": 1.25}, {"task": "all", "mm": 2.5}]
-        return {"status": int("fails" in command), "seconds": 1.0, "tables": [rows, [{"figure": "F.D.", "value": "3"}]]}
+        return {"status": int("fails" in words), "seconds": 1.0, "tables": [rows, [{"figure": "F.D.", "value": "3"}]]}
 
     monkeypatch.setattr(sitting, "ran", run)
     return commands
@@ -257,9 +257,9 @@ def test_a_subject_becomes_a_dated_table_of_all_that_its_commands_print(ran, tmp
 def test_rows_that_are_not_wanted_are_left_out_and_files_of_lasa_put_in(ran, tmp_path):
     subject = Subject("Learning", ("imitation LASA", "imitation assets/lift_box.npz"), "", 1)
     assert sitting.measured("imitation", subject, tmp_path, []) == 0
-    assert [command for command, _ in ran] == ["imitation assets/lift_box.npz"]
-    assert sitting.measured("imitation", subject, tmp_path, [tmp_path / "A.mat", tmp_path / "B.mat"]) == 0
-    assert ran[1][0] == f"imitation {tmp_path}/A.mat {tmp_path}/B.mat"
+    assert [words for words, _ in ran] == [["imitation", "assets/lift_box.npz"]]
+    assert sitting.measured("imitation", subject, tmp_path, [tmp_path / "A 1.mat", tmp_path / "B.mat"]) == 0
+    assert ran[1][0] == ["imitation", f"{tmp_path}/A 1.mat", f"{tmp_path}/B.mat"]
     (data,) = tmp_path.glob("*-imitation.json")
     assert [result["rows"] for result in json.loads(data.read_text())["results"]] == 2 * [
         [{"figure": "F.D.", "value": "3"}]
@@ -276,10 +276,10 @@ def test_a_command_that_fails_is_written_down_the_others_are_measured_and_the_si
 
 
 def test_commands_run_in_processes_of_their_own_and_their_tables_come_back(lasa, tmp_path):
-    result = sitting.ran(f"imitation {lasa / 'Hook.mat'}", tmp_path / "imitation-0")
+    result = sitting.ran(["imitation", str(lasa / "Hook.mat")], tmp_path / "imitation-0")
     assert result["status"] == 0 and result["seconds"] > 0 and result["tables"][0][0]["name"] == "Hook"
     assert (tmp_path / "imitation-0" / "Hook.npz").exists()
-    failed = sitting.ran("around --task nothing", tmp_path / "around-0.npz")
+    failed = sitting.ran(["around", "--task", "nothing"], tmp_path / "around-0.npz")
     assert failed["status"] == 2 and failed["tables"] == []
 
 
@@ -297,7 +297,7 @@ def test_every_command_of_the_sitting_is_one_that_there_is(name, lasa, tmp_path,
             "--out",
             str(tmp_path / f"a{subject.suffix}"),
         ]
-        run = main if sitting._package(command) == "tests.benchmarks" else evaluate
+        run = main if sitting.package_of(arguments[0]) == "tests.benchmarks" else evaluate
         assert run(arguments) == 0
     assert len(read) == len(subject.commands)
 
