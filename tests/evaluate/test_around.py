@@ -158,4 +158,5 @@ def test_only_starts_with_a_rollout_and_the_goal_have_to_be_free():
     first, both = ({i: rollout() for i in starts} for starts in ((0,), (0, 1)))
     assert Place(obstacle, Avoidance(obstacle.parts), ends, first, {}).is_free
     assert not Place(obstacle, Avoidance(obstacle.parts), ends, both, {}).is_free
-    assert not Place(obstacle, Avoidance(obstacle.parts), -ends, first, {}).is_free
+    covered = np.array([0.1, -0.1, -0.2])  # the goal, too
+    assert not Place(obstacle, Avoidance(obstacle.parts), covered, first, {}).is_free
