@@ -121,6 +121,7 @@ def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured
     arrays = measured("around", f"--count 12 --along 0,1 --spread 0 {shapes}")[0]
     mean = lasa_tasks(lasa)["Hook"]().mean_path
     places, sizes = arrays["places"][1:], arrays["sizes"][1:]
+    assert (places[:, 0] != places[:, 1]).any(axis=1).all()
     assert places.shape == sizes.shape == (12, 2, 3) and arrays["turns"].shape == (13, 2, 4)
     assert set(arrays["shapes"][1:].ravel()) == {"sphere", "box", "cylinder"}
     assert 0.06 <= sizes.min() < 0.1 and 0.2 < sizes.max() <= 0.25
