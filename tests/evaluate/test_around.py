@@ -8,12 +8,13 @@ from hook import NUM_DEMONSTRATIONS, apart, hook
 
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.around import TURN_ARC, Place, Rollout
+from dt_viz.evaluate.around import TURN_ARC, Place, Rollout, _shares
 from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import lasa_tasks
 from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.warning import ARM, Kind, MotionWarning
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +162,19 @@ def test_only_starts_with_a_rollout_and_the_goal_have_to_be_free():
     assert not Place(obstacle, Avoidance(obstacle.parts), ends, both, {}).is_free
     covered = np.array([0.1, -0.1, -0.2])  # the goal, too
     assert not Place(obstacle, Avoidance(obstacle.parts), covered, first, {}).is_free
+
+
+def test_shares_are_of_the_places_that_have_motions():
+    obstacle, ends = Union((Sphere((0.0, 0.0, 0.0), 0.1),)), np.array([0.1, 0.1, 0.2])
+    avoidance = Avoidance(obstacle.parts, space="cspace")
+    clearances = {"kept": 0.012, "nearly": 0.0095, "near": 0.005, "touched": -0.002}
+    places = [Place(obstacle, avoidance, ends, {0: rollout(arm=arm), 1: rollout()}, {}) for arm in clearances.values()]
+    places.append(Place(obstacle, avoidance, ends, {1: rollout(turn=91.0)}, {}))
+    places.append(Place(obstacle, avoidance, -ends, {}, {}, (MotionWarning(Kind.NO_WAY, "", ARM),)))
+    figures = {row["figure"]: str(row["value"]) for row in _shares(places)}
+    assert figures["places that leave the end effector's starts and goal free"].startswith("5 of 6")
+    assert figures["blocked"].startswith("1 of 6") and figures["blocked between free ends"].startswith("1 of 6")
+    assert figures["from some of the starts only"].startswith("1 of 5")
+    assert figures["collisions"].startswith("1 of 5") and figures["at least 9 mm kept"].startswith("3 of 5")
+    assert figures["turns sharper than 90°"].startswith("1 of 5")
+    assert figures["the same without avoidance"].startswith("0 of 5") and figures["F.D. mean mm"] == "80.0"

@@ -68,6 +68,16 @@ def test_a_drag_writes_every_step_and_counts_its_jumps(measured, monkeypatch):
     assert rows[-1]["frames"] == len(places) - 1 and rows[-1]["blocked"] == arrays["blocked"].sum()
 
 
+def test_a_frame_counts_where_any_of_its_rollouts_jumps():
+    rollouts = np.zeros((4, 2, 5, 3))
+    rollouts[1:, 0, :, 0] += 0.04  # less than a jump
+    rollouts[2:, 1, :, 0] += 0.06
+    one = drag.Drag(np.zeros((4, 3)), rollouts, np.array([False, True, True, False]), np.full(4, 0.002))
+    row = drag._row("all", [one, one], [one.moved, one.moved])
+    assert (row["frames"], row["frames in which a rollout jumps"], row["blocked"]) == (6, 2, 4)
+    assert row["largest step mm"] == pytest.approx(60) and row["median ms"] == pytest.approx(2.0)
+
+
 def test_random_drags_go_through_the_motion_and_repeat(lasa):
     task, options = lasa_tasks(lasa)["Hook"](), argparse.Namespace(drags=6, seed=3, step=0.001)
     first, second = (list(drag.paths(task, options)) for _ in range(2))
@@ -116,11 +126,15 @@ def test_all_starts_arrive_in_closed_form_and_stepped(exact):
     assert row["smallest det J"] > 0 and row["round trip mm"] < 1e-6
 
 
-@pytest.mark.parametrize(("limit", "value"), [("MAX_DEPARTURE", 1e-12), ("ARRIVED", 1e-9)])
-def test_a_motion_that_departs_or_does_not_arrive_fails_the_measurement(lasa, monkeypatch, tmp_path, limit, value):
+@pytest.mark.parametrize(
+    ("limit", "value", "stepped"), [("MAX_DEPARTURE", 1e-12, "1"), ("ARRIVED", 1e-9, "1"), ("ARRIVED", 1e-9, "0")]
+)
+def test_a_motion_that_departs_or_does_not_arrive_fails_the_measurement(
+    lasa, monkeypatch, tmp_path, limit, value, stepped
+):
     monkeypatch.setattr(exactness, limit, value)
     monkeypatch.setattr(exactness, "STEP_TOLERANCE", 1e-4)
-    few = ["--parts", "starts", "--count", "1", "--stepped", "1", "--out", str(tmp_path / "a.json")]
+    few = ["--parts", "starts", "--count", "1", "--stepped", stepped, "--out", str(tmp_path / "a.json")]
     assert main(["exactness", "--task", "Hook", "--lasa", str(lasa), *few]) == 1
 
 
@@ -197,6 +211,18 @@ def test_the_cheapest_stepping_is_no_finer_than_needed():
         compare(lambda _: straight(), np.array([[0.3, 0.0, 0.1]]), error, 1)["stepped"] for error in (1e-3, 1e-9)
     )
     assert coarse.accurate and fine.accurate and coarse.error > fine.error
+
+
+def test_a_setting_that_is_too_coarse_is_not_taken(monkeypatch):
+    def off_by_its_tolerance(system, starts, times, tolerance):
+        return system.rollout(starts, times) + tolerance / 2
+
+    monkeypatch.setattr(exactness, "stepped_adaptively", off_by_its_tolerance)
+    monkeypatch.setattr(
+        DiffeomorphicSystem, "stepped_rollout", lambda self, starts, times, _: self.rollout(starts, times) + 1
+    )
+    sides = compare(lambda _: straight(), np.array([[0.3, 0.0, 0.1]]), 1e-3, 1)
+    assert sides["stepped"].setting == "DOP853 to 1e-03 m" and sides["stepped"].error < 1e-3
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import Plan
 from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.errors import never
 from dt_viz.evaluate import figures, table1
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.options import InputError
@@ -114,6 +115,24 @@ def test_places_collide_with_each_motion_and_leave_the_ends_free(problem, monkey
         assert distances.min() > 0
         away = np.linalg.norm(place.perturbed[:, None] - problem.task.starts, axis=2).min(axis=1)
         assert (away <= table1.PERTURBED_BY).all()
+
+
+def test_motions_that_end_beside_the_goal_have_not_reached_it(problem):
+    """Of three perturbed starts one is taken to the goal, one 5 mm and one 2 cm beside it."""
+    goal, starts = problem.learned.goal, problem.task.starts[:3]
+    ends = goal + np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0], [0.0, 0.02, 0.0]])
+
+    class Planner:
+        def plan(self, obstacle, starts, cancelled=never):
+            paths = tuple(
+                np.stack([begin, end]) for begin, end in zip(starts, np.resize(ends, starts.shape), strict=True)
+            )
+            return Plan(paths, tuple(np.array([0.0, 1.0]) for _ in paths), tuple(np.zeros((2, 6)) for _ in paths))
+
+    place = table1.Place(Sphere((5.0, 0.0, 0.0), 0.15), starts)
+    arrays = table1.measured(Planner(), problem, [place])
+    np.testing.assert_allclose(arrays["ends_0"], ends)
+    assert arrays["reached"] == pytest.approx([2 / 3])
 
 
 def test_too_many_places_are_refused(problem, monkeypatch):
