@@ -1,12 +1,14 @@
 """Chromium for tests."""
 
 import os
+import shutil
 
 import pytest
 
-from dt_viz.evaluate.pictures import ARGUMENTS, CHROMIUM
-
-__all__ = ["ARGUMENTS", "CHROMIUM", "needs_chromium"]
+CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+"""Chromium's command; None where it is not installed."""
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+"""Arguments with which it draws by software, without a screen."""
 
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None and "DT_VIZ_REQUIRE_BROWSER" not in os.environ,

@@ -43,7 +43,7 @@ MAY_IMPORT: Mapping[str, set[str]] = {
 ONLY_IMPORTERS: Mapping[str, set[str]] = {
     "pinocchio": {"arm/robot.py"},
     "coal": {"arm/link_distances.py"},
-    "matplotlib": {"examples/plot.py", "evaluate/figure6.py"},
+    "matplotlib": {"examples/plot.py", "evaluate/figures.py"},
     "torch": {"baselines/eflow_training.py", "baselines/mpnet_training.py"},
     "ompl": {"baselines/mpnet_rrt.py"},
     "jax": set(),

@@ -129,7 +129,7 @@ def test_handlers_of_signals_are_as_before_when_it_returns(capsys):
     ("arguments", "status", "words"),
     [
         ("--help", 0, "dt-viz evaluate --help"),
-        ("evaluate starts --task nothing", 2, "dt-viz evaluate starts: --task: found 'nothing'"),
+        ("evaluate around --task nothing --out a.npz", 2, "dt-viz evaluate around: --task: found 'nothing'"),
         ("--allow-origin demo.org", 2, "argument --allow-origin: found 'demo.org'; accepted: http://"),
     ],
 )

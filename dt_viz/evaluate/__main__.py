@@ -1,68 +1,85 @@
-"""The command line of the measurements: one subcommand for each file of this folder that measures something."""
+"""The command line of the measurements: one command for each file of this folder that measures something."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
 
 BAD_INPUT = 2
 """Exit status for what the user can put right; argparse uses the same."""
+COMMANDS = ("imitation", "around", "reactive", "table1", "train", "load")
+FORMER: Mapping[str, tuple[str, ...]] = {
+    "avoidance": ("around", "--space", "task"),
+    "places": ("around",),
+    "hand": ("around", "--space", "task"),
+}
+"""Former names of commands, and the arguments that they stand for."""
+BENCHMARKS: Mapping[str, str] = {
+    **{name: name for name in ("drag", "latency", "pictures", "scenes")},
+    **dict.fromkeys(("rollouts", "starts", "velocity"), "exactness"),
+}
+"""Former commands that are for developers, and their names in a checkout."""
 
 
 def main(arguments: Sequence[str] | None = None, prog: str = "python -m dt_viz.evaluate") -> int:
-    """Run one subcommand; returns the process' exit status, or raises SystemExit where argparse does."""
+    """Run one command; returns the process' exit status, or raises SystemExit where argparse does."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in BENCHMARKS:
+        name = BENCHMARKS[given[0]]
+        print(f"{prog}: {given[0]} is now, in a checkout: python -m tests.benchmarks {name}", file=sys.stderr)
+        return BAD_INPUT
+    if given and given[0] in FORMER:
+        stands_for = FORMER[given[0]]
+        print(f"{prog}: {given[0]} is now: {' '.join(stands_for)}", file=sys.stderr)
+        given[:1] = stands_for
+    return run_command("dt_viz.evaluate", COMMANDS, given, prog)
+
+
+def run_command(package: str, commands: Sequence[str], arguments: Sequence[str], prog: str) -> int:
+    """Run one of the commands that modules of a package define; returns the exit status.
+
+    Args:
+        package: full name of the package.
+        commands: names of its modules, each with `add_arguments` and `run`, and a summary in its docstring.
+        arguments: name and options of the command.
+        prog: name of the program in messages.
+    """
     # numerical libraries read these when they are first imported; one thread is how the figures compare
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     from dt_viz.errors import DataError  # noqa: PLC0415
-    from dt_viz.evaluate import (  # noqa: PLC0415
-        avoidance,
-        drag,
-        imitation,
-        latency,
-        load,
-        pictures,
-        places,
-        reactive,
-        rollouts,
-        scenes,
-        starts,
-        table1,
-        train,
-        velocity,
+    from dt_viz.evaluate.options import (  # noqa: PLC0415
+        PRINTED,
+        InputError,
+        ready_to_write,
+        with_negative_values,
+        write_tables,
     )
-    from dt_viz.evaluate.options import InputError, with_negative_values  # noqa: PLC0415
     from dt_viz.learning.imitation import ImitationError  # noqa: PLC0415
 
     parser = argparse.ArgumentParser(prog=prog, description="Measure DT-Viz.")
-    subcommands = parser.add_subparsers(dest="subcommand", metavar="SUBCOMMAND", required=True)
-    for name, module in {
-        "imitation": imitation,
-        "latency": latency,
-        "load": load,
-        "avoidance": avoidance,
-        "drag": drag,
-        "pictures": pictures,
-        "places": places,
-        "reactive": reactive,
-        "rollouts": rollouts,
-        "scenes": scenes,
-        "starts": starts,
-        "table1": table1,
-        "train": train,
-        "velocity": velocity,
-    }.items():
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name in commands:
+        module = import_module(f"{package}.{name}")
         summary = (module.__doc__ or "").splitlines()[0]
-        subcommand = subcommands.add_parser(name, help=summary, description=summary)
-        module.add_arguments(subcommand)
-        subcommand.set_defaults(run=module.run)
-    options = parser.parse_args(with_negative_values(sys.argv[1:] if arguments is None else arguments))
+        subparser = subparsers.add_parser(name, help=summary, description=summary)
+        module.add_arguments(subparser)
+        subparser.add_argument("--tables", type=Path, metavar="FILE.json", help="also write what is printed in tables")
+        subparser.set_defaults(run=module.run)
+    options = parser.parse_args(with_negative_values(arguments))
+    PRINTED.clear()
     try:
-        return options.run(options)
+        tables = None if options.tables is None else ready_to_write(options.tables, ".json")
+        status = options.run(options)
+        if tables is not None:
+            write_tables(tables)
+        return status
     except (DataError, ImitationError, InputError) as error:
-        print(f"{prog} {options.subcommand}: {error}", file=sys.stderr)
+        print(f"{prog} {options.command}: {error}", file=sys.stderr)
         return BAD_INPUT
 
 

@@ -37,22 +37,27 @@ NUM_COMPARED = 400
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Row of the table: means over the held-out demonstrations of a shape."""
+class Followed:
+    """A demonstration that was held out, and what it is followed by."""
 
-    name: str
-    folds: int
-    learned_mm: float
-    """Discrete Fréchet distance of what was learned."""
-    mean_mm: float
-    nearest_mm: float
-    learned_rms_mm: float
-    """Root mean square distance at equal times of what was learned."""
-    mean_rms_mm: float
-    nearest_rms_mm: float
+    demonstration: Demonstration
+    paths: Mapping[str, Array]
+    """(T, d), metres, of each of `WAYS`."""
+    times: Mapping[str, Array]
+    """(T,), seconds."""
+
+    def frechet(self, way: str) -> float:
+        """Discrete Fréchet distance from the demonstration, metres."""
+        return float(frechet([self.paths[way]], [self.demonstration.positions])[0])
+
+    def rms(self, way: str) -> float:
+        """Root mean square distance at equal times, metres."""
+        demonstrated = self.demonstration
+        times = demonstrated.times - demonstrated.times[0]
+        return rms_at_equal_times(self.times[way], self.paths[way], times, demonstrated.positions)
 
 
-def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) -> list[dict[str, Array]]:
+def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) -> list[Followed]:
     """Follow each demonstration in each of `WAYS` without having learned from it.
 
     Args:
@@ -60,13 +65,10 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
         learn: learns from some of them.
         folds: number of folds, at most that of demonstrations.
 
-    Returns:
-        For each demonstration ``WAY`` (T, d), metres, and ``WAY_times`` (T,), seconds, of each way.
-
     Raises:
         ImitationError: nothing can be learned from the others.
     """
-    followed: list[dict[str, Array]] = [{}] * len(demonstrations)
+    followed: dict[int, Followed] = {}
     for held in folds_of(len(demonstrations), folds):
         others = [d for i, d in enumerate(demonstrations) if i not in held]
         imitation = learn(others)
@@ -82,9 +84,13 @@ def follow(demonstrations: Sequence[Demonstration], learn: Learn, folds: int) ->
                 _shifted(start, *mean),
                 _shifted(start, paths[nearest], progress[nearest], durations[nearest]),
             )
-            followed[i] = {way: path for way, (path, _) in zip(WAYS, ways, strict=True)}
-            followed[i] |= {f"{way}_times": t for way, (_, t) in zip(WAYS, ways, strict=True)}
-    return followed
+            by_way = dict(zip(WAYS, ways, strict=True))
+            followed[i] = Followed(
+                demonstrations[i],
+                {way: path for way, (path, _) in by_way.items()},
+                {way: times for way, (_, times) in by_way.items()},
+            )
+    return [followed[i] for i in range(len(demonstrations))]
 
 
 def folds_of(num: int, folds: int) -> list[range]:
@@ -151,37 +157,3 @@ def frechet(paths: Sequence[Array], references: Sequence[Array]) -> Array:
     """Compute discrete Fréchet distances (R,) of paths to references, both at `NUM_COMPARED` points by arc length."""
     a, b = (np.stack([resample_by_arc_length(path, NUM_COMPARED) for path in these]) for these in (paths, references))
     return discrete_frechet(a, b)
-
-
-def summed_up(
-    name: str,
-    folds: int,
-    arrays: Mapping[str, Array],
-    references: Sequence[Array],
-    times: Sequence[Array],
-    millimetres: float,
-) -> HeldOut:
-    """Compare arrays ``WAY_i`` (T, d), in a unit of so many millimetres, with references in that unit and their times.
-
-    Args:
-        name: of the shape.
-        folds: number of folds.
-        arrays: ``WAY_i`` and ``WAY_times_i`` (T,), seconds.
-        references: (T_i, d) demonstrations.
-        times: (T_i,) their times, seconds.
-        millimetres: the unit.
-    """
-    numbers = range(len(references))
-    distances = [frechet([arrays[f"{way}_{i}"] for i in numbers], references).mean() for way in WAYS]
-    apart = [
-        np.mean(
-            [
-                rms_at_equal_times(
-                    arrays[f"{way}_times_{i}"], arrays[f"{way}_{i}"], times[i] - times[i][0], references[i]
-                )
-                for i in numbers
-            ]
-        )
-        for way in WAYS
-    ]
-    return HeldOut(name, folds, *(millimetres * float(value) for value in (*distances, *apart)))

@@ -1,30 +1,24 @@
 """Fit demonstrations and compare each rollout with its own demonstration, in-sample or left out.
 
+    python -m dt_viz.evaluate imitation DIR/*.mat --leave-one-out --out DIR
+
 For each file the folder gets an npz, all lengths in the file's own unit (LASA: millimetres, others: metres):
 
 ``rollout_i`` (T, d), ``times_i`` (T,)
     the motion learned, from the first point of demonstration i until it is at the goal; seconds from 0.
 ``goal`` (d,)
     common end of the motions.
-``fit_seconds``
-    the whole of `dt_viz.learning.imitation.fit`, certificates included, never from a cache.
-``start_seconds``
-    until the motion from a new start is known, its image in base space included; median.
+``fit_seconds``, ``start_seconds``
+    time of the fit, certificates included, never from a cache; and until the motion from a new start is known, median.
 ``min_det_jacobian``, ``round_trip_error``
     smallest det J and largest ‖ψ⁻¹(ψ(x)) − x‖ on a grid over the demonstrations' box grown by half its size on every
     side, computed here, not taken from the fit.
 
 With ``--leave-one-out`` each demonstration is also followed by the motion learned from the others, and by two ways that
 need no learning (see `dt_viz.evaluate.held_out`): SHAPE-held-out.npz holds ``learned_i``, ``mean_i`` and ``nearest_i``
-(T, d) for each demonstration i, and ``learned_times_i`` … (T,); and the motion is followed from starts far away and
-after pushes (see `dt_viz.evaluate.off_course`). ``worst.svg`` shows the held-out demonstrations of all files that are
-met worst, relative to the extent of their shape. ``--crossings`` adds synthetic demonstrations that cross, come back
-or wind (see `dt_viz.evaluate.crossings`).
-
-``--choose SEED`` chooses the constants of the augmented state on one half of the files and measures them on the other,
-both ways round (see `dt_viz.evaluate.choose`); ``choices.json`` holds what it prints.
-
-``figures.json`` holds what the table shows, and ``shapes.png`` all shapes: the paper's fig. 5.
+(T, d) for each demonstration i, and ``learned_times_i`` … (T,). ``figures.json`` holds what the tables show,
+``shapes.png`` all shapes (the paper's fig. 5), and ``worst.png`` the held-out demonstrations that are met worst for the
+extent of their shape.
 """
 
 from __future__ import annotations
@@ -40,35 +34,13 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.evaluate.choose import GRIDS, Choice, choose, measure
-from dt_viz.evaluate.crossings import crossings
-from dt_viz.evaluate.held_out import (
-    WAYS,
-    HeldOut,
-    Learn,
-    Learned,
-    begun,
-    follow,
-    frechet,
-    path_from,
-    rollouts_from,
-    summed_up,
-)
-from dt_viz.evaluate.off_course import AWAY, OffCourse, off_course
-from dt_viz.evaluate.options import (
-    InputError,
-    positive_number,
-    print_table,
-    ready_folder,
-    whole_number,
-    write_json,
-    write_npz,
-)
-from dt_viz.evaluate.picture import Panel, draw_panels
-from dt_viz.evaluate.worst import Case, cases_of, draw_worst, worst_of
+from dt_viz.evaluate import figures
+from dt_viz.evaluate.figures import Panel
+from dt_viz.evaluate.held_out import WAYS, Followed, Learn, Learned, begun, follow, frechet, rollouts_from
+from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number, write_json, write_npz
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
-from dt_viz.learning.augmented import AugmentedImitation, fit_augmented
+from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import learn as learn_in_state
 from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
 from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, fit, grown_grid
@@ -79,7 +51,8 @@ GRID = {2: 101, 3: 25}
 NUM_PHASES = 7
 """Number of phases at which the certificates of augmented motions are computed."""
 STATES = ("plain", "augmented")
-learn_augmented = partial(learn_in_state, state="augmented")
+NUM_WORST = 9
+"""Number of held-out demonstrations that are drawn."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +64,11 @@ class Source:
     """Demonstrations in metres."""
     unit: float
     """Length of one unit of the file, metres."""
+
+    @property
+    def extent(self) -> float:
+        """Larger side of the demonstrations' box, metres."""
+        return float(np.ptp(np.concatenate([d.positions for d in self.demonstrations]), axis=0).max())
 
 
 @dataclass(frozen=True)
@@ -114,118 +92,116 @@ class Figures:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
-    parser.add_argument("files", type=Path, nargs="*", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and picture")
+    """Define the command's arguments."""
+    parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="LASA .mat, .npz, .csv or folder of .csv")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for arrays and figures")
     parser.add_argument("--objective", choices=OBJECTIVES, default=OBJECTIVES[0], help="default: %(default)s")
-    parser.add_argument(
-        "--regularisation", type=positive_number("weight", 1.0), metavar="R", help="of the plain fit (default: its own)"
-    )
     parser.add_argument("--state", choices=STATES, default=STATES[0], help="default: %(default)s")
-    parser.add_argument("--crossings", action="store_true", help="also what crosses itself, comes back or winds")
     parser.add_argument("--leave-one-out", action="store_true", help="also follow each by what the others teach")
-    parser.add_argument(
-        "--folds", type=whole_number(2), metavar="N", help="hold out in so many folds (default: one for each)"
-    )
-    parser.add_argument(
-        "--choose", type=whole_number(0), metavar="SEED", help="also choose constants on half of the files"
-    )
+    folds = "the same, but hold out in so many folds"
+    parser.add_argument("--folds", type=whole_number(2), metavar="N", help=folds)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 2 if one of the shapes could not be fitted."""
-    learn = partial(fit, settings=_settings(options)) if options.state == "plain" else learn_augmented
-    sources = _sources(options.files)
-    _check(options, sources)
+    """Run the command; 2 if one of the shapes could not be fitted."""
+    if options.state == "augmented" and options.objective != OBJECTIVES[0]:
+        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
+    learn: Learn = partial(learn_in_state, state="augmented")
+    if options.state == "plain":
+        learn = partial(fit, settings=ImitationSettings(options.objective))
+    sources, holds_out = _sources(options.files), options.leave_one_out or options.folds is not None
+    alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
+    if holds_out and alone:
+        raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
     folder = ready_folder(options.out)
-    results: list[Figures] = []
-    held_out: list[HeldOut] = []
-    beside: list[OffCourse] = []
-    cases: list[Case] = []
+    rows: list[Figures] = []
     panels: list[Panel] = []
+    held_out: list[dict[str, Any]] = []
+    cases: list[tuple[float, Panel]] = []
     for source in sources:
-        began = time.perf_counter()
+        name, began = source.path.stem, time.perf_counter()
         try:
             imitation = learn(source.demonstrations)
             seconds = time.perf_counter() - began
-            if options.leave_one_out:
-                row, of_source = _held_out(source, learn, options.folds, folder)
-                held_out.append(row)
-                cases += of_source
-                beside.append(off_course(source.path.stem, source.demonstrations, imitation))
+            followed = follow(source.demonstrations, learn, _num_folds(source, options.folds)) if holds_out else []
         except ImitationError as error:
             print(f"{source.path}: {error}", file=sys.stderr)
             continue
         for warning in imitation.warnings:
             print(f"{source.path}: {warning}", file=sys.stderr)
-        arrays = measured(imitation, source, seconds)
-        write_npz(folder / f"{source.path.stem}.npz", **arrays)
-        results.append(compared(arrays, source))
-        demonstrations = [d.positions / source.unit for d in source.demonstrations]
-        panels.append(Panel(source.path.stem, demonstrations, _rollouts(arrays, len(demonstrations))))
-    if results:
-        _report(results)
-        shapes = [asdict(figures) for figures in results]
-        if held_out:
-            _report_held_out(results, held_out)
-            _report_off_course(beside)
-            draw_worst(folder / "worst.svg", worst_of(cases))
-        written = {"held_out": [asdict(row) for row in held_out], "off_course": [asdict(row) for row in beside]}
+        row, arrays, rollouts = measured(imitation, source, seconds)
+        rows.append(row)
+        write_npz(folder / f"{name}.npz", **arrays)
+        panels.append(Panel(name, {"demonstration": _paths(source), "learned": rollouts}))
+        if holds_out:
+            write_npz(folder / f"{name}-held-out.npz", **_arrays(followed, source.unit))
+            held_out.append(summed_up(name, _num_folds(source, options.folds), followed))
+            cases += cases_of(name, source, followed)
+    if rows:
+        shapes = [asdict(row) for row in rows]
+        print("in-sample: each rollout against the demonstration that it was learned from")
+        report(_with_means(shapes))
+        print(f"fit, median: {np.median([row.fit_seconds for row in rows]):.2f} s")
+        if holds_out:
+            print("\nheld out: each demonstration against what was learned from the others")
+            report(_with_means(held_out))
+            better = sum(row["learned_mm"] < min(row["mean_mm"], row["nearest_mm"]) for row in held_out)
+            print(f"nearer than both without learning: {better} of {len(held_out)}")
         chosen = {"state": options.state, "objective": options.objective}
-        write_json(folder / "figures.json", {**chosen, "shapes": shapes, **written})
-        draw_panels(folder / "shapes.png", panels)
-    if options.choose is not None:
-        _report_choices(sources, options.choose, folder)
-    if options.crossings:
-        _report_crossings(options.state, learn, folder)
-    return 0 if len(results) == len(sources) else 2
+        write_json(folder / "figures.json", {**chosen, "shapes": shapes, "held_out": held_out})
+        if figures.can_draw():
+            figures.save(figures.panels(panels), folder / "shapes.png")
+            if cases:
+                worst = [panel for _, panel in worst_of(cases)]
+                figures.save(figures.panels(worst, columns=3), folder / "worst.png")
+    return 0 if len(rows) == len(sources) else 2
 
 
-def _settings(options: argparse.Namespace) -> ImitationSettings:
-    """Settings of the plain fit."""
-    settings = ImitationSettings(options.objective)
-    return replace(settings, regularisation=options.regularisation) if options.regularisation else settings
-
-
-def _check(options: argparse.Namespace, sources: Sequence[Source]) -> None:
-    """Refuse options that do not go together, or with these files."""
-    if not (sources or options.crossings):
-        raise InputError("SHAPE", "no file", "files, or --crossings")
-    if options.state == "augmented" and options.objective != OBJECTIVES[0]:
-        raise InputError("--objective", options.objective, "none with --state augmented, whose fit has no objective")
-    if options.state == "augmented" and options.regularisation:
-        raise InputError("--regularisation", f"{options.regularisation:g}", "none with --state augmented")
-    if options.folds and not options.leave_one_out:
-        raise InputError("--folds", str(options.folds), "it together with --leave-one-out")
-    alone = ", ".join(str(source.path) for source in sources if len(source.demonstrations) == 1)
-    if options.leave_one_out and alone:
-        raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
-    if options.choose is not None and (options.state != "augmented" or len(sources) < 2 or alone):
-        accepted = "it with --state augmented and two or more files, each of two or more demonstrations"
-        raise InputError("--choose", str(options.choose), accepted)
-
-
-def measured(imitation: Learned, source: Source, fit_seconds: float) -> dict[str, Any]:
-    """Compute the arrays of the file's npz; see the module's docstring."""
-    rollouts, times = rollouts_from(imitation, np.stack([d.positions[0] for d in source.demonstrations]))
-    grid = grown_grid(np.concatenate([d.positions for d in source.demonstrations]), GRID[len(imitation.goal)])
-    if isinstance(imitation, AugmentedImitation):
-        states = np.tile(imitation.states(imitation.starts[0]), (NUM_PHASES * len(grid), 1))
-        states[:, : imitation.dim] = np.tile(grid, (NUM_PHASES, 1))
-        states[:, imitation.dim] = np.repeat(np.linspace(0, imitation.top, NUM_PHASES), len(grid))
-        grid = states
-    transform = imitation.system.transform
+def measured(
+    imitation: Learned, source: Source, fit_seconds: float
+) -> tuple[Figures, dict[str, Any], tuple[Array, ...]]:
+    """Follow all demonstrations; the row of the table, the arrays of the file, and the rollouts (T, d), metres."""
+    paths, unit = _paths(source), source.unit
+    rollouts, times = rollouts_from(imitation, np.stack([path[0] for path in paths]))
+    distances = 1e3 * frechet(list(rollouts), paths)
+    at_times = zip(times, rollouts, source.demonstrations, strict=True)
+    rms = [1e3 * rms_at_equal_times(t, rollout, d.times, d.positions) for t, rollout, d in at_times]
+    grid, transform = _states(imitation, paths), imitation.system.transform
+    round_trip, det = round_trip_error(transform, grid), min_det_jacobian(transform.jacobian, grid)
+    start_seconds = float(np.median([_seconds_for(imitation, path[0]) for path in paths]))
+    figures = Figures(
+        name=source.path.stem,
+        demonstrations=len(paths),
+        frechet_mean_mm=float(distances.mean()),
+        frechet_max_mm=float(distances.max()),
+        rms_mm=float(np.mean(rms)),
+        fit_seconds=fit_seconds,
+        start_seconds=start_seconds,
+        end_error_mm=1e3 * float(np.linalg.norm(rollouts[:, -1] - imitation.goal, axis=1).max()),
+        round_trip_of_extent=round_trip / source.extent,
+        min_det_jacobian=det,
+    )
     arrays: dict[str, Any] = {
         "fit_seconds": fit_seconds,
-        "start_seconds": float(np.median([_seconds_for(imitation, d.positions[0]) for d in source.demonstrations])),
-        "min_det_jacobian": min_det_jacobian(transform.jacobian, grid),
-        "round_trip_error": round_trip_error(transform, grid) / source.unit,
-        "goal": imitation.goal / source.unit,
+        "start_seconds": start_seconds,
+        "min_det_jacobian": det,
+        "round_trip_error": round_trip / unit,
+        "goal": imitation.goal / unit,
     }
-    for i in range(len(rollouts)):
-        arrays[f"rollout_{i}"] = rollouts[i] / source.unit
-        arrays[f"times_{i}"] = times[i]
-    return arrays
+    for i, (rollout, t) in enumerate(zip(rollouts, times, strict=True)):
+        arrays |= {f"rollout_{i}": rollout / unit, f"times_{i}": t}
+    return figures, arrays, tuple(rollouts)
+
+
+def _states(imitation: Learned, paths: Sequence[Array]) -> Array:
+    """States (N, d) of the certificates' grid; augmented ones at each of `NUM_PHASES`."""
+    grid = grown_grid(np.concatenate(paths), GRID[len(imitation.goal)])
+    if not isinstance(imitation, AugmentedImitation):
+        return grid
+    states = np.tile(imitation.states(imitation.starts[0]), (NUM_PHASES * len(grid), 1))
+    states[:, : imitation.dim] = np.tile(grid, (NUM_PHASES, 1))
+    states[:, imitation.dim] = np.repeat(np.linspace(0, imitation.top, NUM_PHASES), len(grid))
+    return states
 
 
 def _seconds_for(imitation: Learned, start: Array) -> float:
@@ -236,52 +212,48 @@ def _seconds_for(imitation: Learned, start: Array) -> float:
     return time.perf_counter() - began
 
 
-def compared(arrays: dict[str, Any], source: Source) -> Figures:
-    """Compute the figures from the arrays of a file's npz."""
-    demonstrations = [d.positions / source.unit for d in source.demonstrations]
-    rollouts = _rollouts(arrays, len(demonstrations))
-    distances = frechet(rollouts, demonstrations)
-    rms = [
-        rms_at_equal_times(arrays[f"times_{i}"], rollouts[i], demonstration.times, demonstrations[i])
-        for i, demonstration in enumerate(source.demonstrations)
-    ]
-    end_error = max(float(np.linalg.norm(path[-1] - arrays["goal"])) for path in rollouts)
-    millimetres = 1e3 * source.unit
-    return Figures(
-        name=source.path.stem,
-        demonstrations=len(demonstrations),
-        frechet_mean_mm=millimetres * float(distances.mean()),
-        frechet_max_mm=millimetres * float(distances.max()),
-        rms_mm=millimetres * float(np.mean(rms)),
-        fit_seconds=arrays["fit_seconds"],
-        start_seconds=arrays["start_seconds"],
-        end_error_mm=millimetres * end_error,
-        round_trip_of_extent=arrays["round_trip_error"] / float(np.ptp(np.concatenate(demonstrations), axis=0).max()),
-        min_det_jacobian=arrays["min_det_jacobian"],
-    )
-
-
-def _held_out(source: Source, learn: Learn, folds: int | None, folder: Path) -> tuple[HeldOut, list[Case]]:
-    """Follow each demonstration without having learned from it, and write the paths to the folder."""
-    row, cases, arrays = _followed(source, learn, folds)
-    write_npz(folder / f"{source.path.stem}-held-out.npz", **arrays)
-    return row, cases
-
-
-def _followed(source: Source, learn: Learn, folds: int | None) -> tuple[HeldOut, list[Case], dict[str, Array]]:
-    """Follow each demonstration without having learned from it; the figures, the cases and the paths."""
+def _num_folds(source: Source, folds: int | None) -> int:
     num = len(source.demonstrations)
-    folds = min(folds or num, num)
-    arrays = {
-        f"{name}_{i}": values if name.endswith("_times") else values / source.unit
-        for i, followed in enumerate(follow(source.demonstrations, learn, folds))
-        for name, values in followed.items()
-    }
-    demonstrations = [d.positions / source.unit for d in source.demonstrations]
-    times = [d.times for d in source.demonstrations]
-    name, millimetres = source.path.stem, 1e3 * source.unit
-    row = summed_up(name, folds, arrays, demonstrations, times, millimetres)
-    return row, cases_of(name, arrays, demonstrations, millimetres), arrays
+    return min(folds or num, num)
+
+
+def _paths(source: Source) -> list[Array]:
+    return [d.positions for d in source.demonstrations]
+
+
+def _arrays(followed: Sequence[Followed], unit: float) -> dict[str, Array]:
+    """Arrays of the file of what was held out; lengths in so many metres."""
+    paths = {f"{way}_{i}": f.paths[way] / unit for i, f in enumerate(followed) for way in WAYS}
+    return paths | {f"{way}_times_{i}": f.times[way] for i, f in enumerate(followed) for way in WAYS}
+
+
+def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, Any]:
+    """Means over the held-out demonstrations of a shape, mm: Fréchet distance and distance at equal times."""
+    distances = {f"{way}_mm": 1e3 * float(np.mean([f.frechet(way) for f in followed])) for way in WAYS}
+    rms = {f"{way}_rms_mm": 1e3 * float(np.mean([f.rms(way) for f in followed])) for way in WAYS}
+    return {"name": name, "folds": folds, **distances, **rms}
+
+
+def cases_of(name: str, source: Source, followed: Sequence[Followed]) -> list[tuple[float, Panel]]:
+    """The panel of each held-out demonstration, and how far off what was learned is, relative to the extent."""
+    cases, paths = [], _paths(source)
+    for i, f in enumerate(followed):
+        learned, mean, nearest = (1e3 * f.frechet(way) for way in WAYS)
+        kinds = {
+            "learned from": [path for j, path in enumerate(paths) if j != i],
+            "demonstration": [paths[i]],
+            "learned": [f.paths["learned"]],
+            "mean, shifted": [f.paths["mean"]],
+            "nearest start, shifted": [f.paths["nearest"]],
+        }
+        title = f"{name} {i + 1}  {learned:.1f} mm\nmean {mean:.1f}, nearest {nearest:.1f} mm"
+        cases.append((learned / source.extent, Panel(title, kinds)))
+    return cases
+
+
+def worst_of(cases: Sequence[tuple[float, Panel]], num: int = NUM_WORST) -> list[tuple[float, Panel]]:
+    """The cases in which what was learned is farthest off, the worst first."""
+    return sorted(cases, key=lambda case: -case[0])[:num]
 
 
 def _sources(paths: Sequence[Path]) -> list[Source]:
@@ -296,116 +268,14 @@ def _sources(paths: Sequence[Path]) -> list[Source]:
     return list(sources.values())
 
 
-def _rollouts(arrays: dict[str, Any], num: int) -> list[Array]:
-    return [arrays[f"rollout_{i}"] for i in range(num)]
-
-
-def _report(results: Sequence[Figures]) -> None:
-    print("in-sample: each rollout against the demonstration that it was learned from")
-    header = ("shape", "demos", "Fréchet mean mm", "max mm", "RMS mm", "fit s", "end mm", "round trip/extent", "det J")
-    rows = [
-        (
-            r.name,
-            str(r.demonstrations),
-            f"{r.frechet_mean_mm:.2f}",
-            f"{r.frechet_max_mm:.2f}",
-            f"{r.rms_mm:.2f}",
-            f"{r.fit_seconds:.2f}",
-            f"{r.end_error_mm:.3f}",
-            f"{r.round_trip_of_extent:.1e}",
-            f"{r.min_det_jacobian:.2g}",
-        )
-        for r in results
+def _with_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of a table, and below them the mean, smallest and largest of each column of numbers."""
+    numbers = {column: [row[column] for row in rows] for column in rows[0] if column != "name"}
+    below = {"mean": np.mean, "smallest": np.min, "largest": np.max}
+    return [
+        *rows,
+        *(
+            {"name": name} | {column: float(f(values)) for column, values in numbers.items()}
+            for name, f in below.items()
+        ),
     ]
-    print_table(header, rows)
-    worst = max(results, key=lambda r: r.frechet_mean_mm)
-    slowest = max(results, key=lambda r: r.fit_seconds)
-    tightest = min(results, key=lambda r: r.min_det_jacobian)
-    print(f"\nmeans over {len(results)} shape(s), each the mean over its demonstrations:")
-    mean = np.mean([r.frechet_mean_mm for r in results])
-    largest = max(r.frechet_max_mm for r in results)
-    print(f"Fréchet distance {mean:.2f} mm; worst shape {worst.frechet_mean_mm:.2f} mm ({worst.name})")
-    print(f"largest of a rollout {largest:.2f} mm; RMS at equal times {np.mean([r.rms_mm for r in results]):.2f} mm")
-    median = np.median([r.fit_seconds for r in results])
-    print(f"fit: median {median:.2f} s, worst {slowest.fit_seconds:.2f} s ({slowest.name})")
-    print(f"new start: median {1e3 * np.median([r.start_seconds for r in results]):.2f} ms")
-    print(f"largest distance from the goal at the end {max(r.end_error_mm for r in results):.3f} mm")
-    print(f"largest round trip error {max(r.round_trip_of_extent for r in results):.1e} of the extent")
-    print(f"smallest det J {tightest.min_det_jacobian:.2g} ({tightest.name})")
-
-
-def _report_held_out(results: Sequence[Figures], held_out: Sequence[HeldOut]) -> None:
-    for title, attribute, in_sample in (
-        ("Fréchet mean", "mm", [r.frechet_mean_mm for r in results]),
-        ("RMS at equal times", "rms_mm", [r.rms_mm for r in results]),
-    ):
-        columns = [in_sample, *([getattr(h, f"{way}_{attribute}") for h in held_out] for way in WAYS)]
-        print(f"\nheld out: each demonstration against what was learned from others; {title}, mm")
-        rows = [
-            (h.name, str(h.folds), *(f"{value:.2f}" for value in values))
-            for h, *values in zip(held_out, *columns, strict=True)
-        ]
-        means = ("mean", "", *(f"{np.mean(column):.2f}" for column in columns))
-        print_table(("shape", "folds", "in-sample", "held out", "mean of others", "nearest start"), [*rows, means])
-        better = sum(learned < min(others) for _, learned, *others in zip(*columns, strict=True))
-        print(f"nearer than both without learning: {better} of {len(rows)}")
-
-
-def _report_off_course(beside: Sequence[OffCourse]) -> None:
-    print("\noff the demonstrations; shape error relative to the extent, speed to the fastest demonstrated")
-    heads = [f"{what} at {100 * away:.0f} %" for what in ("shape error", "speed") for away in AWAY]
-    rows = [
-        (b.name, *(f"{v:.3f}" for v in b.shape_error), *(f"{v:.2f}" for v in b.speed), f"{b.drawn:.2f}") for b in beside
-    ]
-    columns = np.array([[*b.shape_error, *b.speed, b.drawn] for b in beside])
-    mean = ("mean", *(f"{value:.3f}" for value in columns.mean(axis=0)))
-    worst = (*columns[:, :-1].max(axis=0), columns[:, -1].min())
-    print_table(("shape", *heads, "drawn after a push"), [*rows, mean, ("worst", *(f"{value:.3f}" for value in worst))])
-
-
-def _report_choices(sources: Sequence[Source], seed: int, folder: Path) -> None:
-    """Choose constants of the augmented state on each half of the files, and print what they do on the other."""
-    names = [source.path.stem for source in sources]
-    choices: list[Choice] = []
-    for grid in GRIDS:
-        measured = measure(grid, lambda: [_followed(source, learn_augmented, None)[0] for source in sources])
-        choices += choose(grid, measured, names, seed)
-    rows = [
-        (
-            choice.figure,
-            str(len(choice.chosen_on)),
-            ", ".join(f"{name} {value:g}" for name, value in choice.chosen),
-            *(f"{value:.2f}" for value in (choice.others_mm, choice.shipped_mm, choice.best_mm)),
-        )
-        for choice in choices
-    ]
-    print("\nconstants chosen on half of the files, and what they do on the others, mm")
-    print_table(("figure", "files", "chosen", "others", "others, as shipped", "others, their best"), rows)
-    write_json(folder / "choices.json", {"seed": seed, "choices": [asdict(choice) for choice in choices]})
-
-
-def _report_crossings(state: str, learn: Learn, folder: Path) -> None:
-    """Follow what crosses, comes back or winds, and print and draw it; labels are found, and given as well."""
-    rows, panels = [], []
-    for name, case in crossings().items():
-        demonstrations = case.demonstrations
-        ways: dict[str, Learn] = {name: learn}
-        if case.labels and state == "augmented":
-            ways = {f"{name}, labels found": learn, f"{name}, given": partial(fit_augmented, labels=case.labels)}
-        extent = float(np.ptp(np.concatenate([d.positions for d in demonstrations]), axis=0).max())
-        for title, way in ways.items():
-            try:
-                imitation = way(demonstrations)
-            except ImitationError as error:
-                rows.append((title, f"{1e3 * extent:.0f}", "–", "–", str(error)))
-                continue
-            labels = imitation.labels if isinstance(imitation, AugmentedImitation) else None
-            begins = zip(demonstrations, labels or [None] * len(demonstrations), strict=True)
-            states = [imitation.system.base.states(d.positions[0], label) for d, label in begins]
-            paths = [path_from(imitation.system, state, len(imitation.goal)) for state in states]
-            worst = float(frechet(paths, [d.positions for d in demonstrations]).max())
-            rows.append((title, f"{1e3 * extent:.0f}", f"{1e3 * worst:.1f}", f"{100 * worst / extent:.1f}", ""))
-            panels.append(Panel(title, [d.positions for d in demonstrations], paths))
-    print(f"\nwhat crosses, comes back or winds, by the {state} state; worst of each case, in-sample")
-    print_table(("case", "extent mm", "Fréchet mm", "% of the extent", ""), rows)
-    draw_panels(folder / "crossings.png", panels)

@@ -44,11 +44,12 @@ import numpy as np
 
 from dt_viz.evaluate.options import (
     InputError,
+    Row,
     add_lasa,
     chosen_task,
     positive_number,
-    print_table,
     ready_to_write,
+    report,
     unit_ms,
     whole_number,
     write_json,
@@ -63,16 +64,12 @@ EDITS_PER_SECOND = 20
 """Rate of a drag's edits; no page sends more."""
 RADIUS, LAP = 0.06, 5.0
 """Radius of the circle around the obstacle's place, in the task's slice, metres, and the time for one lap, seconds."""
-WIDENING = 1e-7
-"""Growth of the radius from one edit to the next, metres, by which no place comes twice."""
 FIRST_PICTURE = 60.0
 """Longest accepted time until a visitor has a picture, seconds."""
 SETTLED = 10.0
 """Time after the first pictures until nothing is refined any more, seconds."""
 PATIENCE = 60.0
 """Longest time to wait for the picture of the last edit, seconds."""
-PING_PAUSE = 0.25
-"""Time between two pings of a visitor, seconds."""
 
 
 @dataclass
@@ -134,7 +131,7 @@ class Visit:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
+    """Define the command's arguments."""
     parser.add_argument("--task", default="draw_s", help="that the server begins with (default: %(default)s)")
     add_lasa(parser)
     modes = tuple(mode.lower() for mode in (*SPACES, OFF))
@@ -149,7 +146,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
+    """Run the command; 1 if a visitor had no picture in time, was lost, or was not shown its last edit."""
     _, task = chosen_task(options)
     out = None if options.out is None else ready_to_write(options.out, ".json")
     unit = unit_ms()
@@ -158,7 +155,7 @@ def run(options: argparse.Namespace) -> int:
     for number in options.clients:
         with _server(options, number) as (url, process):
             visits.append(asyncio.run(_visited(options, url, process, task, number)))
-    _print(visits)
+    report([_row(figures) for figures in visits])
     if out is not None:
         settings = {"task": task.name, "avoid": options.avoid, "seconds": options.seconds, "rest": options.rest}
         machine = {"cores": os.cpu_count(), "python": platform.python_version(), "numpy": np.__version__}
@@ -171,7 +168,8 @@ def places_of(task: Task, number: int, num_edits: int) -> list[Point]:
     """Return where one of several visitors drags the obstacle: a circle in the task's slice, no place twice."""
     edits = np.arange(num_edits)
     angles = 2 * np.pi * edits / (EDITS_PER_SECOND * LAP) + number
-    circle = (RADIUS + WIDENING * edits)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    widening = 1e-7 * edits  # so that no place comes twice, metres
+    circle = (RADIUS + widening)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return [as_point(place) for place in np.asarray(task.obstacle_position) + circle @ task.slice.axes.T]
 
 
@@ -242,7 +240,7 @@ async def _ping(visit: Visit) -> None:
     try:
         while True:
             visit.pings.append(await visit.client.ping())
-            await asyncio.sleep(PING_PAUSE)
+            await asyncio.sleep(0.25)
     except LostError as error:
         visit.lost = str(error)
 
@@ -296,41 +294,32 @@ def _spread(seconds: Array) -> dict[str, float] | None:
     return {"median": float(median), "p95": float(p95), "worst": float(worst)}
 
 
-def _print(visits: Sequence[Mapping[str, Any]]) -> None:
-    header = ("visitors", "first picture s", "pictures/s of each", "gap ms", "edit → picture ms", "kB", "ping ms")
-    print_table((*header, "cores", "MB", "messages/s", "lost", "last shown"), [_row(figures) for figures in visits])
-    print("gaps, edit → picture, pings: median / 95 % / worst; of the gaps and pictures those of the worst visitor")
-
-
-def _row(figures: Mapping[str, Any]) -> tuple[str, ...]:
-    """The row of a number of visitors in the table."""
+def _row(figures: Mapping[str, Any]) -> Row:
+    """Row of a number of visitors in the table: gaps and pictures of the worst of them."""
     firsts, visitors = figures["first_picture_s"], figures["visitors"]
     shown = [visitor for visitor in visitors if "last_shown" in visitor]
     rates = [visitor["pictures_per_s"] for visitor in shown]
-    return (
-        str(figures["clients"]),
-        "–" if None in firsts else f"{max(firsts):.1f}",
-        f"{min(rates):.1f} to {max(rates):.1f}" if rates else "–",
-        _worst(visitor["gap_ms"] for visitor in shown),
-        _worst(visitor["latency_ms"] for visitor in shown),
-        _text(max((visitor["bytes"] / 1e3 for visitor in shown if visitor["bytes"]), default=None), ".0f"),
-        _worst([figures.get("ping_ms")]),
-        _text(figures.get("cores"), ".2f"),
-        _text(figures.get("peak_memory_mb"), ".0f"),
-        _text(figures.get("messages_per_s"), ".0f"),
-        str(sum(bool(visitor["lost"]) for visitor in visitors) + firsts.count(None)),
-        f"{sum(visitor['last_shown'] for visitor in shown)} of {len(shown)}" if shown else "–",
-    )
+    last = f"{sum(visitor['last_shown'] for visitor in shown)} of {len(shown)}" if shown else None
+    return {
+        "visitors": str(figures["clients"]),
+        "first picture s": None if None in firsts else max(firsts),
+        "pictures/s of each": f"{min(rates):.1f} to {max(rates):.1f}" if rates else None,
+        "gap ms, median / 95 % / worst": _worst(visitor["gap_ms"] for visitor in shown),
+        "edit → picture ms": _worst(visitor["latency_ms"] for visitor in shown),
+        "kB": max((visitor["bytes"] / 1e3 for visitor in shown if visitor["bytes"]), default=None),
+        "ping ms": _worst([figures.get("ping_ms")]),
+        "cores": figures.get("cores"),
+        "MB": figures.get("peak_memory_mb"),
+        "messages/s": figures.get("messages_per_s"),
+        "lost": sum(bool(visitor["lost"]) for visitor in visitors) + firsts.count(None),
+        "last shown": last,
+    }
 
 
-def _worst(spreads: Iterable[dict[str, float] | None]) -> str:
+def _worst(spreads: Iterable[dict[str, float] | None]) -> str | None:
     """Text of the largest median, 95 % and worst of several spreads."""
-    known = [spread for spread in spreads if spread is not None]
-    return " / ".join(f"{max(spread[name] for spread in known):.0f}" for name in (known[0] if known else ())) or "–"
-
-
-def _text(number: float | None, form: str) -> str:
-    return "–" if number is None else format(number, form)
+    known = [spread.values() for spread in spreads if spread is not None]
+    return " / ".join(f"{max(values):.0f}" for values in zip(*known, strict=True)) or None
 
 
 def _url(text: str) -> str:

@@ -1,10 +1,11 @@
-"""Shared parts of the subcommands: options of the command line, files to write, and tables."""
+"""Options, tables and files that the commands share."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,11 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.obstacles.occupancy import GENERATORS
-from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.arm.robot import load_jaco
+from dt_viz.engine.engine import Engine
+from dt_viz.folders import default_cache_folder
+from dt_viz.learning.store import FitStore
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, known_tasks
-from dt_viz.transforms.avoidance import SPACES, Avoidance
+from dt_viz.transforms.avoidance import Avoidance
+
+Row = Mapping[str, str | float | None]
+"""Row of a table: text or number of each column by its header, which names the unit."""
+PRINTED: list[Sequence[Row]] = []
+"""Tables that the running command has printed."""
 
 
 class InputError(ValueError):
@@ -37,31 +45,6 @@ def add_lasa(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
 
 
-def add_space(parser: argparse.ArgumentParser, default: str = "task") -> None:
-    """Add `--space`."""
-    what = "what avoids: the end effector (task) or the whole arm (cspace) (default: %(default)s)"
-    parser.add_argument("--space", choices=SPACES, default=default, help=what)
-
-
-def add_avoidance(parser: argparse.ArgumentParser, space: str) -> None:
-    """Add `--space`, `--generator` and `--no-avoidance`."""
-    add_space(parser, space)
-    paper = "probability is the paper's (default: %(default)s)"
-    parser.add_argument("--generator", choices=GENERATORS, default=GENERATORS[0], help=paper)
-    parser.add_argument("--no-avoidance", action="store_true", help="leave the obstacle's transforms out")
-
-
-def scenario_around(obstacles: Sequence[Obstacle], task: Task, options: argparse.Namespace) -> Scenario:
-    """Return the scenario of obstacles with the options of `add_avoidance`."""
-    avoidance = Avoidance(obstacles, space=options.space, generator=options.generator)
-    return avoiding(task, avoidance, on=not options.no_avoidance)
-
-
-def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
-    """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
-    return Scenario(task.name, (Layer(avoidance, on, avoidance.title),))
-
-
 def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], Task]:
     """Return all tasks by name, and the chosen one, loaded.
 
@@ -74,6 +57,16 @@ def chosen_task(options: argparse.Namespace) -> tuple[Mapping[str, TaskEntry], T
         hint = "" if options.lasa is not None else "; --lasa DIR adds more"
         raise InputError("--task", repr(options.task), ", ".join(tasks) + hint)
     return tasks, tasks[options.task]()
+
+
+def new_engine(tasks: Mapping[str, TaskEntry]) -> Engine:
+    """Return an engine that has computed nothing yet, with what was learned before on this machine."""
+    return Engine(tasks, FitStore(default_cache_folder()), load_jaco())
+
+
+def avoiding(task: Task, avoidance: Avoidance, *, on: bool = True) -> Scenario:
+    """Return the scenario of a task with an avoidance, switched on or off, on its imitation."""
+    return Scenario(task.name, (Layer(avoidance, on, avoidance.title),))
 
 
 def whole_number(minimum: int) -> Callable[[str], int]:
@@ -92,9 +85,7 @@ def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
     """Return a type for argparse: a number above 0 and up to `maximum`."""
 
     def convert(text: str) -> float:
-        number = _number(text)
-        if not 0 < number <= maximum:
-            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {unit}, more than 0, at most {maximum:g}")
+        (number,) = _numbers(text, (1,), f"{unit}, more than 0, at most {maximum:g}", math.ulp(0), maximum)
         return number
 
     return convert
@@ -104,10 +95,7 @@ def number(unit: str, minimum: float, maximum: float) -> Callable[[str], float]:
     """Return a type for argparse: a number between two others."""
 
     def convert(text: str) -> float:
-        found = _number(text)
-        if not minimum <= found <= maximum:
-            accepted = f"{unit}, at least {minimum:g} and at most {maximum:g}"
-            raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
+        (found,) = _numbers(text, (1,), f"{unit}, at least {minimum:g} and at most {maximum:g}", minimum, maximum)
         return found
 
     return convert
@@ -117,22 +105,18 @@ def interval(minimum: float, maximum: float) -> Callable[[str], tuple[float, flo
     """Return a type for argparse: LOW,HIGH within bounds, or one number for both."""
 
     def convert(text: str) -> tuple[float, float]:
-        parts = [_number(part) for part in text.split(",")]
-        low, high = parts[0], parts[-1]
-        if len(parts) > 2 or not minimum <= low <= high <= maximum:
-            accepted = f"a number or LOW,HIGH, at least {minimum:g} and at most {maximum:g}"
+        accepted = f"a number or LOW,HIGH, at least {minimum:g} and at most {maximum:g}"
+        found = _numbers(text, (1, 2), accepted, minimum, maximum)
+        if found != sorted(found):
             raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
-        return low, high
+        return found[0], found[-1]
 
     return convert
 
 
 def point(text: str) -> tuple[float, float, float]:
     """Convert X,Y,Z, metres; a type for argparse."""
-    numbers = [_number(part) for part in text.split(",")]
-    if len(numbers) != 3 or not all(math.isfinite(number) for number in numbers):
-        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: three numbers X,Y,Z in metres, such as 0,-0.5,0.4")
-    x, y, z = numbers
+    x, y, z = _numbers(text, (3,), "three numbers X,Y,Z in metres, such as 0,-0.5,0.4", -1e9, 1e9)
     return x, y, z
 
 
@@ -140,8 +124,7 @@ def with_negative_values(arguments: Sequence[str]) -> list[str]:
     """Join an option to a value such as -0.1,-0.5,0.4, which argparse would take for an option."""
     joined: list[str] = []
     for argument in arguments:
-        negative = argument[:1] == "-" and argument[1:2] in set("0123456789.")
-        if negative and joined and joined[-1].startswith("--") and "=" not in joined[-1]:
+        if re.match(r"-[\d.]", argument) and joined and re.fullmatch(r"--[^=]+", joined[-1]):
             joined[-1] += f"={argument}"
         else:
             joined.append(argument)
@@ -198,16 +181,53 @@ def unit_ms() -> float:
     return 1e3 * best
 
 
+def report(rows: Sequence[Row]) -> None:
+    """Print rows, if there are any, as a table whose header is the columns of the first."""
+    if not rows:
+        return
+    PRINTED.append([{column: row.get(column) for column in rows[0]} for row in rows])
+    _print_aligned(tuple(rows[0]), [[as_text(cell) for cell in row.values()] for row in PRINTED[-1]])
+
+
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under a header, the first column aligned left, the others right."""
+    """Print rows of texts under a header."""
+    PRINTED.append([dict(zip(header, row, strict=True)) for row in rows])
+    _print_aligned(header, rows)
+
+
+def write_tables(path: Path) -> None:
+    """Write all tables that were printed to a JSON file: lists of rows; null for what is no number."""
+    finite = [[{name: _finite(cell) for name, cell in row.items()} for row in rows] for rows in PRINTED]
+    write_json(path, {"tables": finite})
+
+
+def _finite(cell: str | float | None) -> str | float | None:
+    return None if isinstance(cell, float) and not math.isfinite(cell) else cell
+
+
+def as_text(value: str | float | None) -> str:
+    """Text of a cell: three digits of a number; a dash where there is none."""
+    if value is None or value != value:  # noqa: PLR0124 - NaN
+        return "–"
+    if isinstance(value, float):
+        return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
+    return str(value)
+
+
+def _print_aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table, the first column aligned left, the others right."""
     widths = [max(len(row[k]) for row in (header, *rows)) for k in range(len(header))]
     for row in (header, *rows):
         cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
         print("  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip())
 
 
-def _number(text: str) -> float:
+def _numbers(text: str, counts: tuple[int, ...], accepted: str, minimum: float, maximum: float) -> list[float]:
+    """Convert so many numbers between bounds, separated by commas."""
     try:
-        return float(text)
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        return math.nan
+        numbers = []
+    if len(numbers) not in counts or not all(minimum <= number <= maximum for number in numbers):
+        raise argparse.ArgumentTypeError(f"found {text!r}; accepted: {accepted}")
+    return numbers

@@ -104,18 +104,9 @@ class ProtocolClient:
 
     async def look(self, width: int = 1280, height: int = 720) -> None:
         """Report the camera; the server then builds the page."""
-        await self.send(
-            "ViewerCameraMessage",
-            wxyz=UPRIGHT,
-            position=(0.0, -2.0, 1.0),
-            fov=0.75,
-            near=0.01,
-            far=1000.0,
-            image_height=height,
-            image_width=width,
-            look_at=(0.0, 0.0, 0.0),
-            up_direction=(0.0, 0.0, 1.0),
-        )
+        where = {"position": (0.0, -2.0, 1.0), "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)}
+        image = {"fov": 0.75, "near": 0.01, "far": 1000.0, "image_height": height, "image_width": width}
+        await self.send("ViewerCameraMessage", wxyz=UPRIGHT, **where, **image)
 
     async def wait_for(self, condition: Callable[[], object], seconds: float) -> bool:
         """Wait until a condition on the page holds; return False if it does not in time.
@@ -168,13 +159,8 @@ class ProtocolClient:
 
     async def move(self, position: ArrayLike, name: str = OBSTACLE) -> None:
         """Drag a gizmo to a place (3,), metres."""
-        await self.send(
-            "TransformControlsUpdateMessage",
-            name=name,
-            owner=self.nodes[name]["owner"],
-            wxyz=UPRIGHT,
-            position=np.asarray(position, float).tolist(),
-        )
+        pose = {"wxyz": UPRIGHT, "position": np.asarray(position, float).tolist()}
+        await self.send("TransformControlsUpdateMessage", name=name, owner=self.nodes[name]["owner"], **pose)
 
     async def release(self, name: str = OBSTACLE) -> None:
         """End the drag of a gizmo."""

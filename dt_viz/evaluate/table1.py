@@ -7,7 +7,7 @@ length. Those places are kept where the hand of every undisturbed motion enters 
 in its usual posture at every start and goal of the demonstrations: each method has a problem that can be solved.
 
 ``DIR/table1.json`` holds ``{method: {task: {column: {"mean", "worst", "paper"}}}}`` in metres and seconds, over all
-places and rollouts; ``paper`` is null where the paper's figure is not known here. ``DIR/METHOD_TASK.npz`` holds what
+places and rollouts; ``paper`` is the paper's value, null where there is none. ``DIR/METHOD_TASK.npz`` holds what
 the cells are made from: ``obstacle_k`` (4,), centre and diameter of the sphere at place k; ``x_k_i``, ``t_k_i`` and
 ``q_k_i``, the path (N, 3), its times (N,) and the arm's postures (M, 6) along it, of the rollout from start i;
 ``demo_i`` (T, 3), its demonstration, and ``demo_t_i``; one array (K, R) for each column, of motions from the starts;
@@ -42,17 +42,23 @@ from typing import Any
 import numpy as np
 
 from dt_viz.arm.collision import load_collision_model
-from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.tracking import UnreachableError, track
-from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import INSTALL, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.registry import METHODS, problem_of
-from dt_viz.engine.engine import Engine
-from dt_viz.evaluate.avoidance import TURN_ARC
-from dt_viz.evaluate.figure6 import MATPLOTLIB, draw
-from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number, write_json, write_npz
+from dt_viz.engine.comparison import curves
+from dt_viz.evaluate import figures
+from dt_viz.evaluate.around import TURN_ARC
+from dt_viz.evaluate.options import (
+    InputError,
+    Row,
+    new_engine,
+    ready_folder,
+    report,
+    whole_number,
+    write_json,
+    write_npz,
+)
 from dt_viz.flows.fields import Array
-from dt_viz.folders import default_cache_folder
-from dt_viz.learning.store import FitStore
 from dt_viz.metrics import (
     dynamic_time_warping,
     frechet,
@@ -64,11 +70,9 @@ from dt_viz.metrics import (
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.scenario.tasks import TASKS, Task
+from dt_viz.scenario.tasks import TASKS
 
 PAPER_TASKS = ("push_box", "lift_box", "draw_s")
-DIAMETER = 0.15
-"""Diameter of the sphere, metres."""
 ALONG, WITHIN = (0.2, 0.8), 0.05
 """Part of the mean demonstration that spheres are drawn along, and largest distance from it, metres."""
 MAX_DRAWN = 2000
@@ -79,27 +83,21 @@ REACHED = 0.01
 """Distance from the goal at which a motion counts as having reached it, metres."""
 NUM_WARPED = 200
 """Number of points of each path that are matched by dynamic time warping."""
-INTERVAL = 0.05
-"""Interval of the jerk's differences, seconds: the paper's 20 Hz."""
-FREE = 1e-3
-"""Maximum collision distance up to which a method counts as free of collisions, metres."""
-ALIKE = 2.0
-"""Ratio of mean Fréchet distances up to which two methods count as comparable."""
 SMALLEST = ("clearance", "reached")
 """Columns whose worst value is the smallest."""
 UNITS = {"turn": (1.0, "°"), "reached": (100.0, "%"), "seconds": (1.0, "s"), "jerk": (1.0, "m/s³")}
 """Factor and unit of each column in the printed table; all others are lengths, printed in millimetres."""
-PAPER: Mapping[tuple[str, str, str], float] = {
-    ("ours", "push_box", "frechet"): 0.124,
-    ("ours", "lift_box", "frechet"): 0.127,
-    ("ours", "draw_s", "frechet"): 0.067,
+PAPER: Mapping[str, Sequence[tuple[float, float]]] = {
+    "ours": ((0.124, 0.0), (0.127, 0.0), (0.067, 0.002)),
+    "ours-no-avoidance": ((0.070, 0.012), (0.112, 0.012), (0.011, 0.018)),
+    "eflow": ((0.068, 0.012), (0.093, 0.152), (0.021, 0.007)),
+    "eflow-repulsive": ((0.168, 0.0), (0.252, 0.001), (0.195, 0.003)),
+    "mpnet": ((0.371, 0.038), (0.133, 0.022)),
+    "mpnet-rrt": ((0.371, 0.0), (0.478, 0.0)),
+    "linear": ((0.242, 0.147), (0.205, 0.031)),
 }
-"""Figures of the paper's Table 1 that are known here, by method, task and column, metres."""
-INCONSISTENT = """The paper's table does not agree with itself in two places, and is no measure there:
-- maximum collision distances above the sphere's radius: no point is deeper in a sphere than that;
-- Fréchet distances of Draw S that are larger than a letter of the LASA data set."""
-FAILED = 1
-"""Exit status if something that a method needs is not installed, or a method was not trained."""
+"""The paper's Table 1: Fréchet and maximum collision distance, metres, by method, for each of `PAPER_TASKS`; it has no
+drawing of the planners."""
 
 
 @dataclass(frozen=True)
@@ -134,49 +132,48 @@ class Place:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
+    """Define the command's arguments."""
     parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=list(METHODS), help="(default: all)")
     parser.add_argument("--tasks", nargs="+", choices=PAPER_TASKS, default=list(PAPER_TASKS), help="(default: all)")
     parser.add_argument("--count", type=whole_number(1), default=10, help="places (default: %(default)s)")
     parser.add_argument("--perturbed", type=whole_number(0), default=200, help="starts (default: %(default)s)")
     parser.add_argument("--seed", type=whole_number(0), default=0, help="of the places (default: %(default)s)")
-    parser.add_argument("--no-figures", action="store_true", help="leave figure 6 out")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the table and its arrays")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 1 if a method needs what is not there."""
+    """Run the command; 1 if a method needs what is not installed, or was not trained."""
     folder, methods = ready_folder(options.out), [METHODS[name] for name in options.methods]
-    missing = {method.title: method.missing for method in methods if method.missing}
-    if not options.no_figures and MATPLOTLIB.missing:
-        missing["figure 6"] = MATPLOTLIB.missing
-    for title, modules in missing.items():
-        print(f"{title} needs {', '.join(modules)}: {INSTALL}; or leave it out", file=sys.stderr)
-    if missing:
-        return FAILED
-    engine = Engine(TASKS, FitStore(default_cache_folder()), load_jaco())
+    for method in methods:
+        if method.missing:
+            print(f"{method.title} needs {', '.join(method.missing)}: {INSTALL}; or leave it out", file=sys.stderr)
+    if any(method.missing for method in methods):
+        return 1
+    engine, draws = new_engine(TASKS), figures.can_draw()
     table: dict[str, dict[str, Any]] = {method.name: {} for method in methods}
     for name in options.tasks:
         problem = problem_of(engine.nominal(Scenario(name)).learned, engine.follower)
         places = drawn(problem, options.count, options.perturbed, options.seed)
-        curves = {}
+        first_motions = {}
         for method in methods:
             try:
                 planner = method.fit(problem)
             except NotFittedError as error:
                 print(f"{method.title}, {problem.task.title}: {error}", file=sys.stderr)
-                return FAILED
+                return 1
             arrays = measured(planner, problem, places)
             write_npz(folder / f"{method.name}_{name}.npz", **arrays)
             table[method.name][name] = cells(method.name, name, arrays)
-            curves[method.title] = arrays
+            x = arrays["x_0_0"]
+            path = x if len(x) > 1 else np.repeat(x, 2, axis=0)
+            first_motions[method.title] = curves(path, problem.task.paths[0], places[0].obstacle)
             print(f"{method.title}, {problem.task.title}: {arrays['seconds'].sum():.0f} s of planning", flush=True)
             write_json(folder / "table1.json", table)
-        _print(problem.task, methods, table)
-        if not options.no_figures:
-            draw(folder / f"figure6_{name}", problem.task.title, curves)
-    print_orderings(table)
-    print(f"\n{INCONSISTENT}")
+        print(f"\n{problem.task.title}: mean (worst) [paper]; lengths in mm")
+        report([_row(method.title, table[method.name][name]) for method in methods])
+        if draws:
+            files = (folder / f"figure6_{name}.{suffix}" for suffix in ("svg", "png"))
+            figures.save(figures.curves(problem.task.title, first_motions), *files)
     return 0
 
 
@@ -194,7 +191,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[P
         if len(places) == count:
             return places
         centre = mean[round(rng.uniform(*ALONG) * (len(mean) - 1))] + _in_ball(rng, WITHIN)
-        sphere = Sphere(as_point(centre), DIAMETER)
+        sphere = Sphere(as_point(centre), 0.15)
         if any(sphere.signed_distance(path).min() >= 0 for path in undisturbed):
             continue
         if model.obstacle_distance(at_ends, sphere)[0].min() <= 0:
@@ -216,7 +213,7 @@ def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Genera
         nearest = int(rng.integers(len(starts)))
         start = starts[nearest] + _in_ball(rng, PERTURBED_BY)
         posture = track(robot, start[None], problem.postures[nearest][0])
-        if posture.error[0] < FREE and model.obstacle_distance(posture.q, sphere)[0].min() > 0:
+        if posture.error[0] < 1e-3 and model.obstacle_distance(posture.q, sphere)[0].min() > 0:
             found.append(start)
     return np.array(found).reshape(-1, 3)
 
@@ -276,7 +273,7 @@ def measure(x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obs
         clearance=nearest.distance,
         goal_error=float(np.linalg.norm(x[-1] - goal)),
         turn=sharpest_turn(x, TURN_ARC),
-        jerk=rms_jerk(t, x, INTERVAL),
+        jerk=rms_jerk(t, x, 0.05),  # the paper's 20 Hz
     )
 
 
@@ -302,6 +299,9 @@ def _ends(planner: Planner, place: Place) -> Array:
 def cells(method: str, task: str, arrays: Mapping[str, Array]) -> dict[str, dict[str, float | None]]:
     """The cells of a method's file, by column; None is unknown."""
     found: dict[str, dict[str, float | None]] = {}
+    of_method = PAPER.get(method, ())
+    values = of_method[PAPER_TASKS.index(task)] if task in PAPER_TASKS[: len(of_method)] else (None, None)
+    paper: Mapping[str, float | None] = {"frechet": values[0], "arm_depth": values[1]}
     for column in COLUMNS:
         values = arrays[column]
         known = bool(np.isfinite(values).all())
@@ -309,81 +309,15 @@ def cells(method: str, task: str, arrays: Mapping[str, Array]) -> dict[str, dict
         found[column] = {
             "mean": float(values.mean()) if known else None,
             "worst": float(worst) if known else None,
-            "paper": PAPER.get((method, task, column)),
+            "paper": paper.get(column),
         }
     return found
 
 
-def print_orderings(table: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print for each ordering that the paper argues from whether it holds, and by which figures."""
-    for task in dict.fromkeys(task for of_method in table.values() for task in of_method):
-        print(f"\n{TASKS[task].title}")
-        for text, holds, figures in orderings({name: row[task] for name, row in table.items() if task in row}):
-            print(f"  {'holds' if holds else 'does NOT hold'}: {text} ({figures})")
-
-
-def orderings(row: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[tuple[str, bool, str]]:
-    """Decide the orderings of one task, those whose methods were measured.
-
-    Args:
-        row: cells of the task, by method and column.
-
-    Returns:
-        What is said, whether it holds, and the figures in words.
-    """
-
-    def mean(method: str, column: str = "frechet") -> float:
-        return row[method][column]["mean"]
-
-    def deepest(method: str) -> float:
-        return row[method]["arm_depth"]["worst"]
-
-    def mm(value: float) -> str:
-        return f"{1e3 * value:.0f} mm"
-
-    def collides(method: str) -> tuple[str, bool, str]:
-        return f"{METHODS[method].title} collides", deepest(method) > FREE, f"M.C.D. at most {mm(deepest(method))}"
-
-    said: list[tuple[str, bool, str]] = []
-    if {"ours-no-avoidance", "eflow"} <= row.keys():
-        pair = mean("ours-no-avoidance"), mean("eflow")
-        text = "pure imitation of ours and EFlow comparable"
-        said.append((text, max(pair) <= ALIKE * min(pair), f"F.D. {mm(pair[0])} and {mm(pair[1])}"))
-    if "ours" in row:
-        said.append(("ours is free of collisions at all places", deepest("ours") <= FREE, mm(deepest("ours"))))
-        for column, who in (("arm_depth", "whole arm"), ("hand_depth", "hand alone")):
-            free = {name: mean(name) for name in row if row[name][column]["worst"] <= FREE}
-            least = min(free, key=free.__getitem__, default="none")
-            text = f"ours has the smallest Fréchet distance of the methods with M.C.D. 0 of the {who}"
-            figures = ", ".join(f"{name} {mm(value)}" for name, value in free.items())
-            said.append((text, least == "ours", f"least is {least}; {figures}"))
-        paper = row["ours"]["frechet"]["paper"]
-        if paper is not None:
-            said.append((f"ours is below the paper's {mm(paper)}", mean("ours") < paper, f"F.D. {mm(mean('ours'))}"))
-    if {"ours", "eflow-repulsive"} <= row.keys():
-        turns = mean("eflow-repulsive", "turn"), mean("ours", "turn")
-        distances = mean("eflow-repulsive"), mean("ours")
-        figures = f"F.D. {mm(distances[0])} to {mm(distances[1])}, turn {turns[0]:.0f}° to {turns[1]:.0f}°"
-        larger = distances[0] > distances[1] and turns[0] > turns[1]
-        said.append(("EFlow (repulsive) departs farther and turns sharper than ours", larger, figures))
-    said += [collides(name) for name in ("mpnet", "linear") if name in row]
-    if "mpnet-rrt" in row:
-        said.append(("MPNet-RRT does not collide", deepest("mpnet-rrt") <= FREE, mm(deepest("mpnet-rrt"))))
-        if "ours" in row:
-            pair = mean("mpnet-rrt"), mean("ours")
-            said.append(
-                ("MPNet-RRT departs farther than ours", pair[0] > pair[1], f"F.D. {mm(pair[0])}, {mm(pair[1])}")
-            )
-    return said
-
-
-def _print(task: Task, methods: Sequence[Method], table: Mapping[str, Mapping[str, Any]]) -> None:
-    print(f"\n{task.title}: mean (worst) [paper]; lengths in mm")
-    rows = []
-    for method in methods:
-        cells_ = table[method.name][task.name]
-        rows.append((method.title, *(_cell(column, cells_[column]) for column in COLUMNS)))
-    print_table(("", *(f"{column} {UNITS[column][1]}" if column in UNITS else column for column in COLUMNS)), rows)
+def _row(title: str, cells: Mapping[str, Mapping[str, float | None]]) -> Row:
+    """Row of a method in the printed table."""
+    names = {column: f"{column} {UNITS[column][1]}" if column in UNITS else column for column in COLUMNS}
+    return {"method": title, **{names[column]: _cell(column, cells[column]) for column in COLUMNS}}
 
 
 def _cell(column: str, cell: Mapping[str, float | None]) -> str:

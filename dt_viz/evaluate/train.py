@@ -15,7 +15,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -26,16 +26,13 @@ from dt_viz.baselines.base import INSTALL, NotFittedError, Problem
 from dt_viz.baselines.registry import TRAINED, problem_of
 from dt_viz.baselines.weights import save_weights, weights_file
 from dt_viz.evaluate.held_out import folds_of, frechet
-from dt_viz.evaluate.options import InputError, print_table, ready_folder, whole_number
+from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import TASKS, Task, lasa_tasks
-
-FAILED = 1
-"""Exit status if something is not installed, or cannot be trained."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +61,7 @@ class Split:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
+    """Define the command's arguments."""
     parser.add_argument("--method", choices=tuple(TRAINED), nargs="+", default=list(TRAINED), help="(default: all)")
     parser.add_argument("--task", nargs="+", metavar="TASK", help="(default: all that ship)")
     parser.add_argument("--lasa", type=Path, metavar="DIR", help="folder of LASA .mat files, each becomes a task")
@@ -75,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 1 if something is not installed, or one of the tasks cannot be trained."""
+    """Run the command; 1 if something is not installed, or one of the tasks cannot be trained."""
     tasks = {**TASKS, **(lasa_tasks(options.lasa) if options.lasa is not None else {})}
     names = options.task or list(TASKS)
     for name in names:
@@ -96,11 +93,15 @@ def run(options: argparse.Namespace) -> int:
                 rows.append(_row(task, method, splits, problems, options))
             except ModuleNotFoundError as error:
                 print(f"{method} is trained with {error.name}, which is not installed: {INSTALL}", file=sys.stderr)
-                return FAILED
+                return 1
             except NotFittedError as error:
                 print(f"{method}, {name}: {error}", file=sys.stderr)
-    _report(rows, "held out" if options.folds else "in-sample")
-    return 0 if len(rows) == len(names) * len(options.method) else FAILED
+    report([asdict(row) for row in rows])
+    compared = "held out" if options.folds else "in-sample"
+    for method in dict.fromkeys(row.method for row in rows):
+        mean = np.mean([row.frechet_mm for row in rows if row.method == method])
+        print(f"{method}: Fréchet mean {mean:.2f} mm {compared}")
+    return 0 if len(rows) == len(names) * len(options.method) else 1
 
 
 def _splits(num: int, folds: int | None, folder: Path) -> list[Split]:
@@ -138,18 +139,3 @@ def _row(
         plan = trained.from_folder(split.folder).fit(problem).plan(Union(), task.starts[split.compared])
         distances.extend(1e3 * frechet(plan.paths, [task.paths[i] for i in split.compared]) / task.scale)
     return Row(method, task.name, num_epochs, max(seconds), float(np.mean(distances)), max(sizes))
-
-
-def _report(rows: list[Row], compared: str) -> None:
-    header = ("method", "task", "epochs", "seconds", f"Fréchet mean mm, {compared}", "kB")
-    cells = [
-        (r.method, r.task, str(r.num_epochs), f"{r.seconds:.0f}", f"{r.frechet_mm:.2f}", f"{r.num_bytes / 1e3:.0f}")
-        for r in rows
-    ]
-    print_table(header, cells)
-    for method in dict.fromkeys(row.method for row in rows):
-        of_method = [row for row in rows if row.method == method]
-        mean = np.mean([row.frechet_mm for row in of_method])
-        slowest = max(row.seconds for row in of_method)
-        reached = f"Fréchet mean {mean:.2f} mm {compared} over {len(of_method)} task(s)"
-        print(f"{method}: {reached}; training at most {slowest:.0f} s")

@@ -1,12 +1,12 @@
-"""`evaluate pictures` takes pictures of the page as a visitor sees it."""
+"""`benchmarks pictures` takes pictures of the page as a visitor sees it."""
 
 import numpy as np
 import pytest
 from chromium import needs_chromium
 from PIL import Image
 
-from dt_viz.evaluate.__main__ import main
 from dt_viz.scenario.paper_scenes import SCENES
+from tests.benchmarks.__main__ import main
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 

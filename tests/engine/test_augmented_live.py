@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from crossings import crossings
 from drawings import frechet
 from oracles import central_differences
 from scenes import avoiding, biases, changed, kinds, starts_at
@@ -14,7 +15,6 @@ import dt_viz as dt
 from dt_viz.control.controller import Controller, Phase
 from dt_viz.engine.frame import Stage
 from dt_viz.errors import DataError, FormatError
-from dt_viz.evaluate.crossings import crossings
 from dt_viz.evaluate.held_out import path_from
 from dt_viz.learning import choice
 from dt_viz.learning.augmented import AugmentedImitation, fit_augmented

@@ -10,6 +10,7 @@ import pytest
 
 from dt_viz.evaluate import load
 from dt_viz.evaluate.__main__ import main
+from dt_viz.evaluate.options import as_text
 from dt_viz.evaluate.protocol_client import ANSWERED, ROLLOUT
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.ui.server import Server
@@ -118,7 +119,7 @@ def test_who_gives_way_is_chosen_and_visitors_of_a_started_server_who_look_on_co
     (visits,) = json.loads(out.read_text())["visits"]
     assert 0 < visits["cores"] < 4 and visits["messages_per_s"] > 1 and visits["peak_memory_mb"] > 50
     assert visits["visitors"] == [{"lost": ""}]
-    assert f"{visits['cores']:.2f}" in capsys.readouterr().out
+    assert as_text(visits["cores"]) in capsys.readouterr().out
 
 
 def test_who_gets_no_picture_in_time_fails_the_measurement(monkeypatch, capsys, url):

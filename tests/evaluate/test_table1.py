@@ -1,6 +1,7 @@
-"""The comparison: where the places are, what the cells are made from, and which orderings are said to hold."""
+"""The comparison: where the places are, what the cells are made from, and what stands beside them."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import Plan
 from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
-from dt_viz.evaluate import figure6, table1
+from dt_viz.errors import never
+from dt_viz.evaluate import figures, table1
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.options import InputError
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
@@ -72,10 +74,23 @@ def test_cells_are_those_of_the_arrays_beside_them(folder, table, method):
 
 
 def test_the_paper_stands_beside_what_is_known_of_it(table):
-    assert table["linear"]["push_box"]["frechet"]["paper"] is None
-    cell = table1.cells("ours", "draw_s", dict.fromkeys(table1.COLUMNS, np.array([[0.1, 0.2]])))
+    assert table["linear"]["push_box"]["frechet"]["paper"] == 0.242
+    assert table["linear"]["push_box"]["turn"]["paper"] is None
+    arrays = dict.fromkeys(table1.COLUMNS, np.array([[0.1, 0.2]]))
+    cell = table1.cells("ours", "draw_s", arrays)
     assert cell["frechet"] == {"mean": pytest.approx(0.15), "worst": 0.2, "paper": 0.067}
+    assert cell["arm_depth"]["paper"] == 0.002
     assert cell["clearance"]["worst"] == 0.1
+    assert table1.cells("linear", "draw_s", arrays)["frechet"]["paper"] is None  # it has no drawing of planners
+    assert table1.cells("modulation", "push_box", arrays)["frechet"]["paper"] is None
+    assert table1.cells("eflow", "lift_box", arrays)["arm_depth"]["paper"] == 0.152
+
+
+def test_the_printed_row_has_mean_worst_and_paper(table):
+    cells = {column: {"mean": 0.1, "worst": 0.2, "paper": None} for column in table1.COLUMNS}
+    cells["frechet"]["paper"] = 0.124
+    row = table1._row("Ours", cells)
+    assert (row["method"], row["frechet"], row["turn °"]) == ("Ours", "100 (200) [124]", "0 (0)")
 
 
 def test_imitation_alone_is_nearer_and_deeper_than_a_straight_line(table):
@@ -100,6 +115,24 @@ def test_places_collide_with_each_motion_and_leave_the_ends_free(problem, monkey
         assert distances.min() > 0
         away = np.linalg.norm(place.perturbed[:, None] - problem.task.starts, axis=2).min(axis=1)
         assert (away <= table1.PERTURBED_BY).all()
+
+
+def test_motions_that_end_beside_the_goal_have_not_reached_it(problem):
+    """Of three perturbed starts one is taken to the goal, one 5 mm and one 2 cm beside it."""
+    goal, starts = problem.learned.goal, problem.task.starts[:3]
+    ends = goal + np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0], [0.0, 0.02, 0.0]])
+
+    class Planner:
+        def plan(self, obstacle, starts, cancelled=never):
+            paths = tuple(
+                np.stack([begin, end]) for begin, end in zip(starts, np.resize(ends, starts.shape), strict=True)
+            )
+            return Plan(paths, tuple(np.array([0.0, 1.0]) for _ in paths), tuple(np.zeros((2, 6)) for _ in paths))
+
+    place = table1.Place(Sphere((5.0, 0.0, 0.0), 0.15), starts)
+    arrays = table1.measured(Planner(), problem, [place])
+    np.testing.assert_allclose(arrays["ends_0"], ends)
+    assert arrays["reached"] == pytest.approx([2 / 3])
 
 
 def test_too_many_places_are_refused(problem, monkeypatch):
@@ -127,82 +160,32 @@ def test_a_motion_that_stays_at_its_start_is_measured(problem):
 
 class TestMissing:
     def test_what_is_not_installed_is_said(self, monkeypatch, tmp_path, capsys):
-        for module in ("dt_viz.baselines.base", "dt_viz.evaluate.figure6"):
-            monkeypatch.setattr(f"{module}.find_spec", lambda module: None)
+        monkeypatch.setattr("dt_viz.baselines.base.find_spec", lambda module: None)
         assert main([*ARGUMENTS, "mpnet-rrt", "linear", "--out", str(tmp_path)]) == 1
-        said = capsys.readouterr().err
-        assert "MPNet-RRT needs ompl: pip install" in said
-        assert "figure 6 needs matplotlib" in said
+        assert "MPNet-RRT needs ompl: pip install" in capsys.readouterr().err
         assert not (tmp_path / "table1.json").exists()
 
     def test_a_method_that_was_not_trained_is_said(self, monkeypatch, tmp_path, capsys):
         monkeypatch.setitem(METHODS, "mpnet", MPNet(tmp_path))
-        assert main([*ARGUMENTS, "mpnet", "--no-figures", "--out", str(tmp_path)]) == 1
+        assert main([*ARGUMENTS, "mpnet", "--out", str(tmp_path)]) == 1
         assert "MPNet, Push box: mpnet has not been trained" in capsys.readouterr().err
 
 
 class TestFigure6:
-    def test_is_drawn_in_both_formats_unless_it_is_left_out(self, folder, monkeypatch, tmp_path):
+    def test_is_drawn_in_both_formats(self, folder):
         assert (folder / "figure6_push_box.svg").read_text().startswith("<?xml")
         assert (folder / "figure6_push_box.png").read_bytes().startswith(b"\x89PNG")
-        monkeypatch.setattr("dt_viz.evaluate.figure6.find_spec", lambda module: None)  # then it is not missed
-        few = ["linear", "--count", "1", "--perturbed", "0", "--no-figures"]
+
+    def test_is_left_out_without_matplotlib(self, monkeypatch, tmp_path, capsys):
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+        few = ["linear", "--count", "1", "--perturbed", "0"]
         assert main([*ARGUMENTS, *few, "--out", str(tmp_path)]) == 0
-        assert not list(tmp_path.glob("figure6*"))
+        assert not list(tmp_path.glob("figure6*")) and (tmp_path / "table1.json").exists()
+        assert capsys.readouterr().err == "no figures: matplotlib is not installed; pip install matplotlib\n"
 
     def test_curves_are_distance_and_depth_along_the_path(self):
-        x = np.stack([np.linspace(0, 1, 7), np.full(7, 0.25), np.zeros(7)], axis=1)
-        arrays = {"x_1_2": x, "demo_2": x[[0, -1]] * [1, 0, 0], "obstacle_1": np.array([0.5, 0.25, 0, 0.5])}
-        distance, depth = figure6.curves(arrays, 1, 2)
-        np.testing.assert_allclose(distance, 0.25)
-        at = np.linspace(0, 1, figure6.NUM_SAMPLES)
-        np.testing.assert_allclose(depth, np.maximum(0.25 - np.abs(at - 0.5), 0), atol=1e-12)
-
-
-class TestOrderings:
-    @staticmethod
-    def row(**changes):
-        """Cells for which all orderings hold, but for changes METHOD_COLUMN."""
-        frechet = {"ours": 0.08, "ours-no-avoidance": 0.01, "eflow": 0.015, "eflow-repulsive": 0.2}
-        frechet |= {"mpnet": 0.2, "mpnet-rrt": 0.3, "linear": 0.2}
-        depth = {"ours-no-avoidance": 0.06, "eflow": 0.06, "mpnet": 0.05, "linear": 0.04}
-        rows = {}
-        for method, value in frechet.items():
-            turn = 90 if method == "eflow-repulsive" else 20
-            rows[method] = {
-                "frechet": {"mean": value, "paper": 0.124 if method == "ours" else None},
-                "arm_depth": {"mean": 0.0, "worst": depth.get(method, 0.0)},
-                "hand_depth": {"mean": 0.0, "worst": depth.get(method, 0.0)},
-                "turn": {"mean": turn},
-            }
-        for (method, column, which), value in changes.get("to", {}).items():
-            rows[method][column][which] = value
-        return rows
-
-    def test_hold_where_they_do(self):
-        found = table1.orderings(self.row())
-        assert len(found) == 10
-        assert all(holds for _, holds, _ in found)
-
-    @pytest.mark.parametrize(
-        ("changed", "value", "text"),
-        [
-            (("eflow", "frechet", "mean"), 0.025, "comparable"),
-            (("ours", "arm_depth", "worst"), 0.01, "ours is free"),
-            (("ours", "frechet", "mean"), 0.25, "of the whole arm"),
-            (("eflow", "hand_depth", "worst"), 0.0, "of the hand alone"),
-            (("ours", "frechet", "mean"), 0.13, "below the paper's"),
-            (("eflow-repulsive", "turn", "mean"), 10, "repulsive"),
-            (("mpnet", "arm_depth", "worst"), 0.0, "MPNet collides"),
-            (("linear", "arm_depth", "worst"), 0.0, "Linear collides"),
-            (("mpnet-rrt", "arm_depth", "worst"), 0.01, "MPNet-RRT does not"),
-            (("mpnet-rrt", "frechet", "mean"), 0.07, "departs farther than ours"),
-        ],
-    )
-    def test_do_not_where_they_do_not(self, changed, value, text):
-        failing = [said for said, holds, _ in table1.orderings(self.row(to={changed: value})) if not holds]
-        assert any(text in said for said in failing)
-
-    def test_of_methods_that_were_left_out_are_not_said(self):
-        row = self.row()
-        assert [text for text, _, _ in table1.orderings({"linear": row["linear"]})] == ["Linear collides"]
+        values = np.column_stack([np.full(7, 0.25), np.linspace(0, 0.1, 7)])
+        distance, depth = figures.curves("A task", {"A method": values}).axes
+        np.testing.assert_allclose(np.transpose(distance.lines[0].get_xydata()), [np.linspace(0, 1, 7), values[:, 0]])
+        np.testing.assert_allclose(np.transpose(depth.lines[0].get_xydata()), [np.linspace(0, 1, 7), values[:, 1]])
+        assert "depth" in depth.get_ylabel() and "distance" in distance.get_ylabel()

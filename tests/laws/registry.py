@@ -304,8 +304,6 @@ FIELDS: dict[str, Generator] = {
     "gradient at the hand": Generator(GradientField(ROBOT, BODY, (HAND,), REACH), near_ready, 1e-5, 1e-5),
     "gradient at the elbow": Generator(GradientField(ROBOT, BODY, (ELBOW,), REACH), near_ready, 1e-5, 1e-5),
 }
-WITHOUT_DERIVATIVE = {"_Clocked"}
-"""Fields that no tangents are carried along."""
 ARM_FIELDS = {name: case.field for name, case in FIELDS.items() if isinstance(case.field, ArmField)}
 
 # --- base systems ---

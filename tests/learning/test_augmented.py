@@ -5,10 +5,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from crossings import crossings
 from drawings import extent, frechet, from_one_start, path_from
 
 from dt_viz.errors import FormatError
-from dt_viz.evaluate.crossings import crossings
 from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.demonstrations import Demonstration

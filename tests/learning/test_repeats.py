@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from crossings import crossings
 from drawings import extent, from_one_start
 
-from dt_viz.evaluate.crossings import crossings
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import learn
 from dt_viz.learning.demonstrations import Demonstration

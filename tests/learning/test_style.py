@@ -5,10 +5,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from crossings import crossings
 from drawings import frechet, path_from
 from scenes import kinds
 
-from dt_viz.evaluate.crossings import crossings
 from dt_viz.flows.phased import Shear
 from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented

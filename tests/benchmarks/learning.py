@@ -1,29 +1,31 @@
-"""What a learned motion does off its demonstrations: from starts far from theirs, and after a push on the way."""
+"""Measure learned motions off their demonstrations: from starts far from theirs, and after a push on the way.
+
+    python -m tests.benchmarks learning DIR/*.mat --state augmented --out learning.json
+
+Directions are in the plane that the mean demonstration is nearest to.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from dt_viz.evaluate.held_out import Learned, begun, frechet, path_from, shifted_to
+from dt_viz.evaluate.options import Row, ready_to_write, report, write_json
 from dt_viz.flows.fields import Array
 from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.choice import learn
+from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
 from dt_viz.metrics import resample_by_arc_length
 
 AWAY = (0.25, 0.5)
 """Distances of starts from the mean one, relative to the extent of the demonstrations."""
-NUM_AWAY, NUM_COMPARED = 12, 200
-"""Number of starts at each distance, and number of points of the mean demonstration."""
-NUM_TIMES, LONGEST = 1500, 3.0
-"""Number of times at which speeds are looked at, and the last of them, in durations of the demonstrations."""
-PUSH, PUSHED_AT, NUM_PUSHED, NUM_DIRECTIONS = 0.2, (0.65, 0.5, 0.35), 3, 8
-"""Length of a push relative to the extent, parts of the way that are left then, number of motions that are pushed,
-and number of directions."""
-DRAWN = 0.05
-"""Distance up to which a place of the rest of a motion counts as drawn, relative to the extent."""
+PUSH, DRAWN = 0.2, 0.05
+"""Length of a push, and distance up to which a place of the rest of a motion counts as drawn, of the extent."""
 
 
 @dataclass(frozen=True)
@@ -39,25 +41,55 @@ class OffCourse:
     """Mean share of the rest of a motion that is still drawn after a push."""
 
 
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the command's arguments."""
+    parser.add_argument("files", type=Path, nargs="+", metavar="SHAPE", help="as of evaluate imitation")
+    parser.add_argument("--state", choices=("plain", "augmented"), default="plain", help="default: %(default)s")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command."""
+    out, found = ready_to_write(options.out, ".json"), []
+    for path in options.files:
+        demonstrations = load_demonstrations(path)
+        found.append(off_course(path.stem, demonstrations, learn(demonstrations, state=options.state)))
+    rows: list[Row] = [
+        {
+            "shape": shape.name,
+            **{f"shape error at {away:.0%}": error for away, error in zip(AWAY, shape.shape_error, strict=True)},
+            **{f"speed at {away:.0%}": speed for away, speed in zip(AWAY, shape.speed, strict=True)},
+            "drawn after a push": shape.drawn,
+        }
+        for shape in found
+    ]
+    numbers = {column: [float(row[column] or 0) for row in rows] for column in rows[0] if column != "shape"}
+    for name, of in (("mean", np.mean), ("largest", np.max), ("smallest", np.min)):
+        rows.append({"shape": name, **{column: float(of(values)) for column, values in numbers.items()}})
+    report(rows)
+    write_json(out, {"state": options.state, "shapes": rows})
+    return 0
+
+
 def off_course(name: str, demonstrations: Sequence[Demonstration], imitation: Learned) -> OffCourse:
     """Measure a motion off its demonstrations."""
     paths = [d.positions for d in demonstrations]
     extent = float(np.ptp(np.concatenate(paths), axis=0).max())
-    mean = np.mean([resample_by_arc_length(path, NUM_COMPARED) for path in paths], axis=0)
+    mean = np.mean([resample_by_arc_length(path, 200) for path in paths], axis=0)
     fastest = max(_fastest(d.times, d.positions) for d in demonstrations)
-    times = np.linspace(0, LONGEST * float(np.mean([d.times[-1] - d.times[0] for d in demonstrations])), NUM_TIMES)
+    times = np.linspace(0, 3 * float(np.mean([d.times[-1] - d.times[0] for d in demonstrations])), 1500)
     errors, speeds = [], []
     across = np.linalg.svd(mean - mean.mean(axis=0))[2][:2]  # in space: in the plane that the mean is nearest to
     for away in AWAY:
         found = []
-        for direction in _directions(NUM_AWAY):
+        for direction in _directions(12):
             start = mean[0] + away * extent * direction @ across
             system, state = begun(imitation, start)
             (error,) = frechet([path_from(system, state, len(start))], [shifted_to(start, mean)])
             found.append((error / extent, _fastest(times, system.rollout(state, times)[:, : len(start)]) / fastest))
         errors.append(float(np.mean([error for error, _ in found])))
         speeds.append(float(max(speed for _, speed in found)))
-    drawn = [_drawn(imitation, d.positions[0], extent, across) for d in demonstrations[:NUM_PUSHED]]
+    drawn = [_drawn(imitation, d.positions[0], extent, across) for d in demonstrations[:3]]
     return OffCourse(name, tuple(errors), tuple(speeds), float(np.mean(drawn)))
 
 
@@ -75,10 +107,10 @@ def _drawn(imitation: Learned, start: Array, extent: float, across: Array) -> fl
     """Share of the rest of a motion that is still drawn after pushes from it, over places and directions."""
     system, state = begun(imitation, start)
     z0, dim, shares = system.transform.forward(state), len(start), []
-    for left in PUSHED_AT:
+    for left in (0.65, 0.5, 0.35):  # part of the way
         here = system.transform.inverse(system.base.at_fraction(z0, np.array([left])))[0]
         rest = path_from(system, here, dim)
-        for direction in _directions(NUM_DIRECTIONS):
+        for direction in _directions(8):
             pushed = here.copy()
             pushed[:dim] += PUSH * extent * direction @ across
             if isinstance(imitation, AugmentedImitation):

@@ -1,5 +1,7 @@
 """Time from the click on each scene of the paper until its first motions, its field and its certificates are there.
 
+    python -m tests.benchmarks scenes --out scenes.json
+
 Each scene begins in an engine that has shown its task before, as on the page. The JSON file holds, by the scene's name,
 ``rollouts_s``, ``live_s`` and ``certified_s``, seconds, and ``median`` and ``worst`` of the last.
 """
@@ -15,7 +17,7 @@ import numpy as np
 from dt_viz.arm.robot import load_jaco
 from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Stage
-from dt_viz.evaluate.options import add_lasa, print_table, ready_to_write, write_json
+from dt_viz.evaluate.options import add_lasa, ready_to_write, report, write_json
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
@@ -28,14 +30,14 @@ SHOWN = (Stage.ROLLOUTS, Stage.LIVE, Stage.CERTIFIED)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
+    """Define the command's arguments."""
     parser.add_argument("--only", choices=tuple(SCENES), nargs="+", metavar="NAME", help=", ".join(SCENES))
     add_lasa(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand."""
+    """Run the command."""
     tasks, out = known_tasks(options.lasa), ready_to_write(options.out, ".json")
     fits, shared, figures = FitStore(default_cache_folder()), Memo(), {}
     for scene in offered(tasks):
@@ -47,12 +49,15 @@ def run(options: argparse.Namespace) -> int:
         for other in scene.tasks:
             fits.get(tasks[other]().demonstrations)
         figures[scene.name] = _seconds(engine, scene.scenario(task))
-        print(f"{scene.title}: certified after {figures[scene.name]['certified_s']:.2f} s", flush=True)
     certified = [times["certified_s"] for times in figures.values()]
-    rows = [(SCENES[name].title, *(f"{seconds:.2f}" for seconds in times.values())) for name, times in figures.items()]
-    print_table(("scene", "rollouts s", "field s", "certified s"), rows)
-    print(f"certified: median {np.median(certified):.2f} s, worst {max(certified):.2f} s, {len(certified)} scenes")
-    write_json(out, {**figures, "median": float(np.median(certified)), "worst": max(certified)})
+    over_all = {"median": float(np.median(certified)), "worst": max(certified)}
+    report(
+        [
+            *({"scene": SCENES[name].title, **times} for name, times in figures.items()),
+            *({"scene": name, "certified_s": seconds} for name, seconds in over_all.items()),
+        ]
+    )
+    write_json(out, {**figures, **over_all})
     return 0
 
 

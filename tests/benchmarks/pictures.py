@@ -1,5 +1,7 @@
 """Take a test picture of the first page and of each scene of the paper, in headless Chromium.
 
+    python -m tests.benchmarks pictures --out DIR
+
 Needs Chromium (Debian: apt-get install chromium) and the test extra. Each picture is the page as a visitor sees it,
 once every check is done and the arm stopped in the middle of its motion: to be looked at by a person.
 """
@@ -7,8 +9,6 @@ once every check is done and the arm stopped in the middle of its motion: to be 
 from __future__ import annotations
 
 import argparse
-import os
-import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -27,25 +27,17 @@ from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.tasks import known_tasks
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
+from tests.chromium import ARGUMENTS, CHROMIUM
 
 FIRST = "first"
 """Name of the picture of the first page."""
-FIRST_TASK = "draw_s"
-MOMENT = 0.45
-"""Part of the time that the motion takes after which the arm is stopped."""
-PATIENCE = 180.0
-"""Longest wait for the page, seconds."""
 DRAWING = 8.0
 """Time that software takes to draw the page, seconds."""
-CHROMIUM = os.environ.get("DT_VIZ_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-"""Chromium's command; None where it is not installed."""
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-"""Arguments with which it draws by software, without a screen."""
 HIDE_NOTICES = "() => document.querySelectorAll('button.mantine-Notification-closeButton').forEach(b => b.click())"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
+    """Define the command's arguments."""
     names = (FIRST, *SCENES)
     parser.add_argument("--only", choices=names, nargs="+", metavar="NAME", help=", ".join(names))
     add_lasa(parser)
@@ -54,9 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand: ends with status 1 where the page complains."""
+    """Run the command: ends with status 1 where the page complains."""
     try:
-        from playwright.sync_api import sync_playwright  # noqa: PLC0415 - of the test extra
+        from playwright.sync_api import sync_playwright
     except ImportError:
         raise InputError("playwright", "not installed", "pip install 'dt-viz[test]'") from None
     if CHROMIUM is None:
@@ -70,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     width, height = options.size
     complaints: list[str] = []
     with sync_playwright() as playwright:
-        server = Server(tasks, FitStore(default_cache_folder()), task=FIRST_TASK, port=0)
+        server = Server(tasks, FitStore(default_cache_folder()), task="draw_s", port=0)
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         try:
             for name in options.only or scenes:
@@ -120,19 +112,19 @@ def _stop_in_the_middle(visitor: Visitor) -> None:
         return
     _until(lambda: live.phase is not Phase.MOVING)
     _until(lambda: live.phase is Phase.MOVING)
-    time.sleep(MOMENT * float(frame.arm.times[-1]))
+    time.sleep(0.45 * float(frame.arm.times[-1]))
     visitor.session.edit("play", view=replace(visitor.session.scenario.view, playing=False))
 
 
 def _until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + 180.0
     while not condition():
         if time.monotonic() > deadline:
-            raise TimeoutError(f"the page was not ready after {PATIENCE:.0f} s")
+            raise TimeoutError("the page was not ready after 180 s")
         time.sleep(0.05)
 
 
-def _complain(message: Any, complaints: list[str]) -> None:  # noqa: ANN401 - of a library that may not be there
+def _complain(message: Any, complaints: list[str]) -> None:
     """Note what a page says; not that it draws by software, nor what the library of its 3-D view will replace."""
     expected = ("software", "WebGL", "GPU", "THREE.Clock")
     if message.type in ("error", "warning") and not any(word in message.text for word in expected):

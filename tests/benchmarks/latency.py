@@ -1,16 +1,15 @@
 """Drag an obstacle or a bias point through a motion and measure the time from each edit until its frame is ready.
 
-Session, worker and engine are the real ones; a display that records replaces the page. The JSON file holds, in
-milliseconds, the median and the 95 % of
+Session, worker and engine are the real ones; a display that records replaces the page.
 
-``median_ms``, ``p95_ms``
-    the time from an edit until its rollouts are ready (stage ROLLOUTS, the first frame of a rebuild).
-``live_median_ms``, ``live_p95_ms``
-    that until the vector field is ready, too (stage LIVE).
-``rebuild_median_ms``, ``rebuild_p95_ms``
-    that for computing the rollouts alone, without the wait for the frame before.
-``whole_median_ms``, ``whole_p95_ms``
-    that for computing all of a drag's frame: rollouts, what the robot in the loop is given, the field.
+    python -m tests.benchmarks latency --task draw_s --seconds 8 --out latency.json
+
+The JSON file holds, in milliseconds, the median and the 95 % of
+
+``median_ms``, ``p95_ms``, ``live_median_ms``, ``live_p95_ms``
+    the time from an edit until its rollouts are ready (stage ROLLOUTS), and until the vector field is, too (LIVE).
+``rebuild_median_ms``, ``rebuild_p95_ms``, ``whole_median_ms``, ``whole_p95_ms``
+    that for computing the rollouts alone, and all of a drag's frame with what the robot in the loop is given.
 ``unit_ms``
     time of a fixed piece of numpy work, in which figures of different machines compare.
 ``frames``, ``skipped``
@@ -20,8 +19,6 @@ milliseconds, the median and the 95 % of
 from __future__ import annotations
 
 import argparse
-import os
-import platform
 import sys
 import time
 from collections.abc import Callable
@@ -31,42 +28,30 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS
-from dt_viz.engine.engine import Engine
 from dt_viz.engine.frame import Frame, Stage
 from dt_viz.engine.session import Display, Pace, Session
 from dt_viz.evaluate.options import (
     InputError,
-    add_space,
     add_task,
     avoiding,
     chosen_task,
+    new_engine,
     positive_number,
-    print_table,
     ready_to_write,
+    report,
     unit_ms,
     whole_number,
     write_json,
 )
-from dt_viz.folders import default_cache_folder
-from dt_viz.learning.store import FitStore
-from dt_viz.motion.nominal import NUM_SAMPLES
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.avoidance import SPACES, Avoidance
 from dt_viz.transforms.bias import BiasPoint
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
-AMPLITUDE = 0.06
-"""Amplitude of the obstacle's motion, metres."""
-PERIODS = 2.9, 4.3
-"""Periods of its motion along the two axes of the task's slice, seconds; their ratio is not simple."""
-PATIENCE = 120.0
-"""Longest time to wait for the last frames, seconds."""
 
 
 @dataclass
@@ -77,21 +62,20 @@ class Recorder(Display):
     """Stage, seconds from the edit until the frame was ready, and seconds of computing alone, of each frame."""
     num_skipped: int = 0
     """Number of skipped edits since the session began."""
-    num_rollouts: int = 0
     error: Exception | None = None
 
     def draw(self, frame: Frame, pace: Pace) -> None:
         self.frames.append((frame.stage, pace.latency, frame.seconds))
-        self.num_skipped, self.num_rollouts = pace.num_skipped, len(frame.rollouts)
+        self.num_skipped = pace.num_skipped
 
     def fail(self, error: Exception) -> None:
         self.error = error
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the subcommand's arguments."""
+    """Define the command's arguments."""
     add_task(parser)
-    add_space(parser, "cspace")
+    parser.add_argument("--space", choices=SPACES, default="cspace", help="what avoids (default: %(default)s)")
     parser.add_argument("--drag", choices=("obstacle", "bias"), default="obstacle", help="what (default: %(default)s)")
     parser.add_argument(
         "--obstacles", type=whole_number(0), default=1, help="in the scene, along the path (default: %(default)s)"
@@ -101,12 +85,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the subcommand; 1 if the session reported an error."""
+    """Run the command; 1 if the session reported an error."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".json")
-    fits, scenario, shown = FitStore(default_cache_folder()), _scenario(task, options), Recorder()
-    fits.get(task.demonstrations)
-    session = Session(Engine(tasks, fits, load_jaco()), lambda _: scenario, task.name, shown)
+    scenario, shown, engine = _scenario(task, options), Recorder(), new_engine(tasks)
+    engine.nominal(scenario)  # learned before
+    session = Session(engine, lambda _: scenario, task.name, shown)
     positions = moving_through(task)
     try:
         _settle(session)
@@ -136,32 +120,29 @@ def run(options: argparse.Namespace) -> int:
             "space": options.space,
             "seconds": options.seconds,
             "edits": num_edits,
-            "edits_per_second": num_edits / elapsed,
-            "rollouts": shown.num_rollouts,
-            "points_a_rollout": NUM_SAMPLES if options.space == "task" else NUM_CONFIGURATIONS,
             "drag": options.drag,
             "obstacles": options.obstacles,
-            "cores": os.cpu_count(),
-            "python": platform.python_version(),
-            "numpy": np.__version__,
         },
     }
     write_json(out, figures)
-    print(f"{task.name}, {shown.num_rollouts} rollouts")
-    names = ("rollouts", "also the field", "computing rollouts", "computing all of it")
-    rows = [(name, *(f"{ms:.1f}" for ms in spread)) for name, spread in zip(names, spreads.values(), strict=True)]
-    in_units = (f"  in units of {unit:.1f} ms", *(f"{ms / unit:.1f}" for ms in spreads["whole_"]))
-    print_table(("edit → frame ready", "median ms", "95 % ms"), [*rows, in_units])
+    names = {"rollouts": "", "also the field": "live_", "computing rollouts": "rebuild_", "computing all": "whole_"}
+    report(
+        [
+            {"edit → frame": name, **{f"{which} ms": figures[f"{key}{which}_ms"] for which in ("median", "p95")}}
+            | {"in units": figures[f"{key}median_ms"] / unit, "95 % in units": figures[f"{key}p95_ms"] / unit}
+            for name, key in names.items()
+        ]
+    )
     print(f"{num_edits} edits, {len(first)} frames ({len(first) / elapsed:.1f} a second), {num_skipped} skipped")
     return 0
 
 
 def moving_through(task: Task) -> Callable[[float], tuple[float, float, float]]:
     """Return a smooth closed curve, (3,) at a time in seconds, around the middle of the mean demonstration."""
-    middle = task.mean_path[50]
+    middle, amplitude, periods = task.mean_path[50], 0.06, np.array([2.9, 4.3])  # whose ratio is not simple
 
     def position(seconds: float) -> tuple[float, float, float]:
-        return as_point(middle + task.slice.axes @ (AMPLITUDE * np.sin(2 * np.pi * seconds / np.array(PERIODS))))
+        return as_point(middle + task.slice.axes @ (amplitude * np.sin(2 * np.pi * seconds / periods)))
 
     return position
 
@@ -200,5 +181,6 @@ def _drag(
 
 
 def _settle(session: Session) -> None:
-    if not session.wait_idle(PATIENCE):
-        raise InputError("--task", f"frames that take more than {PATIENCE:g} s", "a task that can be shown live")
+    """Wait until nothing is left to compute."""
+    if not session.wait_idle(timeout := 120.0):
+        raise InputError("--task", f"frames that take more than {timeout:g} s", "a task that can be shown live")

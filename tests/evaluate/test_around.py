@@ -1,0 +1,180 @@
+"""Obstacles in the way of motions: what is measured around them, and where they are."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hook import NUM_DEMONSTRATIONS, apart, hook
+
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.evaluate.__main__ import main
+from dt_viz.evaluate.around import TURN_ARC, Place, Rollout, _shares
+from dt_viz.metrics import distance_from_path, sharpest_turn
+from dt_viz.obstacles.shapes import Sphere
+from dt_viz.obstacles.union import Union
+from dt_viz.scenario.tasks import lasa_tasks
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.warning import ARM, Kind, MotionWarning
+
+
+@pytest.fixture(scope="module")
+def middle(lasa):
+    """The middle of the mean demonstration in the world, metres."""
+    return lasa_tasks(lasa)["Hook"]().mean_path[50]
+
+
+@pytest.fixture
+def around(measured):
+    """Runs the command with a sphere of 10 cm at a centre: what it writes, rows by their names, figures by theirs."""
+
+    def run(centre, more=""):
+        where = ",".join(f"{value:.6f}" for value in centre)
+        return split(measured("around", f"--obstacle {where} --diameter 0.1 {more}"))
+
+    return run
+
+
+def split(written_and_printed):
+    arrays, (rows, figures) = written_and_printed
+    return arrays, {row[""]: row for row in rows}, {row["figure"]: row["value"] for row in figures}
+
+
+def test_angles_end_effector_and_demonstration_belong_together_and_the_figures_are_theirs(around, middle, robot):
+    arrays, rows, figures = around(middle)
+    model, ball = load_collision_model(), Sphere(tuple(middle), 0.1)
+    for i in range(NUM_DEMONSTRATIONS):
+        q, x, demo = arrays[f"q_{i}"], arrays[f"x_{i}"], arrays[f"demo_{i}"]
+        assert q.shape == (len(x), 6) and len(arrays[f"times_{i}"]) == len(q) and x.shape[1] == demo.shape[1] == 3
+        np.testing.assert_allclose(robot.end_effector(q), x, atol=1e-12)
+        assert np.abs(np.diff(q, axis=0)).max() < 1  # unwrapped
+        assert len(demo) == len(hook(i)[0])
+        assert arrays["hand"][0, i] == pytest.approx(np.linalg.norm(x - middle, axis=1).min() - 0.05, abs=1e-6)
+        assert arrays["arm"][0, i] == pytest.approx(model.obstacle_distance(q, ball)[0].min(), abs=1e-3)
+        assert arrays["frechet"][0, i] == pytest.approx(apart(x, demo), abs=1e-9)
+        assert arrays["turn"][0, i] == pytest.approx(sharpest_turn(x, TURN_ARC)) != arrays["turn_without"][0, i]
+        assert arrays["goal_miss"][0, i] == pytest.approx(np.linalg.norm(x[-1] - arrays["demo_0"][-1]), abs=1e-4)
+        assert rows[f"start {i}"]["hand mm"] == pytest.approx(1e3 * arrays["hand"][0, i])
+    assert rows["all"]["F.D. mm"] == pytest.approx(1e3 * arrays["frechet"].max())
+    assert rows["all"]["arm mm"] == pytest.approx(1e3 * arrays["arm"].min())
+    assert rows["all"]["goal missed mm"] < 1 and rows["all"]["outside limits"] == 0
+    assert float(figures["F.D. mean mm"]) == pytest.approx(1e3 * arrays["frechet"].mean(), abs=0.06)
+    assert figures["collisions"] == "0 of 1 (0.0 %)" and figures["at least 9 mm kept"] == "1 of 1 (100.0 %)"
+
+
+def test_the_whole_arm_avoids_what_the_hand_alone_does_not_and_without_avoidance_both_are_inside(around, middle):
+    by_arm, by_hand = around(middle)[0], around(middle, "--space task")[0]
+    assert by_hand["hand"].min() > 0.009 and by_hand["arm"].min() < -0.02
+    assert by_arm["arm"].min() > 0.009
+    arrays, _, figures = around(middle, "--no-avoidance")
+    assert figures["collisions"] == "1 of 1 (100.0 %)" and arrays["hand"].min() < -0.03
+    np.testing.assert_allclose(arrays["arm"], by_arm["arm_without"], atol=1e-3)
+    assert arrays["detour"].max() < 1e-3 < by_arm["detour"].min()
+
+
+def test_a_start_inside_the_obstacle_is_said_for_the_hand_and_left_out_for_the_arm(
+    around, middle, capsys, lasa, tmp_path
+):
+    demo = around(middle)[0]["demo_0"]
+    where = ["--obstacle", ",".join(map(str, demo[0])), "--size", "0.1", "--out", str(tmp_path / "a.npz")]
+    task = ["--task", "Hook", "--lasa", str(lasa)]
+    assert main(["around", *task, *where, "--space", "task"]) == 0
+    assert "warning: start 1 is inside the obstacle" in capsys.readouterr().out
+    arrays, _, figures = around(demo[0])
+    left = [name[2:] for name in arrays if name.startswith("q_")]
+    assert 0 < len(left) < NUM_DEMONSTRATIONS and "0" not in left and np.isnan(arrays["hand"][0, 0])
+    assert figures["from some of the starts only"] == "1 of 1 (100.0 %)"
+
+
+def test_it_is_said_why_there_is_no_motion(around, middle, lasa, tmp_path, capsys):
+    goal = around(middle)[0]["demo_0"][-1]
+    task = ["--task", "Hook", "--lasa", str(lasa), "--out", str(tmp_path / "a.npz")]
+    for where, reason in {
+        ",".join(map(str, goal)): "the goal is inside the obstacle",
+        "0,0,0.1": "the obstacle touches the arm's base",
+    }.items():
+        assert main(["around", *task, "--obstacle", where, "--diameter", "0.15"]) == 1
+        assert f"no motion: {reason}" in capsys.readouterr().err
+
+
+def test_random_places_are_measured_and_repeat(measured):
+    arrays, rows, figures = split(measured("around", "--count 2 --size 0.1"))
+    assert np.linalg.norm(arrays["places"] - arrays["places"][0], axis=2).max() <= 0.05
+    assert arrays["arm"].shape == (3, NUM_DEMONSTRATIONS) and arrays["ends"].shape == (3, NUM_DEMONSTRATIONS + 1)
+    assert [*rows] == ["place 0", "place 1", "place 2", "all"]
+    assert figures["at least 9 mm kept"].startswith(f"{(np.nanmin(arrays['arm'], axis=1) >= 9e-3).sum()} of 3")
+    assert np.nanmin(arrays["arm"]) > 0 > np.nanmax(arrays["arm_without"])
+    again = measured("around", "--count 2 --size 0.1 --space task")[0]
+    np.testing.assert_array_equal(again["places"], arrays["places"])
+    other = measured("around", "--count 2 --size 0.1 --space task --seed 1")[0]
+    assert (other["places"][1:] != arrays["places"][1:]).all()
+
+
+def test_places_of_the_hand_are_measured_at_its_point_and_compared_with_what_is_forced(measured):
+    arrays, _, figures = split(measured("around", "--count 2 --size 0.1 --space task"))
+    assert arrays["hand_without"].min() < -0.02 and (arrays["hand"].min(axis=1) >= 9e-3).all()
+    forced = arrays["detour"].max(axis=1) / (0.01 - arrays["hand_without"].min(axis=1))
+    median, p95 = map(float, figures["detour/forced where a motion is in the way, median, 95 %"].split(", "))
+    assert [median, p95] == pytest.approx(np.percentile(forced, [50, 95]), abs=0.006)
+
+
+def test_places_are_any_shapes_of_any_size_along_the_whole_motion(lasa, measured):
+    shapes = "--shape any --number 2 --size 0.06,0.25 --no-avoidance"
+    arrays = measured("around", f"--count 12 --along 0,1 --spread 0 {shapes}")[0]
+    mean = lasa_tasks(lasa)["Hook"]().mean_path
+    places, sizes = arrays["places"][1:], arrays["sizes"][1:]
+    assert (places[:, 0] != places[:, 1]).any(axis=1).all()
+    assert places.shape == sizes.shape == (12, 2, 3) and arrays["turns"].shape == (13, 2, 4)
+    assert set(arrays["shapes"][1:].ravel()) == {"sphere", "box", "cylinder"}
+    assert 0.06 <= sizes.min() < 0.1 and 0.2 < sizes.max() <= 0.25
+    nearest = np.linalg.norm(places[:, :, None] - mean, axis=3).argmin(axis=2)
+    assert nearest.min() < 25 and nearest.max() > 75
+    assert distance_from_path(places.reshape(-1, 3), mean).max() < 1e-9
+
+
+def rollout(**changes):
+    """Measurements of a rollout that gives way to a sphere."""
+    values: dict[str, Any] = {
+        "hand": 0.03,
+        "arm": 0.012,
+        "hand_without": -0.04,
+        "arm_without": -0.06,
+        "frechet": 0.08,
+        "detour": 0.07,
+    }
+    rest = {"turn": 20.0, "turn_without": 10.0, "num_outside": 0, "goal_miss": 1e-6}
+    return Rollout(**(values | rest | changes))
+
+
+@pytest.mark.parametrize(("space", "clearance", "forced"), [("task", 0.01, 0.06), ("cspace", -0.002, 0.08)])
+def test_a_place_is_judged_by_its_worst_rollout_and_by_what_avoids(space, clearance, forced):
+    worst = rollout(hand=0.01, arm=-0.002, hand_without=-0.05, arm_without=-0.07, detour=0.12)
+    obstacle = Union((Sphere((0.0, 0.0, 0.0), 0.1),))
+    place = Place(
+        obstacle, Avoidance(obstacle.parts, space=space), np.array([0.1, -0.1, 0.2]), {0: rollout(), 2: worst}, {}
+    )
+    assert place.clearance == clearance and place.ratio == pytest.approx(0.12 / forced)
+
+
+def test_only_starts_with_a_rollout_and_the_goal_have_to_be_free():
+    obstacle, ends = Union((Sphere((0.0, 0.0, 0.0), 0.1),)), np.array([0.1, -0.1, 0.2])
+    first, both = ({i: rollout() for i in starts} for starts in ((0,), (0, 1)))
+    assert Place(obstacle, Avoidance(obstacle.parts), ends, first, {}).is_free
+    assert not Place(obstacle, Avoidance(obstacle.parts), ends, both, {}).is_free
+    covered = np.array([0.1, -0.1, -0.2])  # the goal, too
+    assert not Place(obstacle, Avoidance(obstacle.parts), covered, first, {}).is_free
+
+
+def test_shares_are_of_the_places_that_have_motions():
+    obstacle, ends = Union((Sphere((0.0, 0.0, 0.0), 0.1),)), np.array([0.1, 0.1, 0.2])
+    avoidance = Avoidance(obstacle.parts, space="cspace")
+    clearances = {"kept": 0.012, "nearly": 0.0095, "near": 0.005, "touched": -0.002}
+    places = [Place(obstacle, avoidance, ends, {0: rollout(arm=arm), 1: rollout()}, {}) for arm in clearances.values()]
+    places.append(Place(obstacle, avoidance, ends, {1: rollout(turn=91.0)}, {}))
+    places.append(Place(obstacle, avoidance, -ends, {}, {}, (MotionWarning(Kind.NO_WAY, "", ARM),)))
+    figures = {row["figure"]: str(row["value"]) for row in _shares(places)}
+    assert figures["places that leave the end effector's starts and goal free"].startswith("5 of 6")
+    assert figures["blocked"].startswith("1 of 6") and figures["blocked between free ends"].startswith("1 of 6")
+    assert figures["from some of the starts only"].startswith("1 of 5")
+    assert figures["collisions"].startswith("1 of 5") and figures["at least 9 mm kept"].startswith("3 of 5")
+    assert figures["turns sharper than 90°"].startswith("1 of 5")
+    assert figures["the same without avoidance"].startswith("0 of 5") and figures["F.D. mean mm"] == "80.0"

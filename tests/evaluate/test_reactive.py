@@ -1,0 +1,130 @@
+"""Obstacles that cross the motion of the robot in the loop: where they go, and what is measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dt_viz.arm.collision import load_collision_model
+from dt_viz.control.settings import ControllerSettings
+from dt_viz.evaluate import reactive
+from dt_viz.obstacles.shapes import Sphere, as_point
+
+
+def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured, robot):
+    arrays, (rows,) = measured("reactive", "--speed 0.4 --runs 1 --beside")
+    row = rows[0]
+    q, t, places = arrays["q_0"], arrays["t_0"], arrays["obstacle_0"]
+    assert q.shape == (len(t), 6) and places.shape == (len(t), 3)
+    velocity = np.diff(q, axis=0, prepend=q[:1]) / 0.01
+    assert (np.abs(velocity) < robot.velocity_limits + 1e-9).all()
+    assert np.abs(np.diff(velocity, axis=0)).max() < ControllerSettings().acceleration * 0.01 + 1e-9
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    np.testing.assert_allclose(steps[np.isfinite(steps)], 0.004, rtol=0.02)
+    for kind in ("potential_", "stepped_"):
+        assert len(arrays[f"{kind}q_0"]) == len(arrays[f"{kind}t_0"]) > 100
+    there = np.isfinite(places[:, 0])
+    closest = nearest(q[there], places[there], float(arrays["diameter"]))
+    assert float(row["clearance mm"]) == pytest.approx(1e3 * closest, abs=2)  # it looks between ticks, too
+    assert row["without contact"] == row["goal reached"] == "1 of 1"
+    again, _ = measured("reactive", "--speed 0.4 --runs 1")
+    np.testing.assert_array_equal(again["q_0"], q)
+
+
+def nearest(q, places, diameter):
+    """Smallest distance of the arm's meshes from a sphere at one of its places for each posture."""
+    model = load_collision_model()
+    return min(
+        model.obstacle_distance(joints[None], Sphere(as_point(place), diameter))[0][0]
+        for joints, place in zip(q, places, strict=True)
+    )
+
+
+@pytest.fixture(scope="module")
+def bench(engine):
+    return reactive.Bench(engine, "draw_s", 0.15, 0.03)
+
+
+@pytest.mark.parametrize(("speed", "num"), [(0.1, 1), (1.0, 1), (0.5, 2)])
+def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
+    found = list(reactive.crossings(bench, speed, 3, seed=1, num=num))
+    assert [crossing.start for crossing, _ in found] == [0, 1, 2]
+    for crossing, seconds in found:
+        hand, joints = bench.undisturbed(crossing.start)
+        assert seconds == pytest.approx(len(hand) * reactive.TICK) and len(crossing.passages) == num
+        assert np.linalg.norm(hand[-1] - bench.goal) < 1e-3
+        assert 0 in [crossing.begins, *(passage.comes for passage in crossing.passages)]  # no time is lost
+        for passage in crossing.passages:
+            step = np.linalg.norm(np.diff(passage.path, axis=0), axis=1)
+            assert step.sum() == pytest.approx(passage.length) and np.ptp(step) < 0.01 * step.max()
+            assert passage.gone - passage.comes == pytest.approx(passage.length / speed)
+            assert 0.8 < passage.length < 1.2
+            middle = (passage.comes + passage.gone) / 2
+            tick = round((middle - crossing.begins) / reactive.TICK)
+            assert 0.2 * len(hand) < tick < 0.8 * len(hand)
+            assert np.linalg.norm(passage.at(middle) - hand[tick]) < 0.08
+            np.testing.assert_allclose(passage.at(passage.comes), passage.path[0])
+            np.testing.assert_allclose(passage.at(passage.gone - 1e-9), passage.path[-1], atol=1e-6)
+            assert np.isnan(passage.at(passage.gone)).all() and np.isnan(passage.at(passage.comes - 1e-9)).all()
+            there = joints[max(0, int((passage.comes - crossing.begins) / reactive.TICK))]
+            gap = bench.follower.whole_arm.clearance(there[None], bench.shape(passage.path[0]))[0]
+            assert gap >= reactive.START_ROOM - 0.01
+            assert passage.path[:, 2].min() >= 0.075 + reactive.TABLE_ROOM
+
+
+def test_a_second_obstacle_and_a_turned_box_count(engine):
+    boxes = reactive.Bench(engine, "draw_s", 0.15, 0.03, boxes=True)
+    ((crossing, _),) = reactive.crossings(boxes, 0.5, 1, seed=2, num=2)
+    t = max(passage.comes for passage in crossing.passages)
+    parts = boxes.obstacles(crossing, t)
+    assert len(parts) == 2 and parts[0].wxyz == crossing.passages[0].wxyz != parts[1].wxyz
+    np.testing.assert_allclose([part.position for part in parts], crossing.at(t))
+    q, model = boxes.starts[:1], load_collision_model()
+    run = reactive.Run(q=[q[0]], obstacle=[crossing.at(t)])
+    expected = min(float(model.obstacle_distance(q, part)[0][0]) for part in parts)
+    assert reactive.smallest_distance(boxes, run, crossing) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_smallest_distance_is_found_between_ticks_too(bench):
+    q = np.stack([bench.starts[0]] * 4)
+    hand = bench.robot.end_effector(q[0])
+    places = hand + np.array([[0.5, 0, 0], [0.2, 0, 0.0], [-0.2, 0, 0], [0.0, 0.0, 0.0]])
+    places[3] = np.nan  # gone
+    fine = np.linspace(0, 1, 7)[:, None]
+    dense = np.concatenate([(1 - fine) * a + fine * b for a, b in ((places[0], places[1]), (places[1], places[2]))])
+    least = nearest(np.repeat(q[:1], len(dense), axis=0), dense, bench.diameter)
+    crossing = reactive.Crossing(0, 0.0, (reactive.Passage(places, 0.0, 1.0, 1.0),))
+    found = reactive.smallest_distance(bench, reactive.Run(q=list(q), obstacle=list(places[:, None])), crossing)
+    assert found == pytest.approx(least, abs=1e-9)
+    assert found < nearest(q[:3], places[:3], bench.diameter) - 0.01
+
+
+def test_figures_of_a_run_are_relative_to_the_limits(bench):
+    q = bench.starts[0] + np.cumsum([[0.0], [0.01], [0.03], [0.03]], axis=0) * np.eye(6)[0]
+    away = [np.array([[3.0, 0.0, 0.0]])] * 4
+    run = reactive.Run(list(q), [0.0, 0.01, 0.02, 0.03], away, [0.001, 0.003])
+    found = reactive.Figures.of(
+        bench, reactive.Crossing(0, 0.01, (reactive.Passage(np.zeros((2, 3)), 0.0, 1.0, 1.0),)), run, 0.005
+    )
+    assert found.velocity == pytest.approx(3.0 / bench.robot.velocity_limits[0])
+    assert found.acceleration == pytest.approx(200 / ControllerSettings().acceleration)
+    assert found.lost == pytest.approx(0.015) and found.distance > 2
+    assert found.missed == pytest.approx(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal))
+    touched = replace(found, distance=-0.002, missed=1e-4, lost=0.215)
+    assert reactive.summary([found, touched, touched])[:3] == ("1 of 3", "-2.0", "2 of 3")
+    assert reactive.summary([found, touched, touched])[5:] == ("0.2 (0.2)", "2.00 (3.0, 3)")
+
+
+def test_the_potential_field_pushes_what_is_near_away_from_the_sphere(bench):
+    arm, q = reactive.Potential(bench), bench.starts[0]
+    hand = bench.robot.end_effector(q)
+    far, beside = (bench.shape(hand + np.array([0.0, -away, 0.0])) for away in (1.0, 0.14))
+    assert not arm._away(q, None).any() and not arm._away(q, far).any()
+    step = 1e-4
+    pushed = bench.robot.end_effector(q + step * arm._away(q, beside)) - hand
+    assert pushed[1] > 0.5 * np.linalg.norm(pushed) > 1e-7
+    nearer = bench.robot.end_effector(q + step * arm._away(q, bench.shape(hand - [0.0, 0.12, 0.0]))) - hand
+    assert nearer[1] > pushed[1]
+    np.testing.assert_allclose(arm._at(q, beside), arm._at(q, None) + arm._away(q, beside), atol=1e-12)
+    free = bench.robot.end_effector(q + step * arm._at(q, None)) - hand
+    np.testing.assert_allclose(free / step, arm._hand.velocity(hand), atol=0.02)
