@@ -19,7 +19,7 @@ import numpy as np
 
 from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
-from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
+from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.files.values import Codec
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import AnyImitation, learn
@@ -98,8 +98,8 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
         DataError: as :func:`load_motion`.
     """
     with parsing(MotionError, source, "file", "a file that Motion.save wrote"):
-        archive = NpzFile(content, max_bytes=MAX_BYTES)
-        text = archive.read(TEXT) if TEXT in archive.names else np.zeros(0)
+        arrays = arrays_of(content, max_bytes=MAX_BYTES)
+        text = arrays.pop(TEXT, np.zeros(0))
         if text.dtype.kind != "U" or text.ndim:
             raise FormatError("arrays", "no text that describes a motion", "a file that Motion.save wrote")
         plain = json.loads(str(text))
@@ -107,7 +107,7 @@ def read_motion(content: bytes, source: str | Path) -> tuple[SavedMotion, AnyImi
         version = plain.pop("version", None) if isinstance(plain, dict) else None
         if version != FORMAT:
             raise FormatError("version", repr(version)[:40], f"{FORMAT}; another version of DT-Viz may have saved it")
-        arrays = {name: _checked(archive.read(name), name) for name in archive.names if name != TEXT}
+        arrays = {name: _checked(array, name) for name, array in arrays.items()}
         motion: SavedMotion = _codec().decode(plain, SavedMotion, "motion", arrays)
         learned = {name.removeprefix(LEARNED): array for name, array in arrays.items() if name.startswith(LEARNED)}
         demonstrations = check_demonstrations(motion.demonstrations, source)
