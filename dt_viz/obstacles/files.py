@@ -75,7 +75,7 @@ class LoadedMesh:
     solid: Solid
     name: str
     notes: tuple[str, ...] = ()
-    """Descriptions, for the page, of what was mended and of what is inexact."""
+    """Descriptions, for the page, of what was repaired and of what is inexact."""
 
 
 @dataclass(frozen=True)

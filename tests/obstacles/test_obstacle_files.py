@@ -1,4 +1,4 @@
-"""Meshes and clouds from files: what is read, what is mended, and what is refused, with the reason."""
+"""Meshes and clouds from files: what is read, what is repaired, and what is refused, with the reason."""
 
 import io
 import json
