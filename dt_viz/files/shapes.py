@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -48,6 +50,9 @@ def read_mesh(content: bytes, suffix: str) -> Answer:
     _check_text(content, suffix)
     _check_model(content, suffix)
     vertices, faces = _triangles(content, suffix)
+    if not len(faces):
+        accepted = f"a complete {suffix} file of a closed mesh; a point cloud is loaded as a cloud"
+        raise FormatError("faces", "none that could be read", accepted)
     check_triangles(vertices, faces)
     vertices, faces, notes = repaired(vertices, faces)
     return (vertices, faces), notes
@@ -82,6 +87,8 @@ def _check_model(content: bytes, suffix: str) -> None:
     """Raise FormatError if a file would unpack to very much, or needs an extension."""
     if suffix == ".3mf":
         arrays_of(content, max_bytes=MAX_MODEL, names=())
+    if suffix == ".gltf":
+        json.loads(content)  # trimesh would look for another file
     if suffix in (".glb", ".gltf"):
         _, found, required = content.partition(b'"extensionsRequired"')
         for name in EXTENSIONS:
@@ -89,9 +96,21 @@ def _check_model(content: bytes, suffix: str) -> None:
                 raise FormatError("JSON", f"the extension {name.decode()}", "plain triangles (no Draco, no meshopt)")
 
 
+class _OtherFiles:
+    """What trimesh asks for the files that a file names."""
+
+    def get(self, name: str) -> bytes:
+        """Refuse a file."""
+        raise FormatError("file", f"data in another file, {name[:40]!r}", "a file that holds all its data")
+
+    __getitem__ = get
+
+
 def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
     """Read all parts of a scene; what they add up to is counted before: a few bytes can place a mesh very often."""
-    loaded = trimesh.load(io.BytesIO(content), file_type=suffix[1:], process=False, skip_materials=True)
+    alone: Any = _OtherFiles()
+    file = io.BytesIO(content)
+    loaded = trimesh.load(file, file_type=suffix[1:], resolver=alone, process=False, skip_materials=True)
     scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
     parts = []
     num_vertices = num_faces = 0

@@ -20,8 +20,10 @@ from dt_viz.files import worker
 
 Read = tuple[list[np.ndarray], tuple[str, ...]]
 """Arrays of a file, and notes about it for the page."""
+START = 60.0
+"""Longest time until a process is ready for a file, seconds; a busy machine takes ten to import what it needs."""
 PATIENCE = 20.0
-"""Longest time for a file, seconds."""
+"""Longest time for a file from then on, seconds."""
 LOOK = 0.1
 """Interval of the checks whether it is still wanted, seconds."""
 ROOT = Path(__file__).parents[2]
@@ -54,6 +56,7 @@ class _Process:
                 found = f"something that ended its reader ({self._process.returncode})"
                 raise FormatError("file", found, "a whole file")
             self._answer.seek(0)
+            self._answer.readline(1)
             first = json.loads(self._answer.readline(2**16))
             if "refused" in first:
                 field, found, accepted = map(str, first["refused"])
@@ -72,8 +75,10 @@ class _Process:
             pipe.writelines(request)
 
     def _wait(self, cancelled: Cancelled) -> None:
-        deadline = time.monotonic() + PATIENCE
+        deadline, ready = time.monotonic() + START, False
         while True:
+            if not ready and os.fstat(self._answer.fileno()).st_size:
+                deadline, ready = time.monotonic() + PATIENCE, True
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(timeout=LOOK)
                 return

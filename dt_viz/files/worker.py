@@ -1,8 +1,8 @@
 """Process that reads one visitor's file within limits of memory, time and files, and ends.
 
-It takes a line of JSON, the kind and the suffix, and then the file from its standard input. It gives a line of JSON,
-`{"notes": …}` or `{"refused": [field, found, accepted]}`, and then arrays as `numpy.save` writes them. It imports what
-it needs before it waits for a file, and ends without one when its standard input is closed.
+It imports what it needs, gives an empty line, and waits for a file, or ends without one when its standard input is
+closed. It takes a line of JSON, the kind and the suffix, and then the file. It gives a line of JSON, `{"notes": …}` or
+`{"refused": [field, found, accepted]}`, and then arrays as `numpy.save` writes them.
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ def answer(kind: str, suffix: str, content: bytes) -> tuple[dict[str, object], t
 
 def main() -> None:
     """Read one file from the standard input."""
+    print(flush=True)
     line = sys.stdin.buffer.readline()
     if not line:
         return

@@ -21,13 +21,19 @@ BOX = trimesh.creation.box((0.15, 0.1, 0.05)).export(file_type="stl")
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
 
 
+@pytest.fixture(autouse=True)
+def _ready(monkeypatch):
+    """Nobody else's process is ready."""
+    monkeypatch.setattr(uploads, "_ready", uploads._Ready())
+
+
 @pytest.fixture
 def reader(tmp_path, monkeypatch):
     """Replaces the program of the process."""
 
     def replace(text: str) -> None:
         name = f"reader_{tmp_path.name.strip('0123456789_')}"
-        (tmp_path / f"{name}.py").write_text(textwrap.dedent(text))
+        (tmp_path / f"{name}.py").write_text("print(flush=True)\n" + textwrap.dedent(text))
         monkeypatch.syspath_prepend(tmp_path)
         monkeypatch.setattr(worker, "__name__", name)
 
@@ -78,6 +84,14 @@ def test_what_hangs_is_ended(reader, monkeypatch):
     with pytest.raises(FormatError, match="take more than"):
         read_upload("mesh", ".stl", bytes(10**7))
     assert time.monotonic() - start < PATIENCE
+
+
+def test_what_never_begins_is_ended(reader, monkeypatch):
+    reader("")
+    monkeypatch.setattr(uploads, "START", 0.0)
+    monkeypatch.setattr(uploads, "LOOK", 0.01)
+    with pytest.raises(FormatError, match="take more than"):
+        read_upload("mesh", ".stl", bytes(10**7))
 
 
 def test_it_ends_when_its_visitor_leaves(reader):
