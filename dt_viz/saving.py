@@ -183,7 +183,7 @@ def _made(plain: Any, hint: Any, where: str, arrays: dict[str, np.ndarray]) -> A
     ):  # NDArray is an alias since numpy 2.5
         array = arrays.pop(plain, None) if isinstance(plain, str) else None  # each once, or a few bytes fill the memory
         wanted = np.int64 if "integer" in repr(kinds) else np.float64
-        fits = array is not None and array.dtype == wanted and np.isfinite(array).all()
+        fits = array is not None and array.dtype == wanted and bool(np.isfinite(array).all())
         _checked(plain, fits, where, f"the name of an array of finite {wanted.__name__}")
         return array
     if hint in CLASSES or is_dataclass(hint):

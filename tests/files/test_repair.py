@@ -78,7 +78,9 @@ def bowl() -> trimesh.Trimesh:
     """With walls, but open where they should meet at the rim."""
     half, inner = BALL.slice_plane([0, 0, 0], [0, 0, -1]), trimesh.creation.icosphere(3, 0.09)
     inner.invert()
-    return trimesh.util.concatenate([half, inner.slice_plane([0, 0, 0], [0, 0, -1])])
+    both = trimesh.util.concatenate([half, inner.slice_plane([0, 0, 0], [0, 0, -1])])
+    assert isinstance(both, trimesh.Trimesh)
+    return both
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
 """The process that reads uploads: its limits, its end, and what the server makes of its answers."""
 
 import io
-import os
 import sys
 import textwrap
 import threading
 import time
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from dt_viz.files import uploads, worker
 from dt_viz.files.uploads import read_upload
 from dt_viz.obstacles.files import ShapeError, read_mesh
 
-BOX = trimesh.creation.box((0.15, 0.1, 0.05)).export(file_type="stl")
+BOX = cast(bytes, trimesh.creation.box((0.15, 0.1, 0.05)).export(file_type="stl"))
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
 
 
@@ -138,7 +138,7 @@ def test_one_is_ready_while_somebody_may_send_a_file_and_none_is_left():
 def test_it_ends_by_itself_when_the_server_has_gone():
     process = uploads._Process()
     try:
-        os.close(os.dup(process._process.stdin.fileno()))
+        assert process._process.stdin is not None
         process._process.stdin.close()  # as the kernel does at the end of a process
         wait_until(lambda: process._process.poll() is not None)
         assert process._process.returncode == 0
