@@ -46,6 +46,11 @@ class _Process:
             stderr=subprocess.DEVNULL,
         )
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether it has ended by itself."""
+        return self._process.poll() is not None
+
     def read(self, request: Sequence[bytes], cancelled: Cancelled) -> Read:
         """Have a file read, and end. Raises as `read_upload`."""
         giving = threading.Thread(target=self._give, args=(request,), name="upload", daemon=True)
@@ -106,9 +111,12 @@ class _Ready:
         self._process: _Process | None = None
 
     def take(self) -> _Process:
-        """Return a process."""
+        """Return a process, the one that waits unless it has died meanwhile."""
         with self._lock:
             process, self._process = self._process, None
+        if process is not None and process.has_ended:
+            process.end()
+            process = None
         return process or _Process()
 
     def renew(self) -> None:

@@ -114,7 +114,8 @@ def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0, cancell
     source = Path(source)
     suffix = _suffix(content, source, MESH_SUFFIXES, scale)
     with parsing(ShapeError, source, "file", f"a {suffix} file of a mesh"):
-        (vertices, faces), notes = read_upload("mesh", suffix, content, cancelled)
+        arrays, notes = read_upload("mesh", suffix, content, cancelled)
+        vertices, faces = real_numbers(arrays[0], "vertices"), real_numbers(arrays[1], "faces").astype(np.intp)
         check_triangles(vertices, faces)
         vertices = _checked_size(vertices, vertices[faces].reshape(-1, 3), source, scale)
         solid = Solid(vertices, faces)
