@@ -67,7 +67,8 @@ def inside_of_grid(
     inside = votes >= 2
     if not closed:
         return inside
-    beside = ndimage.binary_dilation(inside) & ~ndimage.binary_erosion(inside)  # lines may meet these nodes either way
+    grown, shrunk = (np.asarray(f(inside), bool) for f in (ndimage.binary_dilation, ndimage.binary_erosion))
+    beside = grown & ~shrunk  # lines may meet these nodes either way
     disputed = np.count_nonzero(((votes == 1) | (votes == 2)) & ~beside) / max(1, np.count_nonzero(inside))
     if disputed > MAX_DISPUTED:
         found = f"large holes: what is inside differs with the direction, in {min(disputed, 1):.0%} of it"
