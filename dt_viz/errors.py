@@ -96,7 +96,7 @@ def parsing(kind: type[DataError], source: str | Path, field: str, accepted: str
             naming(kind, source),
         ):  # what overflows is refused as not finite, or as too large
             yield
-    except DataError:
+    except (DataError, UnwantedError):
         raise
     except Exception as error:  # no reader lists what corrupt bytes make it raise
         reason = " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,10 +1,12 @@
 """Mutated files of every kind that is read, always the same ones, and a program that reads what it is given.
 
 The program takes files from its standard input and prints a line of JSON for each: why it was refused (or nothing), the
-processor time in seconds and the largest memory of the process meanwhile in MB. Another exception than the readers' own
-ends it, as a crash does. Reading is apart from the test because memory can only be measured for a whole process.
+processor time of it and of the processes that it starts, in seconds, by how much its memory grew meanwhile, and the
+largest memory that any of those processes has had, in MB. Another exception than the readers' own ends it, as a crash
+does. Reading is apart from the test because memory can only be measured for a whole process.
 """
 
+import base64
 import copy
 import faulthandler
 import io
@@ -12,9 +14,7 @@ import json
 import re
 import struct
 import sys
-import time
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import cache
@@ -22,7 +22,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import scipy.io
 import trimesh
 
 from dt_viz import saving
@@ -213,25 +212,6 @@ def with_changed_members(content: bytes, rng: Rng) -> bytes:
     return file.getvalue()
 
 
-def with_changed_inside(content: bytes, rng: Rng) -> bytes:
-    """A MATLAB file whose compressed variables are changed inside."""
-    changed = content[:128]
-    at = 128
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from("<II", content, at)
-        data = content[at + 8 : at + 8 + size]
-        at += 8 + size
-        if kind == 15:
-            try:
-                plain = zlib.decompress(data)
-            except zlib.error:
-                return content
-            mutation = (flipped, with_number, with_block_again, without_block)[int(rng.integers(4))]
-            data = zlib.compress(mutation(plain, rng), 1)
-        changed += struct.pack("<II", kind, len(data)) + data
-    return changed
-
-
 EVERYWHERE: tuple[Mutation, ...] = (
     *(flipped, overwritten, truncated, without_block, with_block_again, with_number, with_word, with_line_again),
 )
@@ -243,18 +223,17 @@ def exported(mesh: trimesh.Trimesh, kind: str, **options: str) -> bytes:
     return content.encode() if isinstance(content, str) else content
 
 
+def embedded(glb: bytes) -> bytes:
+    """A glTF file with the data of a GLB file inside its text."""
+    (length,) = struct.unpack_from("<I", glb, 12)
+    scene, data = json.loads(glb[20 : 20 + length]), glb[28 + length :]
+    scene["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    return json.dumps(scene).encode()
+
+
 def npz(**arrays: np.ndarray) -> bytes:
     file = io.BytesIO()
     np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
-    return file.getvalue()
-
-
-def matlab(motions: list[np.ndarray], *, compressed: bool) -> bytes:
-    cells = np.empty((1, len(motions)), dtype=object)
-    for k, positions in enumerate(motions):
-        cells[0, k] = {"pos": 1e3 * positions.T, "t": np.arange(float(len(positions)))[None], "name": "text"}
-    file = io.BytesIO()
-    scipy.io.savemat(file, {"demos": cells, "dt": 0.1}, do_compression=compressed)
     return file.getvalue()
 
 
@@ -310,14 +289,15 @@ def seeds() -> tuple[tuple[str, str, bytes, tuple[Mutation, ...]], ...]:
     return (
         ("demonstrations", "a.csv", "\n".join(rows).encode(), ()),
         ("demonstrations", "a.npz", npz(**arrays), (with_changed_members,) * 4),
-        ("demonstrations", "a.mat", matlab(motions, compressed=False), ()),
-        ("demonstrations", "b.mat", matlab(motions, compressed=True), (with_changed_inside,) * 4),
         ("mesh", "a.stl", exported(BALL, "stl"), ()),
         ("mesh", "b.stl", exported(BALL, "stl_ascii"), ()),
         ("mesh", "a.obj", exported(BALL, "obj"), ()),
         ("mesh", "a.ply", exported(BALL, "ply"), ()),
         ("mesh", "b.ply", exported(BALL, "ply", encoding="ascii"), ()),
         ("mesh", "a.glb", scene, (with_changed_scene,) * 8),
+        ("mesh", "a.gltf", embedded(scene), ()),
+        ("mesh", "a.off", exported(BALL, "off"), ()),
+        ("mesh", "a.3mf", exported(BALL, "3mf"), (with_changed_members,) * 4),
         ("cloud", "a.npz", npz(points=points, labels=labels), (with_changed_members,) * 4),
         ("cloud", "b.npz", npz(points=points[labels].astype(np.float32)), (with_changed_members,) * 4),
         ("cloud", "a.csv", "\n".join(table).encode(), ()),
@@ -384,20 +364,29 @@ def main() -> None:
 
 
 def read_what_is_given() -> None:
+    import resource
+
+    def seconds() -> float:
+        both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        return sum(used.ru_utime + used.ru_stime for used in both)
+
+    def megabytes(name: str) -> float:
+        (kilobytes,) = re.findall(rf"{name}:\s+(\d+) kB", PROCESS.joinpath("status").read_text())
+        return int(kilobytes) / 1024
+
     while line := sys.stdin.buffer.readline():
         faulthandler.dump_traceback_later(MAX_SECONDS, exit=True)
         kind, name, size = json.loads(line)
         content = sys.stdin.buffer.read(size)
         forget()  # what was computed of files before
         PROCESS.joinpath("clear_refs").write_text("5")  # forget the largest memory so far
-        start, message = time.process_time(), ""
+        start, before, message = seconds(), megabytes("VmRSS"), ""
         try:
             read(kind, name, content)
         except DataError as error:
             message = str(error)
-        seconds = time.process_time() - start
-        (kilobytes,) = re.findall(r"VmHWM:\s+(\d+) kB", PROCESS.joinpath("status").read_text())
-        print(json.dumps([message, seconds, int(kilobytes) / 1024]), flush=True)
+        worker = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+        print(json.dumps([message, seconds() - start, megabytes("VmHWM") - before, worker]), flush=True)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import numpy as np
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.errors import DataError, FormatError, parsing
 from dt_viz.files.checks import read_bytes
-from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
+from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.flows.fields import Array
 from dt_viz.learning.store import fingerprint
 from dt_viz.scenario.tasks import Task
@@ -60,8 +60,7 @@ def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -
         raise NotFittedError(text)
     try:
         with parsing(WeightsError, path, "file", accepted):
-            archive = NpzFile(read_bytes(path, MAX_FILE), max_bytes=MAX_BYTES)
-            arrays = {name: archive.read(name) for name in archive.names}
+            arrays = arrays_of(read_bytes(path, MAX_FILE), max_bytes=MAX_BYTES)
             asked = {"_method": method, "_version": version, "_demonstrations": _demonstrations(task)}
             for field, wanted in asked.items():
                 found = arrays.pop(field).item()

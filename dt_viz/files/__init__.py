@@ -1,1 +1,1 @@
-"""Readers of untrusted files, bounded in time and memory."""
+"""Files: checks, archives of arrays, and visitors' files, which a process with limits reads."""

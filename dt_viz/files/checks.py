@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dt_viz.errors import FormatError
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
+
+MAX_FACES = 500_000
+"""Largest number of triangles of a mesh."""
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
@@ -86,3 +89,16 @@ def check_finite(values: Array, field: str, place: Callable[[int], str]) -> None
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]
         raise FormatError(field, f"{values[row, column]} {place(int(row))}", "finite numbers")
+
+
+def check_triangles(vertices: Array, faces: Indices) -> None:
+    """Raise FormatError unless these are finite vertices (V, 3) and at least one, but not too many, faces (F, 3)."""
+    if vertices.ndim != 2 or faces.ndim != 2 or vertices.shape[1] != 3 or faces.shape[1] != 3:
+        raise FormatError("mesh", f"shapes {vertices.shape} and {faces.shape}", "vertices (V, 3) and faces (F, 3)")
+    if not len(faces):
+        raise FormatError("faces", "none", "a closed mesh of triangles; a point cloud is loaded as a cloud")
+    check_at_most("faces", len(faces), MAX_FACES)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        wrong = faces.min() if faces.min() < 0 else faces.max()
+        raise FormatError("faces", f"vertex {wrong}", f"indices of the {len(vertices)} vertices")
+    check_finite(vertices, "vertices", lambda row: f"in vertex {row + 1}")

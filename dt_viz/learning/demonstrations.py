@@ -9,9 +9,17 @@ CSV (``.csv``), UTF-8, one header line and then one line per sample, seconds and
     first,0.04,0.11,0.20,0.30
     second,0.00,0.12,0.21,0.30
 
-    ``demo`` is any label; lines with the same label are one demonstration, in the order they stand in. ``z`` is
-    left out for motions in the plane. Without the column ``demo`` the file is a single demonstration. Of a folder,
-    every CSV file is read, in the order of their names.
+    Columns are found by their names, in any order; others are left out, and a log line names them.
+
+    - ``demo`` is any label; lines with the same label are one demonstration, in the order they stand in. Without it
+      the file is a single demonstration.
+    - ``t``, ``time``, ``timestamp`` or ``stamp``, perhaps with a unit (``time_ms``, ``stamp_ns``); ``%time`` of
+      ``rostopic echo -p`` is nanoseconds. Without it the samples have equal distances in time: `rate` samples per
+      second, or `UNTIMED` seconds in all.
+    - ``x``, ``y``, ``z``, also as ``pos_x``, ``position.x`` or ``field.pose.position.x``. ``z`` is left out for
+      motions in the plane.
+
+    Of a folder, every CSV file is read, in the order of their names.
 
 npz (``.npz``), seconds and metres, for i = 0, 1, 2, …:
     ``times_i`` (T,), ``positions_i`` (T, d), and optionally ``name_i``, a string. Pickled arrays are never opened.
@@ -20,29 +28,38 @@ LASA handwriting (``.mat``, MATLAB v5 to v7), seconds and millimetres:
     ``demos``, a cell array (or array) of structures with ``t`` 1×T and ``pos`` d×T; nothing else in it is used.
 """
 
+import csv
+import io
+import logging
 import re
-from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.io
 
 from dt_viz.errors import DataError, FormatError, naming, parsing
-from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers, too_many
-from dt_viz.files.npz import NpzFile
-from dt_viz.files.text import decimal_numbers, read_table
-from dt_viz.learning.matfile import Value, read_variable
+from dt_viz.files.checks import check_at_most, check_finite, checked_suffix, read_bytes, real_numbers
+from dt_viz.files.npz import arrays_of
+
+logger = logging.getLogger(__name__)
 
 DIMENSIONS = (2, 3)
 MAX_BYTES = 16 * 2**20
 """Largest number of bytes of a file, and of what an npz unpacks to; some 300,000 samples."""
-MAX_CSV_ROWS = 600_000
 MAX_DEMONSTRATIONS = 1000
 MAX_NAME = 1000
 """Largest number of characters of a name."""
-CSV_HEADERS = (("demo", "t", "x", "y"), ("demo", "t", "x", "y", "z"), ("t", "x", "y"), ("t", "x", "y", "z"))
+UNTIMED = 5.0
+"""Duration of a demonstration of a table without times or rate, seconds."""
+TIME = re.compile(r"(?:t|time|timestamp|stamp)(?:[_ .]?[(\[]?(s|ms|us|ns)[)\]]?)?|(%time)")
+"""Names of the column of times, and the unit they end in."""
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+COORDINATE = re.compile(r"(?:.*[._/ ])?(?:p|pos|position)[._/ ]?([xyz])")
+"""Names of the columns of positions other than x, y, z."""
+ACCEPTED = "columns x, y and perhaps z, t and demo, such as 't,x,y,z' or 'timestamp,pos_x,pos_y,pos_z'"
 MAX_COORDINATE, MAX_DURATION = 100.0, 3600.0
 """Largest coordinate (m) and duration (s); numbers beyond them are in another unit."""
 MIN_EXTENT = 1e-6
@@ -177,41 +194,46 @@ def _places(lines: Sequence[Sequence[int]] | None, index: int) -> Callable[[int]
     return lambda row: f"at sample {row + 1}" if lines is None else f"at line {lines[index][row]}"
 
 
-def load_demonstrations(path: str | Path) -> tuple[Demonstration, ...]:
+def load_demonstrations(path: str | Path, *, rate: float | None = None) -> tuple[Demonstration, ...]:
     """Read the demonstrations of a file (CSV, npz, LASA .mat) or of a folder of CSV files.
 
     Args:
         path: the file, whose suffix says what it is (see the module's docstring), or the folder.
+        rate: samples per second (Hz) of tables without times; None takes them as `UNTIMED` seconds long.
 
     Raises:
         DemonstrationError: there is no such file or folder, it cannot be read, is not what its suffix says, or holds
-            demonstrations that :func:`check_demonstrations` refuses. Nothing else is raised, whatever the file holds.
+            demonstrations that :func:`check_demonstrations` refuses; or there are times beside a rate.
     """
     path = Path(path)
     with parsing(DemonstrationError, path, "path", "a readable file or folder"):
         if path.is_dir():
-            return _load_csv_folder(path)
+            return _load_csv_folder(path, rate)
         if not path.exists():
             raise FormatError("path", "no such file or folder", "a readable file or folder")
         content = read_bytes(path, MAX_BYTES)
-    return read_demonstrations(content, path)
+    return read_demonstrations(content, path, rate=rate)
 
 
-def read_demonstrations(content: bytes, source: str | Path) -> tuple[Demonstration, ...]:
-    """Read the demonstrations in the bytes of a file, such as one uploaded from the browser.
+def read_demonstrations(content: bytes, source: str | Path, *, rate: float | None = None) -> tuple[Demonstration, ...]:
+    """Read the demonstrations in the bytes of a file.
 
     Args:
         content: all bytes of the file.
         source: its name or path; the suffix says what it is, the stem names demonstrations that have no name.
+        rate: as for :func:`load_demonstrations`.
 
     Raises:
         DemonstrationError: as :func:`load_demonstrations`.
     """
     source = Path(source)
     with naming(DemonstrationError, source):
-        read, accepted = _READERS[checked_suffix(content, source, _READERS, MAX_BYTES)]
+        suffix = checked_suffix(content, source, _READERS, MAX_BYTES)
+        if rate is not None and not (suffix == ".csv" and 0 < rate < np.inf):
+            raise FormatError("rate", f"{rate} for a {suffix} file", "samples per second, above 0, of a .csv file")
+    read, accepted = _READERS[suffix]
     with parsing(DemonstrationError, source, "file", accepted):
-        demonstrations, lines = read(content, source.stem)
+        demonstrations, lines = read(content, source, rate)
     return check_demonstrations(demonstrations, source, lines)
 
 
@@ -260,95 +282,107 @@ def _files_of(folder: Path, *suffixes: str) -> list[Path]:
         return [path for path in files if path.suffix.lower() in suffixes]
 
 
-def _load_csv_folder(folder: Path) -> tuple[Demonstration, ...]:
+def _load_csv_folder(folder: Path, rate: float | None) -> tuple[Demonstration, ...]:
     if others := _files_of(folder, ".npz", ".mat"):
         raise FormatError("folder", f"{others[0].name!r}", "only .csv files; load other files one by one")
     tables = _files_of(folder, ".csv")
     if not tables:
         raise FormatError("folder", "no .csv file", "one or more .csv files")
-    return check_demonstrations([demo for path in tables for demo in load_demonstrations(path)], folder)
+    return check_demonstrations([demo for path in tables for demo in load_demonstrations(path, rate=rate)], folder)
 
 
-Read = tuple[list[Demonstration], "list[array[int]] | None"]
+Read = tuple[list[Demonstration], list[list[int]] | None]
 """Demonstrations of a file before they are checked, and for each the lines of its samples in a text file."""
 
 
-def _read_csv(content: bytes, stem: str) -> Read:
-    samples: dict[str, array[float]] = {}
-    lines: dict[str, array[int]] = {}
-    header, rows = read_table(content, CSV_HEADERS, max_rows=MAX_CSV_ROWS)
-    columns = [name for name in header if name != "demo"]
-    for line, row in rows:
-        label = stem if len(row) == len(columns) else row[0]
-        if label not in samples:
-            if len(samples) == MAX_DEMONSTRATIONS:
-                raise too_many("demonstrations", MAX_DEMONSTRATIONS)
-            samples[label], lines[label] = array("d"), array("q")
-        samples[label].extend(decimal_numbers(row[-len(columns) :], line))
-        lines[label].append(line)
-    tables = {label: np.asarray(numbers).reshape(-1, len(columns)) for label, numbers in samples.items()}
-    demonstrations = [Demonstration(table[:, 0], table[:, 1:], label) for label, table in tables.items()]
+def _read_csv(content: bytes, source: Path, rate: float | None) -> Read:
+    table = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+    header = [cell.strip().lower() for cell in next(table, [])]
+    columns, second = _columns(header)
+    if "t" in columns and rate is not None:
+        raise FormatError("rate", f"{rate:g} beside a column of times", "either times or a rate")
+    if others := [name for k, name in enumerate(header) if k not in columns.values()]:
+        logger.warning("%s: columns %s are not used", source, ", ".join(others)[:200])
+    numbers = [columns[name] for name in ("t", "x", "y", "z") if name in columns]
+    samples: dict[str, list[list[float]]] = {}
+    lines: dict[str, list[int]] = {}
+    for row in table:
+        if not any(map(str.strip, row)):
+            continue
+        if len(row) != len(header):
+            raise FormatError(f"line {table.line_num}", f"{len(row)} columns", f"{len(header)}, as in the header")
+        label = row[columns["demo"]].strip() if "demo" in columns else source.stem
+        try:
+            samples.setdefault(label, []).append([float(row[column]) for column in numbers])
+        except ValueError as error:
+            raise FormatError(f"line {table.line_num}", repr(",".join(row)[:60]), "decimal numbers") from error
+        lines.setdefault(label, []).append(table.line_num)
+    demonstrations = []
+    for label, rows in samples.items():
+        values = np.array(rows)
+        if "t" in columns:
+            times, positions = second * values[:, 0], values[:, 1:]
+        else:
+            times = np.arange(len(values)) / (rate or max(len(values) - 1, 1) / UNTIMED)
+            positions = values
+        demonstrations.append(Demonstration(times, positions, label))
+    if "t" not in columns and rate is None:
+        logger.warning("%s: no times and no rate: each demonstration takes %g s, evenly sampled", source, UNTIMED)
     return demonstrations, list(lines.values())
 
 
-def _read_npz(content: bytes, stem: str) -> Read:
-    archive = NpzFile(content, max_bytes=MAX_BYTES)
+def _columns(header: Sequence[str]) -> tuple[dict[str, int], float]:
+    """Find the numbers of the columns demo, t, x, y, z, those that there are, and the seconds of a unit of t."""
+    columns = {name: header.index(name) for name in ("demo", "x", "y", "z") if name in header}
+    found = [(k, match) for k, name in enumerate(header) if (match := COORDINATE.fullmatch(name))]
+    if not {"x", "y", "z"} & set(columns):
+        for k, match in found:
+            columns.setdefault(match[1], k)  # the first of several poses
+    second = 1.0
+    for k, name in enumerate(header):
+        if "t" not in columns and (match := TIME.fullmatch(name)):
+            columns["t"], second = k, 1e-9 if match[2] else SECONDS[match[1] or "s"]
+    if not {"x", "y"} <= set(columns):
+        raise FormatError("header line", repr(",".join(header)[:80]), ACCEPTED)
+    return columns, second
+
+
+def _read_npz(content: bytes, source: Path, _rate: float | None) -> Read:
+    arrays = arrays_of(content, max_bytes=MAX_BYTES)
     accepted = "times_0, positions_0, times_1, positions_1, … and optionally name_0, name_1, …"
-    numbers = set()
-    for key in archive.names:
-        match = re.fullmatch(r"(?:times|positions|name)_(0|[1-9][0-9]{0,8})", key)
-        if match is None:
-            raise FormatError("arrays", repr(key[:40]), accepted)
-        numbers.add(int(match[1]))
-
-    def read(key: str) -> np.ndarray:
-        if key not in archive.names:
-            raise FormatError("arrays", f"no {key!r}", accepted)
-        return archive.read(key)
-
+    matches = {key: re.fullmatch(r"(?:times|positions|name)_(0|[1-9][0-9]{0,8})", key) for key in arrays}
     demonstrations = []
-    for i in sorted(numbers):
-        name = f"{stem} {i}"
-        if f"name_{i}" in archive.names:
-            text = archive.read(f"name_{i}")
-            if text.dtype.kind != "U" or text.ndim:
-                raise FormatError(f"name_{i}", f"{text.dtype} of shape {text.shape}", "one string")
-            name = str(text)
-        times, positions = (read(key) for key in (f"times_{i}", f"positions_{i}"))
-        demonstrations.append(Demonstration(times, positions, name))
+    for i in sorted({int(match[1]) if match else -1 for match in matches.values()}):
+        if missing := [key for key in (f"times_{i}", f"positions_{i}") if key not in arrays]:
+            wrong = [repr(key[:40]) for key, match in matches.items() if not match]
+            raise FormatError("arrays", wrong[0] if wrong else f"no {missing[0]!r}", accepted)
+        name = arrays.get(f"name_{i}", np.array(f"{source.stem} {i}"))
+        if name.dtype.kind != "U" or name.ndim:
+            raise FormatError(f"name_{i}", f"{name.dtype} of shape {name.shape}", "one string")
+        demonstrations.append(Demonstration(arrays[f"times_{i}"], arrays[f"positions_{i}"], str(name)))
     return demonstrations, None
 
 
-def _read_lasa(content: bytes, stem: str) -> Read:
-    accepted = "a cell array of structures with t and pos"
-    try:
-        recordings = read_variable(content, "demos")
-    except KeyError as error:
-        raise FormatError("variable 'demos'", "no such variable", accepted) from error
-    if not isinstance(recordings, list):
-        raise FormatError("variable 'demos'", "no cells", accepted)
+def _read_lasa(content: bytes, source: Path, _rate: float | None) -> Read:
+    variables = scipy.io.loadmat(io.BytesIO(content), simplify_cells=True, variable_names=("demos",))
+    accepted = "a cell array of structures with t (1×T) and pos (d×T)"
+    if "demos" not in variables:
+        raise FormatError("variable 'demos'", "no such variable", accepted)
+    recordings = np.atleast_1d(np.asarray(variables["demos"], dtype=object)).ravel()
     demonstrations = []
     for i, recording in enumerate(recordings):
-        times, positions = (_lasa_field(recording, field, f"demos{{{i + 1}}}.{field}") for field in ("t", "pos"))
-        if times.ndim != 2 or 1 not in times.shape:
+        if not isinstance(recording, dict) or not {"t", "pos"} <= set(recording):
+            raise FormatError(f"demos{{{i + 1}}}", "no structure with t and pos", accepted)
+        times, positions = (real_numbers(recording[field], f"demos{{{i + 1}}}.{field}") for field in ("t", "pos"))
+        if times.ndim != 1:
             raise FormatError(f"demos{{{i + 1}}}.t", f"an array of shape {times.shape}", "1×T")
-        demonstrations.append(Demonstration(times.ravel(), positions.T * METRES_PER_LASA_UNIT, f"{stem} {i}"))
+        demonstrations.append(Demonstration(times, positions.T * METRES_PER_LASA_UNIT, f"{source.stem} {i}"))
     return demonstrations, None
 
 
-def _lasa_field(recording: Value, field: str, where: str) -> np.ndarray:
-    fields = recording[0] if isinstance(recording, list) and len(recording) == 1 else recording
-    if not isinstance(fields, dict) or field not in fields:
-        raise FormatError(where, "no such field", "a structure with t (1×T) and pos (d×T)")
-    numbers = fields[field]
-    if not isinstance(numbers, np.ndarray):
-        raise FormatError(where, "something else than numbers", "a matrix of real numbers")
-    return real_numbers(numbers, where)
-
-
-_READERS: dict[str, tuple[Callable[[bytes, str], Read], str]] = {
+_READERS: dict[str, tuple[Callable[[bytes, Path, float | None], Read], str]] = {
     ".csv": (_read_csv, "comma-separated text in UTF-8"),
     ".npz": (_read_npz, "an npz archive of plain numbers; pickled objects are never opened"),
     ".mat": (_read_lasa, "a MATLAB file of version 5 to 7"),
 }
-"""Reader of each kind of file, given all its bytes and the stem of its name, and the accepted content."""
+"""Reader of each kind of file, given all its bytes, its path and the rate, and the accepted content."""

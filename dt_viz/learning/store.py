@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.files.npz import NpzFile, npz_bytes, write_whole
+from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.learning.choice import AnyImitation, State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
@@ -189,8 +189,7 @@ class FitStore:
         if path is None or not path.exists():
             return None
         try:
-            archive = NpzFile(path.read_bytes(), max_bytes=MAX_BYTES)
-            return Imitation.from_arrays({name: archive.read(name) for name in archive.names})
+            return Imitation.from_arrays(arrays_of(path.read_bytes(), max_bytes=MAX_BYTES))
         except Exception as error:  # damaged bytes make zipfile and zlib raise almost anything
             logger.warning("%s is damaged and will be fitted anew: %s", path, error)
             return None

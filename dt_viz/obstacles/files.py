@@ -1,44 +1,35 @@
-"""Readers of obstacles' shapes from files: closed meshes and point clouds.
+"""Obstacles' shapes from files: closed meshes and point clouds.
 
-Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB. They must be closed; small holes and seams are mended
-(see `dt_viz.obstacles.mending`).
+Meshes, in metres (or scaled to them): STL, OBJ, PLY, GLB, glTF with its data inside, OFF, 3MF. They must be closed, but
+for small holes (see `dt_viz.files.repair`).
 
 Point clouds, in metres (or scaled to them):
     PLY (``.ply``): the vertices, with labels if they have a property ``occupied``, ``occupancy`` or ``label``.
     npz (``.npz``): ``points`` (K, 3), and optionally ``labels`` (K,). Pickled arrays are never opened.
-    CSV (``.csv``), UTF-8: a header line ``x,y,z`` or ``x,y,z,occupied`` and one line per point.
+    CSV (``.csv``), UTF-8: a header line with ``x``, ``y``, ``z`` and optionally ``occupied``, and one line per point.
     Labels are 1 (occupied) or 0 (free); without them every point is occupied.
 
-The origin of a shape is moved to the middle of its bounding box.
+The origin of a shape is moved to the middle of its bounding box. Files are read by a process of their own
+(`dt_viz.files.uploads`).
 """
 
 from __future__ import annotations
 
-from array import array
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from dt_viz.errors import DataError, FormatError, naming, parsing
-from dt_viz.files.checks import check_at_most, checked_suffix, real_numbers
-from dt_viz.files.glb import read_glb
-from dt_viz.files.meshes import read_obj, read_stl
-from dt_viz.files.npz import NpzFile
-from dt_viz.files.ply import read_ply
-from dt_viz.files.text import decimal_numbers, read_table
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.errors import Cancelled, DataError, FormatError, naming, never, parsing
+from dt_viz.files.checks import check_triangles, checked_suffix, real_numbers
+from dt_viz.files.uploads import read_upload
+from dt_viz.flows.fields import Array
 from dt_viz.obstacles.clouds import Cloud, check_points
-from dt_viz.obstacles.mending import closed
 from dt_viz.obstacles.solids import Solid
-from dt_viz.obstacles.triangles import MAX_FACES, check_triangles
 
 MAX_BYTES = 20 * 10**6
 """Largest number of bytes of a file."""
-MAX_UNPACKED = 2 * MAX_BYTES
-"""Largest number of bytes that an npz unpacks to."""
-MAX_VERTICES = 3 * MAX_FACES
-MAX_POINTS = 1_000_000
 ENOUGH_POINTS = 100_000
 """Number of points that are used of a cloud; of more, so many are taken at random."""
 MIN_SIZE, MAX_SIZE = 0.01, 1.0
@@ -47,8 +38,10 @@ UNITS = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.02
 """Units of files, in metres; the first that gives a sensible size is suggested."""
 LOST = 0.8
 """Part of a mesh's volume inside the distance grid below which its thin parts are reported as lost."""
-MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".gltf", ".off", ".3mf")
 CLOUD_SUFFIXES = (".ply", ".npz", ".csv")
+MAX_HEADER = 10_000
+"""Number of bytes in which the header of a PLY file ends."""
 
 
 class ShapeError(DataError):
@@ -82,7 +75,7 @@ class LoadedMesh:
     solid: Solid
     name: str
     notes: tuple[str, ...] = ()
-    """Descriptions, for the page, of what was mended and of what is inexact."""
+    """Descriptions, for the page, of what was repaired and of what is inexact."""
 
 
 @dataclass(frozen=True)
@@ -95,62 +88,75 @@ class LoadedCloud:
     """Descriptions, for the page, of what was left out."""
 
 
-def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0) -> LoadedMesh:
+def is_cloud(content: bytes, source: str | Path) -> bool:
+    """Return whether a file holds points rather than a mesh, as its suffix or, in a PLY file, its header says."""
+    suffix = Path(source).suffix.lower()
+    if suffix == ".ply":
+        header = content[:MAX_HEADER].partition(b"end_header")[0]
+        return re.search(rb"element\s+face\s+0*[1-9]", header) is None
+    return suffix in CLOUD_SUFFIXES
+
+
+def read_mesh(content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never) -> LoadedMesh:
     """Read a closed mesh from the bytes of a file, such as one uploaded from the browser.
 
     Args:
         content: all bytes of the file.
         source: its name or path; the suffix says what it is.
         scale: metres for one unit of the file.
+        cancelled: whether nobody wants it any more.
 
     Raises:
         ShapeError: the file is not what its suffix says, or holds no closed mesh of a sensible size. Nothing else is
             raised, whatever the file holds.
+        UnwantedError: nobody wants it any more.
     """
     source = Path(source)
     suffix = _suffix(content, source, MESH_SUFFIXES, scale)
     with parsing(ShapeError, source, "file", f"a {suffix} file of a mesh"):
-        vertices, faces = _triangles(content, suffix)
+        arrays, notes = read_upload("mesh", suffix, content, cancelled)
+        vertices, faces = real_numbers(arrays[0], "vertices"), real_numbers(arrays[1], "faces").astype(np.intp)
         check_triangles(vertices, faces)
-    used = np.zeros(len(vertices), dtype=bool)
-    used[faces] = True
-    vertices = _checked_size(vertices, vertices[used], source, scale)
-    with parsing(ShapeError, source, "mesh", "a closed mesh"):
-        mesh = closed(vertices, faces)
-        solid = Solid(mesh.vertices, mesh.faces)
+        vertices = _checked_size(vertices, vertices[faces].reshape(-1, 3), source, scale)
+        solid = Solid(vertices, faces)
         grid = solid.distances
     if not grid.depth > 0:
         found = f"walls thinner than {1e3 * grid.cell:.1f} mm, which leave nothing inside"
         raise ShapeError(source, "thickness", found, f"a solid thicker than about {2e3 * grid.cell:.0f} mm")
-    notes = mesh.notes
-    if grid.cell**3 * len(grid.interior) < LOST * mesh.volume:
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    volume = float(np.einsum("ni,ni->", a, np.cross(b, c))) / 6
+    if grid.cell**3 * len(grid.interior) < LOST * volume:
         notes += (f"parts thinner than about {2e3 * grid.cell:.0f} mm are rounded away from its distances",)
     return LoadedMesh(solid, source.stem, notes)
 
 
-def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> LoadedCloud:
+def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0, cancelled: Cancelled = never) -> LoadedCloud:
     """Read a point cloud from the bytes of a file, such as one uploaded from the browser.
 
     Args:
         content: all bytes of the file.
         source: its name or path; the suffix says what it is.
         scale: metres for one unit of the file.
+        cancelled: whether nobody wants it any more.
 
     Raises:
         ShapeError: the file is not what its suffix says, or holds no points that make a solid of a sensible size.
             Nothing else is raised, whatever the file holds.
+        UnwantedError: nobody wants it any more.
     """
     source = Path(source)
     suffix = _suffix(content, source, CLOUD_SUFFIXES, scale)
     with parsing(ShapeError, source, "file", f"a {suffix} file of points"):
-        points, labels = {".ply": _ply_points, ".npz": _npz_points, ".csv": _csv_points}[suffix](content)
-        check_at_most("points", len(points), MAX_POINTS)
+        arrays, notes = read_upload("points", suffix, content, cancelled)
+        points, labels = real_numbers(arrays[0], "points"), None
+        if len(arrays) > 1:
+            labels = real_numbers(arrays[1], "labels")
         check_points(points, labels)
         occupied = points if labels is None else points[labels > 0.5]
-        points, notes = _checked_size(points, occupied, source, scale), []
+        points = _checked_size(points, occupied, source, scale)
         if len(points) > ENOUGH_POINTS:
             some = np.sort(np.random.default_rng(0).permutation(len(points))[:ENOUGH_POINTS])
-            notes.append(f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random")
+            notes += (f"{ENOUGH_POINTS} of its {len(points)} points are used, chosen at random",)
             points, labels = points[some], None if labels is None else labels[some]
         if labels is None:
             points = np.unique(points, axis=0)
@@ -159,7 +165,7 @@ def read_cloud(content: bytes, source: str | Path, *, scale: float = 1.0) -> Loa
         depth = cloud.solid.distances.depth
     if not depth > 0:
         raise ShapeError(source, "points", "nothing that has an inside", "points that something occupies")
-    return LoadedCloud(cloud, source.stem, tuple(notes))
+    return LoadedCloud(cloud, source.stem, notes)
 
 
 def _suffix(content: bytes, source: Path, accepted: tuple[str, ...], scale: float) -> str:
@@ -191,39 +197,3 @@ def _checked_size(points: Array, shape: Array, source: Path, scale: float) -> Ar
 
 def _box(sizes: Array) -> str:
     return " × ".join(f"{size:.4g}" for size in sizes) + " m"
-
-
-def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
-    """Read vertices (V, 3) and faces (F, 3) of all parts of a file."""
-    if suffix == ".stl":
-        return read_stl(content, max_triangles=MAX_FACES)
-    if suffix == ".obj":
-        return read_obj(content, max_vertices=MAX_VERTICES, max_triangles=MAX_FACES)
-    if suffix == ".glb":
-        return read_glb(content, max_vertices=MAX_VERTICES, max_triangles=MAX_FACES)
-    ply = read_ply(content, max_vertices=MAX_VERTICES, max_triangles=MAX_FACES)
-    return ply.vertices, ply.faces
-
-
-def _ply_points(content: bytes) -> tuple[Array, Array | None]:
-    ply = read_ply(content, max_vertices=MAX_POINTS, max_triangles=MAX_FACES)
-    return ply.vertices, ply.labels
-
-
-def _npz_points(content: bytes) -> tuple[Array, Array | None]:
-    archive = NpzFile(content, max_bytes=MAX_UNPACKED)
-    if "points" not in archive.names:
-        found = ", ".join(archive.names)[:80] or "none"
-        raise FormatError("arrays", found, "'points' and optionally 'labels'")
-    points = real_numbers(archive.read("points"), "array 'points'", "biuf")
-    labels = real_numbers(archive.read("labels"), "array 'labels'", "biuf") if "labels" in archive.names else None
-    return points, labels
-
-
-def _csv_points(content: bytes) -> tuple[Array, Array | None]:
-    header, rows = read_table(content, (("x", "y", "z"), ("x", "y", "z", "occupied")), max_rows=MAX_POINTS)
-    numbers = array("d")
-    for line, row in rows:
-        numbers.extend(decimal_numbers(row, line))
-    values = np.asarray(numbers).reshape(-1, len(header))
-    return values[:, :3], values[:, 3] if len(header) == 4 else None

@@ -18,8 +18,9 @@ from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
 from dt_viz.errors import check_between
+from dt_viz.files.checks import check_triangles
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.triangles import check_triangles, grid_nodes, inside_of_grid, surface_samples
+from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 
 SMALLEST = 1e-9
 """Smallest size of a solid, and inverse of the largest, in its own unit."""
@@ -331,9 +332,8 @@ def _distances(solid: Solid) -> DistanceGrid:
     origin = centre - cell * (counts - 1) / 2
     shape = (int(counts[0]), int(counts[1]), int(counts[2]))
     nodes = grid_nodes(origin, cell, shape)
-    inside = inside_of_grid(
-        solid.vertices[solid.faces], origin, cell, shape
-    )  # first, since it refuses meshes that take too long
+    # first, since it refuses meshes that take too long, or that are not closed
+    inside = inside_of_grid(solid.vertices[solid.faces], origin, cell, shape, closed=True)
     distance = _surface(solid).distances(nodes, origin, cell, shape)
     radius = float(np.linalg.norm(solid.used - centre, axis=1).max())
     signed = np.where(inside, -distance, distance)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from dt_viz.errors import UnwantedError, end_if
+from dt_viz.files.uploads import keep_ready, let_go
 
 logger = logging.getLogger(__name__)
 
@@ -15,7 +16,7 @@ LOOK = 0.1
 """Interval of the checks whether a waiting visitor is still there, seconds."""
 
 _one_file = threading.Lock()
-"""Lock of the reader: a file takes up to some hundred megabytes on its way to an obstacle."""
+"""Lock of the reader: a file takes up to a gigabyte, in another process, on its way to an obstacle."""
 
 
 class Reader:
@@ -30,6 +31,7 @@ class Reader:
         self._waits = waits
         self._left = threading.Event()
         self._busy = threading.Lock()
+        keep_ready(self)
 
     def begin(self, read: Callable[[], None]) -> bool:
         """Start to read a file; return False if another one of this visitor is being read.
@@ -41,9 +43,14 @@ class Reader:
         threading.Thread(target=self._run, args=(read,), name="file", daemon=True).start()
         return True
 
+    def left(self) -> bool:
+        """Return whether the visitor has left: what is being read is not wanted any more."""
+        return self._left.is_set()
+
     def close(self) -> None:
         """Stop waiting, and drop what is being read: the visitor has left."""
         self._left.set()
+        let_go(self)
 
     @contextmanager
     def turn(self) -> Iterator[None]:
@@ -55,12 +62,12 @@ class Reader:
         if not _one_file.acquire(blocking=False):
             self._waits()
             while not _one_file.acquire(timeout=LOOK):
-                end_if(self._left.is_set)
+                end_if(self.left)
         try:
             yield
         finally:
             _one_file.release()
-        end_if(self._left.is_set)
+        end_if(self.left)
 
     def _run(self, read: Callable[[], None]) -> None:
         try:

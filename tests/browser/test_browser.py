@@ -28,6 +28,7 @@ from PIL import Image
 from scenes import changing
 
 from dt_viz.control.controller import Phase
+from dt_viz.files import uploads
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.obstacles.shapes import MeshObstacle
 from dt_viz.scenario.tasks import TASKS
@@ -195,7 +196,8 @@ def upload_in(page):
     return page.locator("input[type=file]").first
 
 
-def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit):
+def test_a_mesh_is_uploaded_in_its_own_unit_and_turned_by_its_handle(visit, monkeypatch):
+    monkeypatch.setattr(uploads, "_ready", uploads._Ready())  # the tab stays open, and no process with it
     page, visitor = visit
     session = visitor.session
     session.edit("test", **changing(session.scenario, obstacles=(), avoids=False))

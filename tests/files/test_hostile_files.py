@@ -19,10 +19,16 @@ from hostile import PROCESS, hostile_file, seeds
 
 pytestmark = pytest.mark.skipif(not PROCESS.exists(), reason="memory is measured in Linux's way")
 
-MAX_MEGABYTES = 500
-"""Of the whole process, of which more than 100 are the libraries that it loads."""
-MAX_SECONDS = 5
+MAX_GROWTH = 100
+"""Of the process that has a file read, MB, while what it holds is mapped coarsely."""
+MAX_GROWTH_FINE = 400
+"""The same where it is mapped finely."""
+MAX_WORKER = 1100
+"""Of the process that reads, MB."""
+MAX_SECONDS = 20
 """Of processor time, so that other work on the machine does not count."""
+USUAL_SECONDS = 3
+"""Time that all files but few stay below."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +36,8 @@ class Outcome:
     message: str
     """Why the file was refused; empty if it was read."""
     seconds: float
-    megabytes: float
+    growth: float
+    worker: float
 
 
 class ReadingProcess:
@@ -72,22 +79,25 @@ def check(outcome: Outcome, name: str) -> None:
         assert outcome.message.startswith(f"{name}: ")
         assert ": found " in outcome.message and "; accepted: " in outcome.message
         assert len(outcome.message) < 600
-    assert outcome.megabytes < MAX_MEGABYTES
+    assert outcome.worker < MAX_WORKER
     assert outcome.seconds < MAX_SECONDS
 
 
-def read_all(num: int, *arguments: str) -> None:
-    slowest, largest, num_read = 0.0, 0.0, 0
+def read_all(num: int, max_growth: float, *arguments: str) -> None:
+    outcomes = []
     with reading(*arguments) as process:
         for number in range(num):
             kind, name, content = hostile_file(number)
             outcome = process.read(kind, name, content)
             check(outcome, name)
-            if outcome.seconds > slowest or outcome.megabytes > largest:
+            assert outcome.growth < max_growth, f"file {number}, {kind} {name}: {outcome}"
+            if outcome.seconds > USUAL_SECONDS:
                 print(f"file {number}, {kind} {name}, {len(content)} bytes: {outcome}")
-            slowest, largest = max(slowest, outcome.seconds), max(largest, outcome.megabytes)
-            num_read += not outcome.message
-    print(f"{num_read} of {num} were read; at most {slowest:.2f} s and {largest:.0f} MB")
+            outcomes.append(outcome)
+    num_read = sum(not outcome.message for outcome in outcomes)
+    slowest, largest = max(o.seconds for o in outcomes), max(o.growth for o in outcomes)
+    print(f"{num_read} of {num} were read; at most {slowest:.1f} s, {largest:.0f} MB and {outcomes[-1].worker:.0f} MB")
+    assert sum(outcome.seconds > USUAL_SECONDS for outcome in outcomes) < 0.05 * num
     assert 0.02 * num < num_read < 0.9 * num  # the mutations are neither all fatal nor all harmless
 
 
@@ -132,12 +142,23 @@ def glb(scene: dict, data: bytes) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, length) + body
 
 
-def many_matrices() -> bytes:
-    """A cell array of very many empty matrices, eight bytes each."""
-    num = 1_500_000
-    flags, shape = struct.pack("<IIII", 6, 8, 1, 0), struct.pack("<IIii", 5, 8, 1, num)
-    cells = flags + shape + struct.pack("<II8s", 1, 5, b"demos") + struct.pack("<II", 14, 0) * num
-    return bytes(124) + b"\x00\x01IM" + struct.pack("<II", 14, len(cells)) + cells
+def full_of_text() -> bytes:
+    """A 3MF file whose model unpacks to 400 MB."""
+    file = io.BytesIO()
+    with (
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("3D/3dmodel.model", "w", force_zip64=True) as member,
+    ):
+        member.write(b'<model unit="millimeter"><resources>')
+        for _ in range(40):
+            member.write(b"<object/>  " * 10**6)
+    return file.getvalue()
+
+
+def deep() -> bytes:
+    """A scene of nodes one inside the other."""
+    nodes = [{"children": [k + 1]} for k in range(9_999)] + [{"mesh": 0}]
+    return glb({"nodes": nodes, "scenes": [{"nodes": [0]}], "meshes": [{"primitives": []}]}, b"")
 
 
 def instances() -> bytes:
@@ -158,24 +179,25 @@ def instances() -> bytes:
 
 
 ATTACKS = {
-    "a member that bzip2 packs": ("cloud", "a.npz", bzip2_member, "stored or deflated members", 20),
-    "a directory that lies": ("cloud", "a.npz", lying_header, "found", 20),
-    "a mesh in very many places": ("mesh", "a.glb", instances, "faces: found more than 500000 of all instances", 20),
-    "short lines": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"1\n" * 9_999_990, "line 2: found 1 columns", 60),
+    "a member that bzip2 packs": ("cloud", "a.npz", bzip2_member, "bytes when unpacked"),
+    "a directory that lies": ("cloud", "a.npz", lying_header, "found"),
+    "text in an archive": ("mesh", "a.3mf", full_of_text, "bytes when unpacked"),
+    "a mesh in very many places": ("mesh", "a.glb", instances, "faces: found more than 500000 of all parts"),
+    "nodes in nodes": ("mesh", "a.glb", deep, "found"),
+    "short lines": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"1\n" * 9_999_990, "more than 2000000 lines"),
+    "short rows": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"1,1,1\n" * 1_999_990, "points: found 1000001"),
+    "short lines of text": ("mesh", "a.obj", lambda: b"f\n" * 10_000_000, "more than 2000000 lines"),
+    "one line": ("mesh", "a.obj", lambda: b"f " + b"1 " * 9_999_990, "found"),
+    "one line of a ply": ("mesh", "a.ply", lambda: b"ply\nformat ascii 1.0\n" + b"1" * 19_999_900, "found"),
+    "much text": ("mesh", "a.stl", lambda: b"solid\n" + b"facet vertex 1 1 1 " * 1_000_000, "found"),
     "short lines of demonstrations": (
         "demonstrations",
         "a.csv",
         lambda: b"t,x,y\n" + b"1\n" * 8_000_000,
         "line 2: found 1 columns",
-        60,
     ),
-    "short rows": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"1,1,1\n" * 3_333_331, "more than 1000001 lines", 100),
-    "empty lines": ("cloud", "a.csv", lambda: b"x,y,z\n" + b"\n" * 19_999_990, "more than 1000001 lines", 60),
-    "short lines of text": ("mesh", "a.obj", lambda: b"f\n" * 10_000_000, "line 1: found 'f'", 60),
-    "one line": ("mesh", "a.obj", lambda: b"f " + b"1 " * 9_999_990, "more than 100000 characters", 60),
-    "many matrices": ("demonstrations", "a.mat", many_matrices, "more than 100000 values", 100),
 }
-"""Loader, name and content of a file, words of its refusal, and the largest memory that may be needed for that, MB."""
+"""Loader, name and content of a file, and words of its refusal."""
 
 
 @pytest.fixture(scope="module")
@@ -186,20 +208,19 @@ def attacked():
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_what_once_took_gigabytes_is_refused_for_next_to_nothing(attacked, attack):
-    kind, name, make, words, megabytes = ATTACKS[attack]
-    content = make()
-    before = attacked.read("mesh", "a.stl", b"nothing").megabytes  # some of it left by the attack before
-    outcome = attacked.read(kind, name, content)
+def test_what_takes_gigabytes_is_refused_in_the_readers_process(attacked, attack):
+    kind, name, make, words = ATTACKS[attack]
+    outcome = attacked.read(kind, name, make())
+    print(outcome)
     assert words in outcome.message
-    assert outcome.megabytes - before < megabytes + len(content) / 1e6
+    assert outcome.growth < MAX_GROWTH
     check(outcome, name)
 
 
 def test_mutated_files_are_read_or_refused():
-    read_all(105, "--coarse")
+    read_all(48, MAX_GROWTH, "--coarse")
 
 
 @pytest.mark.slow
 def test_very_many_mutated_files_are_read_or_refused():
-    read_all(3000)
+    read_all(3000, MAX_GROWTH_FINE)

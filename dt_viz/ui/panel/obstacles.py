@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,9 +13,18 @@ import numpy as np
 import viser
 
 from dt_viz.engine.session import Session
-from dt_viz.files import ply
+from dt_viz.errors import Cancelled, never
 from dt_viz.obstacles import files as shapes
-from dt_viz.obstacles.files import CLOUD_SUFFIXES, MESH_SUFFIXES, UNITS, ShapeError, SizeError, read_cloud, read_mesh
+from dt_viz.obstacles.files import (
+    CLOUD_SUFFIXES,
+    MESH_SUFFIXES,
+    UNITS,
+    ShapeError,
+    SizeError,
+    is_cloud,
+    read_cloud,
+    read_mesh,
+)
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Obstacle, Point, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
@@ -125,7 +133,7 @@ class ObstaclePanel:
             )
             with gui.add_folder("From a file", expand_by_default=False):
                 self.unit = Control(gui.add_dropdown("Unit of the file", tuple(UNITS)))
-                hint = f"{FORMATS}; a mesh must be closed; a csv of points begins with x,y,z or x,y,z,occupied"
+                hint = f"{FORMATS}; a mesh must be closed; a csv of points has columns x, y, z and perhaps occupied"
                 self._upload = gui.add_upload_button("Mesh or point cloud", icon=viser.Icon.UPLOAD, hint=hint)
                 bindings.properties(self._upload, visible=_has_room)
                 self.again = gui.add_button(
@@ -177,7 +185,7 @@ class ObstaclePanel:
                     name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
                 )
             with self._reader.turn():
-                obstacle, notes = from_file(content, name, scale)
+                obstacle, notes = from_file(content, name, scale, self._reader.left)
         except SizeError as error:
             if error.unit is not None:
                 self._refused = content, name, error.unit
@@ -265,29 +273,28 @@ def name_of(obstacle: Obstacle) -> str:
     return type(obstacle).__name__.removesuffix("Obstacle").lower()
 
 
-def from_file(content: bytes, name: str, scale: float) -> tuple[Obstacle, tuple[str, ...]]:
+def from_file(
+    content: bytes, name: str, scale: float, cancelled: Cancelled = never
+) -> tuple[Obstacle, tuple[str, ...]]:
     """Return the obstacle that a file holds, around the origin, and notes about it for the page.
 
     Args:
         content: all bytes of the file.
         name: name of the file; its suffix says what it is. A PLY without faces is a point cloud.
         scale: metres for one unit of the file.
+        cancelled: whether nobody wants it any more.
 
     Raises:
         ShapeError: the file cannot be used.
+        UnwantedError: nobody wants it any more.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in (*MESH_SUFFIXES, *CLOUD_SUFFIXES):
         raise ShapeError(name, "suffix", repr(suffix) if suffix else "no suffix", FORMATS)
-    if suffix == ".ply":
-        header = content[: ply.MAX_HEADER].partition(b"end_header")[0]
-        is_cloud = re.search(rb"element\s+face\s+0*[1-9]", header) is None
-    else:
-        is_cloud = suffix in CLOUD_SUFFIXES
-    if is_cloud:
-        loaded = read_cloud(content, name, scale=scale)
+    if is_cloud(content, name):
+        loaded = read_cloud(content, name, scale=scale, cancelled=cancelled)
         return CloudObstacle(ORIGIN, loaded.cloud), loaded.notes
-    loaded = read_mesh(content, name, scale=scale)
+    loaded = read_mesh(content, name, scale=scale, cancelled=cancelled)
     return MeshObstacle(ORIGIN, loaded.solid), loaded.notes
 
 

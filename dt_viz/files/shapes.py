@@ -1,0 +1,165 @@
+"""Readers of meshes and point clouds by trimesh and numpy, for the process of `dt_viz.files.worker`.
+
+They are meant for a process with limits: on hostile bytes they raise anything, run long, need memory or crash.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import trimesh
+from trimesh.exchange.ply import load_ply
+
+from dt_viz.errors import FormatError
+from dt_viz.files.checks import MAX_FACES, check_at_most, check_triangles, too_many
+from dt_viz.files.npz import arrays_of
+from dt_viz.files.repair import repaired
+from dt_viz.flows.fields import Array, Indices
+
+MAX_VERTICES = 3 * MAX_FACES
+MAX_POINTS = 1_000_000
+MAX_LINES = 2_000_000
+"""Largest number of lines of a text, each of which takes a hundred bytes and more while it is read."""
+MAX_UNPACKED = 40 * 10**6
+"""Largest number of bytes that an archive of points unpacks to."""
+MAX_MODEL = 200 * 10**6
+"""Largest number of bytes that a 3MF file, which is text in an archive, unpacks to."""
+LABELS = ("occupied", "occupancy", "label", "labels")
+"""Names of the labels in a file of points."""
+TEXTS = (".obj", ".off", ".csv", ".stl", ".ply", ".gltf")
+"""Suffixes of what is text, or may be."""
+EXTENSIONS = (b"KHR_draco_mesh_compression", b"EXT_meshopt_compression", b"EXT_mesh_gpu_instancing")
+"""Extensions of glTF files that change triangles, and are not read."""
+
+Answer = tuple[tuple[np.ndarray, ...], tuple[str, ...]]
+"""Arrays of a file, and notes about them for the page."""
+
+
+def read_mesh(content: bytes, suffix: str) -> Answer:
+    """Read vertices (V, 3) and triangles (F, 3) of a file, all parts in their places, and repair them.
+
+    Raises:
+        FormatError: it has no triangles, or too many.
+        Exception: of any kind, on hostile bytes.
+    """
+    _check_text(content, suffix)
+    _check_model(content, suffix)
+    vertices, faces = _triangles(content, suffix)
+    if not len(faces):
+        accepted = f"a complete {suffix} file of a closed mesh; a point cloud is loaded as a cloud"
+        raise FormatError("faces", "none that could be read", accepted)
+    check_triangles(vertices, faces)
+    vertices, faces, notes = repaired(vertices, faces)
+    return (vertices, faces), notes
+
+
+def read_points(content: bytes, suffix: str) -> Answer:
+    """Read points (K, 3) of a file and, where it has them, their labels (K,).
+
+    Raises:
+        FormatError: it has no points, or too many.
+        Exception: of any kind, on hostile bytes.
+    """
+    _check_text(content, suffix)
+    columns, notes = {".npz": _npz_points, ".csv": _csv_points, ".ply": _ply_points}[suffix](content)
+    check_at_most("points", len(columns[0]), MAX_POINTS)
+    for array in columns:
+        if array.dtype.kind not in "biuf":
+            raise FormatError("points", f"values of type {array.dtype}", "integers or real numbers")
+    return tuple(array.astype(np.float64) for array in columns), notes
+
+
+KINDS: Mapping[str, Callable[[bytes, str], Answer]] = {"mesh": read_mesh, "points": read_points}
+"""Readers by what is asked for."""
+
+
+def _check_text(content: bytes, suffix: str) -> None:
+    if suffix in TEXTS and content.count(b"\n") > MAX_LINES:
+        raise too_many("file", MAX_LINES, "lines")
+
+
+def _check_model(content: bytes, suffix: str) -> None:
+    """Raise FormatError if a file would unpack to very much, or needs an extension."""
+    if suffix == ".3mf":
+        arrays_of(content, max_bytes=MAX_MODEL, names=())
+    if suffix == ".gltf":
+        json.loads(content)  # trimesh would look for another file
+    if suffix in (".glb", ".gltf"):
+        _, found, required = content.partition(b'"extensionsRequired"')
+        for name in EXTENSIONS:
+            if found and name in required:
+                raise FormatError("JSON", f"the extension {name.decode()}", "plain triangles (no Draco, no meshopt)")
+
+
+class _OtherFiles:
+    """What trimesh asks for the files that a file names."""
+
+    def get(self, name: str) -> bytes:
+        """Refuse a file."""
+        raise FormatError("file", f"data in another file, {name[:40]!r}", "a file that holds all its data")
+
+    __getitem__ = get
+
+
+def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
+    """Read all parts of a scene; what they add up to is counted before: a few bytes can place a mesh very often."""
+    alone: Any = _OtherFiles()
+    file = io.BytesIO(content)
+    loaded = trimesh.load(file, file_type=suffix[1:], resolver=alone, process=False, skip_materials=True)
+    scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
+    parts = []
+    num_vertices = num_faces = 0
+    for node in scene.graph.nodes_geometry:
+        place, name = scene.graph[node]
+        part = scene.geometry[name]
+        if isinstance(part, trimesh.Trimesh):
+            num_vertices, num_faces = num_vertices + len(part.vertices), num_faces + len(part.faces)
+            if num_faces > MAX_FACES:
+                raise too_many("faces", MAX_FACES, "of all parts")
+            if num_vertices > MAX_VERTICES:
+                raise too_many("vertices", MAX_VERTICES, "of all parts")
+            parts.append((part, place))
+    vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], 0
+    for part, place in parts:
+        vertices.append(part.vertices @ place[:3, :3].T + place[:3, 3])
+        mirrored = np.linalg.det(place[:3, :3]) < 0
+        faces.append(first + (part.faces[:, ::-1] if mirrored else part.faces))
+        first += len(part.vertices)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _npz_points(content: bytes) -> Answer:
+    arrays = arrays_of(content, max_bytes=MAX_UNPACKED, names=("points", "labels"))
+    if "points" not in arrays:
+        raise FormatError("arrays", "no 'points'", "'points' and optionally 'labels'")
+    return tuple(arrays[name] for name in ("points", "labels") if name in arrays), ()
+
+
+def _csv_points(content: bytes) -> Answer:
+    """Read columns by their names, in any order."""
+    first, _, rows = content.decode("utf-8-sig").partition("\n")
+    header = [name.strip().lower() for name in next(csv.reader([first]), [])]
+    wanted = ["x", "y", "z", *(name for name in LABELS if name in header)][:4]
+    if not set(wanted) <= set(header):
+        raise FormatError("header line", repr(",".join(header)[:80]), "'x,y,z' or 'x,y,z,occupied', in any order")
+    if not rows.strip():  # numpy would warn
+        raise FormatError("points", "0", "one line per point")
+    columns = [header.index(name) for name in wanted]
+    table = np.loadtxt(
+        io.StringIO(rows), delimiter=",", usecols=columns, ndmin=2, max_rows=MAX_POINTS + 1, comments=None
+    )
+    others = [name for name in header if name not in wanted]
+    notes = (f"columns {', '.join(others)[:80]} are not used",) if others else ()
+    return (table[:, :3], *table[:, 3:].T), notes
+
+
+def _ply_points(content: bytes) -> Answer:
+    vertex = load_ply(io.BytesIO(content), skip_materials=True)["metadata"]["_ply_raw"]["vertex"]
+    columns = vertex["data"] if vertex["length"] else dict.fromkeys("xyz", np.empty(0))
+    points = np.stack([np.ravel(columns[axis]) for axis in "xyz"], axis=1)
+    return (points, *[np.ravel(columns[name]) for name in LABELS if name in vertex["properties"]][:1]), ()

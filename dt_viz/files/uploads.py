@@ -1,0 +1,171 @@
+"""Visitors' files, read by a process of their own: what they make a reader do does not harm the server."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from dt_viz.errors import Cancelled, FormatError, end_if, never
+from dt_viz.files import worker
+
+Read = tuple[list[np.ndarray], tuple[str, ...]]
+"""Arrays of a file, and notes about it for the page."""
+START = 60.0
+"""Longest time until a process is ready for a file, seconds; a busy machine takes ten to import what it needs."""
+PATIENCE = 20.0
+"""Longest time for a file from then on, seconds."""
+LOOK = 0.1
+"""Interval of the checks whether it is still wanted, seconds."""
+ROOT = Path(__file__).parents[2]
+"""Folder that holds this package."""
+
+
+class _Process:
+    """A process of `dt_viz.files.worker`, which may read one file."""
+
+    def __init__(self) -> None:
+        path = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `end`; a pipe could be filled without end
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", worker.__name__],
+            cwd=ROOT,  # where -m looks first
+            env=os.environ | threads | {"PYTHONPATH": path},
+            stdin=subprocess.PIPE,
+            stdout=self._answer,
+            stderr=subprocess.DEVNULL,
+        )
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it has ended by itself."""
+        return self._process.poll() is not None
+
+    def read(self, request: Sequence[bytes], cancelled: Cancelled) -> Read:
+        """Have a file read, and end. Raises as `read_upload`."""
+        giving = threading.Thread(target=self._give, args=(request,), name="upload", daemon=True)
+        giving.start()
+        try:
+            self._wait(cancelled)
+            if self._process.returncode:
+                found = f"something that ended its reader ({self._process.returncode})"
+                raise FormatError("file", found, "a whole file")
+            self._answer.seek(0)
+            self._answer.readline(1)
+            first = json.loads(self._answer.readline(2**16))
+            if "refused" in first:
+                field, found, accepted = map(str, first["refused"])
+                raise FormatError(field, found, accepted)
+            size, arrays = os.fstat(self._answer.fileno()).st_size, []
+            while self._answer.tell() < size:
+                arrays.append(np.load(self._answer, allow_pickle=False))
+            return arrays, tuple(map(str, first["notes"]))
+        finally:
+            self.end()
+            giving.join()
+
+    def _give(self, request: Sequence[bytes]) -> None:
+        assert self._process.stdin is not None
+        with suppress(OSError), self._process.stdin as pipe:  # it may have ended
+            pipe.writelines(request)
+
+    def _wait(self, cancelled: Cancelled) -> None:
+        deadline, ready = time.monotonic() + START, False
+        while True:
+            if not ready and os.fstat(self._answer.fileno()).st_size:
+                deadline, ready = time.monotonic() + PATIENCE, True
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(timeout=LOOK)
+                return
+            end_if(cancelled)
+            if time.monotonic() > deadline:
+                found = f"data that take more than {PATIENCE:.0f} s to read"
+                raise FormatError("file", found, "a simpler file")
+
+    def end(self) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stdin is not None
+        with suppress(OSError):  # what it has not taken
+            self._process.stdin.close()
+        self._answer.close()
+
+
+class _Ready:
+    """The process that waits for the next file, as long as somebody may send one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users: set[object] = set()
+        self._process: _Process | None = None
+
+    def take(self) -> _Process:
+        """Return a process, the one that waits unless it has died meanwhile."""
+        with self._lock:
+            process, self._process = self._process, None
+        if process is not None and process.has_ended:
+            process.end()
+            process = None
+        return process or _Process()
+
+    def renew(self) -> None:
+        """Start the next process."""
+        with self._lock:
+            if self._users and self._process is None:
+                self._process = _Process()
+
+    def set_user(self, user: object, *, present: bool) -> None:
+        """Add or remove somebody who may send files; end the process with the last one."""
+        with self._lock:
+            self._users = self._users | {user} if present else self._users - {user}
+            if not self._users and self._process is not None:
+                self._process.end()
+                self._process = None
+
+
+_ready = _Ready()
+
+
+def read_upload(kind: str, suffix: str, content: bytes, cancelled: Cancelled = never) -> Read:
+    """Read a file in another process.
+
+    Args:
+        kind: "mesh" or "points".
+        suffix: the format, in lower case, such as ".stl".
+        content: all bytes of the file.
+        cancelled: whether nobody wants it any more.
+
+    Returns:
+        Arrays of which nothing is known but that no object is in them: vertices and faces, or points and perhaps
+        labels; and notes for the page.
+
+    Raises:
+        FormatError: the file cannot be read, or not within the limits of memory and time.
+        UnwantedError: nobody wants it any more.
+        Exception: of almost any kind, if the process gave another answer.
+    """
+    try:
+        return _ready.take().read((json.dumps([kind, suffix]).encode(), b"\n", content), cancelled)
+    finally:
+        _ready.renew()
+
+
+def keep_ready(user: object) -> None:
+    """Keep a process ready, from the first file on, since this user may send more."""
+    _ready.set_user(user, present=True)
+
+
+def let_go(user: object) -> None:
+    """Keep no process ready for this user any more."""
+    _ready.set_user(user, present=False)

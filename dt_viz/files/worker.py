@@ -1,0 +1,78 @@
+"""Process that reads one visitor's file within limits of memory, time and files, and ends.
+
+It imports what it needs, gives an empty line, and waits for a file, or ends without one when its standard input is
+closed. It takes a line of JSON, the kind and the suffix, and then the file. It gives a line of JSON, `{"notes": …}` or
+`{"refused": [field, found, accepted]}`, and then arrays as `numpy.save` writes them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import suppress
+
+import numpy as np
+
+from dt_viz.errors import FormatError
+from dt_viz.files.shapes import KINDS
+
+MEMORY = 2**30
+"""Largest address space, bytes."""
+SECONDS = 15
+"""Longest time of the processor."""
+ANSWER = 10**8
+"""Largest number of bytes of an answer."""
+NUM_FILES = 32
+"""Largest number of open files."""
+
+
+def limit() -> None:
+    """Limit this process, as far as the platform can."""
+    try:
+        import resource  # noqa: PLC0415 - not on Windows
+    except ImportError:
+        return
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    limits = {
+        "RLIMIT_AS": MEMORY,
+        "RLIMIT_CPU": SECONDS + int(used.ru_utime + used.ru_stime) + 1,
+        "RLIMIT_FSIZE": ANSWER,
+        "RLIMIT_NOFILE": NUM_FILES,
+        "RLIMIT_CORE": 0,
+    }
+    for name, most in limits.items():
+        with suppress(AttributeError, ValueError, OSError):  # unknown there, or above what is allowed anyway
+            resource.setrlimit(getattr(resource, name), (most, most))
+
+
+def answer(kind: str, suffix: str, content: bytes) -> tuple[dict[str, object], tuple[np.ndarray, ...]]:
+    """Read a file; return the first line of the answer and the arrays."""
+    try:
+        arrays, notes = KINDS[kind](content, suffix)
+    except FormatError as error:
+        return {"refused": [error.field, error.found, error.accepted]}, ()
+    except MemoryError:
+        return {"refused": ["file", f"data that need more than {MEMORY / 1e9:.0f} GB to read", "a smaller file"]}, ()
+    except Exception as error:  # no reader lists what corrupt bytes make it raise
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        return {"refused": ["file", f"something that cannot be read ({reason})", f"a {suffix} file"]}, ()
+    return {"notes": notes}, arrays
+
+
+def main() -> None:
+    """Read one file from the standard input."""
+    print(flush=True)
+    line = sys.stdin.buffer.readline()
+    if not line:
+        return
+    limit()
+    kind, suffix = json.loads(line)
+    with np.errstate(all="ignore"):
+        first, arrays = answer(kind, suffix, sys.stdin.buffer.read())
+    sys.stdout.buffer.write(json.dumps(first).encode() + b"\n")
+    for array in arrays:
+        np.save(sys.stdout.buffer, array, allow_pickle=False)
+
+
+if __name__ == "__main__":
+    main()

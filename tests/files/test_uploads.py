@@ -1,0 +1,162 @@
+"""The process that reads uploads: its limits, its end, and what the server makes of its answers."""
+
+import io
+import sys
+import textwrap
+import threading
+import time
+from typing import cast
+
+import numpy as np
+import pytest
+import trimesh
+from pages import PATIENCE, wait_until
+
+from dt_viz.errors import FormatError, UnwantedError
+from dt_viz.files import uploads, worker
+from dt_viz.files.uploads import read_upload
+from dt_viz.obstacles.files import ShapeError, read_mesh
+
+BOX = cast(bytes, trimesh.creation.box((0.15, 0.1, 0.05)).export(file_type="stl"))
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux has them")
+
+
+@pytest.fixture(autouse=True)
+def _ready(monkeypatch):
+    """Nobody else's process is ready."""
+    monkeypatch.setattr(uploads, "_ready", uploads._Ready())
+
+
+@pytest.fixture
+def reader(tmp_path, monkeypatch):
+    """Replaces the program of the process."""
+
+    def replace(text: str) -> None:
+        name = f"reader_{tmp_path.name.strip('0123456789_')}"
+        (tmp_path / f"{name}.py").write_text("print(flush=True)\n" + textwrap.dedent(text))
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.setattr(worker, "__name__", name)
+
+    return replace
+
+
+def test_arrays_and_notes_come_back():
+    (vertices, faces), notes = read_upload("mesh", ".stl", BOX)
+    assert vertices.shape == (8, 3) and faces.shape == (12, 3) and notes == ()
+
+
+def test_what_is_refused_says_why_in_one_line():
+    with pytest.raises(FormatError, match="faces: found none"):
+        read_upload("mesh", ".obj", b"v 0 0 0\n")
+    with pytest.raises(FormatError, match="something that cannot be read"):
+        read_upload("mesh", ".3mf", b"no archive")
+
+
+@LINUX
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        "x = bytearray(2 * 10**9)",
+        "import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\nwhile True: pass",
+        "sys.stdout.buffer.write(bytes(2 * worker.ANSWER))",
+        "import os; os.abort()",
+        "sockets = [__import__('socket').socket() for _ in range(100)]",
+    ],
+)
+def test_what_it_does_beyond_its_limits_ends_it_and_nothing_else(reader, hostile):
+    reader("import sys\nfrom dt_viz.files import worker\nworker.limit()\n" + hostile)
+    with pytest.raises(ShapeError, match=r"ended its reader|cannot be read"):
+        read_mesh(BOX, "a.stl")
+
+
+@pytest.mark.parametrize("answer", ["", "[]", "{}", "no JSON", '{"refused": 3}', '{"notes": []}'])
+def test_any_other_answer_is_one_line_for_the_page(reader, answer):
+    reader(f"print({answer!r})")
+    with pytest.raises(ShapeError) as info:
+        read_mesh(BOX, "a.stl")
+    assert str(info.value).startswith("a.stl: file: found something that cannot be read")
+
+
+def test_what_hangs_is_ended(reader, monkeypatch):
+    reader("import time; time.sleep(1000)")
+    monkeypatch.setattr(uploads, "PATIENCE", 0.3)
+    start = time.monotonic()
+    with pytest.raises(FormatError, match="take more than"):
+        read_upload("mesh", ".stl", bytes(10**7))
+    assert time.monotonic() - start < PATIENCE
+
+
+def test_what_never_begins_is_ended(reader, monkeypatch):
+    reader("")
+    monkeypatch.setattr(uploads, "START", 0.0)
+    monkeypatch.setattr(uploads, "LOOK", 0.01)
+    with pytest.raises(FormatError, match="take more than"):
+        read_upload("mesh", ".stl", bytes(10**7))
+
+
+def test_it_ends_when_its_visitor_leaves(reader):
+    reader("import time; time.sleep(1000)")
+    left = threading.Event()
+    threading.Timer(0.3, left.set).start()
+    with pytest.raises(UnwantedError):
+        read_upload("mesh", ".stl", bytes(10**7), left.is_set)
+
+
+@pytest.mark.parametrize("answer", ["np.array([{}])", "np.lib.format.MAGIC_PREFIX"])
+def test_nothing_is_unpickled(reader, answer):
+    reader(f"""
+        import sys, json, numpy as np
+        sys.stdin.buffer.read()
+        sys.stdout.buffer.write(b'{{"notes": []}}\\n')
+        answer = {answer}
+        if isinstance(answer, bytes):
+            sys.stdout.buffer.write(answer + bytes([1, 0, 118, 0]) + str(
+                {{"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}}).ljust(118).encode())
+        else:
+            np.save(sys.stdout.buffer, answer, allow_pickle=True)
+    """)
+    with pytest.raises((ValueError, MemoryError)):
+        read_upload("mesh", ".stl", BOX)
+
+
+def test_one_is_ready_while_somebody_may_send_a_file_and_none_is_left():
+    """The test fails for what it leaves behind, too."""
+    users = object(), object()
+    for user in users:
+        uploads.keep_ready(user)
+    assert uploads._ready._process is None  # before the first file
+    read_upload("mesh", ".stl", BOX)
+    ready = uploads._ready._process
+    assert ready is not None
+    uploads.let_go(users[0])
+    ready._process.kill()  # as a machine does that is short of memory
+    ready._process.wait()
+    read_upload("mesh", ".stl", BOX)
+    assert uploads._ready._process not in {None, ready}
+    uploads.let_go(users[1])
+    assert uploads._ready._process is None
+
+
+def test_it_ends_by_itself_when_the_server_has_gone():
+    process = uploads._Process()
+    try:
+        assert process._process.stdin is not None
+        process._process.stdin.close()  # as the kernel does at the end of a process
+        wait_until(lambda: process._process.poll() is not None)
+        assert process._process.returncode == 0
+    finally:
+        process.end()
+
+
+def test_answers_are_refusals_or_arrays():
+    assert worker.answer("points", ".csv", b"x,y,z\n1,2,one\n")[0] == {
+        "refused": [
+            "file",
+            "something that cannot be read (could not convert string 'one' to float64 at row 0, column 3.)",
+            "a .csv file",
+        ]
+    }
+    file = io.BytesIO()
+    np.savez(file, points=np.eye(3))
+    first, (points,) = worker.answer("points", ".npz", file.getvalue())
+    assert first == {"notes": ()} and points.dtype == np.float64
