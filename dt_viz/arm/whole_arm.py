@@ -34,7 +34,7 @@ from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import dodge
-from dt_viz.kernels.proximity import contacts, proximity
+from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.kernels.splines import cubics
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
@@ -230,6 +230,7 @@ class WholeArm:
             lambda: room_asked(q, q, np.zeros(1), LEVERS, SLOPE, 0.0),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy()),
+            lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy()),
             lambda: dodge(
                 joints, links, shapes, values, motion, still, still, still, still, bounds, 1.0, np.ones(1), 0.0
             ),

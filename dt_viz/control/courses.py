@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from dt_viz.arm.arm_system import Section
 from dt_viz.arm.retiming import within_velocity_limits
@@ -68,8 +67,10 @@ class Course:
     @cached_property
     def _curve(self) -> tuple[Array, list[float]]:
         """Coefficients (K − 1, 4, 6) of a cubic in each segment, and where these begin."""
-        curve = CubicHermiteSpline(self.times, self.q, np.gradient(self.q, self.times, axis=0))
-        return curve.c.transpose(1, 0, 2), self.times[:-1].tolist()
+        h, slopes = np.diff(self.times)[:, None], np.gradient(self.q, self.times, axis=0)
+        begin, end, mean = slopes[:-1], slopes[1:], np.diff(self.q, axis=0) / h
+        bend = (begin + end - 2 * mean) / h
+        return np.stack([bend / h, (mean - begin) / h - bend, begin, self.q[:-1]], axis=1), self.times[:-1].tolist()
 
 
 def towards(

@@ -11,7 +11,7 @@ from dt_viz.arm.robot import Robot
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.kernels.proximity import contacts, proximity
+from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.obstacles.arrays import records
 
 NUM_POINTS = 8
@@ -132,8 +132,8 @@ class ContactLimit:
 
     def kept(self, q: Array) -> Array:
         """Distances (M,) to keep in a motion whose undisturbed postures are q (N, 6), metres."""
-        apart = np.min([self._contacts(posture)[0] for posture in q], axis=0)
-        return np.minimum(self.clearance, apart)
+        least = least_contacts(self.robot.records, self.body.records, self.pairs, np.array(q, order="C"))
+        return np.minimum(self.clearance, least + OVERSHOOT)
 
     def rows(self, q: Array, kept: Array, dt: float) -> tuple[Array, Array]:
         """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,) where distances (M,) are kept."""

@@ -77,19 +77,42 @@ def contacts(joints: Joints, points: BodyPoints, pairs: Indices, q: Array) -> tu
     n, num = len(joints), len(pairs)
     axes, origins, at = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((len(points), 3))
     apart, slopes = np.empty(num), np.zeros((num, n))
+    _place(joints, points, q, axes, origins, at)
+    for m in range(num):
+        a, b = int(pairs[m, 0]), int(pairs[m, 1])
+        apart[m], away = _apart(points, at, a, b)
+        first = points[a].joint + 1 if a >= 0 else 0  # joints up to that of the first one move both
+        _slopes(axes, origins, first, points[b].joint, (at[b, 0], at[b, 1], at[b, 2]), away, slopes[m])
+    return apart, slopes
+
+
+@short_kernel
+def least_contacts(joints: Joints, points: BodyPoints, pairs: Indices, q: Array) -> Array:
+    """Find the smallest distances (M,), metres, of the same pairs at postures q (N, n)."""
+    n, least = len(joints), np.full(len(pairs), np.inf)
+    axes, origins, at = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((len(points), 3))
+    for row in range(len(q)):
+        _place(joints, points, q[row], axes, origins, at)
+        for m in range(len(pairs)):
+            least[m] = min(least[m], _apart(points, at, int(pairs[m, 0]), int(pairs[m, 1]))[0])
+    return least
+
+
+@compiled
+def _place(joints: Joints, points: BodyPoints, q: Array, axes: Array, origins: Array, at: Array) -> None:
+    """Write the frames of the joints and the places of the points `at` (P, 3), metres."""
     chain(joints, q, axes, origins)
     for k in range(len(points)):
         offset, joint = points[k].offset, points[k].joint
         for c in range(3):
             at[k, c] = offset[c] if joint < 0 else placed(offset, joint, axes, origins, c)
-    for m in range(num):
-        a, b = int(pairs[m, 0]), int(pairs[m, 1])
-        place, first, away = (at[b, 0], at[b, 1], at[b, 2]), 0, (0.0, 0.0, 1.0)
-        apart[m] = at[b, 2] - points[b].radius
-        if a >= 0:  # joints up to that of the first one move both
-            u, v, w = at[b, 0] - at[a, 0], at[b, 1] - at[a, 1], at[b, 2] - at[a, 2]
-            length = np.sqrt(u * u + v * v + w * w)
-            away, first = (u / length, v / length, w / length), points[a].joint + 1
-            apart[m] = length - points[a].radius - points[b].radius
-        _slopes(axes, origins, first, points[b].joint, place, away, slopes[m])
-    return apart, slopes
+
+
+@compiled
+def _apart(points: BodyPoints, at: Array, a: int, b: int) -> tuple[float, Point]:
+    """Find the distance of point b from a, or from the table where that is −1, and the direction away from there."""
+    if a < 0:
+        return at[b, 2] - points[b].radius, (0.0, 0.0, 1.0)
+    u, v, w = at[b, 0] - at[a, 0], at[b, 1] - at[a, 1], at[b, 2] - at[a, 2]
+    length = np.sqrt(u * u + v * v + w * w)
+    return length - points[a].radius - points[b].radius, (u / length, v / length, w / length)

@@ -64,9 +64,9 @@ class TimedAttractor(Attractor):
         """Compute when, (*B, T), s, motions from `z0` (*B, d) come within `distances` (*B, T), m, of the goal."""
         offset = z0 - self.goal
         r0 = np.linalg.norm(offset, axis=-1, keepdims=True)
-        paces = self._blended(offset)
-        togo = self._time_to_go(self._clock(np.minimum(distances, r0)), paces)
-        return self._time_to_go(self._clock(r0), paces) - togo
+        clocks = self._clock(np.concatenate([r0, np.minimum(distances, r0)], axis=-1))
+        togo = self._time_to_go(clocks, self._blended(offset))
+        return togo[..., :1] - togo[..., 1:]
 
     def placed(self, origin: Array, axes: Array, scale: float) -> TimedAttractor:
         """Return the same attractor in a space of more dimensions: a point z becomes origin + scale·axes·z.

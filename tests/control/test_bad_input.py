@@ -8,7 +8,7 @@ from dt_viz.arm.collision import load_collision_model
 from dt_viz.control.controller import Controller, Phase
 from dt_viz.control.limits import ContactLimit
 from dt_viz.control.settings import ControllerSettings
-from dt_viz.kernels.proximity import contacts
+from dt_viz.kernels.proximity import contacts, least_contacts
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -168,3 +168,6 @@ def test_distances_of_contacts_have_these_slopes(live):
         way = rng.normal(size=6)
         there = contacts(live.robot.records, body.records, limit.pairs, q + 1e-6 * way)[0]
         np.testing.assert_allclose((there - apart) / 1e-6, slopes @ way, atol=1e-4)
+        motion = q + rng.normal(scale=0.3, size=(5, 6))
+        least = np.min([contacts(live.robot.records, body.records, limit.pairs, row)[0] for row in motion], axis=0)
+        np.testing.assert_array_equal(least_contacts(live.robot.records, body.records, limit.pairs, motion), least)
