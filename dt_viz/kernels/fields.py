@@ -100,7 +100,7 @@ def _own(
     if term.kind == ASIDE:
         _aside(term, values, u, n, v, Dv)
         return True
-    if (term.kind == REGION or term.kind == SHIFT) and not _any_inside(u, n):
+    if term.kind in (REGION, SHIFT) and not _any_inside(u, n):
         return False
     if term.kind == SHIFT:
         _first(n, v, Dv)
@@ -145,7 +145,7 @@ def at_rest(field: Terms, s: Array, d: int) -> bool:
             for j in range(d):
                 u += term.inward[i, j] * (s[j] - term.origin[j])
             squared += u * u
-        if (term.kind != REGION and term.kind != SHIFT) or squared <= 1:
+        if term.kind not in (REGION, SHIFT) or squared <= 1:
             return False
     return True
 
