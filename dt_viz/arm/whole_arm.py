@@ -33,7 +33,7 @@ from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
-from dt_viz.kernels.dodging import dodge
+from dt_viz.kernels.dodging import Arm, Forecast, dodge
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.kernels.splines import cubics
 from dt_viz.obstacles.arrays import records
@@ -221,7 +221,8 @@ class WholeArm:
         points = self.body.of_chain(self.robot.chain(q.T))
         shapes, values = records((obstacle,))
         joints, links, still = self.robot.records, self.links.records, np.zeros(NUM_JOINTS)
-        motion, bounds = np.ones((1, 6)), np.ones((3, NUM_JOINTS))
+        dodging, ones = Arm(joints, links, still, still, still, 1.0), np.ones((1, 1))
+        forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
             lambda: self.robot.end_effector(q),
             lambda: self.clearance(q, obstacle),
@@ -231,9 +232,7 @@ class WholeArm:
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
             lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy()),
             lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy()),
-            lambda: dodge(
-                joints, links, shapes, values, motion, still, still, still, still, bounds, 1.0, np.ones(1), 0.0
-            ),
+            lambda: dodge(dodging, forecast, still, still, still, still, 0.0),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
             lambda: field.rk4(q, 1.0, 1),

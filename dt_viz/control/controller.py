@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import Enum
 
 import daqp
@@ -25,7 +26,7 @@ from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.control.courses import Course, resting, towards
 from dt_viz.control.dodging import Dodge
 from dt_viz.control.limits import AccelerationLimit, ContactLimit, ObstacleLimit, RangeLimit, VelocityLimit
-from dt_viz.control.obstacle_motion import NOTHING_SEEN, STALE
+from dt_viz.control.obstacle_motion import NOTHING_SEEN
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
@@ -106,7 +107,7 @@ class Controller:
         self._dodge, self._dodging = Dodge(self._arm, self.settings), None
         self._lock = threading.RLock()
         self._solved = solved
-        self._seen = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0)
+        self._seen = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0, self.settings)
         self._section = Section(robot, follower.reference(solved.nominal))
         self._aim, self._then = Aim.GOAL, Aim.GOAL
         self._home: int | None = None
@@ -157,7 +158,7 @@ class Controller:
     def see(self, avoidance: ArmAvoidance | None) -> None:
         """Take note of where the obstacles are now."""
         with self._lock:
-            self._seen, self._changed = self._seen.then(avoidance, self._now), True
+            self._seen, self._changed = self._seen.then(avoidance, self._now, self.settings), True
 
     def watch(self) -> None:
         """Look at the obstacles while no time passes: what lies ahead leads around them also while the robot stands."""
@@ -347,8 +348,8 @@ class Controller:
 
     def _watch(self) -> None:
         """Look at the obstacles where that is due: every few ticks where they move, else after a change."""
-        if self._seen.speed > 0 and self._now > self._seen.time + STALE:
-            self._seen, self._changed = self._seen.then(self._seen.avoidance, self._now), True
+        if self._seen.speed > 0 and self._now > self._seen.time + self.settings.stale:
+            self.see(self._seen.avoidance)
         moving = self._seen.speed > 0
         if self._now >= self._looked + self.settings.look_period and (moving or self._changed):
             self._look()
@@ -359,7 +360,7 @@ class Controller:
         turn = settings.turning * min(self._now - self._looked, 1.0)
         if seen.speed > 0:
             late = self._now - seen.time
-            avoidance = seen.expected(settings.lead + late, settings.room)
+            avoidance = seen.expected(settings.lead + late, settings.room, settings.returning)
             last = min(self._clock + settings.window, course.end)
             times = np.unique(np.linspace(self._clock, last, NUM_CLEAR_MOVING))
             ahead, end = np.stack([course.at(clock) for clock in times]), None
@@ -396,13 +397,13 @@ class Controller:
             lowest, highest = limit.bounds(q, self._velocity, dt)
             lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
         contacts = [limit.rows(q, kept, dt) for limit, kept in zip(self._contacts, self._kept, strict=True)]
-        expected = self._seen.expected(min(self._now - self._seen.time, STALE), 0.0)
-        seen = self._seen.where(expected)
-        *barrier, self._distance = self._barrier.rows(q, seen, dt)
+        seen, late = self._seen, self._now - self._seen.time
+        there = replace(seen, avoidance=seen.expected(late, 0.0, self.settings.returning))
+        *barrier, self._distance = self._barrier.rows(q, there, dt)
         velocity = _nearest(wanted, lower, upper, [*contacts, barrier])
         self._tick = q, wanted, velocity, contacts
-        lowest = float(self._kept[0].min())
-        self._dodging = self._dodge.chosen(q, self._velocity, velocity, self._dodging, seen, lowest)
+        floor = float(self._kept[0].min())
+        self._dodging = self._dodge.chosen(q, self._velocity, velocity, self._dodging, seen, late, floor)
         return velocity if self._dodging is None else _nearest(self._dodging, lower, upper, contacts)
 
     def _settle(self, course: Course) -> None:

@@ -47,11 +47,21 @@ class ControllerSettings:
     obstacle will be."""
     num_ahead: int = 10
     """Number of times in the horizon at which distances are looked at: an obstacle of 1 m/s moves 4 cm between two."""
+    returning: float = 10.0
+    """Rate λ, 1/s, at which an obstacle's velocity returns to its mean: a hand bends its way within about 0.2 s."""
+    averaging: float = 0.3
+    """Time over which that mean is taken, seconds: about one bend."""
     unsure: float = 0.03
     """Deviation of an obstacle from where it is expected now, m per m/s of its speed: that of about one look."""
-    doubt: float = 0.4
+    doubt: float = 0.3
     """Growth of that deviation with the time ahead, m/s per m/s: a way with bends of some centimetres, as a hand makes,
     is left by so much where it is thought to be straight."""
+    floor_depth: float = 0.02
+    """Depth below the table's top that counts as much as one deviation of an obstacle, metres."""
+    stale: float = 0.25
+    """Time without news, seconds, after which an obstacle counts as at rest."""
+    fastest: float = 1.5
+    """Speed, m/s, from which on an obstacle counts as put elsewhere, not as moving."""
     staying: float = 0.03
     """Gain in distance, in deviations, from which on another way of dodging is taken."""
     homing_speed: float = 2.0

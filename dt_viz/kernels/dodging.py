@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, placed
@@ -14,43 +16,68 @@ ENOUGH = 1.0
 """Distance, in deviations of the obstacle from where it is expected, beyond which more is worth nothing."""
 
 
+class Arm(NamedTuple):
+    """An arm and its limits."""
+
+    joints: Joints
+    points: BodyPoints
+    """Of its links."""
+    lower: Array
+    """(n,) smallest angles, rad."""
+    upper: Array
+    """(n,) largest angles, rad."""
+    fastest: Array
+    """(n,) largest velocities, rad/s."""
+    acceleration: float
+    """Largest one, rad/s²."""
+
+
+class Forecast(NamedTuple):
+    """Where obstacles are going to be."""
+
+    shapes: Shapes
+    """(P,) obstacles."""
+    values: Values
+    """Of their grids."""
+    times: Array
+    """(T,) at which distances are looked at, seconds from now."""
+    moved: Array
+    """(T, P, 3) displacement until then, metres."""
+    deviation: Array
+    """(T, P) deviation from there, metres."""
+    kept: float
+    """Distance that is kept, metres."""
+    floor: float
+    """Height that is kept, metres."""
+    depth: float
+    """Depth below it that counts as much as one deviation, metres."""
+
+
 @compiled
-def _room(
-    joints: Joints,
-    points: BodyPoints,
-    shapes: Shapes,
-    values: Values,
-    motion: Array,
-    q: Array,
-    velocity: Array,
-    wanted: Array,
-    bounds: Array,
-    acceleration: float,
-    times: Array,
-    least: float,
-) -> float:
+def _room(arm: Arm, forecast: Forecast, q: Array, velocity: Array, wanted: Array, least: float) -> float:
     """Find the smallest distance, in deviations and at most `ENOUGH`, of an arm that turns to velocities `wanted` (n,).
 
-    Each joint changes its velocity as fast as it may and keeps it then. Ends early where it is below `least`. Other
-    arguments as in `dodge`.
+    Each joint changes its velocity as fast as it may and keeps it then. Ends early where it is below `least`.
     """
-    n, smallest = len(joints), ENOUGH
+    n, smallest, points, moved = len(arm.joints), ENOUGH, arm.points, forecast.moved
     axes, origins, p = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty(n)
-    for t in times:
+    for m in range(len(forecast.times)):
+        t = forecast.times[m]
         for i in range(n):
             change = wanted[i] - velocity[i]
-            ramp = min(abs(change) / acceleration, t)
-            turned = velocity[i] * t + np.sign(change) * acceleration * ramp * (t - ramp / 2)
-            p[i] = min(max(q[i] + turned, bounds[0, i]), bounds[1, i])
-        chain(joints, p, axes, origins)
+            ramp = min(abs(change) / arm.acceleration, t)
+            turned = velocity[i] * t + np.sign(change) * arm.acceleration * ramp * (t - ramp / 2)
+            p[i] = min(max(q[i] + turned, arm.lower[i]), arm.upper[i])
+        chain(arm.joints, p, axes, origins)
         for k in range(len(points)):
-            offset, joint = points[k].offset, points[k].joint
+            offset, joint, radius = points[k].offset, points[k].joint, points[k].radius
             x, y = placed(offset, joint, axes, origins, 0), placed(offset, joint, axes, origins, 1)
             z = placed(offset, joint, axes, origins, 2)
-            for o in range(len(shapes)):
-                u, v, w = x - t * motion[o, 0], y - t * motion[o, 1], z - t * motion[o, 2]
-                away = distance(shapes[o], values, u, v, w) - points[k].radius - motion[o, 3]
-                smallest = min(smallest, away / (motion[o, 4] + t * motion[o, 5]))
+            smallest = min(smallest, (z - radius - forecast.floor) / forecast.depth)
+            for o in range(len(forecast.shapes)):
+                u, v, w = x - moved[m, o, 0], y - moved[m, o, 1], z - moved[m, o, 2]
+                away = distance(forecast.shapes[o], forecast.values, u, v, w) - radius - forecast.kept
+                smallest = min(smallest, away / forecast.deviation[m, o])
         if smallest < least:
             break
     return smallest
@@ -58,19 +85,7 @@ def _room(
 
 @short_kernel
 def dodge(
-    joints: Joints,
-    points: BodyPoints,
-    shapes: Shapes,
-    values: Values,
-    motion: Array,
-    q: Array,
-    velocity: Array,
-    wanted: Array,
-    before: Array,
-    bounds: Array,
-    acceleration: float,
-    times: Array,
-    gain: float,
+    arm: Arm, forecast: Forecast, q: Array, velocity: Array, wanted: Array, before: Array, gain: float
 ) -> tuple[bool, Array]:
     """Choose velocities (n,), rad/s, for an arm at q (n,) that has `velocity` (n,).
 
@@ -79,29 +94,22 @@ def dodge(
     what is wanted.
 
     Args:
-        joints: of the arm.
-        points: of its links.
-        shapes: (P,) obstacles.
-        values: of their grids.
-        motion: (P, 6) velocity of each, m/s, distance that is kept, metres, its deviation from where it is expected,
-            metres, and the growth of that, m/s.
+        arm: the arm.
+        forecast: of the obstacles.
         q: angles, rad.
         velocity: rad/s.
         wanted: (n,) rad/s.
         before: (n,) chosen just before, rad/s; kept where others do not leave `gain` more room.
-        bounds: (3, n) smallest and largest angles, rad, and largest velocities, rad/s.
-        acceleration: largest one, rad/s².
-        times: (T,) at which distances are looked at, seconds.
         gain: in deviations.
 
     Returns:
         Whether what is wanted leads past them, and the velocities.
     """
-    most = _room(joints, points, shapes, values, motion, q, velocity, wanted, bounds, acceleration, times, -np.inf)
+    most = _room(arm, forecast, q, velocity, wanted, -np.inf)
     if most >= ENOUGH:
         return True, wanted
     chosen = wanted.copy()
-    kept = _room(joints, points, shapes, values, motion, q, velocity, before, bounds, acceleration, times, most)
+    kept = _room(arm, forecast, q, velocity, before, most)
     if kept > most:
         most, chosen = min(kept + gain, ENOUGH), before.copy()
     tried = chosen.copy()
@@ -110,8 +118,8 @@ def dodge(
         for number in range(3 ** (last - first)):
             tried[:] = base
             for i in range(first, last):
-                tried[i] = (number // 3 ** (i - first) % 3 - 1) * bounds[2, i]
-            left = _room(joints, points, shapes, values, motion, q, velocity, tried, bounds, acceleration, times, most)
+                tried[i] = (number // 3 ** (i - first) % 3 - 1) * arm.fastest[i]
+            left = _room(arm, forecast, q, velocity, tried, most)
             nearer = ((tried - wanted) ** 2).sum() < ((chosen - wanted) ** 2).sum()
             if left > most or (left == most and nearer):
                 most = left

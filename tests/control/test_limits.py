@@ -7,7 +7,7 @@ import pytest
 
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
 from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
-from dt_viz.control.obstacle_motion import Sighting
+from dt_viz.control.obstacle_motion import Motion, Sighting
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import ArmAvoidance
@@ -48,7 +48,8 @@ def scenes(arm: WholeArm, num):
             at = as_point(points[rng.integers(5, len(points))] + way / np.linalg.norm(way) * rng.uniform(0.12, 0.2))
             shapes.append((Sphere(at, 0.15), Box(at, (0.1, 0.12, 0.14)), Cylinder(at, 0.1, 0.2))[k % 3])
         velocities = rng.normal(scale=0.15, size=(len(shapes), 3)) * (k % 2)
-        yield q, Sighting(0.0, ArmAvoidance(Union(tuple(shapes)), margin=0.02), velocities)
+        motions = tuple(Motion(velocity) for velocity in velocities)
+        yield q, Sighting(0.0, ArmAvoidance(Union(tuple(shapes)), margin=0.02), motions)
 
 
 def test_rows_are_the_rates_at_which_distances_change(arm, barrier):
@@ -74,7 +75,7 @@ def test_less_is_kept_where_less_is_asked_for_and_nothing_without_obstacles(arm,
     np.testing.assert_array_equal(slopes, same)
     np.testing.assert_allclose(bounds - lower, GAIN * KEPT, atol=1e-12)
     for nothing in (None, ArmAvoidance(Union(()))):
-        slopes, bounds, nearest = barrier.rows(q, replace(seen, avoidance=nothing, velocities=np.empty((0, 3))), TICK)
+        slopes, bounds, nearest = barrier.rows(q, replace(seen, avoidance=nothing, motions=()), TICK)
         assert slopes.shape == (0, 6) and not len(bounds) and nearest == np.inf
 
 

@@ -7,28 +7,30 @@ import pytest
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.robot import load_jaco
-from dt_viz.kernels.dodging import ENOUGH, dodge
+from dt_viz.kernels.dodging import ENOUGH, Arm, Forecast, dodge
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 
 ROBOT = load_jaco()
 LINKS = load_body_points().on_moving_links
-BOUNDS = np.stack([ROBOT.lower, ROBOT.upper, ROBOT.velocity_limits])
+FLOOR, DEPTH, KEPT = 0.05, 0.02, 0.01
 UP = np.array([0.0, 0.0, 1.0])
 ACCELERATION, TIMES = 4.0, np.linspace(0, 0.4, 9)[1:]
+ARM = Arm(ROBOT.records, LINKS.records, ROBOT.lower, ROBOT.upper, ROBOT.velocity_limits, ACCELERATION)
 
 
-def room(parts, motion, q, velocity, wanted):
+def room(parts, moved, deviation, q, velocity, wanted):
     """Smallest distance in deviations, at most `ENOUGH`, with joints that turn to `wanted` as fast as they may."""
     smallest = ENOUGH
-    for t in TIMES:
+    for t, places, unsure in zip(TIMES, moved, deviation, strict=True):
         steps = np.linspace(0, t, 4001)
         ramped = velocity + np.clip(wanted - velocity, -ACCELERATION * steps[:, None], ACCELERATION * steps[:, None])
         p = np.clip(q + t * (ramped[1:] + ramped[:-1]).mean(axis=0) / 2, ROBOT.lower, ROBOT.upper)
         points = LINKS.positions(ROBOT, p)
-        for part, (u, v, w, kept, unsure, doubt) in zip(parts, motion, strict=True):
-            away = part.signed_distance(points - t * np.array([u, v, w])) - LINKS.radius - kept
-            smallest = min(smallest, away.min() / (unsure + t * doubt))
+        smallest = min(smallest, (points[:, 2] - LINKS.radius - FLOOR).min() / DEPTH)
+        for part, place, most in zip(parts, places, unsure, strict=True):
+            away = part.signed_distance(points - place) - LINKS.radius - KEPT
+            smallest = min(smallest, away.min() / most)
     return smallest
 
 
@@ -37,7 +39,7 @@ def candidates(chosen):
     for first in (0, 3):
         for senses in product((-1, 0, 1), repeat=3):
             tried = chosen.copy()
-            tried[first : first + 3] = senses * BOUNDS[2, first : first + 3]
+            tried[first : first + 3] = senses * ROBOT.velocity_limits[first : first + 3]
             yield tried
 
 
@@ -50,38 +52,25 @@ def test_what_is_chosen_leaves_most_room_of_what_is_tried(seed):
     coming = rng.normal(size=3)
     coming /= np.linalg.norm(coming)
     parts = (Sphere(as_point(hand - 0.3 * coming), 0.15), Box(as_point(hand + 0.4 * UP), (0.2, 0.2, 0.2)))
-    motion = np.array([[*coming, 0.01, 0.03, 0.4], [0, 0, -0.5, 0.01, 0.02, 0.2]])
-    shapes, values = records(parts)
-    given = (
-        ROBOT.records,
-        LINKS.records,
-        shapes,
-        values,
-        motion,
-        q,
-        velocity,
-        wanted,
-        wanted,
-        BOUNDS,
-        ACCELERATION,
-        TIMES,
-    )
-    clear, chosen = dodge(*given, 0.0)
-    assert clear == (room(parts, motion, q, velocity, wanted) >= ENOUGH)
+    way = TIMES[:, None] * coming + np.outer(TIMES**2, rng.normal(scale=2.0, size=3))
+    moved = np.stack([way, np.outer(TIMES, [0, 0, -0.5])], axis=1)
+    deviation = np.stack([0.03 + 0.4 * TIMES, 0.02 + 0.2 * TIMES], axis=1)
+    forecast = Forecast(*records(parts), TIMES, moved, deviation, KEPT, FLOOR, DEPTH)
+    clear, chosen = dodge(ARM, forecast, q, velocity, wanted, wanted, 0.0)
+    assert clear == (room(parts, moved, deviation, q, velocity, wanted) >= ENOUGH)
     if clear:
         np.testing.assert_array_equal(chosen, wanted)
         return
-    best = room(parts, motion, q, velocity, chosen)
-    assert best >= room(parts, motion, q, velocity, wanted) - 1e-6
+    best = room(parts, moved, deviation, q, velocity, chosen)
+    assert best >= room(parts, moved, deviation, q, velocity, wanted) - 1e-6
     last = [tried for tried in candidates(chosen) if (tried[:3] == chosen[:3]).all()]
-    assert best >= max(room(parts, motion, q, velocity, tried) for tried in last) - 1e-6
+    assert best >= max(room(parts, moved, deviation, q, velocity, tried) for tried in last) - 1e-6
 
 
 def test_what_is_far_away_changes_nothing():
     q, wanted = np.array(ROBOT.home), np.full(6, 0.3)
-    shapes, values = records((Sphere((3.0, 3.0, 3.0), 0.15),))
-    motion = np.array([[0.1, 0, 0, 0.01, 0.03, 0.4]])
-    given = ROBOT.records, LINKS.records, shapes, values, motion, q, wanted, wanted, wanted, BOUNDS, ACCELERATION, TIMES
-    clear, chosen = dodge(*given, 0.0)
+    moved, deviation = np.zeros((len(TIMES), 1, 3)), np.full((len(TIMES), 1), 0.2)
+    forecast = Forecast(*records((Sphere((3.0, 3.0, 3.0), 0.15),)), TIMES, moved, deviation, KEPT, -1.0, DEPTH)
+    clear, chosen = dodge(ARM, forecast, q, wanted, wanted, wanted, 0.0)
     assert clear
     np.testing.assert_array_equal(chosen, wanted)
