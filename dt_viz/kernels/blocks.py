@@ -266,7 +266,7 @@ def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values
         chain(joints, block)
         for lane in range(LANES):
             nearest[lane] = np.inf
-        for p in range(len(points)):
+        for p in range(len(points) - 1, -1, -1):  # what is near the hand is most often nearest
             put(points[p].offset, points[p].joint, block)
             for k in range(len(shapes)):
                 most = nearest[0]
