@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dt_viz.kernels.arm import Array
 from dt_viz.kernels.compiled import short_kernel
-
-Array = NDArray[np.float64]
 
 
 @short_kernel
