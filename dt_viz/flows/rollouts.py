@@ -87,7 +87,7 @@ Evaluate = Callable[[Indices, Array], Array]
 
 
 def evenly_sampled(evaluate: Evaluate, num_rollouts: int, num_samples: int) -> Bundle:
-    """Sample rollouts at even distances along their paths, start and goal included.
+    """Sample rollouts at even distances along their paths, start and goal included; one that rests at even fractions.
 
     Args:
         evaluate: gives the levels of samples.
@@ -99,7 +99,9 @@ def evenly_sampled(evaluate: Evaluate, num_rollouts: int, num_samples: int) -> B
     paths = evaluate(index, np.tile(trial, num_rollouts))[:, -1].reshape(num_rollouts, len(trial), -1)
     lengths = np.cumsum(np.linalg.norm(np.diff(paths, axis=1), axis=2), axis=1)
     even = np.linspace(0, 1, num_samples)
-    fraction = np.concatenate([np.interp(even, np.r_[0, length] / length[-1], trial) for length in lengths])
+    fraction = np.concatenate(
+        [np.interp(even, np.r_[0, length] / length[-1], trial) if length[-1] > 0 else even for length in lengths]
+    )
     index = np.repeat(np.arange(num_rollouts), num_samples)
     return Bundle(index, fraction, evaluate(index, fraction))
 

@@ -74,6 +74,12 @@ def test_even_samples_are_evenly_apart_from_start_to_goal():
         assert gap.max() < 1.05 * gap[2:].min()
 
 
+def test_a_rollout_that_rests_is_sampled_at_even_fractions():
+    bundle = evenly_sampled(lambda i, u: straight(i, u) * (i > 0)[:, None, None], 2, 5)
+    np.testing.assert_array_equal(bundle.fraction[:5], np.linspace(0, 1, 5))
+    np.testing.assert_allclose(bundle.fraction[5:], np.linspace(0, 1, 5), atol=1e-12)
+
+
 def test_splitting_puts_each_sample_to_its_rollout():
     bundle = evenly_sampled(bent, 3, 20)
     parts = bundle.split(bundle.index.astype(float))
