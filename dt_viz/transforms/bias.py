@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, Chain, Diffeomorphism, Flow, Identity, Integration
-from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, Mask, PlacedField, PointField, Projected, VectorField
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, PlacedField, PointField, Projected, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.kernels.fields import REGION, SHIFT, TERM, Terms
 from dt_viz.obstacles.shapes import Point, as_point
@@ -56,13 +56,13 @@ DEEPEST = 0.9
 SNAPSHOT = 0.1
 """Interval of flow time between two checks of the distance: less than half of the time that halves it."""
 LARGE, SMALL = 3.2, 1.5
-"""Largest and smallest `auto` radius, relative to the distance of the farthest motion; it shrinks to leave starts and
-goal outside. On a straight path at 5 cm, these turn the motion by 10° and 40° on a centimetre."""
+"""Largest `auto` radius, relative to the distance of the farthest motion, and smallest one that leaves starts and goal
+outside. On a straight path at 5 cm, these turn the motion by 10° and 40° on a centimetre."""
+SMALLER, WIDER = 1.25, 1.5
+"""Smallest radius, relative to that distance, in later attempts, and factor by which it grows in each one where starts
+or goal are in the region anyway."""
 MIN_RADIUS = 0.10
 """Lower bound of the `auto` radius, metres."""
-SMALLER = 1.25
-"""Smallest `auto` radius of later attempts, relative to that distance: a region with starts or goal in it moves the
-motion below farther away, and the radius must not grow with that."""
 OVERSHOOT = 2.0
 """Factor by which the next attempt prolongs the duration beyond what the last one needed."""
 STEP = 2.2
@@ -176,40 +176,42 @@ class BiasPoint(Transform):
         point, motion, at_least = self, motion.demonstrated, motion.at_least
         if motion.above is not None:  # what is above must not lead the motion past the target again
             point = replace(point, position=as_point(motion.above.forward(np.asarray(point.position))))
-        nearest, tangents, at_end = closest_points(point, motion)
+        nearest, tangents = closest_points(point, motion)
         if point.moves_goal:
             nearest, tangents = motion.goal[None], np.zeros((1, 3))
         distance = float(np.linalg.norm(point.offsets(nearest), axis=1).max())
-        radius = point.radius or self._auto_radius(motion, (SMALL if at_least == 0 else SMALLER) * distance, distance)
+        ends, others = point._room(motion)
+        radius = point.radius or point._auto_radius(motion.earlier, distance, ends, others)
         warnings = self._misplaced(motion, nearest, radius)
 
-        along = tangents.mean(axis=0)
+        # a shift carries starts and goal in the region along, and motions with them: then the paper's field acts alone
+        part = 1.0 if at_least == 0 else _rise(ends / max(distance, AIM), 1.0, SMALL)
+        along = part * tangents.mean(axis=0) * (at_least == 0)
         passing = point._passing(nearest, tangents, along)
         longest = MAX_DURATION if point.strength is None else point.strength
-        shift, shifting = point._shift(passing.mean(axis=0), radius)
-        duration = min(shifting, longest)
-        flows = [self._flow(shift, duration, motion.tolerance)] if duration > 0 else []
+        shift, shifting = point._shift(passing.mean(axis=0), radius, part)
+        shifting = min(shifting, longest)
+        flows = [self._flow(shift, shifting, motion.tolerance)] if shifting > 0 else []
         passing = flows[0].inverse(passing) if flows else passing
         spread = float(np.linalg.norm(point.offsets(passing), axis=1).max())
         across = np.eye(3) - np.outer(along, along)
         waist = Projected(point.field(min(radius, max(MIN_RADIUS, LARGE * spread))), across)
-        gathering, hopeless = longest - duration, False
+        gathering, hopeless = longest - shifting, False
         if point.strength is None:
-            least = max(at_least - duration, 0.0)
-            found = pulling_duration(waist, point, passing, longest=gathering, at_least=least)
-            hopeless = found is None
-            if found is not None:
+            least = max(at_least - shifting, 0.0)
+            if at_least > 0:  # the motion itself was not where the places beside the target led
+                moved = Chain([*flows, self._flow(waist, least, motion.tolerance)]).inverse(motion.positions)
+                passing = closest_points(point, replace(motion, positions=moved))[0]
+            more = pulling_duration(waist, point, passing, gathering - least)
+            hopeless = more is None
+            if more is not None:
                 # starts and goal in the region move the motion below, the farther the longer: converge sooner
-                gathering = min(least + OVERSHOOT * (found - least), gathering) if least > 0 else found
+                gathering = min(least + (OVERSHOOT if at_least > 0 else 1.0) * more, gathering)
         if gathering > 0:
             flows.append(self._flow(waist, gathering, motion.tolerance))
-        duration += gathering
+        duration = shifting + gathering
         if hopeless:
             warnings.append(_warning(motion, Kind.UNREACHED, _too_small(radius, distance)))
-        elif point.strength is None and at_least > 0 and at_end.any() and not point.moves_goal:
-            hopeless = True  # its ends stay where they are, and no other place of it will be nearer
-            text = "a motion has its start or goal nearer to the point than its way: it is not led there"
-            warnings.append(_warning(motion, Kind.UNREACHED, text))
         transform = Chain(flows) if flows else Identity(3)
         goal = transform.inverse(motion.goal) if point.moves_goal else motion.goal
         chosen = {"strength": duration, "radius": radius}
@@ -228,8 +230,8 @@ class BiasPoint(Transform):
         ahead = np.divide(behind, speed, out=np.zeros_like(speed), where=speed > 0.5)
         return nearest + ahead[:, None] * tangents
 
-    def _shift(self, place: Array, radius: float) -> tuple[VectorField, float]:
-        """Make the field whose reverse flow shifts a place (3,) to the target, straight, and the flow time it takes."""
+    def _shift(self, place: Array, radius: float, part: float) -> tuple[VectorField, float]:
+        """Make the field whose reverse flow shifts a place (3,) straight to the target, and the time for a part."""
         offset = self.offsets(place)
         distance = float(np.linalg.norm(offset))
         direction = np.pad(offset, (0, 3 - len(offset))) / max(distance, 1e-12)
@@ -237,8 +239,7 @@ class BiasPoint(Transform):
         u = distance / radius
         if u >= DEEPEST:
             return field, MAX_DURATION
-        room = 1 - u * u
-        return field, u / (4 * room * room) + 3 * u / (8 * room) + 3 / 8 * math.atanh(u)  # ∫ du / (1 − u²)³
+        return field, _shifting_time(u) - _shifting_time((1 - part) * u)
 
     def _flow(self, field: VectorField, duration: float, tolerance: float) -> Diffeomorphism:
         steps = max(1, math.ceil(duration / (STEP * tolerance**0.25)))
@@ -249,6 +250,15 @@ class BiasPoint(Transform):
         if self.strength is not None:
             return True
         return bool((self.distances(motion) <= ACCEPTED).all())
+
+    def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
+        if satisfied or made.hopeless:
+            return ()
+        does = "ends" if self.moves_goal else "passes"
+        text = f"a motion {does} {1e3 * self.distances(motion).max():.0f} mm from it"
+        if min(self._room(motion)) < made.chosen["radius"]:
+            text += ": a start, the goal or another bias point is in its region"
+        return (_warning(motion, Kind.UNREACHED, text),)
 
     def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
         """Warnings about motions that pass beside the target to avoid an obstacle; see `Transform`.
@@ -307,13 +317,20 @@ class BiasPoint(Transform):
             return np.linalg.norm(self.offsets(motion.positions[last]), axis=1)
         return closest_distances(self, motion)
 
-    def _auto_radius(self, motion: MotionBelow, least: float, distance: float) -> float:
+    def _auto_radius(self, earlier: Built | None, distance: float, ends: float, others: float) -> float:
         """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""
-        kept = [motion.starts, np.asarray(motion.targets).reshape(-1, 3)]
-        if not self.moves_goal:
-            kept.append(motion.goal[None])
-        room = float(np.linalg.norm(self.offsets(np.concatenate(kept)), axis=1).min())
-        return max(MIN_RADIUS, min(LARGE * distance, max(least, room)))
+        if earlier is not None:  # ends in the region have moved the motion farther away: it must not grow with that
+            grown = WIDER if ends < distance else 1.0
+            return max(grown * earlier.chosen["radius"], SMALLER * distance)
+        return max(MIN_RADIUS, min(LARGE * distance, max(SMALL * distance, min(ends, others))))
+
+    def _room(self, motion: MotionBelow) -> tuple[float, float]:
+        """Distances of the nearest start, or goal that stays, and of the nearest other bias point, metres."""
+        ends = motion.starts if self.moves_goal else np.concatenate([motion.starts, motion.goal[None]])
+        others = np.asarray(motion.targets).reshape(-1, 3)
+        nearest = (np.linalg.norm(self.offsets(places), axis=1).min(initial=np.inf) for places in (ends, others))
+        to_ends, to_others = map(float, nearest)
+        return to_ends, to_others
 
     def _misplaced(self, motion: MotionBelow, nearest: Array, radius: float) -> list[MotionWarning]:
         """Warnings about the place of the bias point."""
@@ -377,6 +394,17 @@ class Shift(PointField):
         return Terms(term, np.empty(0))
 
 
+def _rise(value: float, low: float, high: float) -> float:
+    """Rise from 0 at a low value to 1 at a high one."""
+    return min(max((value - low) / (high - low), 0.0), 1.0)
+
+
+def _shifting_time(u: float) -> float:
+    """Time in which a shift carries a place from the distance u, in radii, to the target: ∫ du / (1 − u²)³."""
+    room = 1 - u * u
+    return u / (4 * room * room) + 3 * u / (8 * room) + 3 / 8 * math.atanh(u)
+
+
 @lru_cache(maxsize=2)
 def unit_field(dim: int) -> RegionField:
     """The field for the unit region, ridge regression of unit vectors away from the centre of the ball of `dim`.
@@ -401,12 +429,11 @@ def _too_small(radius: float, distance: float) -> str:
     return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
 
 
-def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array, Mask]:
+def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array]:
     """Find where each rollout, as a polyline, comes closest to the target.
 
     Returns:
-        (R, 3) these places, metres, (R, 3) its directions there, unit vectors along the axes that the bias acts on, and
-        (R,) whether they are the rollout's start or goal.
+        (R, 3) these places, metres, and (R, 3) its directions there, unit vectors along the axes that the bias acts on.
     """
     offset = point.offsets(motion.positions)
     start, step = offset[:-1], np.diff(offset, axis=0)
@@ -420,7 +447,7 @@ def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array,
     k = np.array([low + np.argmin(miss[low:high]) for low, high in zip(first, last, strict=True)])
     nearest = motion.positions[k] + part[k, None] * (motion.positions[k + 1] - motion.positions[k])
     tangents = step[k] @ point.axes()[:, : step.shape[1]].T / np.sqrt(np.maximum(squared[k], 1e-300))[:, None]
-    return nearest, tangents, ((k == first) & (part[k] == 0)) | ((k + 1 == last) & (part[k] == 1))
+    return nearest, tangents
 
 
 def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
@@ -428,9 +455,7 @@ def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
     return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)
 
 
-def pulling_duration(
-    field: VectorField, point: BiasPoint, points: Array, *, longest: float, at_least: float = 0.0
-) -> float | None:
+def pulling_duration(field: VectorField, point: BiasPoint, points: Array, longest: float) -> float | None:
     """The shortest duration after which the reverse flow has carried all `points` (N, 3) to the target.
 
     γ is a one-parameter group, so one integration with snapshots passes every duration on its way.
@@ -438,9 +463,7 @@ def pulling_duration(
     Returns:
         The duration, or None where some point has not arrived after the `longest`.
     """
-    duration = at_least
-    if duration > 0:
-        points, _ = integrate(rk4, field, points, None, -duration, math.ceil(duration / SNAPSHOT))
+    duration = 0.0
     distance = np.linalg.norm(point.offsets(points), axis=1)
     away = distance > AIM
     points, distance = points[away], distance[away]
