@@ -16,8 +16,9 @@ class ControllerSettings:
     """Part of the velocity limits that the undisturbed motion uses: the rest closes gaps."""
     gain: float = 8.0
     """Rate at which a gap between the robot and its target is closed, 1/s."""
-    patience: float = 0.25
-    """Gap, rad, at which the clock of the motion stands still and waits for the robot."""
+    patience: float = 0.5
+    """Gap, rad, at which the clock of the motion stands still and waits for the robot. The smaller, the less of the
+    motion is left out after the robot had to give way, and the later it arrives."""
     look_period: float = 0.03
     """Time between two looks at moving obstacles, seconds."""
     lead: float = 0.15

@@ -18,6 +18,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -68,6 +69,8 @@ TABLE_ROOM = 0.01
 """Height of the obstacle above the table, metres."""
 START_ROOM = 0.05
 """Distance of the arm from an obstacle that comes, where the arm is undisturbed, metres."""
+COMING_ROOM = 0.03
+"""That distance from the arm as it is, which may have given way to another obstacle: with less, others are drawn."""
 LONGEST = 30.0
 """Time after the sphere has gone within which the goal has to be reached, seconds."""
 AT_GOAL = 1e-3
@@ -228,11 +231,10 @@ class Bench:
         return self.robot.end_effector(joints), joints
 
 
-def crossings(bench: Bench, speed: float, runs: int, seed: int, num: int = 1) -> Iterator[tuple[Crossing, float]]:
-    """Obstacles that cross, so many at once, and the seconds that the robot takes without them."""
+def crossings(bench: Bench, speed: float, seed: int, num: int = 1) -> Iterator[tuple[Crossing, float]]:
+    """Obstacles that cross, so many at once, and the seconds that the robot takes without them; without an end."""
     rng, known = np.random.default_rng(seed), {}
-    for run in range(runs):
-        start = run % len(bench.starts)
+    for start in cycle(range(len(bench.starts))):
         if start not in known:
             known[start] = bench.undisturbed(start)
         hand, joints = known[start]
@@ -296,6 +298,17 @@ def simulated(bench: Bench, crossing: Crossing, arm: Arm) -> Run:
             break
         q = q + TICK * arm.tick(t, q, crossing, run)
     return run
+
+
+def room_at_coming(bench: Bench, run: Run, crossing: Crossing) -> float:
+    """Smallest distance of the arm from an obstacle at the tick at which that comes, metres."""
+    body, centres = bench.follower.whole_arm, np.array(run.obstacle)
+    ticks = np.isfinite(centres[:, :, 0]).argmax(axis=0)
+    there = zip(ticks, crossing.passages, strict=True)
+    return min(
+        float(body.clearance(run.q[k][None], bench.shape(centres[k, n], passage.wxyz))[0])
+        for n, (k, passage) in enumerate(there)
+    )
 
 
 def smallest_distance(bench: Bench, run: Run, crossing: Crossing) -> float:
@@ -439,18 +452,19 @@ def run(options: argparse.Namespace) -> int:
         kinds |= {"potential_": lambda _: Potential(bench), "stepped_": lambda _: Stepped(bench)}
     arrays: dict[str, Any] = {"diameter": options.diameter}
     figures: dict[str, list[Figures]] = {kind: [] for kind in kinds}
-    rows = []
-    crossed = crossings(bench, options.speed, options.runs, options.seed, options.obstacles)
-    for i, (crossing, seconds) in enumerate(crossed):
+    crossed = crossings(bench, options.speed, options.seed, options.obstacles)
+    while (i := len(figures[""])) < options.runs:
+        crossing, seconds = next(crossed)
         for kind, make in kinds.items():
             found = simulated(bench, crossing, make(crossing))
+            if not kind and room_at_coming(bench, found, crossing) < COMING_ROOM:
+                break
             figures[kind].append(Figures.of(bench, crossing, found, seconds))
             places = np.array(found.obstacle)[:, 0] if options.obstacles == 1 else found.obstacle
             arrays |= {f"{kind}q_{i}": found.q, f"{kind}t_{i}": found.t, f"{kind}obstacle_{i}": places}
             if not kind:
                 arrays[f"wxyz_{i}"] = [passage.wxyz for passage in crossing.passages]
-                rows.append((str(i), *figures[kind][-1].cells()))
-                print(*rows[-1], " ".join(sorted(p.value for p in found.phases)), flush=True)
+                print(i, *figures[kind][-1].cells(), " ".join(sorted(p.value for p in found.phases)), flush=True)
     write_npz(out, **arrays)
     shape = "box" if options.boxes else "sphere"
     size = f"{options.obstacles} {shape}(s) of {options.diameter:g} m"

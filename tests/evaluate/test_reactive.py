@@ -1,6 +1,7 @@
 """Obstacles that cross the motion of the robot in the loop: where they go, and what is measured."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -47,7 +48,7 @@ def bench(engine):
 
 @pytest.mark.parametrize(("speed", "num"), [(0.1, 1), (1.0, 1), (0.5, 2)])
 def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
-    found = list(reactive.crossings(bench, speed, 3, seed=1, num=num))
+    found = list(islice(reactive.crossings(bench, speed, seed=1, num=num), 3))
     assert [crossing.start for crossing, _ in found] == [0, 1, 2]
     for crossing, seconds in found:
         hand, joints = bench.undisturbed(crossing.start)
@@ -74,7 +75,7 @@ def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
 
 def test_a_second_obstacle_and_a_turned_box_count(engine):
     boxes = reactive.Bench(engine, "draw_s", 0.15, 0.03, boxes=True)
-    ((crossing, _),) = reactive.crossings(boxes, 0.5, 1, seed=2, num=2)
+    crossing, _ = next(reactive.crossings(boxes, 0.5, seed=2, num=2))
     t = max(passage.comes for passage in crossing.passages)
     parts = boxes.obstacles(crossing, t)
     assert len(parts) == 2 and parts[0].wxyz == crossing.passages[0].wxyz != parts[1].wxyz
@@ -97,6 +98,22 @@ def test_the_smallest_distance_is_found_between_ticks_too(bench):
     found = reactive.smallest_distance(bench, reactive.Run(q=list(q), obstacle=list(places[:, None])), crossing)
     assert found == pytest.approx(least, abs=1e-9)
     assert found < nearest(q[:3], places[:3], bench.diameter) - 0.01
+
+
+def test_the_room_of_an_obstacle_that_comes_is_that_of_the_arm_as_it_is_then(bench):
+    q = np.stack([bench.starts[0], bench.starts[0] + 0.5])
+    hands = bench.robot.end_effector(q)
+    gone, far = np.full(3, np.nan), np.array([3.0, 0.0, 0.0])
+    passage = reactive.Passage(np.zeros((2, 3)), 0.0, 1.0, 1.0)
+    crossing = reactive.Crossing(0, 0.0, (passage, passage))
+
+    def room(*centres):
+        return reactive.room_at_coming(bench, reactive.Run(q=list(q), obstacle=list(np.array(centres))), crossing)
+
+    assert room([far, gone], [hands[0], far]) > 1  # one has come before, the other is not there yet
+    assert room([far, gone], [far, hands[1]]) < 0
+    expected = bench.follower.whole_arm.clearance(q[1:], bench.shape(hands[0]))[0]
+    assert room([far, gone], [far, hands[0]]) == pytest.approx(expected)
 
 
 def test_figures_of_a_run_are_relative_to_the_limits(bench):
