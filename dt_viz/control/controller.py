@@ -284,9 +284,14 @@ class Controller:
             return Phase.HELD
         if self._settled and np.linalg.norm((self._at - course.q[-1]) * LEVERS) > ASIDE:
             return Phase.ASIDE
-        if self._settled and max(np.abs(self._velocity).max(), np.abs(q - self._at).max()) < AT_REST:
+        if self.rests and np.abs(q - self._at).max() < AT_REST:
             return Phase.RESTING
         return Phase.HOMING if self._aim is Aim.HOME else Phase.MOVING
+
+    @property
+    def rests(self) -> bool:
+        """Whether what it follows has come to its end, and the robot to rest, there or where it is kept from there."""
+        return self._settled and bool(np.abs(self._velocity).max() < AT_REST)
 
     @property
     def touched(self) -> bool:

@@ -204,7 +204,7 @@ class LiveArm:
             wishes, self._wishes = self._wishes, []
         for wish in wishes:
             wish(controller)
-        if self._let_go and (moves or len(controller.ahead) < 2):
+        if self._let_go and (moves or controller.rests):
             self._held, self._let_go = None, False
             controller.release()
         seen, self._seen = self._seen, None
