@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,10 @@ from dt_viz.evaluate.options import (
     whole_number,
     write_json,
 )
-from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.obstacles.shapes import Box, MeshObstacle, Obstacle, Point, Sphere, as_point
+from dt_viz.obstacles.solids import Solid
+from dt_viz.scenario.paper_scenes import bottle
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
@@ -52,6 +55,21 @@ from dt_viz.transforms.bias import BiasPoint
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0
+
+
+def _meshed(place: Point, vertices: Array, faces: Indices) -> MeshObstacle:
+    """Make an obstacle of a mesh with the middle of its box at a place."""
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return MeshObstacle(place, Solid(vertices - middle, faces))
+
+
+SHAPES: Mapping[str, Callable[[Point, float], Obstacle]] = {
+    "sphere": Sphere,
+    "box": lambda place, size: Box(place, (size, 0.8 * size, 0.6 * size)),
+    "mesh": lambda place, size: _meshed(place, *Sphere((0.0, 0.0, 0.0), size).surface()),
+    "bottle": lambda place, _: _meshed(place, bottle().vertices, bottle().faces),
+}
+"""Obstacles at a place, of a diameter; the mesh is that of the sphere, the bottle that of the paper's figures."""
 
 
 @dataclass
@@ -80,6 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--obstacles", type=whole_number(0), default=1, help="in the scene, along the path (default: %(default)s)"
     )
+    parser.add_argument("--shape", choices=tuple(SHAPES), default="sphere", help="of these (default: %(default)s)")
     parser.add_argument("--seconds", type=positive_number("seconds", 3600), required=True, help="to measure")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
 
@@ -122,6 +141,7 @@ def run(options: argparse.Namespace) -> int:
             "edits": num_edits,
             "drag": options.drag,
             "obstacles": options.obstacles,
+            "shape": options.shape,
         },
     }
     write_json(out, figures)
@@ -153,7 +173,8 @@ def _scenario(task: Task, options: argparse.Namespace) -> Scenario:
     diameter = Sphere(task.obstacle_position).diameter / max(1, options.obstacles)
     if options.drag == "obstacle" and options.obstacles == 0:
         raise InputError("--obstacles", "0", "1 or more, or --drag bias")
-    obstacles = tuple(Sphere(as_point(place), diameter) for place in task.mean_path[places])
+    shape = SHAPES[options.shape]
+    obstacles = tuple(shape(as_point(place), diameter) for place in task.mean_path[places])
     scenario = avoiding(task, Avoidance(obstacles, space=options.space))
     if options.drag == "obstacle":
         return scenario

@@ -53,6 +53,17 @@ def test_latency_counts_every_edit_and_reports_both_stages(measured, dragged, mo
     assert rows[-1]["in units"] == pytest.approx(figures["whole_median_ms"] / figures["unit_ms"])
 
 
+@pytest.mark.parametrize("shape", latency.SHAPES)
+def test_an_obstacle_of_any_shape_is_dragged_by_its_middle(shape):
+    place, size = (0.1, -0.4, 0.3), 0.15
+    vertices, _ = (obstacle := latency.SHAPES[shape](place, size)).surface()
+    np.testing.assert_allclose((vertices.min(axis=0) + vertices.max(axis=0)) / 2, 0, atol=1e-3)
+    assert obstacle.position == place and obstacle.signed_distance(np.array(place)) < -0.02
+    if shape in ("sphere", "mesh"):
+        on_sphere = np.array(place) + size / 2 * np.eye(3)
+        np.testing.assert_allclose(obstacle.signed_distance(on_sphere), 0, atol=2e-3)
+
+
 def test_a_drag_writes_every_step_and_counts_its_jumps(measured, monkeypatch):
     monkeypatch.setattr(drag, "JUMP", 0.015)
     monkeypatch.setattr(drag, "NUM_POINTS", 20)
