@@ -127,19 +127,21 @@ class Follower:
                 it may be off by millimetres where the stack stretches space.
             before: joints along nearby rollouts to begin from.
         """
-        fraction = []
+        samples, drawn = np.linspace(0, 1, NUM_CONFIGURATIONS), []
         for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
             length = arc_length(path)
             # where the stack stretches a path, samples by its length alone lie far apart in its fraction
             place = (1 - BY_FRACTION) * length / length[-1] + BY_FRACTION * fractions
-            fraction.append(np.interp(np.linspace(0, 1, NUM_CONFIGURATIONS), place, fractions))
-        index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
-        paths = solution.positions_at(index, np.concatenate(fraction)).reshape(len(fraction), NUM_CONFIGURATIONS, 3)
+            drawn.append(np.array([np.interp(samples, place, values) for values in (fractions, *path.T)]))
+        fraction, paths = np.stack(drawn)[:, 0], np.stack(drawn)[:, 1:].swapaxes(1, 2)
+        if exact:
+            index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
+            paths = solution.positions_at(index, fraction.ravel()).reshape(paths.shape)
         reference, initial = self.reference(nominal), None
         if before is not None and not exact and len(before.tracked.q) == len(paths):  # else starts have come or gone
             same = np.array_equal(before.reference, reference)
             initial = before.tracked.q if same else None  # those of another stance may lie on another branch
-        lifted = replace(lift(self.robot, np.stack(fraction), paths, reference, initial), num_guests=nominal.num_added)
+        lifted = replace(lift(self.robot, fraction, paths, reference, initial), num_guests=nominal.num_added)
         if not exact:
             return lifted
 
