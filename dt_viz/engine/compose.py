@@ -10,7 +10,7 @@ import numpy as np
 from dt_viz.arm.retiming import within_velocity_limits
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.engine.frame import Frame, Stage
-from dt_viz.flows.diffeomorphisms import Flow
+from dt_viz.flows.diffeomorphisms import Chain, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Bundle
@@ -28,7 +28,6 @@ from dt_viz.pictures.panels import PanelPicture, generator_panel, system_panel
 from dt_viz.pictures.sketchbook import BASE_TITLE, Pictures, Sketchbook, in_frame
 from dt_viz.pictures.slice_fields import (
     ARROW_SPACING,
-    Samples,
     arrows_and_colour,
     streamlines,
 )
@@ -215,14 +214,32 @@ def lattice(scenario: Scenario, solved: Solved) -> Array:
     return solved.below.task.slice.posed(scenario.view.slice).grid(ARROW_SPACING).reshape(-1, 3)
 
 
-def velocities(scenario: Scenario, solved: Solved) -> Array:
-    """The hand's velocities (M, 3) at the lattice, m/s, of the whole stack below the arm's avoidance; else NaN."""
-    area = solved.below.task.slice.posed(scenario.view.slice)
-    clearance = _avoided(solved.stack.built).signed_distance
-    samples = Samples(solved.stack.at_phase(rest(scenario, solved)), area, clearance, ARROW_SPACING, jacobian=False)
-    spread = np.full(samples.grid.shape, np.nan)
-    spread[samples.free] = samples.velocities
-    return spread.reshape(-1, 3)
+def learned_velocities(scenario: Scenario, solved: Solved) -> Array:
+    """The hand's velocities (M, 3) at the lattice, m/s, of the motion that nothing is stacked on."""
+    return _velocities_below(scenario, solved, lattice(scenario, solved))
+
+
+def velocities(scenario: Scenario, solved: Solved, learned: Array) -> Array:
+    """The hand's velocities (M, 3) at the lattice, m/s, of the whole stack below the arm's avoidance; else NaN.
+
+    They are `learned` (M, 3) wherever what is stacked moves nothing.
+    """
+    points, built = lattice(scenario, solved), solved.stack.built
+    free = _avoided(built).signed_distance(points) > 0
+    stacked = Chain([Identity(3), *(applied.made.transform for applied in built)])
+    spread = np.full_like(points, np.nan)
+    below, carried = stacked.forward(points[free]), learned[free]
+    moved = (below != points[free]).any(axis=1)
+    carried[moved] = _velocities_below(scenario, solved, below[moved])
+    spread[free] = stacked.inverse_tangents(below, carried[..., None])[1][..., 0]
+    return spread
+
+
+def _velocities_below(scenario: Scenario, solved: Solved, points: Array) -> Array:
+    """Velocities (N, 3), m/s, of the motion that nothing is stacked on, at points (N, 3), metres."""
+    system = frozen(cut_off(solved.below, solved.stack, 0), rest(scenario, solved))
+    images = system.transform.forward(points)
+    return system.transform.inverse_tangents(images, system.base.velocity(images)[..., None])[1][..., 0]
 
 
 def _panels(

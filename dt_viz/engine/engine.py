@@ -361,10 +361,17 @@ class Engine:
             lambda: Lattice.of(compose.lattice(scenario, solved), robot, reference),
             newest=2,
         )
+        of = view.slice, rest.tobytes()
+        learned = self.memo(
+            "learned velocities",
+            (solved.below.learned, solved.stack.rays.base.goal.tobytes(), *of),
+            lambda: compose.learned_velocities(scenario, solved),
+            newest=2,
+        )
         velocities = self.memo(
             "velocities",
-            (made_for, layers, view.slice, rest.tobytes()),
-            lambda: compose.velocities(scenario, solved),
+            (made_for, layers, *of),
+            lambda: compose.velocities(scenario, solved, learned),
             newest=2,
         )
         return replace(pictures, field=lattice.carried(velocities, arm.transform, robot, scenario.obstacle))

@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
-from scenes import changed, frame_at
+from scenes import avoiding, biases, changed, frame_at
 
 from dt_viz.arm.arm_system import ArmSystem, Section
+from dt_viz.engine import compose
 from dt_viz.engine.frame import Stage
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import FINE
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.arm_field import Lattice
+from dt_viz.scenario.scenario import Layer
+from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.transforms.bias import BiasPoint
 
 
 @pytest.fixture(scope="module", name="scene", params=["draw_s", "lift_box"])
@@ -65,3 +70,19 @@ def test_there_is_an_arrow_where_the_hand_moves_and_the_arm_reaches(scene):
     carried = lattice.carried(velocities, Identity(6), robot, Union(()))
     np.testing.assert_allclose(carried.points, places[[0, 4]], atol=1e-3)
     np.testing.assert_allclose(carried.velocities, velocities[[0, 4]], atol=1e-3)
+
+
+@pytest.mark.parametrize("moves_goal", [False, True])
+@pytest.mark.parametrize("task", ["draw_s", "lift_box"])
+def test_velocities_are_those_of_the_whole_stack_whether_it_moves_a_place_or_not(engine, task, moves_goal):
+    path = engine.task(task).mean_path
+    ball, beside = Avoidance((Sphere(as_point(path[30]), 0.1),)), path[-1] + np.array([0.03, 0.0, 0.04])
+    layers = (Layer(ball, name="Hand"), *biases(BiasPoint(as_point(beside), moves_goal=moves_goal)))
+    solved = engine.solved(avoiding(task, layers=layers), FINE)
+    rest, places = compose.rest(solved.scenario, solved), compose.lattice(solved.scenario, solved)
+    found = compose.velocities(solved.scenario, solved, compose.learned_velocities(solved.scenario, solved))
+    free, expected = np.isfinite(found[:, 0]), np.full_like(found, np.nan)
+    expected[free] = solved.stack.at_phase(rest).velocity(places[free])
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
+    alone = compose.learned_velocities(solved.scenario, solved)
+    assert 0.02 < (np.abs(found - alone)[free].max(axis=1) > 1e-4).mean() < 0.98
