@@ -41,6 +41,7 @@ from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import Way, remembered, travel
 from dt_viz.transforms.base import ArmAvoidance
+from dt_viz.transforms.passing import ANEW, Passing
 
 NUM_CONFIGURATIONS = 100
 """Samples of each rollout before refinement."""
@@ -255,7 +256,7 @@ class WholeArm:
         spacing: float,
         *,
         coarse: bool,
-        before: ArmSolution | None = None,
+        passing: Passing = ANEW,
     ) -> ArmSolution:
         """The motions around the obstacle.
 
@@ -273,10 +274,10 @@ class WholeArm:
             spacing: largest distance between neighbouring samples, metres at the hand, about; in coarse motions it is
                 `COARSE_SPACING` if that is more.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
-            before: the motions around the obstacles where they were just before.
+            passing: the ways of motions that these go on from.
         """
         parts = avoidance.obstacle.parts
-        known = remembered(() if before is None else before.ways, parts)
+        known = remembered(passing.arm, parts)
         sides, pins = self._sides(lifted, avoidance, known), self._pins(lifted)
         best = None
         for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
@@ -301,7 +302,7 @@ class WholeArm:
         generator = self._generator(best.ways, avoidance, pins)
         return replace(_Solver(self, lifted, avoidance, generator, spacing, coarse=False).solution(), ways=best.ways)
 
-    def followed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float, before: ArmSolution) -> ArmSolution:
+    def followed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float, passing: Passing) -> ArmSolution:
         """Coarse motions that follow an obstacle which is dragged: they change no faster than the obstacle moves.
 
         Ways out turn towards the sides that are to be taken, and the flow's duration changes, by so much for each metre
@@ -313,11 +314,11 @@ class WholeArm:
             lifted: the motions below.
             avoidance: what is to be avoided.
             spacing: as in `avoiding`.
-            before: the motions where the obstacles were just before.
+            passing: the ways of the motions where the obstacles were just before, and the duration of their flow.
         """
         parts = avoidance.obstacle.parts
-        known = remembered(before.ways, parts)
-        failed = not before.cleared and before.duration >= MAX_DURATION
+        known = remembered(passing.arm, parts)
+        failed = not passing.cleared and passing.duration >= MAX_DURATION
         ways: list[Way | None] = []
         for part, found, last in zip(parts, self._sides(lifted, avoidance, known), known, strict=True):
             if not found:
@@ -331,7 +332,7 @@ class WholeArm:
             return self.undisturbed(lifted, avoidance, spacing)
         moved = max(travel(last.obstacle, part) for last, part in zip(known, parts, strict=True) if last is not None)
         change = DURATION_CHANGE * moved
-        between = max(before.duration - change, 0.0), min(before.duration + change, MAX_DURATION)
+        between = max(passing.duration - change, 0.0), min(passing.duration + change, MAX_DURATION)
         generator = self._generator(ways, avoidance, self._pins(lifted))
         solver = _Solver(self, lifted, avoidance, generator, spacing, coarse=True, between=between)
         return replace(solver.solution(), ways=tuple(ways))
@@ -396,7 +397,7 @@ class WholeArm:
         directions = np.stack([way.direction for way in met])
         return WholeArmField(self.robot, self.body, obstacles, directions, pins, reach)
 
-    def _sides(self, lifted: Lift, avoidance: ArmAvoidance, before: Sequence[Way | None]) -> list[list[Array]]:
+    def _sides(self, lifted: Lift, avoidance: ArmAvoidance, known: Sequence[Way | None]) -> list[list[Array]]:
         """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it.
 
         Obstacles that one posture comes near to are left in one direction where their own ones are opposed: else their
@@ -421,7 +422,7 @@ class WholeArm:
                 Union(tuple(parts[k] for k in which)),
                 margin,
                 num=NUM_WAYS,
-                before=next((way.side for way in (before[k] for k in which) if way is not None), None),
+                before=next((way.side for way in (known[k] for k in which) if way is not None), None),
             )
 
         sides: list[list[Array]] = [[] for _ in parts]

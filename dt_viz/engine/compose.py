@@ -80,19 +80,17 @@ def rollouts_frame(scenario: Scenario, solved: Solved, follower: Follower) -> Fr
         durations=tuple(applied.made.duration if applied else None for applied in made),
         chosen_values=tuple(applied.made.chosen if applied else {} for applied in made),
         arm_duration=arm.duration if arm else None,
+        passing=solved.passing,
     )
 
 
-def with_arm(
-    frame: Frame, solved: Solved, follower: Follower, before: Array | None = None, *, moves: bool = True
-) -> Frame:
+def with_arm(frame: Frame, solved: Solved, follower: Follower, *, moves: bool = True) -> Frame:
     """The frame with the arm's motion along the rollout that it follows, and with the starts that it cannot get to.
 
     Args:
         frame: the rollouts.
         solved: the motion that they are of.
         follower: the arm.
-        before: (`NUM_ARM_SAMPLES`, 6) joints to begin from where the arm follows a path of the hand, rad.
         moves: whether its motion is wanted.
     """
     nominal = solved.nominal
@@ -100,7 +98,7 @@ def with_arm(
     try:
         far = follower.out_of_reach(nominal)
         if moves and frame.chosen is not None and not far[frame.chosen]:
-            arm, warnings = arm_along(frame, solved, frame.chosen, follower, before)
+            arm, warnings = arm_along(frame, solved, frame.chosen, follower)
         warnings += tuple(far_starts(np.array(nominal.numbers)[far], nominal.num_demonstrated))
     except UnreachableError as error:
         warnings = (unreachable(error),)
@@ -108,26 +106,23 @@ def with_arm(
 
 
 def arm_along(
-    frame: Frame, solved: Solved, rollout: int, follower: Follower, before: Array | None = None
+    frame: Frame, solved: Solved, rollout: int, follower: Follower
 ) -> tuple[ArmMotion, tuple[MotionWarning, ...]]:
-    """The arm's motion along a rollout, and what is wrong with it; see `with_arm`.
+    """The arm's motion along a rollout, and what is wrong with it.
 
     Raises:
         UnreachableError: the arm cannot get to where the motions start.
     """
     nominal, times = solved.nominal, frame.times[rollout]
-    number = nominal.numbers[rollout]
     if solved.arm is not None and solved.lifted is not None:
-        rows = solved.arm.index == rollout
+        rows, joints = solved.arm.index == rollout, solved.lifted.tracked
         q, fraction = solved.arm.p[rows], solved.arm.fraction[rows]
-        warnings = follower.warnings(solved.lifted.tracked, number)
     else:
-        bundle = solved.stack.bundle
-        path, fraction = frame.rollouts[rollout], bundle.split(bundle.fraction)[rollout]
+        bundle, path = solved.stack.bundle, frame.rollouts[rollout]
         keep = arm_samples(len(path))
-        joints = follower.along(nominal, path[keep], before)
-        q, times, fraction = joints.q, times[keep], fraction[keep]
-        warnings = follower.warnings(joints, number)
+        joints = follower.along(nominal, path[keep])
+        q, times, fraction = joints.q, times[keep], bundle.split(bundle.fraction)[rollout][keep]
+    warnings = follower.warnings(joints, nominal.numbers[rollout])
     without = follower.undisturbed_along(nominal, rollout).at(np.zeros(len(fraction), int), fraction)
     return ArmMotion(within_velocity_limits(times, q, follower.robot.velocity_limits), q, without), warnings
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from dt_viz.arm.robot import Robot
 from dt_viz.arm.tracking import UnreachableError
@@ -26,7 +26,7 @@ from dt_viz.memo import Memo
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower
 from dt_viz.motion.nominal import Learned, Nominal
-from dt_viz.motion.solve import Solved, goes_on, solve, warped
+from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
 from dt_viz.pictures.arm_field import Lattice
 from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
@@ -43,24 +43,11 @@ NUM_BOOKS = 8
 """Number of learned motions whose pictures are kept."""
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """The frame of a task that was computed last, and its motion."""
-
-    frame: Frame
-    newest: Solved
-    """The motion of the frame."""
-    live: Solved
-    """The same motion at precision LIVE: quicker, and exact enough for a hand that moves."""
-
-
 class Engine:
     """Computes frames for one visitor; one thread calls it.
 
-    The same scenario always gives the same frame, with three exceptions. Where there is no motion for it the last one
-    that there was for the task is shown, marked by `Frame.blocked`. Up to stage LIVE joints are looked for from those
-    shown before: they differ by less than a milliradian. And while an obstacle is dragged, motions keep the side on
-    which they pass it, and the arm its stance; where it then rests this choice is all that is left of the drag.
+    The same scenario with the same passing always gives the same frame, but where there is no motion for it: then the
+    last one that there was for the task is shown, marked by `Frame.blocked`.
     """
 
     def __init__(
@@ -83,7 +70,8 @@ class Engine:
         """The arm in the loop."""
         self.comparison = Comparison(self.follower, self.memo)
         """Other methods beside ours."""
-        self._shown: dict[str, _Shown] = {}
+        self._shown: dict[str, tuple[Frame, Solved]] = {}
+        """The frame of each task that was computed last, and its motion."""
         self._seconds = 0.0
         """Time that the frames of a scenario have taken so far, seconds."""
         self._yielded: Solved | None = None
@@ -144,25 +132,30 @@ class Engine:
         Raises:
             UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
         """
+        scenario = self._decided(scenario, precision)
         return self._solved(scenario, self._admission(scenario, precision).nominal, precision)
+
+    def _decided(self, scenario: Scenario, precision: Precision) -> Scenario:
+        """The scenario, passing obstacles at FINE as its motion of LIVE does, which is shown first."""
+        live = self._motion(scenario, LIVE)[0] if precision is not LIVE else None
+        return scenario if live is None else replace(scenario, passing=live.passing)
 
     def _solved(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
         """The motion of a scenario from the starts that the arm can begin at."""
-        motion, follower, before = scenario.motion, self.follower, self._before(scenario, nominal.learned)
+        motion, follower = scenario.motion, self.follower
         full = self.memo(
             "full",
-            (replace(motion, warp=1.0), precision),
-            lambda: solve(motion, nominal, precision, follower, before),
+            (replace(motion, warp=1.0), motion.passing, precision),
+            lambda: solve(motion, nominal, precision, follower),
             newest=2,
         )
         if motion.warp == 1:
             return full
-        lifted = (before and before.lifted) or full.lifted
         below = self.memo("below", (full.nominal, motion.warp), lambda: full.nominal.warped(motion.warp), newest=1)
         return self.memo(
             "warped",
-            (motion, precision),
-            lambda: warped(full, below, motion.warp, precision, follower, lifted),
+            (motion, motion.passing, precision),
+            lambda: warped(full, below, motion.warp, precision, follower),
             newest=2,
         )
 
@@ -196,7 +189,7 @@ class Engine:
         """
         began, solved = time.perf_counter(), self._yielded
         if frame.blocked:
-            solved = replace(self._shown[frame.scenario.task].newest, scenario=frame.scenario.motion)
+            solved = replace(self._shown[frame.scenario.task][1], scenario=frame.scenario.motion)
         assert solved is not None
         try:
             self.arm.follow(solved, frame.chosen)
@@ -232,23 +225,19 @@ class Engine:
         nominal, avoidance = self.nominal(scenario), scenario.arm_avoidance
         if avoidance is None:
             return Admission(nominal)
-        before = self._before(scenario, nominal.learned)
-        if before is None or not goes_on(scenario, before):
+        passing = scenario.passing
+        if passing is None or not passing.goes_on(avoidance.obstacle.parts):
             return self.follower.admission(nominal, avoidance)
-        return self.follower.admission(nominal, avoidance, before.nominal.stance, keeps=precision is LIVE)
+        return self.follower.admission(nominal, avoidance, passing.stance, keeps=precision is LIVE)
 
     def _motion(self, scenario: Scenario, precision: Precision) -> tuple[Solved | None, tuple[MotionWarning, ...]]:
         """The motion of a scenario, and why it has none, at the ends or between them."""
+        scenario = self._decided(scenario, precision)
         admission = self._admission(scenario, precision)
         if admission.blocked:
             return None, admission.blocked
         solved = self._solved(scenario, admission.nominal, precision)
         return (None, solved.blocked) if solved.blocked else (solved, ())
-
-    def _before(self, scenario: Scenario, learned: Learned) -> Solved | None:
-        """The motion of the task that was shown last; None where it was not learned alike."""
-        shown = self._shown.get(scenario.task)
-        return shown.newest if shown and shown.newest.nominal.learned is learned else None
 
     def _stages(self, scenario: Scenario, cancelled: Cancelled) -> Iterator[Frame]:
         with _cores.slot():
@@ -263,7 +252,7 @@ class Engine:
             frame = self._with_arm(first, live, LIVE)
             frame = replace(frame, stage=Stage.LIVE, pictures=self._pictures(scenario, live, coarse=True))
             frame = self._compared(frame)
-            self._shown[scenario.task] = _Shown(frame, live, live)
+            self._shown[scenario.task] = frame, live
         yield frame
         with _cores.slot(cancelled):
             fine = self.solved(scenario, FINE)
@@ -273,11 +262,11 @@ class Engine:
             frame = self._compared(replace(frame, blocked=fine.blocked))
             if scenario.view.health_plots and frame.chosen is not None:
                 frame = replace(frame, profiles=compose.profiles(frame, fine, frame.chosen, self.follower))
-            self._shown[scenario.task] = _Shown(frame, fine, live)
+            self._shown[scenario.task] = frame, fine
         self._yielded = fine
         yield frame
         with _cores.slot(cancelled):
-            key = scenario.plain
+            key = scenario.plain, scenario.passing
             certificates = self.memo("certificates", key, lambda: certify(frame, fine, self.follower), newest=1)
         if frame.arm is not None:
             with _cores.slot(cancelled):
@@ -316,7 +305,7 @@ class Engine:
         """The frame of stage ROLLOUTS."""
         frame = self.memo(
             "rollouts",
-            (scenario.plain, precision),
+            (scenario.plain, scenario.passing, precision),
             lambda: compose.rollouts_frame(scenario, solved, self.follower),
             newest=2,
         )
@@ -326,22 +315,13 @@ class Engine:
         """The frame of stage ROLLOUTS, with the arm; at LIVE with its motion only if that is drawn."""
         scenario = frame.scenario
         moves = precision is not LIVE or scenario.view.shows_arm_motion
-        before = self._joints_before(scenario, solved, precision)
         with_arm = self.memo(
             "arm",
-            (scenario.plain, precision, moves),
-            lambda: compose.with_arm(frame, solved, self.follower, before, moves=moves),
+            (scenario.plain, scenario.passing, precision, moves),
+            lambda: compose.with_arm(frame, solved, self.follower, moves=moves),
             newest=2,
         )
         return replace(with_arm, scenario=scenario, level=frame.level)
-
-    def _joints_before(self, scenario: Scenario, solved: Solved, precision: Precision) -> Array | None:
-        """Joints that were shown last along the same rollout, to begin from at LIVE; None where there are none."""
-        shown = self._shown.get(scenario.task)
-        if precision is not LIVE or shown is None or shown.frame.arm is None or shown.newest.arm is not None:
-            return None
-        same_learned = shown.newest.nominal.learned is solved.nominal.learned
-        return shown.frame.arm.q if same_learned and shown.frame.scenario.arm_rollout == scenario.arm_rollout else None
 
     def _pictures(self, scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
         others = {panel.shown: self._imitated(panel).learned for panel in scenario.view.panels if panel.shown}
@@ -388,11 +368,10 @@ class Engine:
         if scenario.task not in self._shown:
             undisturbed = self._stages(replace(scenario, stack=_without_obstacles(scenario.stack)), cancelled)
             next(frame for frame in undisturbed if frame.stage is Stage.FINE)
-        shown = self._shown[scenario.task]
-        good, solved = shown.frame, shown.newest
+        good, solved = self._shown[scenario.task]
         if good.arm is None and good.stage is Stage.LIVE:
             good = compose.with_arm(good, solved, self.follower)
-            self._shown[scenario.task] = replace(shown, frame=good)
+            self._shown[scenario.task] = good, solved
         seen = replace(good.scenario, view=scenario.view)
         changed = not seen.computes_like(good.scenario)
         good = replace(good, level=compose.level_of(seen, solved.stack))

@@ -15,6 +15,7 @@ from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.passing import ANEW, Passing
 from dt_viz.warning import MotionWarning
 
 
@@ -106,6 +107,8 @@ class Frame:
     """Values that each layer of `Scenario.stack` chose automatically, by its fields; none where it is off."""
     arm_duration: float | None = None
     """t of the flow by which the whole arm avoids, under a warp that of the full one; None where it does not."""
+    passing: Passing = ANEW
+    """How its motions pass the obstacles, for a scenario that goes on from it."""
     level: int | None = None
     """Index in `levels` of the manifold that the view and the pictures show; None is the top of the stack."""
     arm: ArmMotion | None = None

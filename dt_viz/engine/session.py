@@ -21,6 +21,7 @@ from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.passing import ANEW
 
 logger = logging.getLogger(__name__)
 
@@ -113,6 +114,8 @@ class Session:
         """Whether the last computation ended by an error, so that what is shown is not all that the scenario asks for.
         """
         self._shown: Scenario | None = None
+        self._passing = ANEW
+        """How the motions that are shown pass the obstacles."""
         self._latency = 0.0
         self._live_frames: deque[float] = deque(maxlen=120)
         self._worker = LatestWorker[_Job](self._compute, display.fail, name="session")
@@ -136,6 +139,8 @@ class Session:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
             if edited == self.scenario and not self._failed:
                 return
+            if not edited.passes_like(self.scenario):
+                edited = replace(edited, passing=changes.get("passing"))
             if _is_step(edited, self.scenario):
                 name, when = self._gesture
                 # another control is moved, so whatever was held has been let go, even if nobody said so
@@ -211,7 +216,8 @@ class Session:
         self._begin("load", self._as_seen(scenario(self._engine.task(task))))
 
     def _begin(self, gesture: str, fresh: Scenario) -> None:
-        self.edit(gesture, **{name: getattr(fresh, name) for name in fresh.__dataclass_fields__})
+        fields = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__}
+        self.edit(gesture, **fields | {"passing": ANEW})
         self.end_gesture()
 
     def _as_seen(self, other: Scenario) -> Scenario:
@@ -328,15 +334,27 @@ class Session:
             self._learning = True
         self._display.learning(fraction, message)
 
+    def _decided(self, scenario: Scenario) -> Scenario:
+        """The scenario, whose motions go on passing obstacles as those that are shown do, if that is still open."""
+        if scenario.passing is not None:
+            return scenario
+        shown = self._shown
+        alike = shown is not None and scenario.learned_like(shown)
+        decided = replace(scenario, passing=self._passing if alike else ANEW)
+        with self._lock:
+            if self.scenario == scenario:
+                self.scenario = replace(self.scenario, passing=decided.passing)
+        return decided
+
     def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
-        scenario, edited = job
+        scenario, edited = self._decided(job[0]), job[1]
         self._catch_up()
         for frame in self._engine.frames(scenario, partial(self._learn, scenario), superseded):
             now = time.perf_counter()
             if self._learning:
                 edited = now - frame.seconds  # learning is no rebuild
             drawn = self._shown is not None and scenario.moves_like(self._shown)
-            self._learning, self._shown = False, scenario
+            self._learning, self._shown, self._passing = False, scenario, frame.passing
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
             if frame.stage <= Stage.LIVE:

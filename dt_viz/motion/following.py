@@ -17,12 +17,13 @@ from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, 
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
-from dt_viz.motion.nominal import Learned, Nominal, Stance, Strand
+from dt_viz.motion.nominal import Learned, Nominal, Strand
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.base import ArmAvoidance, start_warnings
+from dt_viz.transforms.passing import Stance
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 BY_FRACTION = 0.3
@@ -117,15 +118,14 @@ class Follower:
         """
         return self._demonstrated(nominal.learned, nominal.stance).reference
 
-    def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool, before: Lift | None = None) -> Lift:
+    def behaving(self, nominal: Nominal, solution: Solution, *, exact: bool) -> Lift:
         """The joints along the motion with the behaviours of the end effector.
 
         Args:
             nominal: what it begins from.
             solution: that motion.
-            exact: whether the end effector is on that motion between the samples, too, and `before` plays no part; else
-                it may be off by millimetres where the stack stretches space.
-            before: joints along nearby rollouts to begin from.
+            exact: whether the end effector is on that motion between the samples, too; else it may be off by
+                millimetres where the stack stretches space.
         """
         samples, drawn = np.linspace(0, 1, NUM_CONFIGURATIONS), []
         for path, fractions in zip(solution.bundle.paths, solution.bundle.split(solution.bundle.fraction), strict=True):
@@ -137,10 +137,8 @@ class Follower:
         if exact:
             index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
             paths = solution.positions_at(index, fraction.ravel()).reshape(paths.shape)
-        reference, initial = self.reference(nominal), None
-        if before is not None and not exact and len(before.tracked.q) == len(paths):  # else starts have come or gone
-            same = np.array_equal(before.reference, reference)
-            initial = before.tracked.q if same else None  # those of another stance may lie on another branch
+        reference = self.reference(nominal)
+        initial = None if exact else self.undisturbed(nominal).tracked.q  # for the eye it does to begin from there
         lifted = replace(lift(self.robot, fraction, paths, reference, initial), num_guests=nominal.num_added)
         if not exact:
             return lifted
@@ -150,29 +148,28 @@ class Follower:
 
         return replace(lifted, exactly=exactly)
 
-    def along(self, nominal: Nominal, path: Array, before: Array | None = None) -> JointPath:
+    def along(self, nominal: Nominal, path: Array) -> JointPath:
         """The joints along one path (T, 3) of the end effector, metres.
 
         Args:
             nominal: the motion whose posture the arm stays near to.
             path: where the end effector goes.
-            before: (T, 6) joints along a nearby path to begin from, rad.
         """
-        return track(self.robot, path, self.reference(nominal), before)
+        return track(self.robot, path, self.reference(nominal))
 
     def admission(
-        self, nominal: Nominal, avoidance: ArmAvoidance, before: Stance | None = None, *, keeps: bool = False
+        self, nominal: Nominal, avoidance: ArmAvoidance, stance: Stance | None = None, *, keeps: bool = False
     ) -> Admission:
         """Whether the whole arm can move around what it avoids, from which starts, and in which stance.
 
         Args:
             nominal: all rollouts.
             avoidance: what is to be avoided.
-            before: the stance where the obstacle was just before, which is kept while none leaves more starts free;
-                None is the usual one.
-            keeps: whether `before` is kept while it leaves the goal and any start free.
+            stance: that where the obstacle was just before, which is kept while none leaves more starts free; None is
+                the usual one.
+            keeps: whether it is kept while it leaves the goal and any start free.
         """
-        asked = avoidance.obstacle, avoidance.margin, before, keeps
+        asked = avoidance.obstacle, avoidance.margin, stance, keeps
         return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=2)
 
     def alternatives(self, nominal: Nominal, avoidance: ArmAvoidance) -> Iterator[Nominal]:
@@ -185,12 +182,12 @@ class Follower:
             yield self._standing(nominal, stance)
 
     def _admission(
-        self, nominal: Nominal, obstacle: Union, margin: float, before: Stance | None, keeps: bool
+        self, nominal: Nominal, obstacle: Union, margin: float, last: Stance | None, keeps: bool
     ) -> Admission:
         blocked = self._unreached(nominal.learned) or self._pedestal_touched(nominal.learned, obstacle)
         if blocked:
             return Admission(nominal, blocked)
-        stance, free = next(self._stances(nominal.learned, obstacle, margin, before, keeps=keeps))
+        stance, free = next(self._stances(nominal.learned, obstacle, margin, last, keeps=keeps))
         if not free[-1]:
             text = "the goal is inside the obstacle: the arm there touches it"
             return Admission(nominal, (MotionWarning(Kind.GOAL_COVERED, text, ARM),))
@@ -231,25 +228,25 @@ class Follower:
         return ()
 
     def _stances(
-        self, learned: Learned, obstacle: Union, margin: float, before: Stance | None, *, keeps: bool
+        self, learned: Learned, obstacle: Union, margin: float, last: Stance | None, *, keeps: bool
     ) -> Iterator[tuple[Stance | None, Mask]]:
         """The stances with most room at the task's starts and goal, the best first: the usual one where it has enough.
 
-        But the stance `before`, if it is not the usual one, comes before all that leave no more starts free; where it
+        But the stance `last`, if it is not the usual one, comes before all that leave no more starts free; where it
         is kept, before all, if it leaves the goal and any start free.
 
         Yields:
             A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
         """
-        if keeps and before is not None:
-            free = self.whole_arm.clearance(self._demonstrated(learned, before).pins, obstacle) >= 0
+        if keeps and last is not None:
+            free = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle) >= 0
             if free[-1] and free[:-1].any():
-                yield before, free
+                yield last, free
         usual, asked = self._demonstrated(learned), max(margin - OVERSHOOT, 0.0)
         near = self.whole_arm.clearance(usual.pins, obstacle)
         enough = bool((near >= asked).all())
         room = near if enough else self._true_room(usual.pins, obstacle, near, margin)
-        if before is None and (enough or (room >= margin).all() or (keeps and room[-1] >= 0 and room[:-1].max() >= 0)):
+        if last is None and (enough or (room >= margin).all() or (keeps and room[-1] >= 0 and room[:-1].max() >= 0)):
             yield None, room >= 0
         known = self.stances(learned)
         clearance = known.room(obstacle)  # of the spheres, which are larger than the arm
@@ -257,11 +254,11 @@ class Follower:
         free[0], ample[0] = room >= 0, room >= margin
         # the goal first, then as many starts as possible, then as much room as is asked for
         most = free[:, -1] * free.shape[1] + free.sum(axis=1)
-        kept = np.zeros(len(free), bool) if before is None else (known.references == before).all(axis=1)
-        left = ~known.alike(0) if before is None and ample[0].all() else np.ones(len(free), bool)
+        kept = np.zeros(len(free), bool) if last is None else (known.references == last).all(axis=1)
+        left = ~known.alike(0) if last is None and ample[0].all() else np.ones(len(free), bool)
         if kept.any() and most[kept].max() == most.max():  # the rest is looked at only where this one does not do
             best = int(np.argmax(kept))
-            yield before, free[best]
+            yield last, free[best]
             left &= ~known.alike(best)
         merit = [most, kept, ample.sum(axis=1), -known.cost(obstacle, asked)]
         for best in np.lexsort(merit[::-1])[::-1]:

@@ -17,12 +17,11 @@ from dt_viz.learning.choice import AnyImitation
 from dt_viz.memo import Memo
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
+from dt_viz.transforms.passing import Stance
 from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
 """Samples of each rollout before refinement: from the task's starts, and from added ones."""
-Stance = tuple[float, float, float, float, float, float]
-"""Posture that the arm stays near to along all rollouts: six joint angles, rad."""
 MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
 """Steps towards the images of moved ends, and metres by which they may miss."""
 

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
 
 from dt_viz.arm.whole_arm import ArmSolution, Lift
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
-from dt_viz.obstacles.ways import remembered, travel
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.transforms.base import start_warnings
+from dt_viz.transforms.passing import ANEW, Passing
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 NUM_ALTERNATIVES = 3
@@ -40,6 +41,8 @@ class Solved:
     """Joints along the stack's motion, which the arm's avoidance is made for; None where there is none."""
     blocked: tuple[MotionWarning, ...] = ()
     """Why there is no motion to show, though its ends are free; empty where there is one."""
+    passing: Passing = ANEW
+    """How it passes the obstacles, under a warp as it does in full."""
 
     @property
     def cleared(self) -> bool:
@@ -54,46 +57,43 @@ class Solved:
         return np.concatenate([self.nominal.starts, [goal + self.scenario.warp * moved]])
 
 
-def solve(
-    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, before: Solved | None = None
-) -> Solved:
+def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower) -> Solved:
     """The motion of a scenario, every flow run for its full duration.
 
     Args:
-        scenario: whose stack it is; its `warp` is left to `warped`.
+        scenario: whose stack it is; its `warp` is left to `warped`. Sides on which the motions of its `passing` pass
+            obstacles are kept while these are dragged.
         nominal: the undisturbed motion, from starts that the arm can begin at. Where the arm finds no way, that of the
             result has another stance, or lacks the starts that have none.
         precision: how exactly.
         follower: the arm.
-        before: the motion that was shown last, of the same learned motion. The sides on which it passes obstacles are
-            kept while they do; and joints of LIVE are looked for from its own, which changes the result by less than a
-            milliradian.
 
     Raises:
         UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
     """
     scenario, avoidance = replace(scenario, warp=1.0), scenario.arm_avoidance
     if avoidance is None or avoidance.duration is not None:
-        return _solved(scenario, nominal, precision, follower, before)
-    if precision is LIVE and before is not None and _is_dragged(scenario, before):
-        return _solved(scenario, _as_many(nominal, before), precision, follower, before, follows=True)
-    solved = _with_a_way(scenario, nominal, follower, before)
+        return _solved(scenario, nominal, precision, follower)
+    passing = scenario.passing or ANEW
+    if precision is LIVE and passing.follows(avoidance.obstacle.parts):
+        return _solved(scenario, _as_many(nominal, passing), precision, follower, follows=True)
+    solved = _with_a_way(scenario, nominal, follower)
     if precision is not LIVE:
-        solved = _solved(scenario, solved.nominal, precision, follower, before)
+        solved = _solved(scenario, solved.nominal, precision, follower)
     return _unless_it_touches(solved, follower)
 
 
-def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower, before: Solved | None) -> Solved:
+def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower) -> Solved:
     """The motion at LIVE, in another stance or without the starts that have no way, where it finds none otherwise.
 
     The same choice serves each precision: it is quick at this one. A stance is also changed where the way is long,
     but not while an obstacle is dragged.
     """
-    solved, avoidance = _solved(scenario, nominal, LIVE, follower, before), scenario.arm_avoidance
+    solved, avoidance = _solved(scenario, nominal, LIVE, follower), scenario.arm_avoidance
     if avoidance is None or solved.arm is None or solved.arm.soon:
         return solved
     for other in islice(follower.alternatives(nominal, avoidance), NUM_ALTERNATIVES):
-        tried = _solved(scenario, other, LIVE, follower, before)
+        tried = _solved(scenario, other, LIVE, follower)
         if tried.arm is not None and (tried.arm.soon if solved.cleared else tried.cleared):
             return tried
     if solved.cleared:
@@ -101,10 +101,16 @@ def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower, before
     others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
     if not (others < nominal.num_hosts).any():
         return solved
-    numbers, how = np.array(nominal.numbers), "without a way around the obstacle for the arm"
-    told = start_warnings(numbers[solved.arm.stuck], nominal.num_demonstrated, Kind.START_COVERED, how)
-    tried = _solved(scenario, nominal.only(others, (*nominal.warnings, *told)), LIVE, follower, before)
+    tried = _solved(scenario, _only(nominal, others), LIVE, follower)
     return tried if tried.cleared else solved
+
+
+def _only(nominal: Nominal, rollouts: Sequence[int] | Indices) -> Nominal:
+    """The motion from some of its starts; of the others it is said that the arm has no way from them."""
+    without = np.delete(np.array(nominal.numbers), rollouts)
+    how = "without a way around the obstacle for the arm"
+    said = start_warnings(without, nominal.num_demonstrated, Kind.START_COVERED, how)
+    return nominal.only(rollouts, (*nominal.warnings, *said))
 
 
 def _unless_it_touches(solved: Solved, follower: Follower) -> Solved:
@@ -118,62 +124,37 @@ def _unless_it_touches(solved: Solved, follower: Follower) -> Solved:
     return replace(solved, blocked=(MotionWarning(Kind.NO_WAY, text, ARM),))
 
 
-def goes_on(scenario: Scenario, before: Solved) -> bool:
-    """Whether the arm was avoiding an obstacle that is hardly anywhere else now."""
-    if before.arm is None or scenario.arm_avoidance is None:
-        return False
-    return any(remembered(before.arm.ways, scenario.arm_avoidance.obstacle.parts))
-
-
-def _is_dragged(scenario: Scenario, before: Solved) -> bool:
-    """Whether an obstacle that the arm was avoiding has moved a little since."""
-    if not goes_on(scenario, before) or before.arm is None or scenario.arm_avoidance is None:
-        return False
-    parts = scenario.arm_avoidance.obstacle.parts
-    known = zip(remembered(before.arm.ways, parts), parts, strict=True)
-    return any(way is not None and travel(way.obstacle, part) > 0 for way, part in known)
-
-
-def _as_many(nominal: Nominal, before: Solved) -> Nominal:
-    """The motion without the starts that had no way before, if any others are left."""
-    without = set(before.nominal.left_out) - set(nominal.left_out)
-    kept = [k for k, number in enumerate(nominal.numbers) if number not in without]
-    if not without or not kept or before.nominal.stance != nominal.stance:
+def _as_many(nominal: Nominal, passing: Passing) -> Nominal:
+    """The motion without the starts that had no way just before, if any others are left."""
+    kept = [k for k, number in enumerate(nominal.numbers) if number not in passing.left_out]
+    if len(kept) == len(nominal.numbers) or not kept or passing.stance != nominal.stance:
         return nominal
-    return nominal.only(kept, before.nominal.warnings)
+    return _only(nominal, kept)
 
 
 def _solved(
-    scenario: Scenario,
-    nominal: Nominal,
-    precision: Precision,
-    follower: Follower,
-    before: Solved | None = None,
-    *,
-    follows: bool = False,
+    scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower, *, follows: bool = False
 ) -> Solved:
-    """The motion in the stance of `nominal`, see `solve`; `follows` is whether it goes on from that before."""
-    stack = build_stack(nominal, scenario.active, precision, before and before.stack)
+    """The motion in the stance of `nominal`, see `solve`; `follows` is whether it goes on in a drag."""
+    passing = scenario.passing or ANEW
+    stack = build_stack(nominal, scenario.active, precision, passing)
     avoidance = scenario.arm_avoidance
+    hand = {applied.place: applied.made.ways for applied in stack.built if any(applied.made.ways)}
     if avoidance is None:
-        return Solved(scenario, nominal, nominal, stack)
+        passed = Passing(hand, stance=nominal.stance, left_out=nominal.left_out)
+        return Solved(scenario, nominal, nominal, stack, passing=passed)
     live = precision is LIVE
-    if stack.built:
-        joints = None if before is None else before.lifted
-        lifted = follower.behaving(nominal, stack, exact=not live, before=joints)
+    lifted = follower.behaving(nominal, stack, exact=not live) if stack.built else follower.undisturbed(nominal)
+    arm, spacing = follower.whole_arm, precision.spacing
+    if follows:
+        solution = arm.followed(lifted, avoidance, spacing, passing)
     else:
-        lifted = follower.undisturbed(nominal)
-    spacing, last = precision.spacing, None if before is None else before.arm
-    if follows and last is not None:
-        arm = follower.whole_arm.followed(lifted, avoidance, spacing, last)
-    else:
-        arm = follower.whole_arm.avoiding(lifted, avoidance, spacing, coarse=live, before=last)
-    return Solved(scenario, nominal, nominal, stack, arm, lifted)
+        solution = arm.avoiding(lifted, avoidance, spacing, coarse=live, passing=passing)
+    passed = Passing(hand, solution.ways, solution.duration, solution.cleared, nominal.stance, nominal.left_out)
+    return Solved(scenario, nominal, nominal, stack, solution, lifted, passing=passed)
 
 
-def warped(
-    full: Solved, below: Nominal, fraction: float, precision: Precision, follower: Follower, before: Lift | None = None
-) -> Solved:
+def warped(full: Solved, below: Nominal, fraction: float, precision: Precision, follower: Follower) -> Solved:
     """The motion with every flow run for a fraction of its duration: straight to the goal at 0, in full at 1.
 
     Args:
@@ -182,7 +163,6 @@ def warped(
         fraction: s, from 0 to 1.
         precision: how exactly.
         follower: the arm.
-        before: joints to look for those of LIVE from, as shown last.
 
     Raises:
         UnreachableError: as `solve`.
@@ -190,7 +170,7 @@ def warped(
     stack, scenario = warped_stack(below, full.stack, fraction, precision), replace(full.scenario, warp=fraction)
     avoidance = scenario.arm_avoidance
     if full.arm is None or avoidance is None:
-        return Solved(scenario, full.nominal, below, stack)
-    lifted = follower.behaving(full.nominal, stack, exact=precision is not LIVE, before=before)
+        return Solved(scenario, full.nominal, below, stack, passing=full.passing)
+    lifted = follower.behaving(full.nominal, stack, exact=precision is not LIVE)
     arm = follower.whole_arm.warped(full.arm, lifted, avoidance, fraction, precision.spacing)
-    return Solved(scenario, full.nominal, below, stack, arm, lifted)
+    return Solved(scenario, full.nominal, below, stack, arm, lifted, passing=full.passing)

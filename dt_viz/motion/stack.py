@@ -17,6 +17,7 @@ from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.ways import Way
 from dt_viz.scenario.scenario import Layer
 from dt_viz.transforms.base import Built, MotionBelow, Transform
+from dt_viz.transforms.passing import ANEW, Passing
 from dt_viz.warning import MotionWarning
 
 MAX_ATTEMPTS = 4
@@ -127,7 +128,7 @@ def climb(positions: Array, transforms: Sequence[Diffeomorphism]) -> Array:
 
 
 def build_stack(
-    nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision: Precision, before: Solution | None = None
+    nominal: Nominal, layers: Sequence[tuple[int, Layer]], precision: Precision, passing: Passing = ANEW
 ) -> Solution:
     """Build the transforms for the motion below them, and the exact rollouts of the whole stack.
 
@@ -139,10 +140,9 @@ def build_stack(
         nominal: the undisturbed motion.
         layers: those that act, from the inside out, each with its place in the whole stack; see `Scenario.active`.
         precision: how exactly.
-        before: the stack as it was just before: motions keep the sides on which they pass obstacles.
+        passing: sides on which motions go on to pass obstacles while these are dragged.
     """
-    known = [before and before.at(place) for place, _ in layers]
-    ways = [applied.made.ways if applied else () for applied in known]
+    ways = [passing.hand.get(place, ()) for place, _ in layers]
     solution, places = None, nominal.learned.places
     for keeps_goal in (True, False):
         rays, bundle = nominal.rays, nominal.bundle
@@ -192,9 +192,9 @@ def _build(
     """Each layer's transform, with the motion that it was made for."""
     built: list[tuple[MotionBelow, Built]] = []
     targets: list[Point] = []
-    for (_, layer), last, outer, before in zip(layers, earlier, above, ways, strict=True):
+    for (_, layer), last, outer, known in zip(layers, earlier, above, ways, strict=True):
         told = {"name": layer.name, "earlier": last, "above": outer, "targets": tuple(targets)}
-        motion = replace(motion, **told, before=before)
+        motion = replace(motion, **told, ways=known)
         made = layer.transform.build(motion)
         built.append((motion, made))
         if layer.transform.anchor is not None:

@@ -14,6 +14,7 @@ from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.base import ArmAvoidance, Transform
+from dt_viz.transforms.passing import Passing
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
 """Quantity shown as colour on the slice: det J of the stack, its Lyapunov value, or the learned occupancy."""
@@ -132,7 +133,7 @@ AVOIDING = (Layer(Avoidance(space="cspace"), name=Avoidance.title),)
 
 @dataclass(frozen=True)
 class Scenario:
-    """All choices that a frame depends on: equal scenarios give equal frames."""
+    """All choices that a frame depends on: scenarios that are equal and have one passing give equal frames."""
 
     task: str
     stack: tuple[Layer, ...] = AVOIDING
@@ -156,6 +157,8 @@ class Scenario:
     scene: str = ""
     """Name of the paper's scene that it began as, if any."""
     view: View = field(default_factory=View)
+    passing: Passing | None = field(default=None, compare=False)
+    """How the motions pass that these go on from while an obstacle is dragged; None where that is not decided yet."""
 
     @cached_property
     def active(self) -> tuple[tuple[int, Layer], ...]:
@@ -214,9 +217,18 @@ class Scenario:
         """Return whether both give the same motion, however it is viewed."""
         return replace(self, view=other.view) == other
 
+    def passes_like(self, other: Scenario) -> bool:
+        """Return whether both give the same motion when every flow has run for its full duration."""
+        return replace(self.motion, warp=1.0) == replace(other.motion, warp=1.0)
+
     def learns_like(self, other: Scenario) -> bool:
         """Return whether both need the same fit."""
         return (self.task, self.objective, self.state) == (other.task, other.objective, other.state)
+
+    def learned_like(self, other: Scenario) -> bool:
+        """Return whether what transforms are stacked on is the same."""
+        mine, theirs = ((s.imitation, s.style, s.style_amount) for s in (self, other))
+        return self.learns_like(other) and mine == theirs
 
     def begins_like(self, other: Scenario) -> bool:
         """Return whether both have the same task, fit and scene, so that one is a small edit of the other."""

@@ -262,7 +262,7 @@ class Avoidance(Transform):
         if self.generator == "probability":
             return tuple(ways), (), motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
-        known = remembered(motion.before if plane is None else (), self.obstacles)
+        known = remembered(motion.ways if plane is None else (), self.obstacles)
         margin = self._kept_margin(motion.demonstrated)
         left = math.inf if self.duration is None else self.duration
         for k, (obstacle, before) in enumerate(zip(self.obstacles, known, strict=True)):

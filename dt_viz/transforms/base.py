@@ -55,8 +55,8 @@ class MotionBelow:
     """Number of rollouts, the first ones, that have a demonstration; None is all. The others begin anywhere."""
     targets: tuple[Point, ...] = ()
     """Places that transforms further down lead the motions to, metres."""
-    before: tuple[Way | None, ...] = ()
-    """Ways out of obstacles that motions took with the transform as it was just before."""
+    ways: tuple[Way | None, ...] = ()
+    """Ways out of the transform's obstacles that motions go on with; see `dt_viz.transforms.passing`."""
     gradual: bool = False
     """Whether these turn to where they are to be as the obstacles move on; else they are there at once."""
 

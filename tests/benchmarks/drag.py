@@ -50,6 +50,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import Task
 from dt_viz.transforms.avoidance import Avoidance, Space
+from dt_viz.transforms.passing import ANEW
 
 SPACE: Mapping[str, Space] = {"hand": "task", "arm": "cspace"}
 """Spaces of the avoidance."""
@@ -130,14 +131,15 @@ def _measured(engine: Engine, task: Task, places: Array, options: argparse.Names
     """Drag the sphere through places (S, 3), metres."""
     without = replace(avoiding(task, Avoidance()), view=View(field=False))
     rollouts = [_by_number(next(engine.frames(without)), range(len(task.paths)), task)]
-    blocked, seconds = [], []
+    blocked, seconds, passing = [], [], ANEW
     for place in places:
         avoidance = Avoidance(Sphere(as_point(place), options.diameter), space=SPACE[options.avoid])
-        scenario = replace(avoiding(task, avoidance), view=View(field=False))
+        scenario = replace(avoiding(task, avoidance), view=View(field=False), passing=passing)
         frames = engine.frames(scenario)
         first = frame = next(frames)
         while frame.stage < Stage.LIVE:
             frame = next(frames)
+        passing = frame.passing
         blocked.append(bool(frame.blocked))
         seconds.append(first.seconds)
         numbers = [] if frame.blocked else engine.solved(scenario, LIVE).nominal.numbers

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
@@ -25,6 +25,7 @@ from dt_viz.scenario.stack import IMITATION, with_added, without
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.transforms.bias import BiasPoint
+from dt_viz.transforms.passing import ANEW, Passing
 
 PATIENCE = 30.0
 
@@ -35,6 +36,7 @@ class Sketch:
 
     scenario: Scenario
     stage: Stage
+    passing: Passing = field(default_factory=Passing, compare=False)
 
 
 class FakeEngine:
@@ -152,6 +154,72 @@ def in_scene(opened):
     opened.scene = SCENES["cloud"].scenario(task)
     opened.session.load("draw_s", SCENES["cloud"].scenario)
     return opened
+
+
+class TestPassing:
+    """Sides on which motions pass obstacles belong to the scenario: decided when it is computed, undone with it."""
+
+    def test_motions_go_on_from_those_that_are_shown_and_a_view_keeps_what_is_decided(self, opened):
+        assert opened.shown.passing is ANEW
+        shown = opened.page.frames[-1].passing
+        opened.edit("drag", obstacles=at(0.1))
+        opened.settle()
+        assert opened.shown.passing is opened.session.scenario.passing is shown
+        opened.session.edit("view", view=View(grid=True))
+        opened.settle()
+        assert opened.shown.view.grid and opened.shown.passing is shown
+        opened.session.edit("warp", warp=0.5)
+        opened.settle()
+        assert opened.shown.warp == 0.5 and opened.shown.passing is shown
+
+    def test_undo_and_redo_bring_them_back(self, opened):
+        decided = [opened.session.scenario.passing]
+        for x in (0.1, 0.2, 0.3):
+            opened.edit(f"drag {x}", obstacles=at(x))
+            opened.settle()
+            decided.append(opened.shown.passing)
+        assert len(set(map(id, decided))) == 4
+        for passing in decided[-2::-1]:
+            opened.session.undo()
+            opened.settle()
+            assert opened.shown.passing is passing
+        for passing in decided[1:]:
+            opened.session.redo()
+            opened.settle()
+            assert opened.shown.passing is passing
+
+    @pytest.mark.parametrize("begin", ["reset", "task", "imitation", "load"])
+    def test_another_motion_and_a_beginning_choose_anew(self, opened, begin):
+        opened.engine.task = lambda name: TASKS[name]()
+        opened.edit("drag", obstacles=at(0.1))
+        opened.settle()
+        assert opened.shown.passing is not ANEW
+        if begin == "reset":
+            opened.session.reset()
+        elif begin == "task":
+            opened.session.choose_task("draw_j")
+        elif begin == "load":
+            opened.session.load("draw_s", lambda _: replace(fresh("draw_s"), passing=Passing(duration=1.0)))
+        else:
+            opened.session.edit("imitation", imitation=False)
+        opened.settle()
+        assert opened.shown.passing is ANEW is opened.session.scenario.passing
+
+    def test_edits_that_are_overtaken_leave_the_decision_to_the_last_one(self, opened):
+        shown = opened.page.frames[-1].passing
+        opened.engine.gate = threading.Event()
+        opened.engine.begun.clear()
+        opened.edit("drag", obstacles=at(0.1))
+        assert opened.engine.begun.wait(PATIENCE)
+        for x in (0.2, 0.3):
+            opened.edit("drag", obstacles=at(x))
+        assert opened.session.scenario.passing is None
+        opened.engine.gate.set()
+        opened.settle()
+        last = opened.page.frames[-1].scenario
+        assert last.obstacles == (at(0.3),) and last.passing is not shown
+        drawn = [frame for frame in opened.page.frames if frame.scenario.obstacles == (at(0.1),)]
+        assert last.passing is drawn[-1].passing
 
 
 def at(x):

@@ -1,5 +1,6 @@
 """Obstacles that are dragged through motions: what is remembered from one frame to the next, and what is left of it."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,13 +13,14 @@ from dt_viz.arm.whole_arm import DURATION_CHANGE
 from dt_viz.engine.frame import Stage
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.following import Follower
-from dt_viz.motion.solve import goes_on, solve
+from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.obstacles.ways import TURNING
 from dt_viz.scenario.scenario import View
 from dt_viz.transforms.base import ArmAvoidance
+from dt_viz.transforms.passing import ANEW
 
 DIAMETER = 0.15
 """Diameter of the dragged ball, metres."""
@@ -32,6 +34,15 @@ DRAGS = {
     ("draw_s", "task"): ((0.0908, -0.5029, 0.2338), (0.74, 0.54, -0.40), 0.042),
     ("push_box", "cspace"): ((0.2340, -0.4880, 0.1777), (-0.72, -0.42, 0.55), 0.056),
 }
+
+
+def dragged(engine, scenarios):
+    """The frames of stage LIVE of scenarios, each of which goes on from the one before."""
+    frames, passing = [], ANEW
+    for scenario in scenarios:
+        frames.append(frame_at(engine, replace(scenario, passing=passing), Stage.LIVE))
+        passing = frames[-1].passing
+    return frames
 
 
 class Drag:
@@ -49,7 +60,7 @@ class Drag:
 
     def dragged(self, engine, offsets):
         """The frames of stage LIVE of an engine."""
-        return [frame_at(engine, self.at(offset), Stage.LIVE) for offset in offsets]
+        return dragged(engine, [self.at(offset) for offset in offsets])
 
 
 ONE_SLOW = [("draw_s", "task"), pytest.param(("push_box", "cspace"), marks=pytest.mark.slow)]
@@ -93,7 +104,7 @@ def test_no_motion_jumps_where_a_drag_goes_on(drag, new_engine):
 def test_no_motion_jumps_where_an_obstacle_comes_over_starts(task, begin, end, initial, new_engine):
     engine, scenario = new_engine(), changed(initial(task), space="task", view=NOTHING_DRAWN)
     balls = [Sphere(as_point(place), DIAMETER) for place in np.linspace(begin, end, 14)]
-    frames = [frame_at(engine, changed(scenario, obstacles=ball), Stage.LIVE) for ball in balls]
+    frames = dragged(engine, [changed(scenario, obstacles=ball) for ball in balls])
     assert largest_step(frames) < JUMP
 
 
@@ -102,8 +113,8 @@ def test_sides_are_kept_at_rest_and_do_not_depend_on_the_steps(drag, new_engine)
     rested = []
     for num in (4, 8):
         engine = new_engine()
-        drag.dragged(engine, np.linspace(-0.012, 0.004, num))
-        live, fine = (engine.solved(drag.at(0.004), precision) for precision in (LIVE, FINE))
+        last = drag.dragged(engine, np.linspace(-0.012, 0.004, num))[-1]
+        live, fine = (engine.solved(last.scenario, precision) for precision in (LIVE, FINE))
         assert ways(fine).kept and ways(fine).direction is ways(fine).side
         assert ways(fine).side @ ways(live).side > 0.9
         rested.append(ways(fine))
@@ -113,8 +124,8 @@ def test_sides_are_kept_at_rest_and_do_not_depend_on_the_steps(drag, new_engine)
 
 def test_a_change_of_sides_is_complete_at_rest(drag, new_engine):
     engine, fresh = new_engine(), new_engine()
-    drag.dragged(engine, np.linspace(-0.012, drag.beyond, 10))
-    rested, alone = (ways(e.solved(drag.at(drag.beyond), FINE)) for e in (engine, fresh))
+    last = drag.dragged(engine, np.linspace(-0.012, drag.beyond, 10))[-1]
+    rested, alone = ways(engine.solved(last.scenario, FINE)), ways(fresh.solved(drag.at(drag.beyond), FINE))
     assert rested.side @ alone.side > 0.999
 
 
@@ -127,6 +138,30 @@ def test_where_nothing_was_dragged_nothing_is_remembered(drag, new_engine):
     np.testing.assert_array_equal(shown.stack.bundle.positions, alone.stack.bundle.positions)
     if shown.arm is not None and alone.arm is not None:
         np.testing.assert_array_equal(shown.arm.p, alone.arm.p)
+
+
+@pytest.mark.parametrize("drag", ONE_SLOW, indirect=True, ids=str)
+def test_a_scenario_with_its_passing_gives_one_motion_after_any_history_and_on_any_thread(drag, new_engine, initial):
+    rng, used = np.random.default_rng(1), new_engine()
+    wanted = drag.dragged(used, np.arange(-0.005, 0.004, 0.001))[-1].scenario
+    passing = ANEW
+    for _ in range(12):
+        task = str(rng.choice(["draw_s", "push_box"]))
+        ball = Sphere(as_point(used.task(task).mean_path[50] + rng.normal(size=3) * 0.05), rng.uniform(0.08, 0.2))
+        other = changed(initial(task), obstacles=ball, space=str(rng.choice(["task", "cspace"])), view=NOTHING_DRAWN)
+        stage = (Stage.LIVE, Stage.FINE)[rng.integers(2)]
+        passing = frame_at(used, replace(other, passing=passing), stage).passing
+    with ThreadPoolExecutor(1) as thread:
+        elsewhere = thread.submit(
+            lambda: [new_engine().solved(wanted, precision) for precision in (LIVE, FINE)]
+        ).result()
+    undecided = new_engine().solved(replace(wanted, passing=None), LIVE)
+    for precision, fresh in zip((LIVE, FINE), elsewhere, strict=True):
+        found = used.solved(wanted, precision)
+        np.testing.assert_array_equal(found.stack.bundle.positions, fresh.stack.bundle.positions)
+        if found.arm is not None:
+            np.testing.assert_array_equal(found.arm.p, fresh.arm.p)
+        assert ways(found).side @ ways(undecided).side < 0.5  # the drag is seen in it
 
 
 # --- the arm ---
@@ -170,9 +205,8 @@ def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, init
     solved = solve(scenario, other, LIVE, follower)
     x, y, z = ball.position
     moved, away = (changed(scenario, obstacles=ball.moved((x, y, z + by))) for by in (0.005, 0.5))
-    assert goes_on(moved, solved) and other.stance is not None
-    assert not goes_on(away, solved)
-    assert not goes_on(scenario, replace(solved, arm=None))
+    assert solved.passing.goes_on(moved.obstacles) and solved.passing.stance == other.stance is not None
+    assert not solved.passing.goes_on(away.obstacles) and not ANEW.goes_on(moved.obstacles)
 
 
 def test_an_engine_keeps_the_stance_that_it_shows_while_an_obstacle_is_dragged(new_engine, initial):
@@ -180,10 +214,9 @@ def test_an_engine_keeps_the_stance_that_it_shows_while_an_obstacle_is_dragged(n
     nominal = engine.nominal(initial("push_box"))
     balls = [beside_goal(nominal, distance) for distance in np.arange(0.11, 0.195, 0.01)]
     scenarios = [changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN) for ball in balls]
-    stances = []
-    for scenario in scenarios:
-        assert not frame_at(engine, scenario, Stage.LIVE).blocked
-        stances.append(engine.solved(scenario, LIVE).nominal.stance)
+    frames = dragged(engine, scenarios)
+    stances = [engine.solved(frame.scenario, LIVE).nominal.stance for frame in frames]
+    assert not any(frame.blocked for frame in frames)
     assert stances[0] is not None and set(stances) == {stances[0]}
     assert new_engine().solved(scenarios[-1], LIVE).nominal.stance != stances[0]
 
@@ -197,10 +230,12 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     before = stance = None
-    for step in np.arange(-0.02, 0.02, 1e-3):
-        ball = Sphere(as_point(through + step * direction), 0.15)
-        scenario = changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN)
-        assert not frame_at(engine, scenario, Stage.LIVE).blocked
+    balls = [Sphere(as_point(through + step * direction), 0.15) for step in np.arange(-0.02, 0.02, 1e-3)]
+    for frame in dragged(
+        engine, [changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN) for ball in balls]
+    ):
+        scenario, ball = frame.scenario, frame.scenario.obstacles[0]
+        assert not frame.blocked
         arm = engine.solved(scenario, LIVE).arm
         if before is not None and engine.solved(scenario, LIVE).nominal.stance == stance:
             assert abs(arm.duration - before.duration) <= 1.001e-3 * DURATION_CHANGE
@@ -213,11 +248,10 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
 def test_after_a_drag_other_settings_act_at_once(new_engine, initial):
     engine, task = new_engine(), "push_box"
     through = engine.task(task).mean_path[45]
-    for step in (0.0, 1e-3):
-        ball = Sphere(as_point(through + np.array([0, 0, step])), 0.15)
-        scenario = changed(initial(task), obstacles=ball, space="cspace", view=NOTHING_DRAWN)
-        frame_at(engine, scenario, Stage.LIVE)
-    wider = changed(scenario, margin=0.04)
+    balls = [Sphere(as_point(through + np.array([0, 0, step])), 0.15) for step in (0.0, 1e-3)]
+    scenarios = [changed(initial(task), obstacles=ball, space="cspace", view=NOTHING_DRAWN) for ball in balls]
+    last = dragged(engine, scenarios)[-1]
+    scenario, wider = last.scenario, replace(changed(last.scenario, margin=0.04), passing=last.passing)
     before = engine.solved(scenario, LIVE).arm
     frame_at(engine, wider, Stage.LIVE)
     after = engine.solved(wider, LIVE).arm
