@@ -6,7 +6,6 @@ import hashlib
 import logging
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -32,84 +31,18 @@ LONGEST_WITHOUT_REPORT = 0.2
 """Longest time between two progress reports to those who wait for a fit, seconds."""
 
 
-class _AbandonedError(Exception):
-    """A fit that nobody waits for any more."""
-
-
-class _RunningFit:
-    """A fit on a thread of its own that runs as long as somebody waits for it."""
-
-    def __init__(self, work: Callable[[Progress], Imitation]) -> None:
-        """Start the thread; the caller counts as waiting."""
-        self._work = work
-        self._changed = threading.Condition()
-        self._num_waiting = 1
-        self._num_reports, self._report = 0, (0.0, "looking for a stored fit")
-        self._result: Imitation | None = None
-        self._error: Exception | None = None
-        threading.Thread(target=self._run, name="fit", daemon=True).start()
-
-    def join(self) -> bool:
-        """Join those who wait; return False if the fit has been abandoned."""
-        with self._changed:
-            self._num_waiting += self._num_waiting > 0
-            return self._num_waiting > 0
-
-    def wait(self, progress: Progress) -> Imitation:
-        """Return the result. What `progress` raises is let through, and ends the fit if nobody else waits for it."""
-        seen = 0
-        try:
-            while True:
-                with self._changed:
-                    if not self._ended and self._num_reports == seen:
-                        self._changed.wait(LONGEST_WITHOUT_REPORT)
-                    ended, fresh = self._ended, self._num_reports > seen
-                    seen, report = self._num_reports, self._report
-                if fresh or not ended:
-                    progress(*report)
-                if self._error is not None:
-                    raise self._error
-                if self._result is not None:
-                    return self._result
-        finally:
-            with self._changed:
-                self._num_waiting -= 1
-
-    @property
-    def _ended(self) -> bool:
-        return self._result is not None or self._error is not None
-
-    def _run(self) -> None:
-        result, failed = None, None
-        try:
-            result = self._work(self._tell)
-        except Exception as error:  # any error is for those who wait
-            failed = error
-        with self._changed:
-            self._result, self._error = result, failed
-            self._changed.notify_all()
-
-    def _tell(self, fraction: float, message: str) -> None:
-        with self._changed:
-            if not self._num_waiting:
-                raise _AbandonedError
-            self._num_reports += 1
-            self._report = (fraction, message)
-            self._changed.notify_all()
-
-
 class FitStore:
     """Fits on demand, once for all visitors; a damaged file is fitted anew, never trusted.
 
-    Each fit has a thread of its own, so that nobody waits for the fit of another motion, and one visitor can stop
-    waiting while others go on.
+    Who asks first for a fit makes it, others wait for that one only; where the first gives up, the next begins anew.
     """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self._memory: dict[str, Imitation] = {}
-        self._running: dict[str, _RunningFit] = {}
-        self._lock = threading.Lock()
+        self._making: dict[str, threading.Lock] = {}
+        self._reports: dict[str, tuple[float, str]] = {}
+        """How far fits are that are being made."""
         if folder is not None:
             _remove_leftovers(folder)
 
@@ -138,38 +71,32 @@ class FitStore:
         Args:
             demonstrations: motions to imitate.
             settings: settings of the fit; None takes the defaults.
-            progress: see `dt_viz.learning.imitation.fit`; not called for a known fit. It is also called repeatedly
-                without news, so that it can raise an exception to cancel: that is let through, and the fit goes on
-                only if somebody else waits for it.
+            progress: see `dt_viz.learning.imitation.fit`; not called for a known fit. It may raise an exception to
+                cancel, which is let through; to those who wait for another's fit it is called repeatedly, also
+                without news.
 
         Raises:
             ImitationError: as `dt_viz.learning.imitation.fit`.
         """
         settings = settings or ImitationSettings()
-        key = _content_key(demonstrations, settings)
-        with self._lock:
-            if key in self._memory:
-                return self._memory[key]
-            running = self._running.get(key)
-            if running is None or not running.join():
-                running = self._running[key] = self._begin(key, demonstrations, settings)
-        return running.wait(progress or (lambda _fraction, _message: None))
+        key, progress = _content_key(demonstrations, settings), progress or (lambda _fraction, _message: None)
+        if key in self._memory:
+            return self._memory[key]
 
-    def _begin(self, key: str, demonstrations: tuple[Demonstration, ...], settings: ImitationSettings) -> _RunningFit:
-        """Start to read or fit on another thread; the lock must be held."""
+        def tell(fraction: float, message: str) -> None:
+            self._reports[key] = fraction, message
+            progress(fraction, message)
 
-        def work(progress: Progress) -> Imitation:
-            try:
-                imitation = self._read(key) or self._fit(key, demonstrations, settings, progress)
-                with self._lock:
-                    return self._memory.setdefault(key, imitation)
-            finally:
-                with self._lock:
-                    if self._running.get(key) is running:
-                        del self._running[key]
-
-        running = _RunningFit(work)
-        return running
+        lock = self._making.setdefault(key, threading.Lock())
+        while not lock.acquire(timeout=LONGEST_WITHOUT_REPORT):
+            progress(*self._reports.get(key, (0.0, "looking for a stored fit")))
+        try:
+            if key not in self._memory:
+                self._memory[key] = self._read(key) or self._fit(key, demonstrations, settings, tell)
+            return self._memory[key]
+        finally:
+            self._reports.pop(key, None)
+            lock.release()
 
     def _fit(
         self, key: str, demonstrations: tuple[Demonstration, ...], settings: ImitationSettings, progress: Progress

@@ -286,36 +286,62 @@ def test_a_cancelled_fit_ends_and_leaves_nothing_behind(tmp_path, gated, learned
     assert noted["calls"] == [2, 2]
 
 
-def test_a_fit_is_made_once_for_all_who_wait_and_goes_on_when_one_of_them_gives_up(tmp_path, gated, learned):
+def test_a_fit_is_made_once_for_all_who_wait(tmp_path, gated, learned):
     gates, noted = gated
     store = FitStore(tmp_path)
-    first, *others = (Visitor(store, 2) for _ in range(4))
-    for visitor in (first, *others):
-        assert visitor.reported.wait(30)  # each is told how far the fit is that one of them began
-    first.gives_up.set()
-    first.join()
-    assert isinstance(first.error, Cancelled)
+    maker = Visitor(store, 2)
+    assert maker.reported.wait(30)
+    leaves, *others = (Visitor(store, 2) for _ in range(3))
+    for visitor in (leaves, *others):
+        assert visitor.reported.wait(30)  # each is told how far the fit is that one of them makes
+    leaves.gives_up.set()
+    leaves.join()
+    assert isinstance(leaves.error, Cancelled)
     assert all(visitor.thread.is_alive() for visitor in others)
     gates[2].set()
-    for visitor in others:
+    for visitor in (maker, *others):
         visitor.join()
         assert visitor.result is learned
     assert noted["calls"] == [2]
 
 
+def test_where_its_maker_gives_up_another_who_waits_makes_it(tmp_path, gated, learned):
+    gates, noted = gated
+    store = FitStore(tmp_path)
+    maker = Visitor(store, 2)
+    assert maker.reported.wait(30)
+    others = [Visitor(store, 2) for _ in range(3)]
+    for visitor in others:
+        assert visitor.reported.wait(30)
+    maker.gives_up.set()
+    maker.join()
+    assert isinstance(maker.error, Cancelled) and all(visitor.thread.is_alive() for visitor in others)
+    gates[2].set()
+    for visitor in others:
+        visitor.join()
+        assert visitor.result is learned
+    assert noted["calls"] == [2, 2]
+
+
 def test_who_waits_can_give_up_although_the_fit_says_nothing(tmp_path, monkeypatch, learned):
-    release = threading.Event()
+    release, begun = threading.Event(), threading.Event()
 
     def silent(*_):
+        begun.set()
         assert release.wait(30)
         return learned
 
     monkeypatch.setattr(dt_viz.learning.store, "fit", silent)
-    visitor = Visitor(FitStore(tmp_path), 2)
+    store = FitStore(tmp_path)
+    maker = Visitor(store, 2)
+    assert begun.wait(30)
+    visitor = Visitor(store, 2)
     visitor.gives_up.set()
     visitor.join()
     assert isinstance(visitor.error, Cancelled)
     release.set()
+    maker.join()
+    assert maker.result is learned
 
 
 def test_what_a_server_left_half_written_an_hour_ago_is_removed_at_the_next_start(tmp_path):
