@@ -30,7 +30,7 @@ from dt_viz.learning.augmented import AugmentedImitation, unknown_label
 from dt_viz.learning.choice import State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
-from dt_viz.motion.certificates import Certificates, Shown, certified
+from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned
@@ -200,7 +200,7 @@ class Motion:
             float(scenario.obstacle.signed_distance(path).min()), found=motion_warnings(solved, missed)
         )
         times = solution.rays.times(bundle.index, bundle.fraction)
-        return certified(known, solution, solved.ends, Shown(bundle.index, bundle.fraction, times, path))
+        return certified(known, solution, solved.ends, DrawnSamples(bundle.index, bundle.fraction, times, path))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.
@@ -403,7 +403,7 @@ class Arm:
         )
 
 
-class Controller(control.Controller):
+class Controller(control.ArmController):
     """The joint velocities of an arm in the loop, wherever it is: see `dt_viz.control.controller`.
 
         controller = dt.Controller(motion, arm)

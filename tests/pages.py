@@ -27,7 +27,7 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.bindings import Bindings
-from dt_viz.ui.panel.panel import Panel
+from dt_viz.ui.panel.panel import ControlPanel
 from dt_viz.ui.scene.tripod import Tripod
 from dt_viz.ui.visitor import Visitor
 
@@ -102,10 +102,10 @@ class CameraClient:
         asyncio.run(self._reported(self.camera))
 
 
-def panel_of(server: viser.ViserServer, notify: Any = ignored) -> Panel:
+def panel_of(server: viser.ViserServer, notify: Any = ignored) -> ControlPanel:
     """A panel without a page."""
     tripod = Tripod(cast(Any, CameraClient()), lambda: None)
-    return Panel(server.gui, TITLES, load_jaco(), ignored, notify, tripod, ignored)
+    return ControlPanel(server.gui, TITLES, load_jaco(), ignored, notify, tripod, ignored)
 
 
 class NoFrames:

@@ -104,7 +104,7 @@ class CollisionReport:
         return tuple(found)
 
 
-class _Pieces(NamedTuple):
+class _MotionPieces(NamedTuple):
     """Pieces of a path, each for one item, with lower bounds of its distance at both ends."""
 
     start: Array  # (P,) samples from the path's start
@@ -114,10 +114,10 @@ class _Pieces(NamedTuple):
     at_end: Array
     travel: Array  # (P,) upper bound of the distance that the item's points move, metres
 
-    def take(self, which: NDArray[np.bool_]) -> _Pieces:
+    def take(self, which: NDArray[np.bool_]) -> _MotionPieces:
         """Select some of them."""
         start, end, item, at_start, at_end, travel = self
-        return _Pieces(start[which], end[which], item[which], at_start[which], at_end[which], travel[which])
+        return _MotionPieces(start[which], end[which], item[which], at_start[which], at_end[which], travel[which])
 
     def lower(self) -> Array:
         """Compute lower bounds (P,) of the distances anywhere on the pieces."""
@@ -152,14 +152,14 @@ class _Search:
             return None
         return Nearest(self._best, self._measure.names(self._item), min(self._place, float(self._last)))
 
-    def _first_pieces(self) -> _Pieces:
+    def _first_pieces(self) -> _MotionPieces:
         last, num_items = len(self._q) - 1, self._travelled.shape[1]
         knots = np.append(np.arange(0, last, KNOT_STRIDE), last)
         travel = np.diff(self._travelled[knots], axis=0)  # (K − 1, I)
         padded = np.pad(travel, [(1, 1), (0, 0)])
         places, items = np.repeat(knots.astype(float), num_items), np.tile(np.arange(num_items), len(knots))
         values = self._measured(places, items, np.maximum(padded[:-1], padded[1:]).ravel())
-        return _Pieces(
+        return _MotionPieces(
             places[:-num_items],
             places[num_items:],
             items[num_items:],
@@ -168,13 +168,13 @@ class _Search:
             travel.ravel(),
         )
 
-    def _halved(self, pieces: _Pieces) -> _Pieces:
+    def _halved(self, pieces: _MotionPieces) -> _MotionPieces:
         start, end, item, at_start, at_end, _ = pieces
         middle = (start + end) / 2
         first = self._travel_to(middle, item) - self._travel_to(start, item)
         second = self._travel_to(end, item) - self._travel_to(middle, item)
         at_middle = self._measured(middle, item, np.maximum(first, second))
-        return _Pieces(
+        return _MotionPieces(
             np.concatenate([start, middle]),
             np.concatenate([middle, end]),
             np.tile(item, 2),

@@ -216,7 +216,7 @@ class JointLimits(Diffeomorphism):
         return len(self.lower)
 
     def scaled(self, fraction: float) -> JointLimits:
-        """See `Diffeomorphism`. A part of the flow does not hold joints inside their limits."""
+        """A part of the flow does not hold joints inside their limits."""
         return replace(self, fraction=fraction * self.fraction)
 
     def inside(self, q: Array) -> Array:

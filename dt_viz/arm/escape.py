@@ -51,7 +51,8 @@ def escape_directions(
         obstacle: obstacle to escape from.
         margin: required clearance, metres.
         num: largest number of directions.
-        velocity: (3,) the obstacle's, m/s; None where it rests. Whoever runs away along it is caught up with.
+        velocity: (3,) the obstacle's, m/s; None where it rests. Directions along it are costly: the obstacle
+            would follow the arm.
         before: (3,) escape that was chosen just before. What is nearest to it comes first, or second where it costs
             more than `STAYING` times the least.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dt_viz.arm.robot import NUM_JOINTS, KinematicChain, Robot
-from dt_viz.kernels.tracking import LIMIT_WEIGHT, Arm, Postures, settle, walk
+from dt_viz.kernels.tracking import LIMIT_WEIGHT, Postures, TrackingArm, settle, walk
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -58,7 +58,7 @@ class UnreachableError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class JointPath:
+class TrackedPath:
     """A joint trajectory that follows an end-effector path.
 
     Attributes:
@@ -147,7 +147,7 @@ def track(
     start: ArrayLike,
     initial: ArrayLike | None = None,
     reference: ArrayLike | None = None,
-) -> JointPath:
+) -> TrackedPath:
     """Follow end-effector paths with the joints.
 
     Every waypoint solves  q_k = argmin h(q)  subject to  x(q) = x_k, with
@@ -222,9 +222,9 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
     return settle(_arm(robot), posture, begin, targets, np.zeros(len(q), int), 0, NUM_CORRECTIONS, -1.0)
 
 
-def _arm(robot: Robot) -> Arm:
+def _arm(robot: Robot) -> TrackingArm:
     """The arm for compiled loops."""
-    return Arm(robot.records, np.array(robot.end_effector_offset), np.array(robot.lower), np.array(robot.upper))
+    return TrackingArm(robot.records, np.array(robot.end_effector_offset), np.array(robot.lower), np.array(robot.upper))
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -251,10 +251,10 @@ def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArr
     return swept.reshape(q.shape)
 
 
-def _report(robot: Robot, q: Array, path: Array) -> JointPath:
+def _report(robot: Robot, q: Array, path: Array) -> TrackedPath:
     chain = robot.chain(q.reshape(-1, NUM_JOINTS).T)
     manipulability = chain.manipulability().reshape(path.shape[:-1])
-    return JointPath(
+    return TrackedPath(
         q=q,
         error=np.linalg.norm(chain.position.T.reshape(path.shape) - path, axis=-1),
         limits_hit=np.any((q <= robot.lower) | (q >= robot.upper), axis=-1),

@@ -27,13 +27,13 @@ from dt_viz.arm.cspace import (
 )
 from dt_viz.arm.escape import escape_directions
 from dt_viz.arm.robot import NUM_JOINTS, Robot
-from dt_viz.arm.tracking import JointPath, track
+from dt_viz.arm.tracking import TrackedPath, track
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
-from dt_viz.kernels.dodging import Arm, Forecast, dodge
+from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.kernels.splines import cubics
 from dt_viz.obstacles.arrays import records
@@ -61,7 +61,7 @@ SLOPE = 0.1
 OVERSHOOT = 7e-3
 """Distance by which the covering spheres stick out of the arm, about, metres: so much less margin is asked of them."""
 MOVED = 5e-3
-"""Distance beside its start at which a guest's hand may begin before it is said, metres."""
+"""Smallest shift of an added start by the avoidance that is reported, metres."""
 ROUNDING = 1e-3
 """Tolerance of a clearance, metres."""
 MESH_ROUNDING = 0.5e-3
@@ -99,20 +99,20 @@ class Lift:
 
     fractions: Array
     """(R, T) increasing along each rollout."""
-    tracked: JointPath
+    tracked: TrackedPath
     """Joints at these fractions; its q has shape (R, T, 6)."""
     reference: Array
     """(6,) posture that the arm stays near to, rad."""
     exactly: Callable[[Array, Indices, Array], Array] | None = None
     """Takes postures (N, 6) between the fractions onto the motion that they follow, of these rollouts (N,) at these
     fractions (N,); None is content with the spline."""
-    num_guests: int = 0
-    """Number of the rollouts, the last ones, that no avoidance is made for: they are carried along."""
+    num_added: int = 0
+    """Number of the rollouts, the last ones, from added starts: the avoidance is not made for these."""
 
     @property
-    def num_hosts(self) -> int:
+    def num_shaping(self) -> int:
         """Number of the rollouts, the first ones, that an avoidance is made for."""
-        return len(self.fractions) - self.num_guests
+        return len(self.fractions) - self.num_added
 
     @cached_property
     def _splines(self) -> tuple[Array, Array]:
@@ -132,24 +132,24 @@ class Lift:
     def only(self, rollout: int) -> Lift:
         """One of the rollouts."""
         q, error, limits_hit, manipulability, damped = (
-            getattr(self.tracked, name)[rollout : rollout + 1] for name in JointPath.__dataclass_fields__
+            getattr(self.tracked, name)[rollout : rollout + 1] for name in TrackedPath.__dataclass_fields__
         )
-        tracked = JointPath(q, error, limits_hit, manipulability, damped)
+        tracked = TrackedPath(q, error, limits_hit, manipulability, damped)
         return Lift(self.fractions[rollout : rollout + 1], tracked, self.reference)
 
     @cached_property
     def pins(self) -> Array:
-        """(R' + 1, 6) postures at the starts of the R' hosts and at the goal, rad."""
-        return np.concatenate([self.tracked.q[: self.num_hosts, 0], self.tracked.q[:1, -1]])
+        """(R' + 1, 6) postures at the starts of the R' rollouts that shape the flow, and at the goal, rad."""
+        return np.concatenate([self.tracked.q[: self.num_shaping, 0], self.tracked.q[:1, -1]])
 
 
-def joined(lifts: Sequence[Lift], num_guests: int) -> Lift:
-    """The rollouts of several, one after the other, the last ones guests, with the reference of the first."""
-    tracked = JointPath(
-        *(np.concatenate([getattr(part.tracked, name) for part in lifts]) for name in JointPath.__dataclass_fields__)
+def joined(lifts: Sequence[Lift], num_added: int) -> Lift:
+    """The rollouts of several, one after the other, those from added starts last, with the reference of the first."""
+    tracked = TrackedPath(
+        *(np.concatenate([getattr(part.tracked, name) for part in lifts]) for name in TrackedPath.__dataclass_fields__)
     )
     fractions = np.concatenate([part.fractions for part in lifts])
-    return Lift(fractions, tracked, lifts[0].reference, num_guests=num_guests)
+    return Lift(fractions, tracked, lifts[0].reference, num_added=num_added)
 
 
 def lift(robot: Robot, fractions: Array, paths: Array, reference: Array, initial: Array | None = None) -> Lift:
@@ -183,7 +183,7 @@ class ArmSolution:
     duration: float
     """t of the avoidance flow."""
     clearance: float
-    """Smallest distance of the covering spheres from the obstacle along the hosts, metres."""
+    """Smallest distance of the covering spheres from the obstacle along the rollouts that shape the flow, metres."""
     stuck: Indices
     """Hosts that do not keep the clearance that is asked for."""
     too_near: Indices
@@ -195,7 +195,7 @@ class ArmSolution:
 
     @property
     def cleared(self) -> bool:
-        """Whether all hosts keep the clearance that is asked for."""
+        """Whether all rollouts that shape the flow keep the clearance that is asked for."""
         return not len(self.stuck)
 
     @property
@@ -222,7 +222,7 @@ class WholeArm:
         points = self.body.of_chain(self.robot.chain(q.T))
         shapes, values = records((obstacle,))
         joints, links, still = self.robot.records, self.links.records, np.zeros(NUM_JOINTS)
-        dodging, ones = Arm(joints, links, still, still, still, 1.0), np.ones((1, 1))
+        dodging, ones = LimitedArm(joints, links, still, still, still, 1.0), np.ones((1, 1))
         forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
             lambda: self.robot.end_effector(q),
@@ -263,7 +263,7 @@ class WholeArm:
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
         margin, or what the start or goal beside it has. Of several ways out the first is taken that works soon, else
         the one with the least detour, else the one that comes nearest to working, all by coarse motions. All this looks
-        at the hosts only: guests do not change their motions.
+        only at rollouts from the task's starts: added ones do not change their motions.
 
         While an obstacle is dragged, the side on which all motions pass it is kept until another one is much shorter,
         or this one fails; see `followed`.
@@ -367,9 +367,9 @@ class WholeArm:
         solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
         return replace(solver.through(full.transform.scaled(fraction), full.duration), ways=full.ways)
 
-    def touches(self, solution: ArmSolution, num_hosts: int, obstacle: Union) -> bool:
-        """Whether the arm's meshes touch the obstacle on the motions of the hosts, the first so many ones."""
-        p = solution.p[solution.index < num_hosts]
+    def touches(self, solution: ArmSolution, num_shaping: int, obstacle: Union) -> bool:
+        """Whether the arm's meshes touch the obstacle on the first `num_shaping` motions."""
+        p = solution.p[solution.index < num_shaping]
         return bool((self.mesh_clearance(p, obstacle, np.full(len(p), ROUNDING)) < ROUNDING).any())
 
     def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
@@ -403,7 +403,7 @@ class WholeArm:
         Obstacles that one posture comes near to are left in one direction where their own ones are opposed: else their
         flows would hold each other up, and motions turn back between them.
         """
-        q, parts, margin = lifted.tracked.q[: lifted.num_hosts], avoidance.obstacle.parts, avoidance.margin
+        q, parts, margin = lifted.tracked.q[: lifted.num_shaping], avoidance.obstacle.parts, avoidance.margin
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
@@ -465,13 +465,12 @@ class _Solver:
         self._room = arm.clearance(lifted.pins, avoidance.obstacle) - ROUNDING
 
     def solution(self) -> ArmSolution:
-        """See `WholeArm.avoiding`."""
         duration = self._avoidance.duration
         if self._generator is None:
             duration = 0.0
         elif duration is None:
-            hosts = self._lifted.tracked.q[: self._lifted.num_hosts]
-            q = self._arm.limits.inside(hosts[:, ::STRIDE].reshape(-1, NUM_JOINTS))
+            shaping = self._lifted.tracked.q[: self._lifted.num_shaping]
+            q = self._arm.limits.inside(shaping[:, ::STRIDE].reshape(-1, NUM_JOINTS))
             duration = self._clearing_duration(q[self._lack(q) > 0])
         return self._with_duration(min(max(duration, self._shortest), self._longest))
 
@@ -481,7 +480,7 @@ class _Solver:
         if self._generator is None or self._avoidance.duration is not None:
             return self._along(bundle, transform, duration)
         for _ in range(MAX_ROUNDS):
-            p = (bundle.positions / LEVERS)[self._of_hosts(bundle)]
+            p = (bundle.positions / LEVERS)[self._shaping(bundle)]
             lack = self._lack(p)
             if duration >= self._longest or not (lack > ROUNDING).any():
                 break
@@ -489,7 +488,7 @@ class _Solver:
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
         for _ in range(0 if self._coarse or duration >= self._longest else MAX_ROUNDS):
-            p = (bundle.positions / LEVERS)[self._of_hosts(bundle)]
+            p = (bundle.positions / LEVERS)[self._shaping(bundle)]
             lack = self._mesh_lack(p)
             worst = np.argsort(-lack)[:NUM_EXTENDED_FOR]
             if lack[worst[0]] <= MESH_ROUNDING:
@@ -516,16 +515,16 @@ class _Solver:
 
     def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float) -> ArmSolution:
         p = bundle.positions / LEVERS
-        hosts, near = self._of_hosts(bundle), self._lack(p) > ROUNDING
-        clearance = float(self._arm.clearance(p[hosts], self._avoidance.obstacle).min())
+        shaping, near = self._shaping(bundle), self._lack(p) > ROUNDING
+        clearance = float(self._arm.clearance(p[shaping], self._avoidance.obstacle).min())
         q = self._lifted.at(bundle.index, bundle.fraction)
-        stuck, too_near = (np.unique(bundle.index[near & which]) for which in (hosts, ~hosts))
+        stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
         away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
-        moved = np.unique(bundle.index[away & ~hosts & (bundle.fraction == 0)])
+        moved = np.unique(bundle.index[away & ~shaping & (bundle.fraction == 0)])
         return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, stuck, too_near, moved)
 
-    def _of_hosts(self, bundle: Bundle) -> Mask:
-        return bundle.index < self._lifted.num_hosts
+    def _shaping(self, bundle: Bundle) -> Mask:
+        return bundle.index < self._lifted.num_shaping
 
     def _sampled(self, transform: Diffeomorphism) -> Bundle:
         num_rollouts, num_samples = self._lifted.fractions.shape

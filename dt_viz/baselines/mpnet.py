@@ -23,7 +23,7 @@ import numpy as np
 
 from dt_viz.arm.robot import NUM_JOINTS
 from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
-from dt_viz.baselines.postures import Query, Surroundings, planned
+from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.baselines.weights import FOLDER, load_weights
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
@@ -150,7 +150,7 @@ class Search:
     model: MPNetModel
     encoded: Array
     """Z (28,) of the obstacle."""
-    surroundings: Surroundings
+    surroundings: PlanningScene
     rng: np.random.Generator
     cancelled: Cancelled = never
     known: dict[bytes, bool] = field(default_factory=dict)
@@ -218,7 +218,7 @@ class MPNetPlanner:
 
     def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
-        encoded, surroundings = self.model.encoded(obstacle), Surroundings.of(self.problem.robot, obstacle)
+        encoded, surroundings = self.model.encoded(obstacle), PlanningScene.of(self.problem.robot, obstacle)
         queries, ways, warnings = [], [], []
         for number, start in enumerate(starts):
             query = Query.of(self.problem, start)

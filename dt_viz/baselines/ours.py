@@ -82,7 +82,7 @@ class _WholeArmPlanner:
         if solved.blocked or arm is None:
             return {}
         due, limits = solved.stack.rays.times(arm.index, arm.fraction), self.follower.robot.velocity_limits
-        rows = [arm.index == rollout for rollout in range(len(solved.nominal.strands))]
+        rows = [arm.index == rollout for rollout in range(len(solved.nominal.trajectories))]
         return {
             number: (arm.p[row], within_velocity_limits(due[row], arm.p[row], limits))
             for number, row in zip(solved.nominal.numbers, rows, strict=True)
@@ -114,4 +114,4 @@ def from_starts(learned: Learned, starts: Array) -> tuple[Nominal, list[int]]:
     points = [as_point(start) for start in starts]
     added = list(dict.fromkeys(point for point in points if point not in known))
     numbers = {**known, **{point: len(learned.task.starts) + k for k, point in enumerate(added)}}
-    return learned.nominal([learned.strand(Start(point)) for point in added]), [numbers[point] for point in points]
+    return learned.nominal([learned.trajectory(Start(point)) for point in added]), [numbers[point] for point in points]

@@ -52,7 +52,7 @@ class Query:
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class PlanningScene:
     """What the arm may hit: an obstacle, the table and itself, by its meshes."""
 
     robot: Robot
@@ -61,7 +61,7 @@ class Surroundings:
     model: CollisionModel
 
     @classmethod
-    def of(cls, robot: Robot, obstacle: Union) -> Surroundings:
+    def of(cls, robot: Robot, obstacle: Union) -> PlanningScene:
         """The surroundings of an arm with an obstacle."""
         return cls(robot, obstacle, load_body_points().on_moving_links, load_collision_model())
 

@@ -73,7 +73,7 @@ class Aim(Enum):
     HAND = "hand"
 
 
-class Controller:
+class ArmController:
     """A robot's state and what it follows; `step` is for one thread, `follow` and the rest may come from another."""
 
     def __init__(self, follower: Follower, solved: Solved, settings: ControllerSettings | None = None) -> None:

@@ -10,7 +10,7 @@ from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
-from dt_viz.kernels.dodging import Arm, Forecast, dodge
+from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
 from dt_viz.obstacles.arrays import records
 
 
@@ -19,9 +19,8 @@ class Dodge:
     """The way past obstacles that move, the arm's own acceleration foreseen.
 
     Each choice of velocities is foreseen for a short time: the joints turn to them as fast as they may and keep them,
-    the obstacles go on as `dt_viz.control.obstacle_motion.Motion` says. How near they come, in deviations of the
-    obstacles from there, is the worth of a choice. Choosing anew in each tick, that is model predictive control with
-    one move, by enumeration.
+    the obstacles go on as `ObstacleMotion` says. How near they come, in deviations of the obstacles from there, is the
+    worth of a choice. Choosing anew in each tick, that is model predictive control with one move, by enumeration.
     """
 
     arm: WholeArm
@@ -51,7 +50,7 @@ class Dodge:
         moved = np.stack([seen.motions[k].ahead(times + late, settings.returning) for k in moving], axis=1)
         deviation = settings.unsure + settings.doubt * times
         clear, velocities = dodge(
-            Arm(
+            LimitedArm(
                 robot.records,
                 self.arm.links.records,
                 robot.lower,

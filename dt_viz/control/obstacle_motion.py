@@ -15,7 +15,7 @@ from dt_viz.transforms.base import ArmAvoidance
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ObstacleMotion:
     """The measured motion of an obstacle: a velocity v that swings about its mean m.
 
     Its deviation d = v − m returns as a critically damped one does, d̈ + 2λḋ + λ²d = 0: what is moved by hand bends its
@@ -31,15 +31,15 @@ class Motion:
     age: float = 0.0
     """Time for which it is known, seconds."""
 
-    def then(self, moved: Array, passed: float, averaging: float) -> Motion:
+    def then(self, moved: Array, passed: float, averaging: float) -> ObstacleMotion:
         """Take note of a displacement (3,), metres, in a time, seconds; the mean is over `averaging` seconds."""
         velocity, age = moved / passed, self.age + passed
         if not self.age:
-            return Motion(velocity, np.zeros(3), velocity, age)
+            return ObstacleMotion(velocity, np.zeros(3), velocity, age)
         surprise = velocity - self.velocity - passed / 2 * self.acceleration  # in the mean velocity of that time
         acceleration = self.acceleration + surprise / passed
         mean = self.mean + passed / min(age, averaging) * (velocity - self.mean)
-        return Motion(velocity + passed / 2 * acceleration, acceleration, mean, age)
+        return ObstacleMotion(velocity + passed / 2 * acceleration, acceleration, mean, age)
 
     def ahead(self, times: Array, rate: float) -> Array:
         """Displacements (T, 3), metres, after times (T,), seconds, with λ the rate, 1/s, at which it returns."""
@@ -58,7 +58,7 @@ class Sighting:
     """Time of the sighting, seconds."""
     avoidance: ArmAvoidance | None
     """What is avoided, and how."""
-    motions: tuple[Motion, ...]
+    motions: tuple[ObstacleMotion, ...]
     """Of its P parts."""
 
     @cached_property
@@ -91,7 +91,7 @@ class Sighting:
         known = [] if self.avoidance is None else list(zip(self.avoidance.obstacle.parts, self.motions, strict=True))
         for part in parts:
             alike = [(_between(old, part), k) for k, (old, _) in enumerate(known) if _alike(part, old)]
-            motion = Motion()
+            motion = ObstacleMotion()
             if alike and passed < settings.stale:
                 moved, k = min(alike, key=lambda found: float(np.linalg.norm(found[0])))
                 if passed == 0:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """Settings of `dt_viz.control.controller.Controller`."""
+    """Settings of `dt_viz.control.controller.ArmController`."""
 
     acceleration: float = 4.0
     """Limit of the joints' acceleration, rad/s². The arm's URDF names none; joints then reach their limits of velocity,

@@ -14,7 +14,7 @@ from dt_viz.motion.certificates import (
     MAX_OFF,
     MAX_OFF_TRACKED,
     Certificates,
-    Shown,
+    DrawnSamples,
     certified,
     certified_arm,
     clearance_warnings,
@@ -43,7 +43,7 @@ def certify(frame: Frame, fine: Solved, follower: Follower) -> Certificates:
 
 def _certified_hand(frame: Frame, fine: Solved) -> Certificates:
     stack, obstacle, path = fine.stack, frame.scenario.obstacle, np.concatenate(frame.rollouts)
-    shown = Shown(stack.bundle.index, stack.bundle.fraction, np.concatenate(frame.times), path)
+    shown = DrawnSamples(stack.bundle.index, stack.bundle.fraction, np.concatenate(frame.times), path)
     known = certified(frame.certificates, stack, fine.ends, shown)
     known = known.warning(*clearance_warnings(known.clearance, float(obstacle.signed_distance(path).min())))
     depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
@@ -64,10 +64,10 @@ def _certified_arm(frame: Frame, fine: Solved, arm: ArmSolution, follower: Follo
         *fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed),
     )
     known, q = certified_arm(known, arm.transform, p, undisturbed, by_hand=integration.by_hand)
-    shown = Shown(arm.index, arm.fraction, times, robot.end_effector(q))
+    shown = DrawnSamples(arm.index, arm.fraction, times, robot.end_effector(q))
     known = certified(known, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
-    hosts = arm.index < len(frame.rollouts) - fine.nominal.num_added
-    kept = float(whole_arm.clearance(p[hosts], avoidance.obstacle).min())
+    shaping = arm.index < len(frame.rollouts) - fine.nominal.num_added
+    kept = float(whole_arm.clearance(p[shaping], avoidance.obstacle).min())
     return known.warning(*clearance_warnings(known.clearance, kept))
 
 
@@ -81,6 +81,6 @@ def with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates
     known = replace(known, collision=report).warning(*(w for w in report.warnings if w.kind not in apart))
     if fine.arm is None or avoidance is None:
         return known
-    hosts = range(len(frame.rollouts) - fine.nominal.num_added)
-    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == host], avoidance.obstacle) for host in hosts]
+    shaping = range(len(frame.rollouts) - fine.nominal.num_added)
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == k], avoidance.obstacle) for k in shaping]
     return known.warning(*margin_warnings(scenario, nearest, fine.nominal.numbers))

@@ -144,7 +144,7 @@ def profiles(frame: Frame, solved: Solved, chosen: int, follower: Follower) -> P
             hand_profile(undisturbed, demonstration, potential, obstacle),
             of_mean=of_mean,
         )
-    rows, fraction = arm.index == chosen, nominal.strands[chosen].fraction
+    rows, fraction = arm.index == chosen, nominal.trajectories[chosen].fraction
     p = arm.p[rows]
     below = follower.robot.end_effector(arm.transform.forward(p))
     q = follower.undisturbed_along(nominal, chosen).at(np.zeros(len(fraction), int), fraction)

@@ -118,8 +118,10 @@ class Engine:
             learned = self.memo("styled", key, lambda: self._styled(scenario), newest=NEWEST)
         else:
             learned = self._shared("learned", key, lambda: self._learned(scenario, progress))
-        strand = learned.strand  # a start that is dragged leaves nothing behind
-        added = [self.memo("strand", (learned, s), lambda s=s: strand(s), newest=NEWEST) for s in scenario.starts]
+        trajectory = learned.trajectory  # a start that is dragged leaves nothing behind
+        added = [
+            self.memo("trajectory", (learned, s), lambda s=s: trajectory(s), newest=NEWEST) for s in scenario.starts
+        ]
         return self.memo("nominal", (learned, scenario.starts), lambda: learned.nominal(added), newest=4)
 
     def _imitated(self, panel: Panel, progress: Progress | None = None) -> Nominal:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from dt_viz.arm.tracking import track
-from dt_viz.control.controller import Controller, Phase
+from dt_viz.control.controller import ArmController, Phase
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
@@ -31,7 +31,7 @@ TABLE_ROOM = 0.025
 BESIDE = 0.01
 """Distance of the hand from where it is held that is worth a word, metres."""
 
-_Wish = Callable[[Controller], None]
+_Wish = Callable[[ArmController], None]
 
 
 class LiveArm:
@@ -49,7 +49,7 @@ class LiveArm:
         self._follower = follower
         self._changing = threading.Lock()
         self._wishes: list[_Wish] = []
-        self._controller: Controller | None = None
+        self._controller: ArmController | None = None
         self._solved: Solved | None = None
         self._chosen: int | None = None
         self._starts: tuple[int, ...] = ()
@@ -148,7 +148,7 @@ class LiveArm:
         starts = tuple(np.array(nominal.numbers)[reached].tolist())
         if self._controller is None:
             first = chosen or 0
-            controller, q = Controller(self._follower, solved), self._q
+            controller, q = ArmController(self._follower, solved), self._q
             if q is None:
                 q = _posture(self._follower, solved, first)
             controller.begin(q, first)
@@ -163,7 +163,7 @@ class LiveArm:
             self._wish(lambda controller: self._go_home(controller, number))
 
     def see(self, avoidance: ArmAvoidance | None) -> None:
-        """Take note of where the obstacles are now: it touches none, also before there is a motion around them."""
+        """Update the obstacles that the controller keeps away from, before the motion around them is computed."""
         self._seen = (avoidance,)
 
     def stop(self) -> None:
@@ -231,12 +231,12 @@ class LiveArm:
         with self._changing:
             self._wishes.append(wish)
 
-    def _hold(self, controller: Controller) -> None:
+    def _hold(self, controller: ArmController) -> None:
         place = self._held
         if place is not None:
             controller.hold(place)
 
-    def _push(self, controller: Controller) -> None:
+    def _push(self, controller: ArmController) -> None:
         robot, q = self._follower.robot, self._q
         if q is None or self._solved is None or not len(controller.ahead):
             return
@@ -250,7 +250,7 @@ class LiveArm:
                 break
         controller.displace(best)
 
-    def _places_aside(self, controller: Controller, q: Array) -> Iterator[Array]:
+    def _places_aside(self, controller: ArmController, q: Array) -> Iterator[Array]:
         """Places (3,), metres, to push the hand to, the farthest first."""
         robot, ahead = self._follower.robot, controller.ahead[:2]
         hand, along = robot.end_effector(q), np.ptp(robot.end_effector(ahead), axis=0)
@@ -269,14 +269,14 @@ class LiveArm:
         table = float(hand[2] - min(TABLE_ROOM, now[2]))
         return min(table, float(scenario.obstacle.signed_distance(hand))) if scenario.avoids else table
 
-    def _go_home(self, controller: Controller, number: int) -> None:
+    def _go_home(self, controller: ArmController, number: int) -> None:
         solved = self._solved
         rollout = None if solved is None else solved.nominal.rollout(number)
         if rollout is not None:
             self._number, self._homing, self._rested = number, True, 0.0
             controller.home(rollout)
 
-    def _go_round(self, controller: Controller, seconds: float) -> None:
+    def _go_round(self, controller: ArmController, seconds: float) -> None:
         """Set out for the next start, or from there for the goal, when the robot has rested."""
         phase = controller.phase
         rests = phase in (Phase.RESTING, Phase.ASIDE)

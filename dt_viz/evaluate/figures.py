@@ -27,7 +27,7 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Panel:
+class FigurePanel:
     """Motions of one shape."""
 
     title: str
@@ -35,7 +35,7 @@ class Panel:
     """(T_i, d) of each kind of `STYLES`, in any unit."""
 
 
-def panels(shapes: Sequence[Panel], columns: int = 6) -> Figure:
+def panels(shapes: Sequence[FigurePanel], columns: int = 6) -> Figure:
     """Draw a panel for each shape, at most so many beside each other; a motion in space from its broadest side.
 
     Raises:

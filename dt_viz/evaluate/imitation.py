@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from dt_viz.evaluate import figures
-from dt_viz.evaluate.figures import Panel
+from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import WAYS, Followed, Learn, Learned, begun, follow, frechet, rollouts_from
 from dt_viz.evaluate.options import InputError, ready_folder, report, whole_number, write_json, write_npz
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
@@ -72,7 +72,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Figures:
+class ImitationFigures:
     """Row of the table: distances of a shape's rollouts from the demonstrations they were learned from."""
 
     name: str
@@ -114,10 +114,10 @@ def run(options: argparse.Namespace) -> int:
     if holds_out and alone:
         raise InputError("--leave-one-out", f"one demonstration only in {alone}", "two or more in each")
     folder = ready_folder(options.out)
-    rows: list[Figures] = []
-    panels: list[Panel] = []
+    rows: list[ImitationFigures] = []
+    panels: list[FigurePanel] = []
     held_out: list[dict[str, Any]] = []
-    cases: list[tuple[float, Panel]] = []
+    cases: list[tuple[float, FigurePanel]] = []
     for source in sources:
         name, began = source.path.stem, time.perf_counter()
         try:
@@ -132,7 +132,7 @@ def run(options: argparse.Namespace) -> int:
         row, arrays, rollouts = measured(imitation, source, seconds)
         rows.append(row)
         write_npz(folder / f"{name}.npz", **arrays)
-        panels.append(Panel(name, {"demonstration": _paths(source), "learned": rollouts}))
+        panels.append(FigurePanel(name, {"demonstration": _paths(source), "learned": rollouts}))
         if holds_out:
             write_npz(folder / f"{name}-held-out.npz", **_arrays(followed, source.unit))
             held_out.append(summed_up(name, _num_folds(source, options.folds), followed))
@@ -159,7 +159,7 @@ def run(options: argparse.Namespace) -> int:
 
 def measured(
     imitation: Learned, source: Source, fit_seconds: float
-) -> tuple[Figures, dict[str, Any], tuple[Array, ...]]:
+) -> tuple[ImitationFigures, dict[str, Any], tuple[Array, ...]]:
     """Follow all demonstrations; the row of the table, the arrays of the file, and the rollouts (T, d), metres."""
     paths, unit = _paths(source), source.unit
     rollouts, times = rollouts_from(imitation, np.stack([path[0] for path in paths]))
@@ -169,7 +169,7 @@ def measured(
     grid, transform = _states(imitation, paths), imitation.system.transform
     round_trip, det = round_trip_error(transform, grid), min_det_jacobian(transform.jacobian, grid)
     start_seconds = float(np.median([_seconds_for(imitation, path[0]) for path in paths]))
-    figures = Figures(
+    figures = ImitationFigures(
         name=source.path.stem,
         demonstrations=len(paths),
         frechet_mean_mm=float(distances.mean()),
@@ -234,7 +234,7 @@ def summed_up(name: str, folds: int, followed: Sequence[Followed]) -> dict[str, 
     return {"name": name, "folds": folds, **distances, **rms}
 
 
-def cases_of(name: str, source: Source, followed: Sequence[Followed]) -> list[tuple[float, Panel]]:
+def cases_of(name: str, source: Source, followed: Sequence[Followed]) -> list[tuple[float, FigurePanel]]:
     """The panel of each held-out demonstration, and how far off what was learned is, relative to the extent."""
     cases, paths = [], _paths(source)
     for i, f in enumerate(followed):
@@ -247,11 +247,11 @@ def cases_of(name: str, source: Source, followed: Sequence[Followed]) -> list[tu
             "nearest start, shifted": [f.paths["nearest"]],
         }
         title = f"{name} {i + 1}  {learned:.1f} mm\nmean {mean:.1f}, nearest {nearest:.1f} mm"
-        cases.append((learned / source.extent, Panel(title, kinds)))
+        cases.append((learned / source.extent, FigurePanel(title, kinds)))
     return cases
 
 
-def worst_of(cases: Sequence[tuple[float, Panel]], num: int = NUM_WORST) -> list[tuple[float, Panel]]:
+def worst_of(cases: Sequence[tuple[float, FigurePanel]], num: int = NUM_WORST) -> list[tuple[float, FigurePanel]]:
     """The cases in which what was learned is farthest off, the worst first."""
     return sorted(cases, key=lambda case: -case[0])[:num]
 

@@ -28,7 +28,7 @@ from dt_viz.arm.arm_system import ArmSystem, Section
 from dt_viz.arm.collision import load_collision_model
 from dt_viz.arm.cspace import REACH_PER_TEMPERATURE
 from dt_viz.arm.robot import NUM_JOINTS, Robot, cross, load_jaco
-from dt_viz.control.controller import Controller, Phase
+from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.options import (
@@ -143,7 +143,7 @@ class Run:
     phases: set[Phase] = field(default_factory=set)
 
 
-class Arm(Protocol):
+class Driver(Protocol):
     """What moves the robot."""
 
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
@@ -156,11 +156,11 @@ class Arm(Protocol):
         ...
 
 
-class InTheLoop(Arm):
+class InTheLoop(Driver):
     """The controller, which looks at the obstacles now and then."""
 
     def __init__(self, bench: Bench, crossing: Crossing) -> None:
-        self._bench, self.controller = bench, Controller(bench.follower, bench.solved)
+        self._bench, self.controller = bench, ArmController(bench.follower, bench.solved)
         self.controller.begin(bench.starts[crossing.start], crossing.start)
         self.controller.home(crossing.start)
         self._looks, self._went, self._present = 0.0, False, True
@@ -221,7 +221,7 @@ class Bench:
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
-        controller, q, passed = Controller(self.follower, self.solved), self.starts[start], []
+        controller, q, passed = ArmController(self.follower, self.solved), self.starts[start], []
         while len(passed) < LONGEST / TICK:
             passed.append(q)
             q = q + TICK * controller.step(q, TICK)
@@ -286,7 +286,7 @@ def _path(middle: Array, rng: np.random.Generator) -> Array:
     return resample_by_arc_length(middle + np.outer(s, axes[:, 0]) + np.outer(wave, axes[:, 1]), 401)
 
 
-def simulated(bench: Bench, crossing: Crossing, arm: Arm) -> Run:
+def simulated(bench: Bench, crossing: Crossing, arm: Driver) -> Run:
     """Run an arm until it rests at the goal, or `LONGEST` seconds after the obstacles have gone."""
     run, q = Run(), bench.starts[crossing.start].copy()
     for k in range(int((crossing.gone + crossing.begins + LONGEST) / TICK)):
@@ -347,7 +347,7 @@ def _smallest_distance(bench: Bench, q: Array, places: Array, wxyz: Quaternion) 
     return best
 
 
-class _Field(Arm):
+class _FieldDriver(Driver):
     """An arm that is given velocities of a field at equal times, within the limits."""
 
     def __init__(self, bench: Bench, period: float) -> None:
@@ -380,7 +380,7 @@ class _Field(Arm):
         return np.zeros(NUM_JOINTS)
 
 
-class Potential(_Field):
+class Potential(_FieldDriver):
     """The undisturbed motion's velocity plus the repulsion of all body points (Khatib's field)."""
 
     def __init__(self, bench: Bench) -> None:
@@ -410,12 +410,12 @@ class Potential(_Field):
         return total
 
 
-class Stepped(_Field):
+class Stepped(_FieldDriver):
     """Eq. (4) of the newest stack at the posture where the arm is, held for the paper's 20 Hz."""
 
     def __init__(self, bench: Bench) -> None:
         super().__init__(bench, PAPER_PERIOD)
-        self._dodging = Controller(bench.follower, bench.solved)
+        self._dodging = ArmController(bench.follower, bench.solved)
 
     def _at(self, q: Array, sphere: Obstacle | None) -> Array:
         bench = self._bench
@@ -447,11 +447,11 @@ def run(options: argparse.Namespace) -> int:
         raise InputError("--beside", "several obstacles, or boxes", "one sphere")
     engine = Engine(tasks, FitStore(default_cache_folder()), load_jaco())
     bench = Bench(engine, task.name, options.diameter, options.margin, boxes=options.boxes)
-    kinds: dict[str, Callable[[Crossing], Arm]] = {"": lambda crossing: InTheLoop(bench, crossing)}
+    kinds: dict[str, Callable[[Crossing], Driver]] = {"": lambda crossing: InTheLoop(bench, crossing)}
     if options.beside:
         kinds |= {"potential_": lambda _: Potential(bench), "stepped_": lambda _: Stepped(bench)}
     arrays: dict[str, Any] = {"diameter": options.diameter}
-    figures: dict[str, list[Figures]] = {kind: [] for kind in kinds}
+    figures: dict[str, list[RunFigures]] = {kind: [] for kind in kinds}
     crossed = crossings(bench, options.speed, options.seed, options.obstacles)
     while (i := len(figures[""])) < options.runs:
         crossing, seconds = next(crossed)
@@ -459,7 +459,7 @@ def run(options: argparse.Namespace) -> int:
             found = simulated(bench, crossing, make(crossing))
             if not kind and room_at_coming(bench, found, crossing) < COMING_ROOM:
                 break
-            figures[kind].append(Figures.of(bench, crossing, found, seconds))
+            figures[kind].append(RunFigures.of(bench, crossing, found, seconds))
             places = np.array(found.obstacle)[:, 0] if options.obstacles == 1 else found.obstacle
             arrays |= {f"{kind}q_{i}": found.q, f"{kind}t_{i}": found.t, f"{kind}obstacle_{i}": places}
             if not kind:
@@ -481,7 +481,7 @@ HEADER = (
 
 
 @dataclass(frozen=True)
-class Figures:
+class RunFigures:
     """Measurements of one run."""
 
     distance: float
@@ -497,7 +497,7 @@ class Figures:
     ticks: Array
 
     @classmethod
-    def of(cls, bench: Bench, crossing: Crossing, run: Run, seconds: float) -> Figures:
+    def of(cls, bench: Bench, crossing: Crossing, run: Run, seconds: float) -> RunFigures:
         """Measure a run."""
         q = np.array(run.q)
         velocity = np.diff(q, axis=0, prepend=q[:1]) / TICK
@@ -518,7 +518,7 @@ class Figures:
         )  # fmt: skip
 
 
-def summary(found: list[Figures]) -> tuple[str, ...]:
+def summary(found: list[RunFigures]) -> tuple[str, ...]:
     """The figures of all runs."""
     num = len(found)
     free, reached = sum(f.distance > 0 for f in found), sum(f.missed <= AT_GOAL for f in found)

@@ -118,7 +118,7 @@ COLUMNS = (*(value.name for value in fields(Measured)), "reached", "seconds")
 
 
 @dataclass(frozen=True)
-class Place:
+class RandomPlace:
     """A sphere, and starts beside the demonstrated ones."""
 
     sphere: Sphere
@@ -177,7 +177,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[Place]:
+def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[RandomPlace]:
     """Draw the places of a task, as the module says, and perturbed starts, divided among the places.
 
     Raises:
@@ -186,7 +186,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[P
     task, model = problem.task, load_collision_model()
     rng, mean, undisturbed = np.random.default_rng(seed), task.mean_path, problem.learned.demonstrated.paths
     at_ends = np.concatenate([path[[0, -1]] for path in problem.postures])
-    places: list[Place] = []
+    places: list[RandomPlace] = []
     for _ in range(MAX_DRAWN):
         if len(places) == count:
             return places
@@ -198,7 +198,7 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[P
             continue
         share = (len(places) + 1) * num_perturbed // count - len(places) * num_perturbed // count
         beside = np.random.default_rng([seed, len(places)])  # places do not depend on how many starts there are
-        places.append(Place(sphere, _perturbed(problem, sphere, share, beside)))
+        places.append(RandomPlace(sphere, _perturbed(problem, sphere, share, beside)))
     found = f"{len(places)} of {task.title!r} among {MAX_DRAWN} spheres"
     raise InputError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
 
@@ -223,7 +223,7 @@ def _in_ball(rng: np.random.Generator, radius: float) -> Array:
     return radius * rng.uniform() ** (1 / 3) * direction / np.linalg.norm(direction)
 
 
-def measured(planner: Planner, problem: Problem, places: Sequence[Place]) -> dict[str, Array]:
+def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) -> dict[str, Array]:
     """Plan and measure the motions of a method at all places.
 
     Returns:
@@ -286,7 +286,7 @@ def joints_along(problem: Problem, plan: Plan) -> tuple[Array, ...]:
     )
 
 
-def _ends(planner: Planner, place: Place) -> Array:
+def _ends(planner: Planner, place: RandomPlace) -> Array:
     """Where motions from the perturbed starts of a place end, (P, 3), metres."""
     if not len(place.perturbed):
         return place.perturbed

@@ -36,7 +36,7 @@ from dt_viz.scenario.tasks import TASKS, Task, lasa_tasks
 
 
 @dataclass(frozen=True)
-class Row:
+class FitRow:
     """Row of the table."""
 
     method: str
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
         raise InputError("--folds", f"one demonstration only in {', '.join(alone)}", "two or more in each")
     folder = ready_folder(options.out)
     fits, follower = FitStore(default_cache_folder()), Follower(load_jaco())
-    rows: list[Row] = []
+    rows: list[FitRow] = []
     for name in names:
         task = tasks[name]()
         splits = _splits(len(task.demonstrations), options.folds, folder)
@@ -121,7 +121,7 @@ def _problem(task: Task, split: Split, fits: FitStore, follower: Follower) -> Pr
 
 def _row(
     task: Task, method: str, splits: Sequence[Split], problems: Sequence[Problem], options: argparse.Namespace
-) -> Row:
+) -> FitRow:
     """Train a method on each split, write the weights, and follow the demonstrations with what was written."""
     trained = TRAINED[method]
     num_epochs = options.epochs or trained.num_epochs
@@ -138,4 +138,4 @@ def _row(
         sizes.append(path.stat().st_size)
         plan = trained.from_folder(split.folder).fit(problem).plan(Union(), task.starts[split.compared])
         distances.extend(1e3 * frechet(plan.paths, [task.paths[i] for i in split.compared]) / task.scale)
-    return Row(method, task.name, num_epochs, max(seconds), float(np.mean(distances)), max(sizes))
+    return FitRow(method, task.name, num_epochs, max(seconds), float(np.mean(distances)), max(sizes))

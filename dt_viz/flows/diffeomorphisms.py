@@ -97,7 +97,7 @@ class Flow(Diffeomorphism):
         return self.field.dim
 
     def scaled(self, fraction: float) -> Flow:
-        """See `Diffeomorphism`. The number of steps stays, so an exact inverse stays exact."""
+        """The number of steps stays, so an exact inverse stays exact."""
         return replace(self, duration=fraction * self.duration)
 
     def min_step_determinant(self, s: Array, *, inverse: bool) -> float:
@@ -255,7 +255,7 @@ class Placed(Diffeomorphism):
         return (y - self.origin) @ self.axes / self.scale
 
     def scaled(self, fraction: float) -> Placed:
-        """See `Diffeomorphism`. Frame and scale stay."""
+        """Frame and scale stay."""
         return replace(self, inner=self.inner.scaled(fraction))
 
     def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:

@@ -204,7 +204,7 @@ class PhasedAttractor(Attractor):
         return np.linalg.norm(z[..., :num] - self.goal[:num], axis=-1)
 
     def left(self, z: Array) -> Array:
-        """See `Attractor`: the phase (*B,), metres."""
+        """The phase (*B,), metres."""
         return z[..., self.predictions.dim]
 
     def velocity(self, z: Array) -> Array:
@@ -299,7 +299,7 @@ class Frozen(Attractor):
         )
 
     def potential_at(self, distance: float) -> float:
-        """See `Attractor`: at a distance from where the whole system's motions end, at this phase."""
+        """At a distance from where the whole system's motions end, at this phase."""
         return self.moving.potential_at(float(np.hypot(distance, self.rest[0])))
 
     def velocity(self, z: Array) -> Array:

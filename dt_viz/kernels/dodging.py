@@ -16,7 +16,7 @@ ENOUGH = 1.0
 """Distance, in deviations of the obstacle from where it is expected, beyond which more is worth nothing."""
 
 
-class Arm(NamedTuple):
+class LimitedArm(NamedTuple):
     """An arm and its limits."""
 
     joints: Joints
@@ -54,7 +54,7 @@ class Forecast(NamedTuple):
 
 
 @compiled
-def _room(arm: Arm, forecast: Forecast, q: Array, velocity: Array, wanted: Array, least: float) -> float:
+def _room(arm: LimitedArm, forecast: Forecast, q: Array, velocity: Array, wanted: Array, least: float) -> float:
     """Find the smallest distance, in deviations and at most `ENOUGH`, of an arm that turns to velocities `wanted` (n,).
 
     Each joint changes its velocity as fast as it may and keeps it then. Ends early where it is below `least`.
@@ -85,7 +85,7 @@ def _room(arm: Arm, forecast: Forecast, q: Array, velocity: Array, wanted: Array
 
 @short_kernel
 def dodge(
-    arm: Arm, forecast: Forecast, q: Array, velocity: Array, wanted: Array, before: Array, gain: float
+    arm: LimitedArm, forecast: Forecast, q: Array, velocity: Array, wanted: Array, before: Array, gain: float
 ) -> tuple[bool, Array]:
     """Choose velocities (n,), rad/s, for an arm at q (n,) that has `velocity` (n,).
 

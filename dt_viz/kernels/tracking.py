@@ -51,7 +51,7 @@ BLOCK = block_of(
 """Memory for a step of a block of postures."""
 
 
-class Arm(NamedTuple):
+class TrackingArm(NamedTuple):
     """An arm of n joints."""
 
     joints: Joints
@@ -92,7 +92,7 @@ def _aim(postures: Postures, which: int, lane: int, block: Record) -> None:
 
 
 @compiled
-def _newton(arm: Arm, gain: float, block: Record) -> None:
+def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
     """Make one damped resolved-rate step towards the targets and improve the posture in the null space.
 
     With e = target − x(q), H ≈ ∇²h (Gauss–Newton) and p = −H⁻¹∇h:
@@ -147,7 +147,7 @@ def _newton(arm: Arm, gain: float, block: Record) -> None:
 
 
 @compiled
-def _linearise(arm: Arm, block: Record) -> None:
+def _linearise(arm: TrackingArm, block: Record) -> None:
     """Find the error, and the derivatives J and D of the hand's place and direction."""
     n, hand, axes, origins, place = len(arm.joints), arm.hand, block.axes, block.origins, block.place
     target, error, direction, J, D = block.target, block.error, block.direction, block.J, block.D
@@ -256,7 +256,7 @@ def _invert(block: Record) -> None:
 
 
 @compiled
-def _move(arm: Arm, block: Record) -> None:
+def _move(arm: TrackingArm, block: Record) -> None:
     """Move the joints by p, at most `STEP_LIMIT` and up to their limits, in the lanes that move."""
     q, p, largest, moves, caution = block.q, block.p, block.largest, block.moves, block.caution
     for lane in range(LANES):
@@ -281,7 +281,7 @@ def _move(arm: Arm, block: Record) -> None:
 
 @kernel
 def settle(
-    arm: Arm,
+    arm: TrackingArm,
     postures: Postures,
     q: Array,
     targets: Array,
@@ -332,7 +332,7 @@ def settle(
 
 
 @kernel
-def walk(arm: Arm, postures: Postures, lines: Array, lengths: Array, starts: Array, num_strides: int) -> Array:
+def walk(arm: TrackingArm, postures: Postures, lines: Array, lengths: Array, starts: Array, num_strides: int) -> Array:
     """Walk along lines, one step a stride.
 
     Args:

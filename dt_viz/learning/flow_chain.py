@@ -25,7 +25,7 @@ ROUNDING = 1e-9  # part of a distance by which inducing points on the edge of th
 
 
 @dataclass(frozen=True)
-class Layer:
+class FlowLayer:
     """Features of one stationary field: the Gaussians of a grid that are near the data."""
 
     grid: GaussianGrid
@@ -35,7 +35,7 @@ class Layer:
     """C⁻ᵀ, (m, m)."""
 
     @classmethod
-    def near(cls, points: Array, sigma: float, *, spacing: float, reach: float) -> Layer:
+    def near(cls, points: Array, sigma: float, *, spacing: float, reach: float) -> FlowLayer:
         """Make a layer of Gaussians of width `sigma` on a grid around `points` (N, d).
 
         Args:
@@ -50,7 +50,7 @@ class Layer:
         return cls.of(grid, np.flatnonzero(distance <= farthest))
 
     @classmethod
-    def of(cls, grid: GaussianGrid, active: NDArray[np.integer[Any]] | None = None) -> Layer:
+    def of(cls, grid: GaussianGrid, active: NDArray[np.integer[Any]] | None = None) -> FlowLayer:
         """Make a layer of the Gaussians of a grid with indices `active`; None takes all."""
         if active is None:
             active = np.arange(grid.num_points)
@@ -94,7 +94,7 @@ class Layer:
 class Stack:
     """ψ⁻¹ as a chain of layers; layer 0 acts first. Coefficients are lists of L arrays (m_l, d)."""
 
-    layers: tuple[Layer, ...]
+    layers: tuple[FlowLayer, ...]
     steps: int
     """Number of Euler steps of each layer."""
 

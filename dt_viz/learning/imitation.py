@@ -18,7 +18,7 @@ from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import expected_motions
 from dt_viz.learning.demonstrations import DIMENSIONS, Demonstration
-from dt_viz.learning.flow_chain import Layer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
+from dt_viz.learning.flow_chain import FlowLayer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import TimedAttractor, learn_timing
 from dt_viz.learning.trajectory import TrajectoryFit
@@ -247,7 +247,7 @@ def _fit_trajectories(motions: Motions, settings: ImitationSettings, progress: P
             layers = layers_along(shapes, sigma, spacing=settings.spacing, reach=settings.reach)
         else:
             flat = np.concatenate(shapes).reshape(-1, normalised.shape[-1])
-            layer = Layer.of(equally_spaced_grid(flat, settings.num_inducing, 0.5 / sigma**2))
+            layer = FlowLayer.of(equally_spaced_grid(flat, settings.num_inducing, 0.5 / sigma**2))
             layers = (layer,) * (len(shapes) - 1)
         stack = Stack(layers, steps)
         thetas = regress(stack, shapes, regularisation)

@@ -23,7 +23,7 @@ from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from dt_viz.flows.fields import Array
-from dt_viz.learning.flow_chain import Layer, Stack
+from dt_viz.learning.flow_chain import FlowLayer, Stack
 
 SMOOTHING = 0.04  # width of the filter for tangents, as a fraction of the motion; half of it to find what winds
 MAX_TURN = (
@@ -216,10 +216,10 @@ def regress(stack: Stack, shapes: Sequence[Array], regularisation: float, iterat
     return thetas
 
 
-def layers_along(shapes: Sequence[Array], sigma: float, *, spacing: float, reach: float) -> tuple[Layer, ...]:
+def layers_along(shapes: Sequence[Array], sigma: float, *, spacing: float, reach: float) -> tuple[FlowLayer, ...]:
     """Make a layer for each pair of neighbouring shapes (R, n, d), with Gaussians near the two only."""
     d = shapes[0].shape[-1]
     return tuple(
-        Layer.near(np.concatenate([a, b]).reshape(-1, d), sigma, spacing=spacing, reach=reach)
+        FlowLayer.near(np.concatenate([a, b]).reshape(-1, d), sigma, spacing=spacing, reach=reach)
         for a, b in pairwise(shapes)
     )

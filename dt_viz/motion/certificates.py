@@ -2,8 +2,8 @@
 
 A motion y(t) of the stack is the image of a motion of the base system: ψ(y(t)) = z(t). Certified is that ψ is a
 diffeomorphism along it, that ψ⁻¹ undoes ψ there, that Φ(ψ(y)) falls, and the conjugacy itself: each sample lies where
-the base motion from its start is at the time that is said, up to the goal. What is drawn of another motion, in another
-order, displaced or at other times fails the last of these.
+the base motion from its start is at its time, up to the goal. The conjugacy check catches drawn samples of another
+motion, and those that are permuted, shifted or mistimed.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Certificates:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class DrawnSamples:
     """Motions of the end effector as they are shown, one after the other, and what is said of each sample."""
 
     index: Indices
@@ -93,7 +93,7 @@ class Shown:
 
 
 def certified(
-    known: Certificates, stack: Solution, ends: Array, shown: Shown, *, tolerance: float = MAX_OFF
+    known: Certificates, stack: Solution, ends: Array, shown: DrawnSamples, *, tolerance: float = MAX_OFF
 ) -> Certificates:
     """Add the certificates of a stack along the motions that are shown of it, and a warning for each that fails.
 
@@ -201,7 +201,7 @@ def _beside(off: float, tolerance: float) -> tuple[MotionWarning, ...]:
     return (MotionWarning(Kind.OFF_MOTION, text),)
 
 
-def _of_ends(missed: Array, shown: Shown) -> tuple[MotionWarning, ...]:
+def _of_ends(missed: Array, shown: DrawnSamples) -> tuple[MotionWarning, ...]:
     """Warnings about starts and goal: of base motions that miss theirs by (R + 1, d), and of samples."""
     texts = []
     first = np.r_[True, np.diff(shown.index) > 0]
@@ -213,7 +213,7 @@ def _of_ends(missed: Array, shown: Shown) -> tuple[MotionWarning, ...]:
     return tuple(MotionWarning(Kind.OTHER_ENDS, text) for text in texts)
 
 
-def _of_times(stack: Solution, shown: Shown, base_motion: Array) -> tuple[MotionWarning, ...]:
+def _of_times(stack: Solution, shown: DrawnSamples, base_motion: Array) -> tuple[MotionWarning, ...]:
     """Whether the base motion is elsewhere (N, d) at the times that are said."""
     then = stack.rays.base.flow(stack.rays.z0[shown.index], shown.times[:, None])[:, 0]
     off = np.linalg.norm(then - base_motion, axis=1) - np.where(shown.fraction == 1, ARRIVED, 0.0)
@@ -224,7 +224,7 @@ def _of_times(stack: Solution, shown: Shown, base_motion: Array) -> tuple[Motion
     return (MotionWarning(Kind.OTHER_TIMES, text),)
 
 
-def _falls(distance: Array, shown: Shown) -> bool:
+def _falls(distance: Array, shown: DrawnSamples) -> bool:
     """Whether Φ falls along every rollout from sample to sample: it grows with the `distance` (N,) from the goal alone.
 
     Samples that lie too close together to tell must only be said to go on.

@@ -45,7 +45,7 @@ def motion_warnings(solved: Solved, missed: float) -> tuple[MotionWarning, ...]:
         text = "the motions are stretched too far to be sampled closely: what is drawn cuts corners"
         warnings.append(MotionWarning(Kind.UNSAMPLED, text))
     integration = _of_integration(solved)
-    if scenario.warp < 1:  # what does not do yet what it is made for has not failed
+    if scenario.warp < 1:  # wishes that are not met yet are no failures
         return (*warnings, *integration, *nominal.warnings)
     if arm is not None:
         warnings += _of_arm(solved)
@@ -110,7 +110,7 @@ def _top(solved: Solved, applied: Applied, index: Indices, positions: Array) -> 
         index,
         positions,
         name=applied.name,
-        num_demonstrated=nominal.num_hosts,
+        num_demonstrated=nominal.num_shaping,
     )
 
 

@@ -12,12 +12,12 @@ from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.collision import SELF_MARGIN, CollisionModel, load_collision_model
 from dt_viz.arm.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
 from dt_viz.arm.stances import Stances, stances
-from dt_viz.arm.tracking import JointPath, UnreachableError, drawn_onto, inverse_kinematics, track
+from dt_viz.arm.tracking import TrackedPath, UnreachableError, drawn_onto, inverse_kinematics, track
 from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
-from dt_viz.motion.nominal import Learned, Nominal, Strand
+from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_STARTS
@@ -89,7 +89,7 @@ class Follower:
         """
         if nominal is nominal.learned.demonstrated:
             return self._demonstrated(nominal.learned)
-        rollouts = range(len(nominal.strands))
+        rollouts = range(len(nominal.trajectories))
         return self._memo(
             "joined",
             nominal,
@@ -103,12 +103,14 @@ class Follower:
         Raises:
             UnreachableError: the arm cannot get to where the task's motions start.
         """
-        number, strand, stance = nominal.numbers[rollout], nominal.strands[rollout], nominal.stance
+        number, trajectory, stance = nominal.numbers[rollout], nominal.trajectories[rollout], nominal.stance
         if number < nominal.num_demonstrated:
             return self._demonstrated(nominal.learned, stance).only(number)
         reference = self.reference(nominal)
         # a start that is dragged leaves nothing behind
-        return self._memo("added", (strand, stance), lambda: _lift_added(self.robot, strand, reference), newest=NEWEST)
+        return self._memo(
+            "added", (trajectory, stance), lambda: _lift_added(self.robot, trajectory, reference), newest=NEWEST
+        )
 
     def reference(self, nominal: Nominal) -> Array:
         """The posture (6,), rad, that the arm stays near to.
@@ -139,7 +141,7 @@ class Follower:
             paths = solution.positions_at(index, fraction.ravel()).reshape(paths.shape)
         reference = self.reference(nominal)
         initial = None if exact else self.undisturbed(nominal).tracked.q  # for the eye it does to begin from there
-        lifted = replace(lift(self.robot, fraction, paths, reference, initial), num_guests=nominal.num_added)
+        lifted = replace(lift(self.robot, fraction, paths, reference, initial), num_added=nominal.num_added)
         if not exact:
             return lifted
 
@@ -148,7 +150,7 @@ class Follower:
 
         return replace(lifted, exactly=exactly)
 
-    def along(self, nominal: Nominal, path: Array) -> JointPath:
+    def along(self, nominal: Nominal, path: Array) -> TrackedPath:
         """The joints along one path (T, 3) of the end effector, metres.
 
         Args:
@@ -317,16 +319,16 @@ class Follower:
         """
         reference = self.reference(nominal)
 
-        def reached(strand: Strand) -> bool:
-            tracked = track(self.robot, strand.start[None], reference)
+        def reached(trajectory: NominalTrajectory) -> bool:
+            tracked = track(self.robot, trajectory.start[None], reference)
             return bool(tracked.error[0] <= MAX_TRACKING_ERROR)
 
-        def far(number: int, strand: Strand) -> bool:
+        def far(number: int, trajectory: NominalTrajectory) -> bool:
             if number < nominal.num_demonstrated:
                 return False
-            return not self._memo("reached", (strand, nominal.stance), lambda: reached(strand), newest=NEWEST)
+            return not self._memo("reached", (trajectory, nominal.stance), lambda: reached(trajectory), newest=NEWEST)
 
-        return np.array([far(*numbered) for numbered in zip(nominal.numbers, nominal.strands, strict=True)])
+        return np.array([far(*numbered) for numbered in zip(nominal.numbers, nominal.trajectories, strict=True)])
 
     def admitted(self, nominal: Nominal, obstacle: Union, touched: Mask | None = None) -> Nominal:
         """The rollouts that the whole arm can begin: without those from starts where it is out of reach or room.
@@ -355,7 +357,7 @@ class Follower:
         warnings = far_starts(numbers[far], num, source="") + _touching_starts(numbers[touches], num)
         return nominal.only(np.flatnonzero(~(far | touches)), warnings)
 
-    def warnings(self, joints: JointPath, number: int) -> tuple[MotionWarning, ...]:
+    def warnings(self, joints: TrackedPath, number: int) -> tuple[MotionWarning, ...]:
         """Why the joints along the rollout from the start of this number, counted from 0, are not to be trusted."""
         warnings = []
         worst = float(joints.error.max())
@@ -405,8 +407,8 @@ def _as_stance(posture: Array) -> Stance:
     return a, b, c, d, e, f
 
 
-def _lift_added(robot: Robot, strand: Strand, reference: Array) -> Lift:
-    path, fraction = strand.positions, strand.fraction
+def _lift_added(robot: Robot, trajectory: NominalTrajectory, reference: Array) -> Lift:
+    path, fraction = trajectory.positions, trajectory.fraction
     keep = np.linspace(0, len(fraction) - 1, NUM_CONFIGURATIONS).round().astype(int)
     return lift(robot, fraction[None, keep], path[None, keep], reference)
 

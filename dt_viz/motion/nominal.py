@@ -27,7 +27,7 @@ MAX_CHORDS, IMAGE_TOLERANCE = 6, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Strand:
+class NominalTrajectory:
     """One undisturbed rollout."""
 
     start: Array
@@ -64,7 +64,7 @@ class Learned:
     @cached_property
     def demonstrated(self) -> Nominal:
         """The rollouts from the task's starts."""
-        return Nominal(self, self._strands(self.system.base.demonstrated(self.task.starts), NUM_SAMPLES))
+        return Nominal(self, self._trajectories(self.system.base.demonstrated(self.task.starts), NUM_SAMPLES))
 
     def warped(self, fraction: float) -> Learned:
         """The same with the imitation's flows run for a fraction of their durations."""
@@ -96,21 +96,21 @@ class Learned:
         """The label of each demonstration; none where there are none."""
         return (self.imitation.labels or ()) if isinstance(self.imitation, AugmentedImitation) else ()
 
-    def strand(self, start: Start) -> Strand:
+    def trajectory(self, start: Start) -> NominalTrajectory:
         """The rollout from an added start; a label that it cannot have is that of the nearest demonstrated start."""
         label = start.label if start.label in self.labels else None
-        return self._strands(self.system.base.states(np.array([start.place]), label), NUM_ADDED_SAMPLES)[0]
+        return self._trajectories(self.system.base.states(np.array([start.place]), label), NUM_ADDED_SAMPLES)[0]
 
-    def nominal(self, added: Sequence[Strand]) -> Nominal:
+    def nominal(self, added: Sequence[NominalTrajectory]) -> Nominal:
         """The rollouts from the task's starts and from added ones."""
-        return Nominal(self, (*self.demonstrated.strands, *added)) if added else self.demonstrated
+        return Nominal(self, (*self.demonstrated.trajectories, *added)) if added else self.demonstrated
 
-    def _strands(self, states: Array, num_samples: int) -> tuple[Strand, ...]:
+    def _trajectories(self, states: Array, num_samples: int) -> tuple[NominalTrajectory, ...]:
         images, jacobians = self.images(states)
         rays = Rays(images, self.system.base)
         bundle = evenly_sampled(lambda i, u: self.places(rays.at(i, u))[:, None], len(states), num_samples)
         parts = states[:, :3], images, jacobians, bundle.split(bundle.fraction), bundle.paths
-        return tuple(Strand(*part) for part in zip(*parts, strict=True))
+        return tuple(NominalTrajectory(*part) for part in zip(*parts, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class Nominal:
     """The motion that transforms are stacked on: the learned one, and its rollouts from some starts."""
 
     learned: Learned
-    strands: tuple[Strand, ...]
+    trajectories: tuple[NominalTrajectory, ...]
     """The rollouts; those from the task's starts first."""
     left_out: tuple[int, ...] = ()
     """Numbers of the starts, the task's first, that have no rollout here."""
@@ -158,14 +158,14 @@ class Nominal:
         return sum(number >= self.num_demonstrated for number in self.numbers)
 
     @property
-    def num_hosts(self) -> int:
-        """Number of the rollouts, the first ones, that begin at the task's starts."""
-        return len(self.strands) - self.num_added
+    def num_shaping(self) -> int:
+        """Number of the rollouts, the first ones, that begin at the task's starts: flows are made for these."""
+        return len(self.trajectories) - self.num_added
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
         """Number of each rollout's start among all of the scenario's, the task's first."""
-        total = len(self.strands) + len(self.left_out)
+        total = len(self.trajectories) + len(self.left_out)
         return tuple(number for number in range(total) if number not in self.left_out)
 
     def rollout(self, number: int) -> int | None:
@@ -178,8 +178,8 @@ class Nominal:
         def chosen() -> Nominal:
             kept = {self.numbers[k] for k in rollouts}
             left_out = (*self.left_out, *(number for number in self.numbers if number not in kept))
-            strands = tuple(self.strands[k] for k in rollouts)
-            return replace(self, strands=strands, left_out=tuple(sorted(left_out)), warnings=tuple(warnings))
+            trajectories = tuple(self.trajectories[k] for k in rollouts)
+            return replace(self, trajectories=trajectories, left_out=tuple(sorted(left_out)), warnings=tuple(warnings))
 
         return self._parts("only", (tuple(rollouts), tuple(warnings)), chosen, newest=4)
 
@@ -194,16 +194,16 @@ class Nominal:
         bundle = self.bundle
         samples = Rays(images, learned.system.base).at(bundle.index, bundle.fraction)
         paths = bundle.split(learned.places(samples))
-        strands = (
-            replace(strand, image=image, jacobian=jacobian, positions=path)
-            for strand, image, jacobian, path in zip(self.strands, images, jacobians, paths, strict=True)
+        trajectories = (
+            replace(trajectory, image=image, jacobian=jacobian, positions=path)
+            for trajectory, image, jacobian, path in zip(self.trajectories, images, jacobians, paths, strict=True)
         )
-        return replace(self, learned=learned, strands=tuple(strands))
+        return replace(self, learned=learned, trajectories=tuple(trajectories))
 
     @cached_property
     def starts(self) -> Array:
         """(R, 3), metres."""
-        return np.stack([strand.start for strand in self.strands])
+        return np.stack([trajectory.start for trajectory in self.trajectories])
 
     @property
     def states(self) -> Array:
@@ -216,26 +216,26 @@ class Nominal:
 
     def states_of(self, rollout: int) -> Array:
         """(n, k) states of the samples of a rollout."""
-        strand = self.strands[rollout]
-        samples = self.rays.at(np.full(len(strand.fraction), rollout), strand.fraction)
-        return np.concatenate([strand.positions, samples[:, 3:]], axis=1)
+        trajectory = self.trajectories[rollout]
+        samples = self.rays.at(np.full(len(trajectory.fraction), rollout), trajectory.fraction)
+        return np.concatenate([trajectory.positions, samples[:, 3:]], axis=1)
 
     @cached_property
     def rays(self) -> Rays:
         """Rays of the rollouts in base space."""
-        return Rays(np.stack([strand.image for strand in self.strands]), self.system.base)
+        return Rays(np.stack([trajectory.image for trajectory in self.trajectories]), self.system.base)
 
     @cached_property
     def bundle(self) -> Bundle:
         """Samples of the rollouts."""
-        index = np.repeat(np.arange(len(self.strands)), [len(strand.fraction) for strand in self.strands])
-        fraction = np.concatenate([strand.fraction for strand in self.strands])
-        return Bundle(index, fraction, np.concatenate([strand.positions for strand in self.strands])[:, None])
+        fractions, positions = zip(*((each.fraction, each.positions) for each in self.trajectories), strict=True)
+        index = np.repeat(np.arange(len(fractions)), [len(fraction) for fraction in fractions])
+        return Bundle(index, np.concatenate(fractions), np.concatenate(positions)[:, None])
 
     @cached_property
     def paths(self) -> tuple[Array, ...]:
         """Positions of each rollout, (T_i, 3), metres."""
-        return tuple(strand.positions for strand in self.strands)
+        return tuple(trajectory.positions for trajectory in self.trajectories)
 
     @cached_property
     def ends(self) -> Array:
@@ -251,7 +251,7 @@ class Nominal:
         """ψ of the states at `ends`: by chord steps on ψ⁻¹, which is the cheaper side of ψ."""
         at_goal, J_at_goal = self.learned.at_goal
         images = np.concatenate([self.rays.z0, at_goal])
-        J = np.concatenate([[strand.jacobian for strand in self.strands], J_at_goal])
+        J = np.concatenate([[trajectory.jacobian for trajectory in self.trajectories], J_at_goal])
         error = ends - self.ends
         for _ in range(MAX_CHORDS):
             images = images + (J @ error[..., None])[..., 0]

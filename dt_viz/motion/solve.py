@@ -98,8 +98,8 @@ def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower) -> Sol
             return tried
     if solved.cleared:
         return solved
-    others = np.setdiff1d(np.arange(len(nominal.strands)), solved.arm.stuck)
-    if not (others < nominal.num_hosts).any():
+    others = np.setdiff1d(np.arange(len(nominal.trajectories)), solved.arm.stuck)
+    if not (others < nominal.num_shaping).any():
         return solved
     tried = _solved(scenario, _only(nominal, others), LIVE, follower)
     return tried if tried.cleared else solved
@@ -118,7 +118,7 @@ def _unless_it_touches(solved: Solved, follower: Follower) -> Solved:
     avoidance = solved.scenario.arm_avoidance
     if solved.cleared or solved.arm is None or avoidance is None:
         return solved
-    if not follower.whole_arm.touches(solved.arm, solved.nominal.num_hosts, avoidance.obstacle):
+    if not follower.whole_arm.touches(solved.arm, solved.nominal.num_shaping, avoidance.obstacle):
         return solved
     text = "the arm finds no way around the obstacle between starts and goal"
     return replace(solved, blocked=(MotionWarning(Kind.NO_WAY, text, ARM),))

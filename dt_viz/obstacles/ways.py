@@ -29,7 +29,7 @@ class Way:
     direction: Array
     """(3,) unit vector of the motions' way out: the same, or on its way there from another one."""
     kept: bool = False
-    """Whether it goes on from a way out where the obstacle was before."""
+    """Whether it was carried over from the way out at the obstacle's last pose."""
     length: float = 0.0
     """Longest displacement of a motion along `direction`, metres."""
 

@@ -61,8 +61,7 @@ ROUNDING = 1e-6
 ACCEPTED_MARGIN = 0.9
 """Smallest part of the margin that samples between the checked ones may keep."""
 BESIDE = 1e-3
-"""Depth that still counts as beside an obstacle, metres, since its surface is only nearly known; also the depth below
-its covered start that a motion may reach."""
+"""Tolerance of an obstacle's surface, metres, which is only nearly known, and of the depth of a covered start."""
 NUM_DIRECTIONS, MAX_STEPS_OUT = 360, 200
 """Number of directions of a plane in which a way out of obstacles is searched, and largest number of steps."""
 SHORTEST = 1e-4
@@ -198,7 +197,7 @@ class Avoidance(Transform):
         return goal + length.min() * directions[length.argmin()]
 
     def build(self, motion: MotionBelow) -> Built:
-        """See `Transform`. The automatic flow time is the shortest that clears all avoidable samples of this motion.
+        """The automatic flow time is the shortest that clears all avoidable samples of this motion.
 
         The flow also moves the ends of the next attempt's motion, and the flow time only grows from one attempt to the
         next: where a start or goal is close to the obstacle it may end up longer than needed.

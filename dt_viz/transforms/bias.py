@@ -172,7 +172,7 @@ class BiasPoint(Transform):
         return (s - np.asarray(self.position)) @ self.axes()[:, : 3 if self.plane is None else 2]
 
     def build(self, motion: MotionBelow) -> Built:
-        """See `Transform`. The automatic strength is the smallest that brings every motion to the target."""
+        """The automatic strength is the smallest that brings every motion to the target."""
         point, motion, at_least = self, motion.demonstrated, motion.at_least
         if motion.above is not None:  # what is above must not lead the motion past the target again
             point = replace(point, position=as_point(motion.above.forward(np.asarray(point.position))))

@@ -19,7 +19,7 @@ from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import selected, transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
-from dt_viz.ui.panel.panel import Panel
+from dt_viz.ui.panel.panel import ControlPanel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.ruler import Ruler
 from dt_viz.ui.scene import palette
@@ -37,7 +37,7 @@ from dt_viz.ui.scene.scene import ScenePictures
 from dt_viz.ui.scene.slice import MovableSlice
 from dt_viz.ui.scene.starts import Starts
 from dt_viz.ui.scene.tripod import Tripod
-from dt_viz.ui.scene.way import Way
+from dt_viz.ui.scene.way import WayAhead
 
 NOTICE_SECONDS = 12.0
 """Time after which a notification closes by itself, seconds."""
@@ -86,7 +86,7 @@ class Visitor(Display):
             self.their_arm = TheirArm(client.scene, robot)
             self.objects = Objects(client.scene)
             self.drawing = Drawing(client.scene, self.arm.frames[-1].name, robot.end_effector_offset)
-            self.way = Way(client.scene, self.pictures.middles)
+            self.way = WayAhead(client.scene, self.pictures.middles)
             self.grip = Grip(client.scene, robot, self.arm.frames[-1].name, self._hand, self._hand_held)
         self._robot = robot
         self._posed: tuple[bytes, bool] | None = None
@@ -94,7 +94,7 @@ class Visitor(Display):
         self.playback = Playback(engine.arm, self._pose, self.fail)
         """What moves the arm."""
         self._tripod = Tripod(client, self._hand)
-        self._panel = Panel(client.gui, titles, robot, self._save_png, self._notify, self._tripod, self._darken)
+        self._panel = ControlPanel(client.gui, titles, robot, self._save_png, self._notify, self._tripod, self._darken)
         self.session = Session(engine, lambda name: initial_scenario(engine, name), task, self)
         self._panel.connect(self.session)
         self._panel.push.connect(engine.arm.push)

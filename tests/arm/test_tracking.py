@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 from dt_viz.arm.robot import NUM_JOINTS, Robot, load_jaco
-from dt_viz.arm.tracking import STEP_TOLERANCE, JointPath, UnreachableError, inverse_kinematics, track
+from dt_viz.arm.tracking import STEP_TOLERANCE, TrackedPath, UnreachableError, inverse_kinematics, track
 
 BOX = np.array([[-0.4, -0.65, 0.05], [0.4, -0.3, 0.75]])  # where the tasks live, metres
 STEPS = 5 * STEP_TOLERANCE  # rad, that a posture may be away from the best one
@@ -62,7 +62,7 @@ class TestInverseKinematics:
 
 
 class TestTracking:
-    def follow(self, robot: Robot, path: np.ndarray) -> JointPath:
+    def follow(self, robot: Robot, path: np.ndarray) -> TrackedPath:
         return track(robot, path, inverse_kinematics(robot, path[0]))
 
     @settings(max_examples=30)

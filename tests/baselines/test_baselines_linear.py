@@ -9,7 +9,7 @@ from dt_viz.arm.link_distances import Poses
 from dt_viz.arm.robot import collision_meshes
 from dt_viz.arm.tracking import UnreachableError
 from dt_viz.baselines.linear import Linear
-from dt_viz.baselines.postures import NUM_SAMPLES, Query, Surroundings, planned
+from dt_viz.baselines.postures import NUM_SAMPLES, PlanningScene, Query, planned
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 
@@ -83,7 +83,7 @@ class TestSurroundings:
     def test_a_line_is_free_only_where_no_vertex_of_the_meshes_enters_anything(self, problem, lines, shape):
         place = as_point(problem.task.mean_path[50])
         part = Sphere(place, 0.15) if shape == "sphere" else Box(place, (0.1, 0.2, 0.12))
-        around = Surroundings.of(problem.robot, Union((part,)))
+        around = PlanningScene.of(problem.robot, Union((part,)))
         verdicts = []
         for line in lines[:30]:
             verdicts.append(around.is_free(*line))
@@ -93,7 +93,7 @@ class TestSurroundings:
 
     def test_what_is_far_from_everything_is_free(self, problem, lines):
         model = load_collision_model()
-        far, nothing = (Surroundings.of(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
+        far, nothing = (PlanningScene.of(problem.robot, Union(parts)) for parts in ((Sphere((5.0, 0.0, 0.0)),), ()))
         for line in lines[:15]:
             itself = model.nearest_to_itself(np.stack(line))
             assert far.is_free(*line) == nothing.is_free(*line)
@@ -101,7 +101,7 @@ class TestSurroundings:
                 assert nothing.is_free(*line)
 
     def test_nothing_between_two_samples_is_passed_through(self, problem, lines):
-        free = [line for line in lines if Surroundings.of(problem.robot, Union()).is_free(*line)]
+        free = [line for line in lines if PlanningScene.of(problem.robot, Union()).is_free(*line)]
         assert len(free) > 10
         rng, mesh = np.random.default_rng(2), collision_meshes()[-1]
         for start, end in free[:15]:
@@ -109,10 +109,10 @@ class TestSurroundings:
             vertex = mesh.vertices[rng.integers(len(mesh.vertices))]
             place = poses.rotations[0, mesh.joint + 1] @ vertex + poses.origins[0, mesh.joint + 1]
             speck = Union((Sphere(as_point(place), 0.0005),))
-            assert not Surroundings.of(problem.robot, speck).is_free(start, end)
+            assert not PlanningScene.of(problem.robot, speck).is_free(start, end)
 
     def test_the_arm_may_not_pass_through_itself_or_the_table(self, problem):
-        nothing, model, rng = Surroundings.of(problem.robot, Union()), load_collision_model(), np.random.default_rng(1)
+        nothing, model, rng = PlanningScene.of(problem.robot, Union()), load_collision_model(), np.random.default_rng(1)
         seen = set()
         for q in problem.robot.clip(rng.uniform(-np.pi, np.pi, size=(40, 6)) + problem.robot.home):
             report = model.report(q[None], Union())

@@ -26,7 +26,7 @@ from dt_viz.baselines.mpnet import (
     cloud,
 )
 from dt_viz.baselines.mpnet_rrt import MPNetRRT
-from dt_viz.baselines.postures import Surroundings
+from dt_viz.baselines.postures import PlanningScene
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -59,7 +59,7 @@ def search(free):
 
     line = SimpleNamespace(robot=SimpleNamespace(clip=np.asarray), is_free=lambda start, end: free(start[0], end[0]))
     model = MPNetModel.of(weights())
-    return Search(model, np.zeros(ENCODER[-1]), cast("Surroundings", line), np.random.default_rng(0))
+    return Search(model, np.zeros(ENCODER[-1]), cast(PlanningScene, line), np.random.default_rng(0))
 
 
 def at(*values):

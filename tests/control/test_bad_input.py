@@ -5,7 +5,7 @@ import pytest
 from scenes import changed
 
 from dt_viz.arm.collision import load_collision_model
-from dt_viz.control.controller import Controller, Phase
+from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.limits import ContactLimit
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.kernels.proximity import contacts, least_contacts
@@ -26,7 +26,7 @@ class Robot:
         self.follower, self.robot = engine.follower, engine.follower.robot
         self.solved = engine.solved(changed(initial(task), space="cspace", obstacles=(), margin=0.03), LIVE)
         self.q = self.follower.undisturbed(self.solved.nominal).tracked.q[0, 0].copy()
-        self.controller, self.velocity = Controller(self.follower, self.solved), np.zeros(6)
+        self.controller, self.velocity = ArmController(self.follower, self.solved), np.zeros(6)
         self.unavoidable = 0.0
 
     def tick(self, dt=TICK):

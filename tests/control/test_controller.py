@@ -8,7 +8,7 @@ from scenes import changed
 
 from dt_viz.arm.arm_system import ArmSystem
 from dt_viz.arm.collision import load_collision_model
-from dt_viz.control.controller import Controller, Phase
+from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import LIVE
@@ -70,7 +70,7 @@ class Scene:
         return replace(self.solved, scenario=changed(self.scenario, obstacles=sphere))
 
     def controller(self, solved=None):
-        return Controller(self.engine.follower, solved or self.solved)
+        return ArmController(self.engine.follower, solved or self.solved)
 
     def begun(self, seconds, solved=None):
         """A robot that has moved for some seconds from the start."""
@@ -260,7 +260,7 @@ class TestDisturbances:
                 return scene.engine.follower.reference(nominal) + offset
 
         offset = np.zeros(6)
-        robot = Robot(Controller(Leaning(), scene.solved), scene.start).run(1.0)  # pyright: ignore[reportArgumentType]
+        robot = Robot(ArmController(Leaning(), scene.solved), scene.start).run(1.0)  # pyright: ignore[reportArgumentType]
         offset = np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
         robot.controller.follow(scene.solved)
         scene.assert_arrives(robot)

@@ -7,7 +7,7 @@ import pytest
 
 from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
 from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
-from dt_viz.control.obstacle_motion import Motion, Sighting
+from dt_viz.control.obstacle_motion import ObstacleMotion, Sighting
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.transforms.base import ArmAvoidance
@@ -48,7 +48,7 @@ def scenes(arm: WholeArm, num):
             at = as_point(points[rng.integers(5, len(points))] + way / np.linalg.norm(way) * rng.uniform(0.12, 0.2))
             shapes.append((Sphere(at, 0.15), Box(at, (0.1, 0.12, 0.14)), Cylinder(at, 0.1, 0.2))[k % 3])
         velocities = rng.normal(scale=0.15, size=(len(shapes), 3)) * (k % 2)
-        motions = tuple(Motion(velocity) for velocity in velocities)
+        motions = tuple(ObstacleMotion(velocity) for velocity in velocities)
         yield q, Sighting(0.0, ArmAvoidance(Union(tuple(shapes)), margin=0.02), motions)
 
 

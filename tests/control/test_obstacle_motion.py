@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dt_viz.control.obstacle_motion import NOTHING_SEEN, Motion, Sighting
+from dt_viz.control.obstacle_motion import NOTHING_SEEN, ObstacleMotion, Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -49,7 +49,7 @@ def test_a_deviation_from_the_mean_velocity_returns_as_a_critically_damped_one()
     for _ in range(round(0.3 / step)):
         place += step * (mean + d)
         d, rate = d + step * rate, rate - step * (2 * RATE * rate + RATE**2 * d)
-    found = Motion(velocity, acceleration, mean, 1.0).ahead(np.array([0.3]), RATE)
+    found = ObstacleMotion(velocity, acceleration, mean, 1.0).ahead(np.array([0.3]), RATE)
     np.testing.assert_allclose(found, [place], atol=1e-4)
 
 

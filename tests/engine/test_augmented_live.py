@@ -12,7 +12,7 @@ from oracles import central_differences
 from scenes import avoiding, biases, changed, kinds, starts_at
 
 import dt_viz as dt
-from dt_viz.control.controller import Controller, Phase
+from dt_viz.control.controller import ArmController, Phase
 from dt_viz.engine.frame import Stage
 from dt_viz.errors import DataError, FormatError
 from dt_viz.evaluate.held_out import path_from
@@ -23,7 +23,7 @@ from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.learning.preparation import ImitationError, prepare
 from dt_viz.metrics import distance_from_path
-from dt_viz.motion.certificates import Certificates, Shown, certified
+from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.panels import Panel
@@ -353,7 +353,9 @@ def test_the_8_is_drawn_as_demonstrated(engine):
 def test_certificates_recognise_motions_of_other_conditions(engine):
     solved = engine.solved(in_the_way(engine), FINE)
     stack, bundle = solved.stack, solved.stack.bundle
-    shown = Shown(bundle.index, bundle.fraction, stack.rays.times(bundle.index, bundle.fraction), bundle.positions)
+    shown = DrawnSamples(
+        bundle.index, bundle.fraction, stack.rays.times(bundle.index, bundle.fraction), bundle.positions
+    )
     assert not certified(Certificates(0.01), stack, solved.ends, shown).warnings
     another = replace(stack, rays=replace(stack.rays, z0=np.roll(stack.rays.z0, 1, axis=0)))
     assert Kind.OFF_MOTION in kinds(certified(Certificates(0.01), another, solved.ends, shown).warnings)
@@ -453,7 +455,7 @@ def farthest_from(hand, path):
 
 def test_the_arm_draws_the_8(engine, loop):
     solved, joints = loop
-    controller, robot = Controller(engine.follower, solved), engine.follower.robot
+    controller, robot = ArmController(engine.follower, solved), engine.follower.robot
     hand, q = drawn(robot, controller, joints[0])
     assert controller.phase is Phase.RESTING and controller.left < 1e-3
     assert np.linalg.norm(hand[-1] - solved.nominal.goal) < 1e-3
@@ -467,7 +469,7 @@ def test_the_arm_draws_the_8(engine, loop):
 @pytest.mark.parametrize("way", ["pushed", "held"])
 def test_after_a_disturbance_it_draws_the_rest(engine, loop, way):
     solved, joints = loop
-    robot, controller = engine.follower.robot, Controller(engine.follower, solved)
+    robot, controller = engine.follower.robot, ArmController(engine.follower, solved)
     q = run(controller, joints[0], 2.5, [])
     path = solved.stack.bundle.paths[0]
     assert 0.2 < controller.left < 0.9
@@ -486,7 +488,7 @@ def test_after_a_disturbance_it_draws_the_rest(engine, loop, way):
 
 def test_its_velocity_is_that_of_the_system_at_its_phase(engine, loop):
     solved, joints = loop
-    controller, passed = Controller(engine.follower, solved), []
+    controller, passed = ArmController(engine.follower, solved), []
     q, compared = joints[0], 0
     for _ in range(12):
         q = run(controller, q, 0.25, passed)
@@ -507,7 +509,7 @@ def test_the_arm_draws_the_pattern_of_the_rollout_that_it_begins(new_engine, rol
     q = engine.follower.undisturbed(solved.nominal).tracked.q[rollout][0]
     path, other = (solved.nominal.paths[k] for k in (rollout, 1 - rollout))
     for aim in ("begin", "home"):
-        controller = Controller(engine.follower, solved)
+        controller = ArmController(engine.follower, solved)
         if aim == "begin":
             controller.begin(q, rollout)
         else:

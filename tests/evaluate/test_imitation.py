@@ -10,7 +10,7 @@ from PIL import Image
 
 from dt_viz.evaluate import figures, imitation
 from dt_viz.evaluate.__main__ import main
-from dt_viz.evaluate.figures import Panel
+from dt_viz.evaluate.figures import FigurePanel
 from dt_viz.evaluate.held_out import WAYS, follow
 from dt_viz.learning.demonstrations import Demonstration, save_demonstrations
 from dt_viz.learning.imitation import fit, grown_grid
@@ -121,7 +121,7 @@ def test_the_worst_of_what_was_held_out_is_drawn(left_out, monkeypatch, lasa, tm
 
 
 def test_the_worst_cases_are_the_farthest_off_first():
-    cases = [(share, Panel(name, {})) for name, share in {"large": 0.03, "small": 0.1, "met": 0.01}.items()]
+    cases = [(share, FigurePanel(name, {})) for name, share in {"large": 0.03, "small": 0.1, "met": 0.01}.items()]
     assert [panel.title for _, panel in imitation.worst_of(cases, 2)] == ["small", "large"]
 
 
@@ -129,8 +129,8 @@ def test_a_panel_is_drawn_from_the_broadest_side_under_its_name():
     path = np.column_stack([np.linspace(0, 3, 20), np.linspace(0, 4, 20), np.linspace(0, 1, 20)])
     figure = figures.panels(
         [
-            Panel("A", {"demonstration": [path], "learned": [path]}),
-            Panel("B", {"demonstration": [path], "learned": [path[:2]]}),
+            FigurePanel("A", {"demonstration": [path], "learned": [path]}),
+            FigurePanel("B", {"demonstration": [path], "learned": [path[:2]]}),
         ]
     )
     first, second = figure.axes

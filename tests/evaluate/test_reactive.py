@@ -120,7 +120,7 @@ def test_figures_of_a_run_are_relative_to_the_limits(bench):
     q = bench.starts[0] + np.cumsum([[0.0], [0.01], [0.03], [0.03]], axis=0) * np.eye(6)[0]
     away = [np.array([[3.0, 0.0, 0.0]])] * 4
     run = reactive.Run(list(q), [0.0, 0.01, 0.02, 0.03], away, [0.001, 0.003])
-    found = reactive.Figures.of(
+    found = reactive.RunFigures.of(
         bench, reactive.Crossing(0, 0.01, (reactive.Passage(np.zeros((2, 3)), 0.0, 1.0, 1.0),)), run, 0.005
     )
     assert found.velocity == pytest.approx(3.0 / bench.robot.velocity_limits[0])

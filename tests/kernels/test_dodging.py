@@ -7,7 +7,7 @@ import pytest
 
 from dt_viz.arm.body_points import load_body_points
 from dt_viz.arm.robot import load_jaco
-from dt_viz.kernels.dodging import ENOUGH, Arm, Forecast, dodge
+from dt_viz.kernels.dodging import ENOUGH, Forecast, LimitedArm, dodge
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 
@@ -16,7 +16,7 @@ LINKS = load_body_points().on_moving_links
 FLOOR, DEPTH, KEPT = 0.05, 0.02, 0.01
 UP = np.array([0.0, 0.0, 1.0])
 ACCELERATION, TIMES = 4.0, np.linspace(0, 0.4, 9)[1:]
-ARM = Arm(ROBOT.records, LINKS.records, ROBOT.lower, ROBOT.upper, ROBOT.velocity_limits, ACCELERATION)
+ARM = LimitedArm(ROBOT.records, LINKS.records, ROBOT.lower, ROBOT.upper, ROBOT.velocity_limits, ACCELERATION)
 
 
 def room(parts, moved, deviation, q, velocity, wanted):

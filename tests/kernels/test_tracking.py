@@ -7,10 +7,10 @@ import pytest
 from dt_viz.arm.robot import load_jaco
 from dt_viz.arm.tracking import LIMIT_MARGIN
 from dt_viz.kernels.blocks import LANES
-from dt_viz.kernels.tracking import Arm, Postures, settle, walk
+from dt_viz.kernels.tracking import Postures, TrackingArm, settle, walk
 
 ROBOT = load_jaco()
-ARM = Arm(ROBOT.records, np.array(ROBOT.end_effector_offset), np.array(ROBOT.lower), np.array(ROBOT.upper))
+ARM = TrackingArm(ROBOT.records, np.array(ROBOT.end_effector_offset), np.array(ROBOT.lower), np.array(ROBOT.upper))
 
 
 def postures(num, seed=0):

@@ -12,7 +12,7 @@ from dt_viz.flows.diffeomorphisms import Flow, min_det_jacobian
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.learning.flow_chain import Layer, Stack, equally_spaced_grid, min_step_determinant
+from dt_viz.learning.flow_chain import FlowLayer, Stack, equally_spaced_grid, min_step_determinant
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
 from dt_viz.learning.preparation import ImitationError
 from dt_viz.learning.unbending import unbending
@@ -138,7 +138,7 @@ def test_a_motion_that_turns_twice_round_gets_more_layers():
 def test_the_fitted_chain_is_the_transform_and_sensitivities_are_the_derivatives_of_its_inverse(dim):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(40, dim))
-    layer = Layer.near(points, 1.0, spacing=1.0, reach=1.0)
+    layer = FlowLayer.near(points, 1.0, spacing=1.0, reach=1.0)
     stack = Stack((layer, layer), steps=3)
     thetas = [0.3 * rng.normal(size=(layer.num_features, dim)) for _ in range(2)]
     x, by_z, by_theta = stack.inverse_with_sensitivity(points, thetas)

@@ -14,7 +14,7 @@ from drawings import extent, from_one_start
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.choice import learn
 from dt_viz.learning.demonstrations import Demonstration
-from dt_viz.learning.flow_chain import Layer
+from dt_viz.learning.flow_chain import FlowLayer
 from dt_viz.learning.timing import MIN_PACE, _fit_pace
 from dt_viz.scenario.tasks import TASKS
 
@@ -99,12 +99,12 @@ def test_the_state_and_the_labels_do_not_hang_on_rounding_or_order(name):
 
 def test_inducing_points_on_the_edge_of_the_reach_are_in_use_however_they_are_rounded():
     ends = np.array([[0.0, 0.0], [0.0, 5.0]])
-    inner = Layer.near(ends, 1.0, spacing=1.0, reach=1.25).grid.axes[1][2:-2]  # heights of inducing points
+    inner = FlowLayer.near(ends, 1.0, spacing=1.0, reach=1.25).grid.axes[1][2:-2]  # heights of inducing points
     points = np.concatenate([ends, np.stack([np.zeros_like(inner), inner], axis=1)])
-    exact = Layer.near(points, 1.0, spacing=1.0, reach=1.25)
+    exact = FlowLayer.near(points, 1.0, spacing=1.0, reach=1.25)
     for seed in range(10):
         noise = 1e-13 * np.random.default_rng(seed).normal(size=points.shape)
-        np.testing.assert_array_equal(Layer.near(points + noise, 1.0, spacing=1.0, reach=1.25).active, exact.active)
+        np.testing.assert_array_equal(FlowLayer.near(points + noise, 1.0, spacing=1.0, reach=1.25).active, exact.active)
 
 
 @pytest.mark.parametrize("quick", [False, True])

@@ -23,7 +23,7 @@ from dt_viz.motion.certificates import (
     MAX_OFF,
     MAX_OFF_POSTURE,
     Certificates,
-    Shown,
+    DrawnSamples,
     certified,
     clearance_warnings,
     delay_warnings,
@@ -61,14 +61,14 @@ def straight(*fractions):
 
 
 def as_shown(bundle):
-    return Shown(bundle.index, bundle.fraction, RAYS.times(bundle.index, bundle.fraction), bundle.positions)
+    return DrawnSamples(bundle.index, bundle.fraction, RAYS.times(bundle.index, bundle.fraction), bundle.positions)
 
 
 SHOWN = as_shown(bundle_of(IDENTITY))
 
 
 def certificates_of(
-    shown: Shown | Bundle = SHOWN, ends=None, transform: Diffeomorphism = IDENTITY, known=KNOWN, **options
+    shown: DrawnSamples | Bundle = SHOWN, ends=None, transform: Diffeomorphism = IDENTITY, known=KNOWN, **options
 ):
     """Certificates of what is shown, said to be motions of the transform."""
     if isinstance(shown, Bundle):

@@ -75,7 +75,7 @@ class TestAdmission:
         (reason,) = admission.nominal.warnings
         assert reason.kind is Kind.START_COVERED and reason.text.startswith("start") and "3" in reason.text
         assert (away[list(admission.nominal.left_out)] < 0.15).all()
-        assert len(admission.nominal.strands) + len(admission.nominal.left_out) == 7
+        assert len(admission.nominal.trajectories) + len(admission.nominal.left_out) == 7
 
     @pytest.mark.parametrize(
         ("place", "diameter", "kind", "says"),
@@ -230,8 +230,8 @@ class TestNoWay:
         assert lift.solved(moved, passing=passing).nominal is lift.nominal
 
     def test_starts_from_which_there_is_no_way_are_left_out_and_named_and_not_tried_again_in_a_drag(self, lift):
-        num, tried = len(lift.nominal.strands), []
-        lift.spoil(lambda lifted: tried.append(lifted.num_hosts) or lifted.num_hosts == num, stuck=np.array([2]))
+        num, tried = len(lift.nominal.trajectories), []
+        lift.spoil(lambda lifted: tried.append(lifted.num_shaping) or lifted.num_shaping == num, stuck=np.array([2]))
         solved = lift.solved()
         assert solved.arm is not None and solved.cleared and solved.nominal.left_out == (2,) and tried[0] == num
         assert len(np.unique(solved.arm.index)) == len(solved.stack.bundle.paths) == num - 1
@@ -248,7 +248,7 @@ class TestNoWay:
 
     @pytest.mark.parametrize("precision", [LIVE, pytest.param(FINE, marks=pytest.mark.slow)], ids=["live", "fine"])
     def test_no_way_is_said_instead_of_shown_where_the_arm_would_touch(self, lift, precision):
-        lift.spoil(lambda lifted: True, stuck=np.arange(len(lift.nominal.strands)))
+        lift.spoil(lambda lifted: True, stuck=np.arange(len(lift.nominal.trajectories)))
         assert lift.solved(precision=precision).blocked == ()  # it comes near, but does not touch
         lift.go_straight_through()
         (warning,) = lift.solved(precision=precision).blocked

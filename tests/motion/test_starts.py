@@ -88,11 +88,11 @@ def test_the_whole_arm_makes_way_for_the_task_and_names_the_added_starts_that_it
     numbers, arm = solved.nominal.numbers, solved.arm
     doubtful = np.union1d(arm.too_near, arm.moved)
     assert len(doubtful)
-    for guest in doubtful:
-        assert re.search(rf"added starts? [\d, ]*\b{numbers[guest] - 6}\b", named)
-    for guest in np.setdiff1d(np.arange(7, len(frame.rollouts)), doubtful):
-        np.testing.assert_allclose(frame.rollouts[guest][0], grid.starts[numbers[guest] - 7].place, atol=MOVED)
-        assert engine.follower.whole_arm.clearance(arm.p[arm.index == guest], scenario.obstacle).min() > 0
+    for added in doubtful:
+        assert re.search(rf"added starts? [\d, ]*\b{numbers[added] - 6}\b", named)
+    for added in np.setdiff1d(np.arange(7, len(frame.rollouts)), doubtful):
+        np.testing.assert_allclose(frame.rollouts[added][0], grid.starts[numbers[added] - 7].place, atol=MOVED)
+        assert engine.follower.whole_arm.clearance(arm.p[arm.index == added], scenario.obstacle).min() > 0
 
 
 @pytest.mark.parametrize("space", ["task", "cspace"])
@@ -152,7 +152,7 @@ def test_dragging_a_start_keeps_only_the_newest_rollouts(new_engine, initial):
     for x in np.linspace(-0.1, 0.1, 110):
         moved = replace(scenario, starts=starts_at((x, -0.5, 0.45)))
         assert isinstance(engine.nominal(moved), Nominal)
-    assert engine.memo.count("strand") < 100
+    assert engine.memo.count("trajectory") < 100
     assert engine.memo.count("nominal") < 10
 
 
@@ -169,7 +169,7 @@ def test_what_is_shown_does_not_depend_on_which_starts_were_there_before(engine,
 
 def test_the_ground_keeps_what_it_has_of_the_demonstrations(engine, initial):
     nominal = engine.nominal(initial("lift_box"))
-    more = nominal.learned.nominal([nominal.learned.strand(Start((0.1, -0.5, 0.3)))])
+    more = nominal.learned.nominal([nominal.learned.trajectory(Start((0.1, -0.5, 0.3)))])
     assert nominal.learned.nominal(()) is nominal
     np.testing.assert_array_equal(more.starts[:-1], nominal.starts)
     alike, other = more.rays_between(more.ends), nominal.rays_between(nominal.ends)

@@ -5,7 +5,7 @@ import pytest
 
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.rollouts import Middles
-from dt_viz.ui.scene.way import BESIDE, PERIOD, STEP, TRAIL_SECONDS, Way
+from dt_viz.ui.scene.way import BESIDE, PERIOD, STEP, TRAIL_SECONDS, WayAhead
 
 AHEAD = np.linspace([0.0, 0.0, 0.3], [0.2, 0.0, 0.3], 5)
 
@@ -17,7 +17,7 @@ def _middles():
 
 @pytest.fixture(name="way")
 def _way(scene, middles):
-    return Way(scene, middles)
+    return WayAhead(scene, middles)
 
 
 def moved(way, seconds, speed=0.1, begins=0.0):

@@ -88,7 +88,7 @@ MAX_FLOWS = 3
 """Number of flows that ψ is composed of until a picture of the generator brings its own."""
 
 
-class Panel:
+class ControlPanel:
     """The control panel of one visitor."""
 
     def __init__(

@@ -37,7 +37,7 @@ def add_settings(
         order: order of all of them in the folder.
     """
     for setting in dict.fromkeys(setting for kind in registry.KINDS for setting in offered(kind)):
-        _BUILDERS[type(setting)](gui, _Field(bindings, offered, chosen, setting), setting, order)
+        _BUILDERS[type(setting)](gui, _SettingField(bindings, offered, chosen, setting), setting, order)
 
 
 def chosen_values(frame: Frame) -> dict[str, Mapping[str, float]]:
@@ -49,7 +49,7 @@ def chosen_values(frame: Frame) -> dict[str, Mapping[str, float]]:
 
 
 @dataclass(frozen=True)
-class _Field:
+class _SettingField:
     """The field of the chosen transform that a setting is about."""
 
     bindings: Bindings
@@ -105,7 +105,7 @@ class _Field:
         return None if name is None or frame is None else chosen_values(frame).get(name, {}).get(self.setting.field)
 
 
-def _add_number(gui: viser.GuiApi, field: _Field, setting: Number, order: float | None) -> None:
+def _add_number(gui: viser.GuiApi, field: _SettingField, setting: Number, order: float | None) -> None:
     def shown(value: float | None) -> float:
         """Return what the slider shows: while it is automatic what was chosen, to go on from by hand."""
         value = field.suggestion() if value is None else value
@@ -136,18 +136,18 @@ def _add_number(gui: viser.GuiApi, field: _Field, setting: Number, order: float 
     field.bindings.properties(slider.handle, disabled=field.read(lambda value: value is None, otherwise=KEEP))
 
 
-def _add_switch(gui: viser.GuiApi, field: _Field, setting: Switch, order: float | None) -> None:
+def _add_switch(gui: viser.GuiApi, field: _SettingField, setting: Switch, order: float | None) -> None:
     handle = gui.add_checkbox(setting.label, False, order=order, visible=False, hint=setting.hint)
     field.bind(handle, bool, lambda _before, on: on)
 
 
-def _add_choice(gui: viser.GuiApi, field: _Field, setting: Choice, order: float | None) -> None:
+def _add_choice(gui: viser.GuiApi, field: _SettingField, setting: Choice, order: float | None) -> None:
     keys = {label: key for key, label in setting.options.items()}
     handle = gui.add_dropdown(setting.label, tuple(keys), order=order, visible=False, hint=setting.hint)
     field.bind(handle, lambda value: setting.options[value], lambda _before, label: keys[label])
 
 
-def _add_integration(gui: viser.GuiApi, field: _Field, _setting: FlowIntegration, order: float | None) -> None:
+def _add_integration(gui: viser.GuiApi, field: _SettingField, _setting: FlowIntegration, order: float | None) -> None:
     hint = "auto: errors stay invisible; the others take equal steps, and the status warns of their errors"
     methods = {label: method for method, label in METHOD_LABELS.items()}
     field.bind(
@@ -163,7 +163,7 @@ def _add_integration(gui: viser.GuiApi, field: _Field, _setting: FlowIntegration
     )
 
 
-_BUILDERS: Mapping[type[Setting], Callable[[viser.GuiApi, _Field, Any, float | None], None]] = {
+_BUILDERS: Mapping[type[Setting], Callable[[viser.GuiApi, _SettingField, Any, float | None], None]] = {
     Number: _add_number,
     Switch: _add_switch,
     Choice: _add_choice,

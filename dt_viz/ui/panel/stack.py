@@ -45,7 +45,7 @@ _COLOURS: Mapping[type[Transform], Colour] = {Avoidance: palette.OBSTACLE, BiasP
 
 
 @dataclass(frozen=True)
-class Row:
+class StackRow:
     """Row of the list: a transform with its buttons."""
 
     name: str
@@ -62,7 +62,7 @@ class StackPanel:
         bindings.properties(gui.add_html(""), content=formula_html)
         self._folder = gui.add_folder("Stack, the outermost on top")
         self.rows: list[Any] = []
-        self._shown: tuple[Row, ...] = ()
+        self._shown: tuple[StackRow, ...] = ()
         with self._folder:
             self._warp = WarpControls(gui, bindings, BELOW)
             add_transform_settings(gui, bindings, BELOW + 2)
@@ -76,11 +76,11 @@ class StackPanel:
         """Stop playing."""
         self._warp.close()
 
-    def _wanted(self, scenario: Scenario) -> tuple[Row, ...]:
+    def _wanted(self, scenario: Scenario) -> tuple[StackRow, ...]:
         frame = self._bindings.frame
         return rows(scenario, {} if frame is None else durations(frame))
 
-    def _show(self, wanted: tuple[Row, ...]) -> None:
+    def _show(self, wanted: tuple[StackRow, ...]) -> None:
         """Reuse the rows that there are, from the top; those that are not needed are hidden."""
         self._shown = wanted
         while len(self.rows) < len(wanted):
@@ -90,7 +90,7 @@ class StackPanel:
         for handle in self.rows[len(wanted) :]:
             handle.visible = False
 
-    def _add_row(self, row: Row) -> None:
+    def _add_row(self, row: StackRow) -> None:
         k = len(self.rows)
         with self._folder:
             handle = self._gui.add_button_group(row.label, row.buttons)
@@ -109,7 +109,7 @@ def press(session: Session, name: str, button: str) -> None:
     session.end_gesture()
 
 
-def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row, ...]:
+def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[StackRow, ...]:
     """Return the rows from the top down, with the durations of the last frame."""
     on = {layer.name for layer in scenario.stack if layer.on}
     seen, order, rows = levels(scenario), listed(scenario), []
@@ -118,13 +118,13 @@ def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[Row
         look = (_look(scenario, name),) * (name in seen)
         transform = transform_of(scenario, name)
         label = _label(name, durations.get(name), "t" if transform is None else transform.flow_time)
-        rows.append(Row(name, label, (ON if name in on else OFF, *moves, *look)))
+        rows.append(StackRow(name, label, (ON if name in on else OFF, *moves, *look)))
     place = place_of(scenario, WHOLE_ARM)
     if WHOLE_ARM in tunable(scenario) and place is not None:
         label = _label(WHOLE_ARM, durations.get(WHOLE_ARM))
-        rows.append(Row(WHOLE_ARM, label, (ON if scenario.stack[place].on else OFF,)))
-    imitation = Row(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
-    base = Row(BASE, BASE, (SHOWN if BASE_PANEL in scenario.view.panels else SHOW,))
+        rows.append(StackRow(WHOLE_ARM, label, (ON if scenario.stack[place].on else OFF,)))
+    imitation = StackRow(IMITATION, IMITATION, (ON if scenario.imitation else OFF, _look(scenario, IMITATION)))
+    base = StackRow(BASE, BASE, (SHOWN if BASE_PANEL in scenario.view.panels else SHOW,))
     return (*reversed(rows), imitation, base)
 
 

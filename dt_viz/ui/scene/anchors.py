@@ -158,7 +158,7 @@ class Anchors(Dragged):
         return [item.handles for item in self.items]
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: shows the regions, and remembers the slice for drags."""
+        """Shows the regions, and remembers the slice for drags."""
         super().draw(frame)
         layers = zip(frame.scenario.stack, frame.chosen_values, strict=False)
         radii = {layer.name: chosen.get("radius") for layer, chosen in layers}

@@ -29,7 +29,7 @@ ABOVE, APART = 0.012, 0.045
 """Height of a name above its motion, and of one name above another, metres."""
 
 
-class _Motions:
+class _DrawnMotions:
     """Motions of one method, and its name beside them."""
 
     def __init__(self, scene: viser.SceneApi, name: str, title: str) -> None:
@@ -70,7 +70,7 @@ class ComparedMotions(Picture):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene.add_frame("/compared", show_axes=False, visible=False))
         self._scene, self._dark = scene, False
-        self.motions: dict[str, _Motions] = {}
+        self.motions: dict[str, _DrawnMotions] = {}
         """Of the methods that were ever shown."""
 
     def draw(self, frame: Frame) -> None:
@@ -80,7 +80,7 @@ class ComparedMotions(Picture):
         names: list[Array] = []
         for name, compared in shown.items():
             if name not in self.motions:
-                self.motions[name] = _Motions(self._scene, name, compared.method.title)
+                self.motions[name] = _DrawnMotions(self._scene, name, compared.method.title)
                 self._dye(self.motions[name])
             self.motions[name].show(compared, frame.rollouts[frame.chosen or 0], names)
 
@@ -89,7 +89,7 @@ class ComparedMotions(Picture):
         for motions in self.motions.values():
             self._dye(motions)
 
-    def _dye(self, motions: _Motions) -> None:
+    def _dye(self, motions: _DrawnMotions) -> None:
         for lines in motions.lines.values():
             lines.dye(self._dark)
 

@@ -147,7 +147,7 @@ class Dragged(Picture):
         raise NotImplementedError
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers the slice for drags."""
+        """Remembers the slice for drags."""
         self._slice = frame.task.slice
 
     @contextmanager

@@ -32,7 +32,7 @@ class MovableSlice(Picture):
         self._scenario: Scenario | None = None
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers the slice of the task."""
+        """Remembers the slice of the task."""
         home = frame.task.slice
         if home is not self._home:
             self._home = home

@@ -55,7 +55,7 @@ class Table(Picture):
         )
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: it never changes."""
+        """It never changes."""
 
     def dye(self, dark: bool) -> None:
         self.node.color = palette.shade(palette.TABLE, dark)

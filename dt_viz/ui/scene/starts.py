@@ -87,7 +87,7 @@ class Starts(Picture):
         """Pictures of the starts, in the order of the scenario."""
 
     def draw(self, frame: Frame) -> None:
-        """See `Picture`: remembers the slice; starts without a motion are grey."""
+        """Remembers the slice; starts without a motion are grey."""
         self._slice = frame.slice
         colour = palette.STALE if frame.blocked else palette.ADDED
         for item in self.items:

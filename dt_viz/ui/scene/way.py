@@ -24,7 +24,7 @@ PERIOD = 0.2
 """Time between two drawings, seconds: each sends the whole line to the browser."""
 
 
-class Way(Shown):
+class WayAhead(Shown):
     """A line from the hand to where it is going, and a fading one to where it was."""
 
     def __init__(self, scene: viser.SceneApi, middles: Middles) -> None:
