@@ -55,7 +55,7 @@ from dt_viz.transforms.base import Transform
 from dt_viz.transforms.bias import BiasPoint
 
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
-FINER = 1e-3
+FINER = 1e-4
 """Tolerance of the truth, relative to the required accuracy."""
 ARRIVED = 1e-4
 """Distance from the goal within which a motion has arrived, metres."""
@@ -162,7 +162,7 @@ def compare(systems: Systems, starts: Array, accuracy: float, repeats: int) -> d
                 break
         return best
 
-    tolerances = accuracy * 10.0 ** -np.arange(4)
+    tolerances = accuracy * 10.0 ** -np.arange(5)
     by_setting = {f"flow to {t:.0e} m": systems(t) for t in tolerances}
     exact = cheapest({name: lambda s=system: s.rollout(starts, times) for name, system in by_setting.items()})
     # a stepper whose field is rougher than its own tolerance takes ever smaller steps: the flow is ten times finer
