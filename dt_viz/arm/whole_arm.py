@@ -274,7 +274,7 @@ class WholeArm:
             spacing: largest distance between neighbouring samples, metres at the hand, about; in coarse motions it is
                 `COARSE_SPACING` if that is more.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
-            passing: the ways of motions that these go on from.
+            passing: ways out to keep while obstacles are dragged.
         """
         parts = avoidance.obstacle.parts
         known = remembered(passing.arm, parts)

@@ -290,7 +290,7 @@ class ArmController:
 
     @property
     def rests(self) -> bool:
-        """Whether what it follows has come to its end, and the robot to rest, there or where it is kept from there."""
+        """Whether the course has ended and the robot stands still, at its end or where a limit holds it."""
         return self._settled and bool(np.abs(self._velocity).max() < AT_REST)
 
     @property

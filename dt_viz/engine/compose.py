@@ -14,6 +14,7 @@ from dt_viz.flows.diffeomorphisms import Chain, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Bundle
+from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.diagnostics import anchor_warnings, motion_warnings, target_warnings
@@ -26,11 +27,7 @@ from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.panels import PanelPicture, generator_panel, system_panel
 from dt_viz.pictures.sketchbook import BASE_TITLE, Pictures, Sketchbook, in_frame
-from dt_viz.pictures.slice_fields import (
-    ARROW_SPACING,
-    arrows_and_colour,
-    streamlines,
-)
+from dt_viz.pictures.slice_fields import ARROW_SPACING, arrows_and_colour, streamlines
 from dt_viz.scenario.panels import BASE_PANEL, Panel, offsets
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
@@ -209,15 +206,15 @@ def lattice(scenario: Scenario, solved: Solved) -> Array:
     return solved.below.task.slice.posed(scenario.view.slice).grid(ARROW_SPACING).reshape(-1, 3)
 
 
-def learned_velocities(scenario: Scenario, solved: Solved) -> Array:
-    """The hand's velocities (M, 3) at the lattice, m/s, of the motion that nothing is stacked on."""
-    return _velocities_below(scenario, solved, lattice(scenario, solved))
+def learned_system(scenario: Scenario, solved: Solved) -> DiffeomorphicSystem:
+    """The learned motion of places (3,), without what is stacked on it, at the phase that the slice shows."""
+    return frozen(cut_off(solved.below, solved.stack, 0), rest(scenario, solved))
 
 
 def velocities(scenario: Scenario, solved: Solved, learned: Array) -> Array:
-    """The hand's velocities (M, 3) at the lattice, m/s, of the whole stack below the arm's avoidance; else NaN.
+    """The hand's velocities (M, 3) at the lattice, m/s, of the whole stack below the arm's avoidance.
 
-    They are `learned` (M, 3) wherever what is stacked moves nothing.
+    Places inside an obstacle have none, NaN. They are `learned` (M, 3) where the stack moves nothing.
     """
     points, built = lattice(scenario, solved), solved.stack.built
     free = _avoided(built).signed_distance(points) > 0
@@ -225,16 +222,9 @@ def velocities(scenario: Scenario, solved: Solved, learned: Array) -> Array:
     spread = np.full_like(points, np.nan)
     below, carried = stacked.forward(points[free]), learned[free]
     moved = (below != points[free]).any(axis=1)
-    carried[moved] = _velocities_below(scenario, solved, below[moved])
+    carried[moved] = learned_system(scenario, solved).velocity(below[moved])
     spread[free] = stacked.inverse_tangents(below, carried[..., None])[1][..., 0]
     return spread
-
-
-def _velocities_below(scenario: Scenario, solved: Solved, points: Array) -> Array:
-    """Velocities (N, 3), m/s, of the motion that nothing is stacked on, at points (N, 3), metres."""
-    system = frozen(cut_off(solved.below, solved.stack, 0), rest(scenario, solved))
-    images = system.transform.forward(points)
-    return system.transform.inverse_tangents(images, system.base.velocity(images)[..., None])[1][..., 0]
 
 
 def _panels(

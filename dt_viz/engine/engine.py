@@ -112,16 +112,12 @@ class Engine:
 
     def nominal(self, scenario: Scenario, progress: Progress | None = None) -> Nominal:
         """The undisturbed motion of a scenario, from all of its starts; see `frames`."""
-        key = (scenario.task, scenario.imitation, scenario.objective, scenario.state)
         if scenario.style and scenario.imitation:
-            key = (scenario.task, scenario.style, scenario.style_amount)
-            learned = self.memo("styled", key, lambda: self._styled(scenario), newest=NEWEST)
+            learned = self.memo("styled", scenario.learned, lambda: self._styled(scenario), newest=NEWEST)
         else:
-            learned = self._shared("learned", key, lambda: self._learned(scenario, progress))
-        trajectory = learned.trajectory  # a start that is dragged leaves nothing behind
-        added = [
-            self.memo("trajectory", (learned, s), lambda s=s: trajectory(s), newest=NEWEST) for s in scenario.starts
-        ]
+            learned = self._shared("learned", scenario.learned, lambda: self._learned(scenario, progress))
+        make = learned.trajectory  # a start that is dragged leaves nothing behind
+        added = [self.memo("added start", (learned, s), lambda s=s: make(s), newest=NEWEST) for s in scenario.starts]
         return self.memo("nominal", (learned, scenario.starts), lambda: learned.nominal(added), newest=4)
 
     def _imitated(self, panel: Panel, progress: Progress | None = None) -> Nominal:
@@ -134,13 +130,7 @@ class Engine:
         Raises:
             UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
         """
-        scenario = self._decided(scenario, precision)
         return self._solved(scenario, self._admission(scenario, precision).nominal, precision)
-
-    def _decided(self, scenario: Scenario, precision: Precision) -> Scenario:
-        """The scenario, passing obstacles at FINE as its motion of LIVE does, which is shown first."""
-        live = self._motion(scenario, LIVE)[0] if precision is not LIVE else None
-        return scenario if live is None else replace(scenario, passing=live.passing)
 
     def _solved(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
         """The motion of a scenario from the starts that the arm can begin at."""
@@ -234,7 +224,6 @@ class Engine:
 
     def _motion(self, scenario: Scenario, precision: Precision) -> tuple[Solved | None, tuple[MotionWarning, ...]]:
         """The motion of a scenario, and why it has none, at the ends or between them."""
-        scenario = self._decided(scenario, precision)
         admission = self._admission(scenario, precision)
         if admission.blocked:
             return None, admission.blocked
@@ -337,22 +326,23 @@ class Engine:
         robot, reference = self.follower.robot, self.follower.reference(solved.nominal)
         rest, layers = compose.rest(scenario, solved), tuple(layer for _, layer in scenario.active)
         made_for = solved.below if solved.stack.built or scenario.warp < 1 else solved.below.learned
+        places = compose.lattice(scenario, solved)
         lattice = self.memo(
             "lattice",
             (scenario.task, view.slice, reference.tobytes()),
-            lambda: Lattice.of(compose.lattice(scenario, solved), robot, reference),
+            lambda: Lattice.of(places, robot, reference),
             newest=2,
         )
         of = view.slice, rest.tobytes()
         learned = self.memo(
             "learned velocities",
             (solved.below.learned, solved.stack.rays.base.goal.tobytes(), *of),
-            lambda: compose.learned_velocities(scenario, solved),
+            lambda: compose.learned_system(scenario, solved).velocity(places),
             newest=2,
         )
         velocities = self.memo(
             "velocities",
-            (made_for, layers, *of),
+            (made_for, layers, *solved.passing.hand.values(), *of),
             lambda: compose.velocities(scenario, solved, learned),
             newest=2,
         )

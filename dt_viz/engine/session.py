@@ -127,12 +127,13 @@ class Session:
         """The scenario's task. Raises what `Engine.task` raises."""
         return self._engine.task(self.scenario.task)
 
-    def edit(self, gesture: str, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
+    def edit(self, gesture: str, *, anew: bool = False, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
         """Replace some values of the scenario and have it computed anew.
 
         Args:
             gesture: which control is being moved; edits by one control in quick succession are undone together.
-            **changes: fields of `Scenario`.
+            anew: whether sides and stance are chosen anew, not kept from the motion that is shown.
+            **changes: fields of `Scenario`, without `passing`.
         """
         now = time.monotonic()
         with self._lock:
@@ -140,7 +141,7 @@ class Session:
             if edited == self.scenario and not self._failed:
                 return
             if not edited.passes_like(self.scenario):
-                edited = replace(edited, passing=changes.get("passing"))
+                edited = replace(edited, passing=ANEW if anew else None)
             if _is_step(edited, self.scenario):
                 name, when = self._gesture
                 # another control is moved, so whatever was held has been let go, even if nobody said so
@@ -216,8 +217,8 @@ class Session:
         self._begin("load", self._as_seen(scenario(self._engine.task(task))))
 
     def _begin(self, gesture: str, fresh: Scenario) -> None:
-        fields = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__}
-        self.edit(gesture, **fields | {"passing": ANEW})
+        changes = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "passing"}
+        self.edit(gesture, anew=True, **changes)
         self.end_gesture()
 
     def _as_seen(self, other: Scenario) -> Scenario:
@@ -335,16 +336,15 @@ class Session:
         self._display.learning(fraction, message)
 
     def _decided(self, scenario: Scenario) -> Scenario:
-        """The scenario, whose motions go on passing obstacles as those that are shown do, if that is still open."""
+        """The scenario with a passing: that of the motion that is shown, of the same fit, where none is decided yet."""
         if scenario.passing is not None:
             return scenario
-        shown = self._shown
-        alike = shown is not None and scenario.learned_like(shown)
-        decided = replace(scenario, passing=self._passing if alike else ANEW)
+        alike = self._shown is not None and scenario.learned == self._shown.learned
+        passing = self._passing if alike else ANEW
         with self._lock:
-            if self.scenario == scenario:
-                self.scenario = replace(self.scenario, passing=decided.passing)
-        return decided
+            if self.scenario.passing is None and self.scenario.passes_like(scenario):
+                self.scenario = replace(self.scenario, passing=passing)
+        return replace(scenario, passing=passing)
 
     def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
         scenario, edited = self._decided(job[0]), job[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -108,9 +108,8 @@ class Follower:
             return self._demonstrated(nominal.learned, stance).only(number)
         reference = self.reference(nominal)
         # a start that is dragged leaves nothing behind
-        return self._memo(
-            "added", (trajectory, stance), lambda: _lift_added(self.robot, trajectory, reference), newest=NEWEST
-        )
+        make = partial(_lift_added, self.robot, trajectory, reference)
+        return self._memo("added", (trajectory, stance), make, newest=NEWEST)
 
     def reference(self, nominal: Nominal) -> Array:
         """The posture (6,), rad, that the arm stays near to.
@@ -134,13 +133,13 @@ class Follower:
             length = arc_length(path)
             # where the stack stretches a path, samples by its length alone lie far apart in its fraction
             place = (1 - BY_FRACTION) * length / length[-1] + BY_FRACTION * fractions
-            drawn.append(np.array([np.interp(samples, place, values) for values in (fractions, *path.T)]))
-        fraction, paths = np.stack(drawn)[:, 0], np.stack(drawn)[:, 1:].swapaxes(1, 2)
+            drawn.append([np.interp(samples, place, values) for values in (fractions, *path.T)])
+        fraction, paths = np.array(drawn)[:, 0], np.moveaxis(np.array(drawn)[:, 1:], 1, 2)
         if exact:
             index = np.repeat(np.arange(len(fraction)), NUM_CONFIGURATIONS)
             paths = solution.positions_at(index, fraction.ravel()).reshape(paths.shape)
         reference = self.reference(nominal)
-        initial = None if exact else self.undisturbed(nominal).tracked.q  # for the eye it does to begin from there
+        initial = None if exact else self.undisturbed(nominal).tracked.q  # near enough to begin from
         lifted = replace(lift(self.robot, fraction, paths, reference, initial), num_added=nominal.num_added)
         if not exact:
             return lifted

@@ -42,7 +42,7 @@ class Solved:
     blocked: tuple[MotionWarning, ...] = ()
     """Why there is no motion to show, though its ends are free; empty where there is one."""
     passing: Passing = ANEW
-    """How it passes the obstacles, under a warp as it does in full."""
+    """Sides and stance of the motion, under a warp those of the full one."""
 
     @property
     def cleared(self) -> bool:
@@ -106,7 +106,7 @@ def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower) -> Sol
 
 
 def _only(nominal: Nominal, rollouts: Sequence[int] | Indices) -> Nominal:
-    """The motion from some of its starts; of the others it is said that the arm has no way from them."""
+    """The motion from some of its starts, with a warning that the arm has no way from the others."""
     without = np.delete(np.array(nominal.numbers), rollouts)
     how = "without a way around the obstacle for the arm"
     said = start_warnings(without, nominal.num_demonstrated, Kind.START_COVERED, how)
@@ -140,18 +140,18 @@ def _solved(
     stack = build_stack(nominal, scenario.active, precision, passing)
     avoidance = scenario.arm_avoidance
     hand = {applied.place: applied.made.ways for applied in stack.built if any(applied.made.ways)}
+    passed = Passing(hand, stance=nominal.stance, left_out=nominal.left_out)
     if avoidance is None:
-        passed = Passing(hand, stance=nominal.stance, left_out=nominal.left_out)
         return Solved(scenario, nominal, nominal, stack, passing=passed)
     live = precision is LIVE
     lifted = follower.behaving(nominal, stack, exact=not live) if stack.built else follower.undisturbed(nominal)
     arm, spacing = follower.whole_arm, precision.spacing
     if follows:
-        solution = arm.followed(lifted, avoidance, spacing, passing)
+        found = arm.followed(lifted, avoidance, spacing, passing)
     else:
-        solution = arm.avoiding(lifted, avoidance, spacing, coarse=live, passing=passing)
-    passed = Passing(hand, solution.ways, solution.duration, solution.cleared, nominal.stance, nominal.left_out)
-    return Solved(scenario, nominal, nominal, stack, solution, lifted, passing=passed)
+        found = arm.avoiding(lifted, avoidance, spacing, coarse=live, passing=passing)
+    passed = replace(passed, arm=found.ways, duration=found.duration, cleared=found.cleared)
+    return Solved(scenario, nominal, nominal, stack, found, lifted, passing=passed)
 
 
 def warped(full: Solved, below: Nominal, fraction: float, precision: Precision, follower: Follower) -> Solved:

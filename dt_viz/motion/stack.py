@@ -140,7 +140,7 @@ def build_stack(
         nominal: the undisturbed motion.
         layers: those that act, from the inside out, each with its place in the whole stack; see `Scenario.active`.
         precision: how exactly.
-        passing: sides on which motions go on to pass obstacles while these are dragged.
+        passing: sides to keep while obstacles are dragged.
     """
     ways = [passing.hand.get(place, ()) for place, _ in layers]
     solution, places = None, nominal.learned.places

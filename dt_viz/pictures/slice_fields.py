@@ -64,17 +64,14 @@ class ColourPicture:
 class Samples:
     """A system at the free lattice points of a slice, evaluated once for several pictures."""
 
-    def __init__(
-        self, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, spacing: float, *, jacobian: bool
-    ) -> None:
-        """Evaluate ψ.
+    def __init__(self, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, spacing: float) -> None:
+        """Evaluate ψ and its Jacobian.
 
         Args:
             system: the system of ψ.
             area: the slice.
             clearance: distance from the blocked region.
             spacing: spacing of the lattice, metres.
-            jacobian: whether to compute J, too, which then also gives the velocities.
         """
         self.system, self.area = system, area
         self.grid = area.grid(spacing)
@@ -84,19 +81,12 @@ class Samples:
         self.free = self.clearance > 0
         self.points = self.grid[self.free]
         """(N, 3) free points, metres."""
-        transform, self.jacobians = system.transform, None
-        if jacobian:
-            self.images, self.jacobians = transform.jacobian(self.points)
-        else:
-            self.images = transform.forward(self.points)
+        self.images, self.jacobians = system.transform.jacobian(self.points)
 
     @property
     def velocities(self) -> Array:
         """(N, 3), m/s."""
-        f = self.system.base.velocity(self.images)[..., None]
-        if self.jacobians is not None:
-            return np.linalg.solve(self.jacobians, f)[..., 0]
-        return self.system.transform.inverse_tangents(self.images, f)[1][..., 0]
+        return np.linalg.solve(self.jacobians, self.system.base.velocity(self.images)[..., None])[..., 0]
 
     @property
     def field(self) -> FieldPicture:
@@ -120,18 +110,17 @@ def arrows_and_colour(
     function, det = colour in {"det", "lyapunov"}, colour == "det"
     field, samples = None, None
     if arrows or (function and coarse):
-        samples = Samples(system, area, clearance, ARROW_SPACING, jacobian=det and coarse)
+        samples = Samples(system, area, clearance, ARROW_SPACING)
         field = samples.field if arrows else None
     if not function:
         return field, None
     if samples is None or not coarse:
-        samples = Samples(system, area, clearance, FINE_COLOUR, jacobian=det)
+        samples = Samples(system, area, clearance, FINE_COLOUR)
     return field, det_jacobian(samples) if det else lyapunov_value(samples)
 
 
 def det_jacobian(samples: Samples) -> ColourPicture:
     """Compute det J of ψ: the ratio of a small volume in base space to the original; ≤ 0 where ψ folds."""
-    assert samples.jacobians is not None
     values = samples.spread(np.linalg.det(samples.jacobians))
     return ColourPicture("det", samples.area, values, samples.clearance, np.empty((0, 2, 3)))
 

@@ -158,12 +158,19 @@ class Scenario:
     """Name of the paper's scene that it began as, if any."""
     view: View = field(default_factory=View)
     passing: Passing | None = field(default=None, compare=False)
-    """How the motions pass that these go on from while an obstacle is dragged; None where that is not decided yet."""
+    """Sides and stance that the motions keep while an obstacle is dragged; None until the session decides."""
 
     @cached_property
     def active(self) -> tuple[tuple[int, Layer], ...]:
         """The layers that change the end effector's motion, from the inside out, each with its place in the stack."""
         return tuple((k, layer) for k, layer in enumerate(self.stack) if layer.on and layer.transform.acts)
+
+    @property
+    def learned(self) -> tuple[object, ...]:
+        """What the motion that transforms are stacked on depends on."""
+        if self.style and self.imitation:
+            return self.task, self.style, self.style_amount
+        return self.task, self.imitation, self.objective, self.state
 
     @property
     def avoidance(self) -> Avoidance:
@@ -224,11 +231,6 @@ class Scenario:
     def learns_like(self, other: Scenario) -> bool:
         """Return whether both need the same fit."""
         return (self.task, self.objective, self.state) == (other.task, other.objective, other.state)
-
-    def learned_like(self, other: Scenario) -> bool:
-        """Return whether what transforms are stacked on is the same."""
-        mine, theirs = ((s.imitation, s.style, s.style_amount) for s in (self, other))
-        return self.learns_like(other) and mine == theirs
 
     def begins_like(self, other: Scenario) -> bool:
         """Return whether both have the same task, fit and scene, so that one is a small edit of the other."""

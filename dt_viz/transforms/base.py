@@ -56,7 +56,7 @@ class MotionBelow:
     targets: tuple[Point, ...] = ()
     """Places that transforms further down lead the motions to, metres."""
     ways: tuple[Way | None, ...] = ()
-    """Ways out of the transform's obstacles that motions go on with; see `dt_viz.transforms.passing`."""
+    """Ways out of the transform's obstacles to keep while these are dragged; see `dt_viz.transforms.passing`."""
     gradual: bool = False
     """Whether these turn to where they are to be as the obstacles move on; else they are there at once."""
 

@@ -1,4 +1,4 @@
-"""On which side motions pass obstacles, and in which stance the arm does: chosen once, kept by scenarios that go on."""
+"""Sides on which motions pass obstacles, and stance of the arm: kept from one scenario to the next in a drag."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Stance = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Passing:
-    """How a scenario's motions pass its obstacles, for the next one to go on with while an obstacle is dragged."""
+    """Sides and stance of a motion, which the next one keeps while an obstacle is dragged."""
 
     hand: Mapping[int, tuple[Way | None, ...]] = field(default_factory=dict)
     """Ways of the end effector out of the obstacles of each layer, by its place in the stack."""
@@ -23,21 +23,21 @@ class Passing:
     duration: float = 0.0
     """t of the flow by which the whole arm avoids."""
     cleared: bool = True
-    """Whether the whole arm finds a way by it."""
+    """Whether that flow clears the obstacles."""
     stance: Stance | None = None
     """Stance of the arm; None is its usual one."""
     left_out: tuple[int, ...] = ()
     """Numbers of the starts that have no motion."""
 
     def goes_on(self, obstacles: Sequence[Obstacle]) -> bool:
-        """Return whether the whole arm was passing an obstacle that is hardly anywhere else now."""
+        """Return whether an obstacle that the whole arm passed is still there, or nearby."""
         return any(remembered(self.arm, obstacles))
 
     def follows(self, obstacles: Sequence[Obstacle]) -> bool:
-        """Return whether such an obstacle has moved since."""
+        """Return whether such an obstacle has moved a little."""
         known = zip(remembered(self.arm, obstacles), obstacles, strict=True)
         return any(way is not None and travel(way.obstacle, part) > 0 for way, part in known)
 
 
 ANEW = Passing()
-"""Passing of a scenario that goes on from none: sides and stances are chosen anew."""
+"""Nothing to keep: sides and stance are chosen anew."""

@@ -205,6 +205,28 @@ class TestPassing:
         opened.settle()
         assert opened.shown.passing is ANEW is opened.session.scenario.passing
 
+    def test_a_beginning_of_the_same_motion_keeps_what_is_shown(self, opened):
+        opened.engine.task = lambda name: TASKS[name]()
+        opened.edit("drag", obstacles=at(0.1))
+        opened.settle()
+        own, there = opened.session.scenario, opened.shown.passing
+        opened.session.load("draw_s", lambda _: replace(own, view=View(grid=True), passing=None))
+        opened.settle()
+        assert opened.session.scenario.passing is opened.shown.passing is there
+
+    def test_what_is_decided_reaches_a_scenario_whose_view_was_changed_meanwhile(self, opened):
+        opened.engine.gate = threading.Event()
+        opened.engine.begun.clear()
+        opened.edit("drag", obstacles=at(0.1))
+        assert opened.engine.begun.wait(PATIENCE)
+        opened.edit("drag", obstacles=at(0.2))  # waits for the worker
+        opened.session.edit("view", view=replace(opened.session.scenario.view, speed=2.0))  # needs no computation
+        assert opened.session.scenario.passing is None
+        opened.engine.gate.set()
+        opened.settle()
+        assert opened.session.scenario.view.speed == 2.0
+        assert opened.session.scenario.passing is opened.shown.passing is not None
+
     def test_edits_that_are_overtaken_leave_the_decision_to_the_last_one(self, opened):
         shown = opened.page.frames[-1].passing
         opened.engine.gate = threading.Event()

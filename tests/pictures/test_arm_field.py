@@ -80,9 +80,9 @@ def test_velocities_are_those_of_the_whole_stack_whether_it_moves_a_place_or_not
     layers = (Layer(ball, name="Hand"), *biases(BiasPoint(as_point(beside), moves_goal=moves_goal)))
     solved = engine.solved(avoiding(task, layers=layers), FINE)
     rest, places = compose.rest(solved.scenario, solved), compose.lattice(solved.scenario, solved)
-    found = compose.velocities(solved.scenario, solved, compose.learned_velocities(solved.scenario, solved))
+    alone = compose.learned_system(solved.scenario, solved).velocity(places)
+    found = compose.velocities(solved.scenario, solved, alone)
     free, expected = np.isfinite(found[:, 0]), np.full_like(found, np.nan)
     expected[free] = solved.stack.at_phase(rest).velocity(places[free])
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
-    alone = compose.learned_velocities(solved.scenario, solved)
     assert 0.02 < (np.abs(found - alone)[free].max(axis=1) > 1e-4).mean() < 0.98
