@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from dt_viz.arm.robot import LinkMesh, collision_meshes
+from dt_viz.robot.robot import LinkMesh, collision_meshes
 
 FILE = Path(__file__).parent / "body_points.npz"
 MAX_RADIUS = 0.055  # metres: the upper links are 0.041 thick
@@ -26,7 +26,7 @@ Ball = tuple[np.ndarray, float]  # centre (3,) and radius, metres
 
 
 def body_points() -> dict[str, np.ndarray]:
-    """The arrays of ``dt_viz.arm.body_points.BodyPoints``, sorted by joint."""
+    """The arrays of ``dt_viz.robot.body_points.BodyPoints``, sorted by joint."""
     spheres = []
     for mesh in collision_meshes():
         spheres += [(mesh.joint, centre, radius) for centre, radius in _cover(mesh, max_radius(mesh))]

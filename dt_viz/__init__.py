@@ -15,6 +15,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dt_viz.avoidance.bias import BiasPoint
+    from dt_viz.avoidance.hand import Avoidance
+    from dt_viz.avoidance.transform import Transform
     from dt_viz.errors import DataError, FormatError
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
@@ -22,9 +25,6 @@ if TYPE_CHECKING:
     from dt_viz.library import Arm, BlockedError, Controller, HandController, JointPath, Motion, Path, fit, load_jaco
     from dt_viz.motion.certificates import Certificates
     from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
-    from dt_viz.transforms.avoidance import Avoidance
-    from dt_viz.transforms.base import Transform
-    from dt_viz.transforms.bias import BiasPoint
     from dt_viz.warning import MotionWarning
 
 __all__ = [
@@ -71,9 +71,9 @@ _MODULES = {
     ),
     "motion.certificates": ("Certificates",),
     "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
-    "transforms.avoidance": ("Avoidance",),
-    "transforms.base": ("Transform",),
-    "transforms.bias": ("BiasPoint",),
+    "avoidance.hand": ("Avoidance",),
+    "avoidance.transform": ("Transform",),
+    "avoidance.bias": ("BiasPoint",),
     "warning": ("MotionWarning",),
 }
 """Names by the module that defines them."""

@@ -205,9 +205,9 @@ def _prepare(fits: FitStore, task: Task, leaving: threading.Event) -> None:
 
 def _compile(leaving: threading.Event) -> None:
     """Compile what a drag repeats: once for a processor, for half a minute; later it is only loaded."""
-    from dt_viz.arm.body_points import load_body_points  # noqa: PLC0415
-    from dt_viz.arm.robot import load_jaco  # noqa: PLC0415
-    from dt_viz.arm.whole_arm import WholeArm  # noqa: PLC0415
+    from dt_viz.avoidance.arm import WholeArm  # noqa: PLC0415
+    from dt_viz.robot.body_points import load_body_points  # noqa: PLC0415
+    from dt_viz.robot.robot import load_jaco  # noqa: PLC0415
 
     began, bar = time.monotonic(), _Bar("Compiling for this processor, once")
     for fraction in WholeArm(load_jaco(), load_body_points()).compiled():

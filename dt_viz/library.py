@@ -17,30 +17,30 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dt_viz.arm.retiming import within_velocity_limits
-from dt_viz.arm.robot import Robot
-from dt_viz.arm.robot import load_jaco as load_robot
-from dt_viz.arm.tracking import inverse_kinematics, track
+from dt_viz.avoidance.transform import Transform
 from dt_viz.control import controller as control
 from dt_viz.errors import FormatError, check_between
+from dt_viz.flows.augmented_systems import frozen
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.flows.phased import frozen
 from dt_viz.flows.rollouts import Rays, evenly_sampled, refined
 from dt_viz.learning.augmented import AugmentedImitation, unknown_label
-from dt_viz.learning.choice import State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import ImitationSettings, Objective
+from dt_viz.learning.state import State, learn
 from dt_viz.motion.certificates import Certificates, DrawnSamples, certified
 from dt_viz.motion.diagnostics import motion_warnings
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import NUM_SAMPLES, Learned
 from dt_viz.motion.solve import Solved, solve
 from dt_viz.motion.stack import FINE, LIVE, Solution, build_stack
+from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
+from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.robot import Robot
+from dt_viz.robot.robot import load_jaco as load_robot
 from dt_viz.saving import SavedMotion, load_motion, save_motion
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.base import Transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +208,7 @@ class Motion:
         A file that is there is replaced, and stays as it is if something fails.
 
         Raises:
-            DataError: a transform is not one of `dt_viz.transforms.registry.KINDS`, or holds what could not be read.
+            DataError: a transform is not one of `dt_viz.avoidance.registry.KINDS`, or holds what could not be read.
             OSError: the file cannot be written.
         """
         learned = self._learned

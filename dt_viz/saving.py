@@ -22,18 +22,18 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import msgspec
 import numpy as np
 
+from dt_viz.avoidance import registry
+from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
 from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.choice import AnyImitation, learn
 from dt_viz.learning.demonstrations import MAX_COORDINATE, Demonstration, check_demonstrations
 from dt_viz.learning.imitation import Imitation
 from dt_viz.learning.preparation import ImitationError
+from dt_viz.learning.state import AnyImitation, learn
 from dt_viz.obstacles.shapes import SHAPES, Obstacle
 from dt_viz.scenario.scenario import Layer
-from dt_viz.transforms import registry
-from dt_viz.transforms.base import Transform
 
 FORMAT = 1
 """Version of the file; raised where files from before cannot be read any more, also by a change of the imitation's

@@ -30,13 +30,13 @@ from hypothesis import HealthCheck, settings
 from playwright.sync_api import sync_playwright
 from scenes import avoiding, frame_at
 
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.robot import Robot, load_jaco
-from dt_viz.arm.whole_arm import WholeArm
-from dt_viz.engine.engine import Engine
+from dt_viz.avoidance.arm import WholeArm
 from dt_viz.learning.store import FitStore
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.robot import Robot, load_jaco
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.engine import Engine
 
 # Nothing here is timed, and a failure must come back on the next run.
 settings.register_profile(

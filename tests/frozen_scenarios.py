@@ -13,19 +13,19 @@ from pathlib import Path
 import numpy as np
 from scenes import starts_at
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
 from dt_viz.files.npz import npz_bytes
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning.imitation import Imitation, fit
 from dt_viz.learning.store import FitStore, fingerprint
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Stage
 
 FOLDER = Path(__file__).parent / "frozen"
 DESCRIPTIONS = json.loads((FOLDER / "scenarios.json").read_text(encoding="utf-8"))

@@ -25,6 +25,8 @@ import numpy as np
 import trimesh
 
 from dt_viz import saving
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
 from dt_viz.errors import DataError
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning import demonstrations as demos
@@ -34,8 +36,6 @@ from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, _solid_map, unit_sphere_map
 from dt_viz.saving import SavedMotion, save_motion
 from dt_viz.scenario.scenario import Layer
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.bias import BiasPoint
 
 PROCESS = Path("/proc/self")
 """What Linux says of this process."""

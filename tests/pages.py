@@ -13,18 +13,18 @@ from scenes import biases, changed, starts_at
 from viser import _messages as messages  # noqa: TID251
 from viser._gui_handles import GuiProgressBarHandle  # noqa: TID251
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.live_arm import LiveArm
-from dt_viz.engine.session import Session
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.motion.certificates import Certificates
 from dt_viz.motion.following import Follower
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, rotation
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.robot_loop import LiveArm
+from dt_viz.session.session import Session
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.panel import ControlPanel

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pinocchio as pin  # noqa: TID251, here it is the oracle
 
-from dt_viz.arm.robot import NUM_JOINTS, Robot, package_folder, urdf_path
+from dt_viz.robot.robot import NUM_JOINTS, Robot, package_folder, urdf_path
 
 
 def random_configurations(robot: Robot, seed: int, shape: tuple[int, ...]) -> np.ndarray:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from dt_viz.arm import cspace
-from dt_viz.arm.cspace import WholeArmField
-from dt_viz.arm.robot import NUM_JOINTS, cross
-from dt_viz.arm.tracking import DIRECTION_WEIGHT
+from dt_viz.avoidance import arm_field as cspace
+from dt_viz.avoidance.arm_field import WholeArmField
+from dt_viz.robot.inverse_kinematics import DIRECTION_WEIGHT
+from dt_viz.robot.robot import NUM_JOINTS, cross
 
 
 def velocities(field: WholeArmField, q: np.ndarray) -> np.ndarray:

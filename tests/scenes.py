@@ -5,12 +5,12 @@ from dataclasses import fields, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import avoidance_layer, with_avoidance
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.bias import BiasPoint
 
 RANDOM_TASKS = ("draw_s", "lift_box", "push_box")
 OF_AVOIDANCE = {field.name for field in fields(Avoidance)}

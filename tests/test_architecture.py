@@ -14,8 +14,8 @@ PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 FOUNDATION = {"errors", "folders", "memo", "metrics", "shipped", "warning"}
 """Modules of no package, which import each other only."""
-BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "transforms"}
-BELOW_ENGINE = BELOW_SCENARIO | {"arm", "scenario", "motion", "control", "pictures"}
+BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "robot", "avoidance"}
+BELOW_SESSION = BELOW_SCENARIO | {"scenario", "motion", "control", "pictures"}
 MAY_IMPORT: Mapping[str, set[str]] = {
     "foundation": set(),
     "kernels": {"foundation"},
@@ -23,26 +23,26 @@ MAY_IMPORT: Mapping[str, set[str]] = {
     "files": {"foundation", "flows"},
     "learning": {"foundation", "flows", "files"},
     "obstacles": {"foundation", "kernels", "flows", "files"},
-    "transforms": {"foundation", "kernels", "flows", "learning", "obstacles"},
-    "arm": {"foundation", "kernels", "flows", "files", "obstacles", "transforms"},
-    "scenario": BELOW_SCENARIO - {"files"},
-    "motion": BELOW_SCENARIO | {"arm", "scenario"},
-    "control": BELOW_SCENARIO | {"kernels", "arm", "scenario", "motion"},
-    "pictures": BELOW_SCENARIO | {"arm", "scenario"},
+    "robot": {"foundation", "kernels", "flows", "files", "obstacles"},
+    "avoidance": {"foundation", "kernels", "flows", "learning", "obstacles", "robot"},
+    "scenario": BELOW_SCENARIO - {"files", "robot"},
+    "motion": BELOW_SCENARIO | {"scenario"},
+    "control": BELOW_SCENARIO | {"kernels", "scenario", "motion"},
+    "pictures": BELOW_SCENARIO | {"scenario"},
     "saving": BELOW_SCENARIO | {"scenario"},
-    "library": BELOW_ENGINE - {"pictures", "files"} | {"saving"},
-    "engine": BELOW_ENGINE | {"baselines"},
-    "baselines": BELOW_ENGINE - {"pictures"},
-    "ui": BELOW_ENGINE | {"engine", "baselines"},
-    "evaluate": BELOW_ENGINE | {"engine", "baselines", "ui"},
+    "library": BELOW_SESSION - {"pictures", "files"} | {"saving"},
+    "session": BELOW_SESSION | {"baselines"},
+    "baselines": BELOW_SESSION - {"pictures"},
+    "ui": BELOW_SESSION | {"session", "baselines"},
+    "evaluate": BELOW_SESSION | {"session", "baselines", "ui"},
     "examples": {"foundation"},
-    "cli": BELOW_ENGINE | {"engine", "ui", "evaluate"},
+    "cli": BELOW_SESSION | {"session", "ui", "evaluate"},
     "__main__": {"cli"},
 }
 """The packages from the bottom up, and which of those below each may import."""
 ONLY_IMPORTERS: Mapping[str, set[str]] = {
-    "pinocchio": {"arm/robot.py"},
-    "coal": {"arm/link_distances.py"},
+    "pinocchio": {"robot/robot.py"},
+    "coal": {"robot/link_distances.py"},
     "matplotlib": {"examples/plot.py", "evaluate/figures.py"},
     "torch": {"baselines/eflow_training.py", "baselines/mpnet_training.py"},
     "ompl": {"baselines/mpnet_rrt.py"},

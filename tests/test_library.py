@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import dt_viz as dt
-from dt_viz.arm.collision import load_collision_model
 from dt_viz.examples import arm_controller, controller, plot
 from dt_viz.examples.viser_scene import Scene
 from dt_viz.library import Motion
+from dt_viz.robot.collision import load_collision_model
 from dt_viz.shipped import ASSETS
 from dt_viz.warning import Kind
 

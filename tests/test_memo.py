@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scenes import changed, changing
 
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.session import Session
 from dt_viz.memo import Memo
 from dt_viz.motion import following
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.engine import Engine
+from dt_viz.session.session import Session
 
 
 def test_a_result_is_computed_once_kinds_do_not_mix_and_the_results_that_were_used_last_stay():

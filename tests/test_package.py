@@ -24,7 +24,7 @@ PATIENCE = 300.0
 """Seconds that anything may take: the machine may be busy."""
 EVERYTHING = """
 import pkgutil, dt_viz
-from dt_viz.arm.body_points import load_body_points
+from dt_viz.robot.body_points import load_body_points
 from dt_viz.scenario.tasks import TASKS
 for module in pkgutil.walk_packages(dt_viz.__path__, "dt_viz."):
     if not module.name.endswith("_training"):  # these need the extra "baselines"

@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 from twirl import shown_in_the_readme
 
 import dt_viz as dt
+from dt_viz.avoidance import registry
+from dt_viz.avoidance.transform import Transform
 from dt_viz.files import npz
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.obstacles.shapes import SHAPES, MeshObstacle
 from dt_viz.saving import FORMAT, MAX_BYTES, _made, _plain, read_motion
 from dt_viz.shipped import ASSETS
-from dt_viz.transforms import registry
-from dt_viz.transforms.base import Transform
 
 FROZEN = Path(__file__).parent / "frozen"
 

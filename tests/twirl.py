@@ -7,9 +7,9 @@ from typing import ClassVar  # noqa: F401 - of the README's example
 import numpy as np
 
 import dt_viz
+from dt_viz.avoidance.transform import Built, MotionBelow, Number, Setting, Transform  # noqa: F401
 from dt_viz.flows.diffeomorphisms import Flow  # noqa: F401
 from dt_viz.flows.fields import Array
-from dt_viz.transforms.base import Built, MotionBelow, Number, Setting, Transform  # noqa: F401
 
 
 @dataclass(frozen=True)

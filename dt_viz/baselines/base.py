@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import ClassVar, Protocol
 
-from dt_viz.arm.robot import Robot
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.tasks import Task
 
 INSTALL = 'pip install "dt-viz[baselines]"'

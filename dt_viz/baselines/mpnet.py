@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.arm.robot import NUM_JOINTS
 from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.baselines.weights import FOLDER, load_weights
@@ -29,6 +28,7 @@ from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import rotation
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.robot import NUM_JOINTS
 
 VERSION = 1
 """Version of the weights, raised with every change to what they mean."""

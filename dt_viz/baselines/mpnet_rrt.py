@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.arm.robot import NUM_JOINTS, Robot
 from dt_viz.baselines.base import Planner, Problem
 from dt_viz.baselines.mpnet import SEED, MPNet, MPNetPlanner, Search
 from dt_viz.baselines.postures import Query
 from dt_viz.flows.fields import Array
+from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 SECONDS = 10.0
 """Time for a stretch, seconds; where none is found in it, the stretch stays in collision."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.arm.retiming import within_velocity_limits
+from dt_viz.avoidance.hand import Avoidance
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
@@ -16,8 +16,8 @@ from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, Precision
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.scenario.scenario import Layer, Scenario, Start
-from dt_viz.transforms.avoidance import Avoidance
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.arm.body_points import BodyPoints, load_body_points
-from dt_viz.arm.collision import CollisionModel, load_collision_model
-from dt_viz.arm.retiming import within_velocity_limits
-from dt_viz.arm.robot import Robot
-from dt_viz.arm.tracking import IK_TOLERANCE, inverse_kinematics
 from dt_viz.baselines.base import Plan, Problem
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import arc_length, interpolate
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.body_points import BodyPoints, load_body_points
+from dt_viz.robot.collision import CollisionModel, load_collision_model
+from dt_viz.robot.inverse_kinematics import IK_TOLERANCE, inverse_kinematics
+from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.robot import Robot
 
 NUM_SAMPLES = 200
 """Number of even samples of a motion; its corners come on top."""

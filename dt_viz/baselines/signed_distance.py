@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.transform import axes_of
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.ours import from_starts
 from dt_viz.baselines.surface import distance_and_normal
@@ -21,8 +23,6 @@ from dt_viz.motion.stack import LIVE, Precision, build_stack
 from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import Layer
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.base import axes_of
 
 RANGE = 0.10
 """Distance from the surface at which the field ends, metres."""

@@ -1,6 +1,6 @@
 """The flow around obstacles of a robot in the loop: a diffeomorphism of configuration space made for its own motion.
 
-It is the flow of `dt_viz.arm.cspace.WholeArmField`, as `dt_viz.arm.whole_arm` makes it for all rollouts of a task at
+It is the flow of `avoidance.arm_field.WholeArmField`, as `dt_viz.avoidance.arm` makes it for all rollouts of a task at
 once. No posture is pinned: a robot at rest gives way, too, and where nothing comes too near, the flow is the identity.
 """
 
@@ -12,16 +12,16 @@ from functools import partial
 
 import numpy as np
 
-from dt_viz.arm.cspace import LEVERS, REACH_PER_TEMPERATURE, WholeArmField
-from dt_viz.arm.escape import escape_directions
-from dt_viz.arm.robot import NUM_JOINTS
-from dt_viz.arm.whole_arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm, clearing_duration
+from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm, clearing_duration
+from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, WholeArmField
+from dt_viz.avoidance.detour import escape_directions
+from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.ways import OPPOSITE, turned
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.obstacles.shapes import Obstacle
-from dt_viz.obstacles.ways import OPPOSITE, turned
-from dt_viz.transforms.base import ArmAvoidance
+from dt_viz.robot.robot import NUM_JOINTS
 
 NUM_COMPARED = 16
 """Number of colliding postures that escape directions are compared by, about; half of it where an obstacle moves, for

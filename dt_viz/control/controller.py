@@ -2,7 +2,7 @@
 
 With q(t) the course, the undisturbed motion of the joints, and ψ_q the flow around obstacles, made for where these will
 be, the robot's target is p(t) = ψ_q⁻¹(q(t)): while nothing moves, the motion of eq. (4) lifted to the joints
-(`dt_viz.arm.arm_system`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among those that the limits allow
+(`control.arm_system`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among those that the limits allow
 (`dt_viz.control.limits`). The clock of the course waits in proportion to the gap, so that a robot that had to give way
 takes up its motion where it left it. Home, hold and shove are other courses of the same loop.
 """
@@ -18,10 +18,9 @@ import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dt_viz.arm.arm_system import ArmSystem, Section
-from dt_viz.arm.cspace import LEVERS
-from dt_viz.arm.robot import NUM_JOINTS
-from dt_viz.arm.tracking import track
+from dt_viz.avoidance.arm_field import LEVERS
+from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.control.courses import Course, resting, towards
 from dt_viz.control.dodging import Dodge
@@ -33,7 +32,8 @@ from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
-from dt_viz.transforms.base import ArmAvoidance
+from dt_viz.robot.inverse_kinematics import track
+from dt_viz.robot.robot import NUM_JOINTS
 
 MOVED = 5e-3
 """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""

@@ -8,12 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from dt_viz.arm.arm_system import Section
-from dt_viz.arm.retiming import within_velocity_limits
-from dt_viz.arm.tracking import track
+from dt_viz.control.arm_system import Section
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.robot.inverse_kinematics import track
+from dt_viz.robot.retiming import within_velocity_limits
 
 CONVERGED = 1e-5
 """Distance from the section, rad, that counts as none."""

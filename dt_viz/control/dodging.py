@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array

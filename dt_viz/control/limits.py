@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.arm.body_points import BodyPoints
-from dt_viz.arm.robot import Robot
-from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
 from dt_viz.obstacles.arrays import records
+from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.robot import Robot
 
 NUM_POINTS = 8
 """Number of body points, those nearest to what they may not touch, that have a barrier."""

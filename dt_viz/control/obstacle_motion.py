@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
+from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.base import ArmAvoidance
 
 
 @dataclass(frozen=True, eq=False)

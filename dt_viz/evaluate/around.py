@@ -33,9 +33,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dt_viz.arm.collision import load_collision_model
-from dt_viz.arm.tracking import UnreachableError
-from dt_viz.engine.engine import ArmMotion, Engine
+from dt_viz.avoidance.hand import SPACES, Avoidance
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
     Row,
@@ -58,8 +56,10 @@ from dt_viz.motion.stack import FINE, Solution
 from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import SPACES, Avoidance
+from dt_viz.session.engine import ArmMotion, Engine
 from dt_viz.warning import Kind, MotionWarning
 
 TURN_ARC = 0.015

@@ -41,9 +41,9 @@ from dt_viz.evaluate.options import InputError, ready_folder, report, whole_numb
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import Array
 from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.choice import learn as learn_in_state
 from dt_viz.learning.demonstrations import METRES_PER_LASA_UNIT, Demonstration, load_demonstrations
 from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSettings, fit, grown_grid
+from dt_viz.learning.state import learn as learn_in_state
 from dt_viz.metrics import rms_at_equal_times
 
 GRID = {2: 101, 3: 25}

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine
+from dt_viz.avoidance.hand import Avoidance
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import TASKS, Task, TaskEntry, known_tasks
-from dt_viz.transforms.avoidance import Avoidance
+from dt_viz.session.engine import Engine
 
 Row = Mapping[str, str | float | None]
 """Row of a table: text or number of each column by its header, which names the unit."""

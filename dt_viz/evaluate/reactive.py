@@ -24,13 +24,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dt_viz.arm.arm_system import ArmSystem, Section
-from dt_viz.arm.collision import load_collision_model
-from dt_viz.arm.cspace import REACH_PER_TEMPERATURE
-from dt_viz.arm.robot import NUM_JOINTS, Robot, cross, load_jaco
+from dt_viz.avoidance.arm_field import REACH_PER_TEMPERATURE
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
-from dt_viz.engine.engine import Engine
 from dt_viz.evaluate.options import (
     InputError,
     add_task,
@@ -50,8 +49,9 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.base import ArmAvoidance
+from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.robot import NUM_JOINTS, Robot, cross, load_jaco
+from dt_viz.session.engine import Engine
 
 TICK = 0.01
 """Time between two ticks, seconds."""

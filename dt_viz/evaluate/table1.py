@@ -41,11 +41,8 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.arm.collision import load_collision_model
-from dt_viz.arm.tracking import UnreachableError, track
 from dt_viz.baselines.base import INSTALL, NotFittedError, Plan, Planner, Problem
 from dt_viz.baselines.registry import METHODS, problem_of
-from dt_viz.engine.comparison import curves
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.around import TURN_ARC
 from dt_viz.evaluate.options import (
@@ -69,8 +66,11 @@ from dt_viz.metrics import (
 )
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.inverse_kinematics import UnreachableError, track
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.comparison import curves
 
 PAPER_TASKS = ("push_box", "lift_box", "draw_s")
 ALONG, WITHIN = (0.2, 0.8), 0.05

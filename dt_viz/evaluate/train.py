@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.arm.robot import load_jaco
 from dt_viz.baselines.base import INSTALL, NotFittedError, Problem
 from dt_viz.baselines.registry import TRAINED, problem_of
 from dt_viz.baselines.weights import save_weights, weights_file
@@ -32,6 +31,7 @@ from dt_viz.learning.store import FitStore
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import TASKS, Task, lasa_tasks
 
 

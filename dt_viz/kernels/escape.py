@@ -1,4 +1,4 @@
-"""The whole arm's escape from obstacles: the formulas of `dt_viz.arm.cspace.WholeArmField` and its flow."""
+"""The whole arm's escape from obstacles: the formulas of `dt_viz.avoidance.arm_field.WholeArmField` and its flow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map that keeps joints inside their limits: the formulas of `dt_viz.arm.cspace.JointLimits`, joint by joint."""
+"""The map that keeps joints inside their limits: the formulas of `avoidance.arm_field.JointLimits`, joint by joint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracking of places with an arm's joints by Newton steps: the formulas of `dt_viz.arm.tracking.track`."""
+"""Tracking of places with an arm's joints by Newton steps: the formulas of `dt_viz.robot.inverse_kinematics.track`."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@ it started, and a label if there is one. The motion c(s; a) predicted for a is
 
     c(u s_max; a) = mean(u) + u (start − mean(1)) + GP(a)(u),
 
-the mean demonstration, an offset that fades, and a Gaussian process over the starts. The shear along it (see
-`dt_viz.flows.phased`) is ψ; the base system runs s down on a clock that is predicted for a, too. Where demonstrations
-fall into groups of different shapes, each has a mean and a process of its own, and a start follows the group that
+the mean demonstration, an offset that fades, and a Gaussian process over the starts. The shear along it
+(see `flows.augmented_systems`) is ψ; the base system runs s down on a clock that is predicted for a, too. Where
+demonstrations fall into groups of different shapes, each has a mean and a process of its own, and a start follows the group that
 begins nearest: for each a ψ is a diffeomorphism of (y, s), but from group to group it jumps with a.
 """
 
@@ -24,13 +24,13 @@ from typing import TypeVar
 import numpy as np
 
 from dt_viz.errors import FormatError
+from dt_viz.flows.augmented_systems import PhaseCurve, PhasedAttractor, Shear
 from dt_viz.flows.fields import Array
-from dt_viz.flows.phased import PhaseCurve, PhasedAttractor, Shear
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 from dt_viz.learning.demonstrations import Demonstration
+from dt_viz.learning.initial_guess import groups_of
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import ARRIVED, TimedAttractor
-from dt_viz.learning.unbending import groups_of
 from dt_viz.metrics import arc_length, interpolate
 
 FEWEST_KNOTS, MOST_KNOTS, POINTS_PER_KNOT = 30, 240, 5
@@ -171,7 +171,7 @@ class Pattern:
 
 @dataclass(frozen=True, eq=False)
 class AugmentedImitation:
-    """A learned motion in the augmented state, for any start: what `dt_viz.flows.phased.Predictions` are."""
+    """A learned motion in the augmented state, for any start: what `dt_viz.flows.augmented_systems.Predictions` are."""
 
     starts: Array
     """(R, d) of the demonstrations, metres."""
@@ -189,7 +189,7 @@ class AugmentedImitation:
     fit_seconds: float
     warnings: tuple[str, ...] = ()
     reason: str = ""
-    """Why it was learned in this state, where that was not asked for; see `dt_viz.learning.choice`."""
+    """Why it was learned in this state, where that was not asked for; see `dt_viz.learning.state`."""
     _of_starts: Array | None = field(default=None, repr=False)
     """(R,) labels of the starts."""
     _label_unit: float = field(default=1.0, repr=False)

@@ -19,10 +19,10 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import expected_motions
 from dt_viz.learning.demonstrations import DIMENSIONS, Demonstration
 from dt_viz.learning.flow_chain import FlowLayer, Stack, equally_spaced_grid, min_step_determinant, scaled_field
+from dt_viz.learning.initial_guess import layers_along, regress, unbending
 from dt_viz.learning.preparation import ImitationError, Motions, prepare
 from dt_viz.learning.timing import TimedAttractor, learn_timing
 from dt_viz.learning.trajectory import TrajectoryFit
-from dt_viz.learning.unbending import layers_along, regress, unbending
 from dt_viz.learning.velocity import VelocityFit
 from dt_viz.metrics import interpolate, resample_by_arc_length
 

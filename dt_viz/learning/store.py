@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from dt_viz.files.npz import arrays_of, npz_bytes, write_whole
-from dt_viz.learning.choice import AnyImitation, State, learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import Imitation, ImitationSettings, Progress, fit
+from dt_viz.learning.state import AnyImitation, State, learn
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class FitStore:
         state: State = "auto",
         progress: Progress | None = None,
     ) -> AnyImitation:
-        """Return what is learned from these demonstrations in a state; see `dt_viz.learning.choice.learn` and `get`.
+        """Return what is learned from these demonstrations in a state; see `dt_viz.learning.state.learn` and `get`.
 
         What is learned in the augmented state is not stored: it takes milliseconds.
         """

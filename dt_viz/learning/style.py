@@ -1,6 +1,6 @@
 """Style: how one hand's motions differ from another's, taken off one action and put on a third (the paper's sec. 6).
 
-ψ_A and ψ_B of two augmented imitations are shears along motions over the same phase (see `dt_viz.flows.phased`), so
+ψ_A and ψ_B of two augmented imitations are shears along motions over the same phase (see `flows.augmented_systems`), so
 that ψ_A∘ψ_B⁻¹, which leads from the one hand to the other, is one, too: along the difference of their mean motions,
 (y, s) ↦ (y + d(s), s). Put on a third motion, whole or in part, it is as stable, and det J stays 1.
 """
@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.flows.augmented_systems import PhaseCurve
 from dt_viz.flows.fields import Array
-from dt_viz.flows.phased import PhaseCurve
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.preparation import ImitationError
 

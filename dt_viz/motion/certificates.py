@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dt_viz.arm.collision import CollisionReport
-from dt_viz.arm.cspace import LEVERS
-from dt_viz.arm.retiming import within_velocity_limits
-from dt_viz.arm.robot import Robot
+from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.motion.stack import Solution
+from dt_viz.robot.collision import CollisionReport
+from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.robot import Robot
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres, told
 
 NUM_CHECKED, NUM_CHECKED_POSTURES = 400, 100

@@ -7,9 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from dt_viz.arm.collision import Nearest
-from dt_viz.arm.cspace import LEVERS
-from dt_viz.arm.robot import Robot
+from dt_viz.avoidance.arm_field import LEVERS
+from dt_viz.avoidance.transform import MotionBelow, start_warnings
 from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import MAX_SAMPLES
@@ -17,10 +16,11 @@ from dt_viz.motion.certificates import MAX_ROUND_TRIP
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import Applied, Solution
+from dt_viz.robot.collision import Nearest
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.scenario.starts import REACH, SHOULDER
-from dt_viz.transforms.base import MotionBelow, start_warnings
 from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres
 
 MAX_GOAL_MISS = 1e-3

@@ -8,22 +8,22 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.collision import SELF_MARGIN, CollisionModel, load_collision_model
-from dt_viz.arm.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
-from dt_viz.arm.stances import Stances, stances
-from dt_viz.arm.tracking import TrackedPath, UnreachableError, drawn_onto, inverse_kinematics, track
-from dt_viz.arm.whole_arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
+from dt_viz.avoidance.arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
+from dt_viz.avoidance.passing import Stance
+from dt_viz.avoidance.postures import Stances, stances
+from dt_viz.avoidance.transform import ArmAvoidance, start_warnings
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
 from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.collision import SELF_MARGIN, CollisionModel, load_collision_model
+from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, drawn_onto, inverse_kinematics, track
+from dt_viz.robot.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.base import ArmAvoidance, start_warnings
-from dt_viz.transforms.passing import Stance
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 BY_FRACTION = 0.3

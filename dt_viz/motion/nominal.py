@@ -8,16 +8,16 @@ from functools import cached_property
 
 import numpy as np
 
+from dt_viz.avoidance.passing import Stance
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.choice import AnyImitation
+from dt_viz.learning.state import AnyImitation
 from dt_viz.memo import Memo
 from dt_viz.scenario.scenario import Start
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.passing import Stance
 from dt_viz.warning import MotionWarning
 
 NUM_SAMPLES, NUM_ADDED_SAMPLES = 200, 100
@@ -49,7 +49,7 @@ class Learned:
     task: Task
     imitation: AnyImitation
     system: DiffeomorphicSystem
-    """The system of its states: places (3,) in the plain state; see `dt_viz.flows.phased` for the augmented one."""
+    """The system of its states: places (3,) in the plain state; see `flows.augmented_systems` for the augmented one."""
     goal: Array
     """(3,), metres."""
 

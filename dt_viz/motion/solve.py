@@ -8,15 +8,15 @@ from itertools import islice
 
 import numpy as np
 
-from dt_viz.arm.whole_arm import ArmSolution, Lift
+from dt_viz.avoidance.arm import ArmSolution, Lift
+from dt_viz.avoidance.passing import ANEW, Passing
+from dt_viz.avoidance.transform import start_warnings
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
 from dt_viz.motion.warp import warped_stack
 from dt_viz.scenario.scenario import Scenario
-from dt_viz.transforms.base import start_warnings
-from dt_viz.transforms.passing import ANEW, Passing
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 NUM_ALTERNATIVES = 3

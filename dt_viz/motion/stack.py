@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.avoidance.passing import ANEW, Passing
+from dt_viz.avoidance.transform import Built, MotionBelow, Transform
+from dt_viz.avoidance.ways import Way
+from dt_viz.flows.augmented_systems import OnPlaces, frozen, on_places
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.flows.phased import OnPlaces, frozen, on_places
 from dt_viz.flows.rollouts import Bundle, Rays, refined
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.motion.nominal import Nominal
 from dt_viz.obstacles.shapes import Point
-from dt_viz.obstacles.ways import Way
 from dt_viz.scenario.scenario import Layer
-from dt_viz.transforms.base import Built, MotionBelow, Transform
-from dt_viz.transforms.passing import ANEW, Passing
 from dt_viz.warning import MotionWarning
 
 MAX_ATTEMPTS = 4

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.arm.cspace import JointLimits
-from dt_viz.arm.robot import NUM_JOINTS, Robot
-from dt_viz.arm.tracking import track
+from dt_viz.avoidance.arm_field import JointLimits
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.slice_fields import FieldPicture
+from dt_viz.robot.inverse_kinematics import track
+from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 STEP = 4e-3
 """Length of the steps that derivatives are taken from, metres at the hand."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from dt_viz.flows.augmented_systems import Frozen
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Mask
-from dt_viz.flows.phased import Frozen
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.obstacles.union import Union

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array
-from dt_viz.learning.choice import State
+from dt_viz.learning.state import State
 from dt_viz.obstacles.shapes import Point
 from dt_viz.scenario.slices import Slice
 

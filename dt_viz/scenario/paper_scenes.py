@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
@@ -19,8 +21,6 @@ from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import IMITATION, plane_of, with_added
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.bias import BiasPoint
 
 IN_8 = 0.09
 """Diameter of the sphere in the 8, metres."""

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import Stack, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.bias import BiasPoint
 
 SWINGS, TURNS = 5, 3
 """Number of swings through the motion and back on one round, and of turns of their direction."""

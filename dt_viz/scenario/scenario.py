@@ -6,15 +6,15 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
-from dt_viz.learning.choice import State
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.passing import Passing
+from dt_viz.avoidance.transform import ArmAvoidance, Transform
 from dt_viz.learning.imitation import Objective
+from dt_viz.learning.state import State
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.panels import Panel
 from dt_viz.scenario.slices import SlicePose
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.base import ArmAvoidance, Transform
-from dt_viz.transforms.passing import Passing
 
 SliceColour = Literal["none", "det", "lyapunov", "occupancy"]
 """Quantity shown as colour on the slice: det J of the stack, its Lyapunov value, or the learned occupancy."""

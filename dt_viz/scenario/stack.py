@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.avoidance.hand import Avoidance, Space
+from dt_viz.avoidance.transform import Surroundings, Transform
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance, Space
-from dt_viz.transforms.base import Surroundings, Transform
 
 IMITATION, WHOLE_ARM = "Imitation", "Whole arm"
 """Names of the transforms below and above the stack: the learned one, and the avoidance in configuration space."""

@@ -13,8 +13,8 @@ from dt_viz.flows.diffeomorphisms import Placed
 from dt_viz.flows.fields import Array
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.choice import AnyImitation
 from dt_viz.learning.demonstrations import Demonstration, DemonstrationError, lasa_files, load_demonstrations
+from dt_viz.learning.state import AnyImitation
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.scenario.objects import Ball, LiftedBox, Pot, PushedBox, TaskObject
 from dt_viz.scenario.slices import Slice

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dt_viz.engine.engine import ArmMotion
-from dt_viz.engine.live_arm import REST, LiveArm
 from dt_viz.flows.fields import Array
+from dt_viz.session.engine import ArmMotion
+from dt_viz.session.robot_loop import REST, LiveArm
 
 logger = logging.getLogger(__name__)
 

@@ -12,12 +12,12 @@ from typing import NoReturn
 
 import viser
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
 from dt_viz.obstacles.files import MAX_BYTES
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import TaskEntry
+from dt_viz.session.engine import Engine
 from dt_viz.ui.gate import Gate
 from dt_viz.ui.origins import Origin, Origins
 from dt_viz.ui.visitor import NOTICE_SECONDS, Visitor

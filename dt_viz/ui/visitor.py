@@ -9,16 +9,16 @@ from dataclasses import replace
 
 import viser
 
-from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Display, Pace, Session
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point, as_quaternion
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import selected, transform_of, with_avoidance, with_transform
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.session import Display, Pace, Session
 from dt_viz.ui.panel.panel import ControlPanel
 from dt_viz.ui.playback import Playback
 from dt_viz.ui.ruler import Ruler

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from plans import joints_of
 
-from dt_viz.arm.collision import load_collision_model
-from dt_viz.arm.link_distances import Poses
-from dt_viz.arm.robot import collision_meshes
-from dt_viz.arm.tracking import UnreachableError
 from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.postures import NUM_SAMPLES, PlanningScene, Query, planned
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.inverse_kinematics import UnreachableError
+from dt_viz.robot.link_distances import Poses
+from dt_viz.robot.robot import collision_meshes
 
 
 def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal(problem):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from plans import joints_of
 
-from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.mpnet import (
@@ -30,6 +29,7 @@ from dt_viz.baselines.postures import PlanningScene
 from dt_viz.errors import UnwantedError
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import load_collision_model
 
 needs_torch = pytest.mark.skipif(find_spec("torch") is None, reason="torch is an extra")
 needs_ompl = pytest.mark.skipif(find_spec("ompl") is None, reason="ompl is an extra")

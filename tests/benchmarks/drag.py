@@ -29,8 +29,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Frame, Stage
+from dt_viz.avoidance.hand import Avoidance, Space
+from dt_viz.avoidance.passing import ANEW
 from dt_viz.evaluate.options import (
     Row,
     add_task,
@@ -49,8 +49,8 @@ from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance, Space
-from dt_viz.transforms.passing import ANEW
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Frame, Stage
 
 SPACE: Mapping[str, Space] = {"hand": "task", "arm": "cspace"}
 """Spaces of the avoidance."""

@@ -26,6 +26,9 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.transform import Transform
 from dt_viz.evaluate.held_out import arrival_times
 from dt_viz.evaluate.options import (
     Row,
@@ -50,9 +53,6 @@ from dt_viz.obstacles.shapes import CloudObstacle, Point, Sphere, as_point
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.base import Transform
-from dt_viz.transforms.bias import BiasPoint
 
 NUM_ROLLOUTS, NUM_POINTS = 8, 200
 FINER = 1e-4

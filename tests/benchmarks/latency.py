@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Display, Pace, Session
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import SPACES, Avoidance
 from dt_viz.evaluate.options import (
     InputError,
     add_task,
@@ -50,8 +50,8 @@ from dt_viz.scenario.paper_scenes import bottle
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
-from dt_viz.transforms.avoidance import SPACES, Avoidance
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.session import Display, Pace, Session
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0

@@ -18,8 +18,8 @@ from dt_viz.evaluate.held_out import Learned, begun, frechet, path_from, shifted
 from dt_viz.evaluate.options import Row, ready_to_write, report, write_json
 from dt_viz.flows.fields import Array
 from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.choice import learn
 from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
+from dt_viz.learning.state import learn
 from dt_viz.metrics import resample_by_arc_length
 
 AWAY = (0.25, 0.5)

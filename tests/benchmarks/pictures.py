@@ -19,12 +19,12 @@ from typing import Any
 from PIL import Image
 
 from dt_viz.control.controller import Phase
-from dt_viz.engine.frame import Stage
 from dt_viz.evaluate.options import InputError, add_lasa
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.tasks import known_tasks
+from dt_viz.session.frame import Stage
 from dt_viz.ui.server import Server
 from dt_viz.ui.visitor import Visitor
 from tests.chromium import ARGUMENTS, CHROMIUM

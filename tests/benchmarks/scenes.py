@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Stage
 from dt_viz.evaluate.options import add_lasa, ready_to_write, report, write_json
 from dt_viz.folders import default_cache_folder
 from dt_viz.learning.store import FitStore
 from dt_viz.memo import Memo
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.paper_scenes import SCENES, offered
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import known_tasks
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Stage
 
 SHOWN = (Stage.ROLLOUTS, Stage.LIVE, Stage.CERTIFIED)
 """Stages that are timed."""

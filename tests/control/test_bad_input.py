@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.arm.collision import load_collision_model
+from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.limits import ContactLimit
 from dt_viz.control.settings import ControllerSettings
@@ -12,7 +12,7 @@ from dt_viz.kernels.proximity import contacts, least_contacts
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.base import ArmAvoidance
+from dt_viz.robot.collision import load_collision_model
 
 TICK, LATE = 0.01, 0.5
 SETTINGS = ControllerSettings()

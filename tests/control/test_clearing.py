@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.arm.cspace import LEVERS
-from dt_viz.arm.whole_arm import OVERSHOOT
+from dt_viz.avoidance.arm import OVERSHOOT
+from dt_viz.avoidance.arm_field import LEVERS
+from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.base import ArmAvoidance
 
 MARGIN = 0.03
 RESTS = np.zeros((1, 3))

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.arm.arm_system import ArmSystem
-from dt_viz.arm.collision import load_collision_model
+from dt_viz.control.arm_system import ArmSystem
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.robot.collision import load_collision_model
 
 TICK = 0.01
 MARGIN = 0.03

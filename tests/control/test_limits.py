@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dt_viz.arm.whole_arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
 from dt_viz.control.obstacle_motion import ObstacleMotion, Sighting
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.base import ArmAvoidance
 
 STEP = 1e-5
 TICK = 0.01

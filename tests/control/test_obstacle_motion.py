@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.control.obstacle_motion import NOTHING_SEEN, ObstacleMotion, Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.base import ArmAvoidance
 
 VELOCITY = np.array([0.1, -0.05, 0.02])
 PERIOD = 0.03

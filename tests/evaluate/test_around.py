@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from hook import NUM_DEMONSTRATIONS, apart, hook
 
-from dt_viz.arm.collision import load_collision_model
+from dt_viz.avoidance.hand import Avoidance
 from dt_viz.evaluate.__main__ import main
 from dt_viz.evaluate.around import TURN_ARC, Place, Rollout, _shares
 from dt_viz.metrics import distance_from_path, sharpest_turn
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import load_collision_model
 from dt_viz.scenario.tasks import lasa_tasks
-from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from hook import NUM_DEMONSTRATIONS
 
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Stage
 from dt_viz.evaluate.__main__ import main as evaluate
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
@@ -19,6 +17,8 @@ from dt_viz.learning.imitation import fit
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.metrics import discrete_frechet, distance_from_path
 from dt_viz.scenario.tasks import TASKS, lasa_tasks
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Stage
 from tests.benchmarks import drag, exactness, latency, sitting
 from tests.benchmarks.__main__ import main
 from tests.benchmarks.exactness import MAX_DEPARTURE, compare, stepped_adaptively, stepped_beside

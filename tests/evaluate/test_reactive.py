@@ -6,10 +6,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from dt_viz.arm.collision import load_collision_model
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate import reactive
 from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.robot.collision import load_collision_model
 
 
 def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured, robot):

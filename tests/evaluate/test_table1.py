@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 
-from dt_viz.arm.collision import load_collision_model
 from dt_viz.baselines.base import Plan
 from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
@@ -17,6 +16,7 @@ from dt_viz.evaluate.options import InputError
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import load_collision_model
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from laws.registry import TOP, Waves, bump, phased, states
 
+from dt_viz.flows.augmented_systems import Shear, frozen, on_places
 from dt_viz.flows.diffeomorphisms import Chain
-from dt_viz.flows.phased import Shear, frozen, on_places
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from laws.registry import bent
 from oracles import central_differences
 
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler, rk4
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem, asinh_exp, log_sinh
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.bias import BiasPoint
 
 seeds = st.integers(0, 2**32 - 1)
 

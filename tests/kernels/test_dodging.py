@@ -5,11 +5,11 @@ from itertools import product
 import numpy as np
 import pytest
 
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.robot import load_jaco
 from dt_viz.kernels.dodging import ENOUGH, Forecast, LimitedArm, dodge
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
+from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.robot import load_jaco
 
 ROBOT = load_jaco()
 LINKS = load_body_points().on_moving_links

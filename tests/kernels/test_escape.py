@@ -5,13 +5,13 @@ import plain_escape
 import pytest
 from laws.registry import OBSTACLES, TILTED
 
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.cspace import COMPLEX_STEP, WholeArmField
-from dt_viz.arm.robot import load_jaco
-from dt_viz.arm.whole_arm import WholeArm
+from dt_viz.avoidance.arm import WholeArm
+from dt_viz.avoidance.arm_field import COMPLEX_STEP, WholeArmField
 from dt_viz.flows.integrators import integrate, integrate_adaptive, rk4
 from dt_viz.obstacles.shapes import as_point
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.robot import load_jaco
 
 ROBOT = load_jaco()
 ARM = WholeArm(ROBOT, load_body_points())

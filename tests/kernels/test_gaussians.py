@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.special import eval_hermite, expit
 
+from dt_viz.avoidance.bias import RegionField, Shift
+from dt_viz.avoidance.sides import Sideways
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, PointField, Projected, Sum
 from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4
 from dt_viz.kernels.gaussians import LANES, exponential
 from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, OccupancyMap
-from dt_viz.transforms.bias import RegionField, Shift
-from dt_viz.transforms.sides import Sideways
 
 COUNTS = [1, 2, 5, LANES, 2 * LANES + 7]
 

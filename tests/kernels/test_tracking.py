@@ -4,10 +4,10 @@ import numpy as np
 import plain_tracking
 import pytest
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.arm.tracking import LIMIT_MARGIN
 from dt_viz.kernels.blocks import LANES
 from dt_viz.kernels.tracking import Postures, TrackingArm, settle, walk
+from dt_viz.robot.inverse_kinematics import LIMIT_MARGIN
+from dt_viz.robot.robot import load_jaco
 
 ROBOT = load_jaco()
 ARM = TrackingArm(ROBOT.records, np.array(ROBOT.end_effector_offset), np.array(ROBOT.lower), np.array(ROBOT.upper))

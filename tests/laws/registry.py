@@ -11,11 +11,14 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import dt_viz
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.cspace import ArmField, GradientField, JointLimits, WholeArmField
-from dt_viz.arm.robot import HOME, NUM_JOINTS, load_jaco
+from dt_viz.avoidance.arm_field import ArmField, GradientField, JointLimits, WholeArmField
+from dt_viz.avoidance.bias import BiasPoint, Shift, unit_field
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.sides import Sideways
+from dt_viz.avoidance.transform import Transform
 from dt_viz.baselines.eflow import Coupling, Normalisation
 from dt_viz.baselines.signed_distance import SignedDistanceField
+from dt_viz.flows.augmented_systems import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
 from dt_viz.flows.diffeomorphisms import (
     AdaptiveFlow,
     Chain,
@@ -28,7 +31,6 @@ from dt_viz.flows.diffeomorphisms import (
 )
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, Projected, Sum, VectorField
 from dt_viz.flows.integrators import euler, implicit_euler
-from dt_viz.flows.phased import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
 from dt_viz.flows.systems import Attractor
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.obstacles.clouds import Cloud
@@ -46,11 +48,9 @@ from dt_viz.obstacles.shapes import (
 )
 from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.robot import HOME, NUM_JOINTS, load_jaco
 from dt_viz.scenario.tasks import DRAWING_AXES
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.base import Transform
-from dt_viz.transforms.bias import BiasPoint, Shift, unit_field
-from dt_viz.transforms.sides import Sideways
 
 Points = Callable[[int], np.ndarray]
 """Gives so many points (num, d), always the same."""

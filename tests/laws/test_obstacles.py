@@ -8,10 +8,10 @@ import trimesh
 from laws.registry import OBSTACLES, PLACE, SIMILAR, TILTED
 from oracles import central_differences
 
+from dt_viz.avoidance.hand import clearing_duration
 from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.obstacles.shapes import MAX_BALLS, SHAPES, UPRIGHT, Box, CloudObstacle, MeshObstacle, Obstacle, rotation
 from dt_viz.obstacles.union import Union
-from dt_viz.transforms.avoidance import clearing_duration
 
 
 def test_every_shape_has_an_example():

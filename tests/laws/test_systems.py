@@ -5,8 +5,8 @@ import pytest
 from laws.registry import BASES, MAPS, ONLY_AT_A_MOMENT, bump, product_classes
 from oracles import central_differences
 
+from dt_viz.flows.augmented_systems import PhasedAttractor, Shear, on_places
 from dt_viz.flows.diffeomorphisms import Chain
-from dt_viz.flows.phased import PhasedAttractor, Shear, on_places
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 
 

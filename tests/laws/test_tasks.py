@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.arm.tracking import inverse_kinematics, track
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.hand import SPACES
 from dt_viz.flows.diffeomorphisms import min_det_jacobian, round_trip_error
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
+from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.avoidance import SPACES
+from dt_viz.session.frame import Stage
 from dt_viz.warning import Kind
 
 

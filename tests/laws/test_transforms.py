@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from laws.registry import TRANSFORMS
 
+from dt_viz.avoidance.registry import KINDS
+from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow, Integration, min_det_jacobian, round_trip_error
 from dt_viz.flows.fields import GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.scenario.scenario import Layer, Scenario
-from dt_viz.transforms.base import MotionBelow
-from dt_viz.transforms.registry import KINDS
 
 GOAL = np.array([0.25, -0.42, 0.3])
 STARTS = np.array([-0.25, -0.4, 0.32]) + np.array([[0.0, 0.0, 0.0], [0.01, 0.01, -0.01], [-0.01, 0.0, 0.01]])

@@ -14,8 +14,8 @@ from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.flow_chain import FlowLayer, Stack, equally_spaced_grid, min_step_determinant
 from dt_viz.learning.imitation import Imitation, ImitationSettings, fit
+from dt_viz.learning.initial_guess import unbending
 from dt_viz.learning.preparation import ImitationError
-from dt_viz.learning.unbending import unbending
 from dt_viz.learning.velocity import VelocityFit
 
 

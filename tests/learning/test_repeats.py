@@ -12,9 +12,9 @@ from crossings import crossings
 from drawings import extent, from_one_start
 
 from dt_viz.learning.augmented import AugmentedImitation
-from dt_viz.learning.choice import learn
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.flow_chain import FlowLayer
+from dt_viz.learning.state import learn
 from dt_viz.learning.timing import MIN_PACE, _fit_pace
 from dt_viz.scenario.tasks import TASKS
 

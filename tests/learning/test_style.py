@@ -9,7 +9,8 @@ from crossings import crossings
 from drawings import frechet, path_from
 from scenes import kinds
 
-from dt_viz.flows.phased import Shear
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.flows.augmented_systems import Shear
 from dt_viz.learning import augmented
 from dt_viz.learning.augmented import fit_augmented
 from dt_viz.learning.preparation import ImitationError
@@ -18,7 +19,6 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Layer, Scenario
 from dt_viz.scenario.tasks import STYLES, TASKS
-from dt_viz.transforms.avoidance import Avoidance
 from dt_viz.warning import Kind
 
 

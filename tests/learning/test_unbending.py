@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from drawings import extent, frechet
 
-from dt_viz.learning import unbending as module
+from dt_viz.learning import initial_guess as module
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.imitation import fit
+from dt_viz.learning.initial_guess import unbending
 from dt_viz.learning.preparation import prepare
-from dt_viz.learning.unbending import unbending
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.scenario.tasks import TASKS
 

@@ -7,14 +7,14 @@ import pytest
 from oracles import central_differences
 from scenes import changed
 
-from dt_viz.arm.arm_system import ArmSystem, Section
-from dt_viz.arm.tracking import track
+from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Flow, Identity
 from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.robot.inverse_kinematics import track
 
 ARRIVED = 0.02
 """Metres in base space from the goal at which the motions that are compared end."""

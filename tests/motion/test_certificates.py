@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from scenes import changed, frame_at, kinds
 
-from dt_viz.arm.cspace import LEVERS
-from dt_viz.arm.retiming import within_velocity_limits
-from dt_viz.engine.certify import certify
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Frame, Stage
+from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.diffeomorphisms import Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
@@ -32,7 +28,11 @@ from dt_viz.motion.certificates import (
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import FINE, Solution
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.scenario.scenario import View
+from dt_viz.session.certify import certify
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Frame, Stage
 from dt_viz.warning import Kind, MotionWarning
 
 BASE = Attractor(np.array([0.5, 0.2, 0.0]), 0.2, 0.05)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, frame_at, says
 
-from dt_viz.arm.collision import Nearest, load_collision_model
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import BESIDE, Avoidance
 from dt_viz.motion.diagnostics import MARGIN_TOLERANCE, MAX_GOAL_MISS, margin_warnings
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
+from dt_viz.robot.collision import Nearest, load_collision_model
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import plane_of
-from dt_viz.transforms.avoidance import BESIDE, Avoidance
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Stage
 from dt_viz.warning import ARM, Kind, MotionWarning, told
 
 
@@ -165,7 +165,7 @@ def test_a_margin_that_the_meshes_do_not_keep_is_said_with_what_they_keep():
 @pytest.mark.parametrize("kept", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_the_last_frame_says_what_margin_the_meshes_keep(engine, new_engine, initial, monkeypatch, kept):
     if not kept:  # the flow ends where the covering spheres are clear
-        monkeypatch.setattr("dt_viz.arm.whole_arm.MESH_ROUNDING", np.inf)
+        monkeypatch.setattr("dt_viz.avoidance.arm.MESH_ROUNDING", np.inf)
         engine = new_engine()
     margin, scenario = 0.01, changed(initial("draw_s"), space="cspace", margin=0.01, view=View(field=False))
     frame = stage(engine, scenario, Stage.CERTIFIED)

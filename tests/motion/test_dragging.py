@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from scenes import changed, frame_at
 
-from dt_viz.arm.escape import STAYING, escape_directions
-from dt_viz.arm.whole_arm import DURATION_CHANGE
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.arm import DURATION_CHANGE
+from dt_viz.avoidance.detour import STAYING, escape_directions
+from dt_viz.avoidance.passing import ANEW
+from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.ways import TURNING
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
-from dt_viz.obstacles.ways import TURNING
 from dt_viz.scenario.scenario import View
-from dt_viz.transforms.base import ArmAvoidance
-from dt_viz.transforms.passing import ANEW
+from dt_viz.session.frame import Stage
 
 DIAMETER = 0.15
 """Diameter of the dragged ball, metres."""

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from scenes import changed, frame_at, kinds, starts_at
 
-from dt_viz.arm.arm_system import Section
-from dt_viz.arm.collision import SELF_MARGIN, load_collision_model
-from dt_viz.arm.tracking import UnreachableError
-from dt_viz.arm.whole_arm import LONG, NUM_CONFIGURATIONS
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.arm import LONG, NUM_CONFIGURATIONS
+from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.control.arm_system import Section
 from dt_viz.errors import UnwantedError
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
 from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import SELF_MARGIN, load_collision_model
+from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.base import ArmAvoidance
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Stage
 from dt_viz.warning import Kind
 
 FAR = Sphere((3.0, 3.0, 3.0))

@@ -8,8 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import changed, frame_at
 
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.engine.frame import Stage
 from dt_viz.metrics import (
     discrete_frechet,
     distance_from_path,
@@ -17,7 +15,9 @@ from dt_viz.metrics import (
     resample_by_arc_length,
 )
 from dt_viz.motion.profiles import NUM_SAMPLES, body_profile
+from dt_viz.robot.body_points import load_body_points
 from dt_viz.scenario.scenario import View
+from dt_viz.session.frame import Stage
 from dt_viz.ui.panel.health_plots import HealthPlots
 
 SHOWN = View(field=False, health_plots=True)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scenes import beside, random_scenario, says
 
+from dt_viz.avoidance.bias import MAX_TARGET_MISS
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
-from dt_viz.transforms.bias import MAX_TARGET_MISS
 from dt_viz.warning import Kind
 
 BETWEEN_SAMPLES = 1e-4

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scenes import biases, changed, frame_at, says, starts_at
 
-from dt_viz.arm.whole_arm import MOVED
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.arm import MOVED
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import Start, View
 from dt_viz.scenario.stack import plane_of
 from dt_viz.scenario.starts import with_grid
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Stage
 
 NUM = 5
 

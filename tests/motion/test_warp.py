@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, frame_at
 
-import dt_viz.engine.engine
-from dt_viz.engine.frame import Stage
+import dt_viz.session.engine
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.metrics import distance_from_path, maximum_collision_distance
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import surroundings
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Stage
 
 WARPS = (0.0, 0.15, 0.5, 0.85)
 
@@ -100,8 +100,8 @@ def test_a_nearly_full_warp_is_nearly_the_stack_and_a_full_one_is_the_stack(engi
 
 def test_what_auto_chose_for_the_full_stack_stays_and_is_worked_out_once(new_engine, engine, monkeypatch):
     solved = []
-    solve = dt_viz.engine.engine.solve
-    monkeypatch.setattr(dt_viz.engine.engine, "solve", lambda *args: solved.append(args) or solve(*args))
+    solve = dt_viz.session.engine.solve
+    monkeypatch.setattr(dt_viz.session.engine, "solve", lambda *args: solved.append(args) or solve(*args))
     fresh, scenario = new_engine(), stacked(engine, "draw_s", view=View(field=False))
     full = frame_at(fresh, scenario, Stage.FINE)
     for warp in (0.4, 0.0, 1.0):

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, frame_at
 
-from dt_viz.arm.arm_system import ArmSystem, Section
-from dt_viz.engine import compose
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.flows.diffeomorphisms import Identity
 from dt_viz.motion.stack import FINE
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.arm_field import Lattice
 from dt_viz.scenario.scenario import Layer
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session import compose
+from dt_viz.session.frame import Stage
 
 
 @pytest.fixture(scope="module", name="scene", params=["draw_s", "lift_box"])

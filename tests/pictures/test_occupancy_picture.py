@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scenes import frame_at
 
-from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import MAX_POINTS, NEAR, learned_occupancy, occupancy_picture
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import Slice
+from dt_viz.session.frame import Stage
 
 AREA = Slice(np.array([0.0, -0.5, 0.4]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T, (0.2, 0.15))
 SHAPES = [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import avoiding, biases, changed, frame_at
 
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import Attractor
 from dt_viz.motion.stack import LIVE, build_stack
@@ -16,7 +16,7 @@ from dt_viz.scenario.panels import BASE_PANEL, Panel, directions, offsets
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, plane_of, side_by_side, switched
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Stage
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.panels import Panels
 

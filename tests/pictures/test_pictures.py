@@ -7,12 +7,12 @@ import pytest
 from scenes import changed, frame_at, tilted
 from scipy.spatial import KDTree
 
-from dt_viz.engine.frame import Stage
 from dt_viz.motion.stack import FINE, LIVE, build_stack
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.pictures.sketchbook import FINE_SPACING, LINE_SPACING
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
+from dt_viz.session.frame import Stage
 
 TASK_NAMES = ["draw_s", "lift_box"]
 ALL = View(generator=True, grid=True, panels=(BASE_PANEL,))

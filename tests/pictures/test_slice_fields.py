@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scenes import biases, changed, frame_at, tilted
 
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.motion.stack import FINE, LIVE, build_stack, cut_off
 from dt_viz.pictures.slice_fields import MAX_OFFSET, SEPARATION
 from dt_viz.scenario.scenario import SLICE_COLOURS, View
 from dt_viz.scenario.stack import levels, surroundings
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Stage
 
 TASK_NAMES = ["draw_s", "lift_box"]
 
@@ -51,8 +51,8 @@ def test_everything_lies_on_the_slice_wherever_it_is(engine, scenario, colour):
 def test_neither_another_slice_nor_another_rollout_for_the_arm_solves_anything_again(new_engine, initial, monkeypatch):
     engine, scenario = new_engine(), initial("lift_box")
     before = list(engine.frames(scenario))
-    monkeypatch.setattr("dt_viz.engine.engine.solve", lambda *_: pytest.fail("solved again"))
-    monkeypatch.setattr("dt_viz.engine.engine.certify", lambda *_: pytest.fail("certified again"))
+    monkeypatch.setattr("dt_viz.session.engine.solve", lambda *_: pytest.fail("solved again"))
+    monkeypatch.setattr("dt_viz.session.engine.certify", lambda *_: pytest.fail("certified again"))
     moved = replace(scenario, view=View(slice=tilted(engine.task(scenario.task)), level="Imitation"))
     for old, new in zip(before, engine.frames(moved), strict=True):
         assert new.scenario == moved and new.stage is old.stage and new.level == 0

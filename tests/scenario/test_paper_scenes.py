@@ -8,8 +8,6 @@ import scipy.io
 import trimesh
 from scenes import changed, frame_at
 
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Stage
 from dt_viz.learning.store import FitStore
 from dt_viz.metrics import maximum_collision_distance, resample_by_arc_length
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Sphere
@@ -17,6 +15,8 @@ from dt_viz.scenario.paper_scenes import SCENES, clover, in_clover, offered
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import POTS, TASKS, known_tasks
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Stage
 
 SHIPPED = [scene.name for scene in offered(TASKS)]
 

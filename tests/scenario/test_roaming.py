@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.engine.player import Player
 from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.scenario.roaming import (
     GOAL_SWAY,
@@ -19,6 +18,7 @@ from dt_viz.scenario.roaming import (
     crossings,
 )
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.player import Player
 
 SECONDS = np.arange(0, 60, 0.05)
 

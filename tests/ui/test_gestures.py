@@ -8,13 +8,13 @@ import pytest
 from pages import MIDDLE
 from scenes import avoiding, beside, biases, frame_at
 
-from dt_viz.engine.frame import Stage
-from dt_viz.engine.session import Pace
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Stage
+from dt_viz.session.session import Pace
 from dt_viz.ui.panel.panel import PLOTS, VIEW_LABELS
 
 PACE = Pace(0.02, 10.0, 0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pages import PATIENCE
 
-from dt_viz.engine.engine import ArmMotion
-from dt_viz.engine.live_arm import REST
+from dt_viz.session.engine import ArmMotion
+from dt_viz.session.robot_loop import REST
 from dt_viz.ui import playback as playback_module
 from dt_viz.ui.playback import Playback, at_moment
 

@@ -10,15 +10,15 @@ from pages import frame_of, ignored
 from scenes import avoiding, changed, frame_at
 from viser import transforms  # noqa: TID251
 
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.cspace import LEVERS
-from dt_viz.arm.robot import load_jaco
-from dt_viz.engine.engine import ArmMotion
-from dt_viz.engine.frame import Stage
+from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.engine import ArmMotion
+from dt_viz.session.frame import Stage
 from dt_viz.ui.panel.panel import VIEW_LABELS
 from dt_viz.ui.panel.plots import NUM_SAMPLES, JointPlots, joint_curves
 from dt_viz.ui.scene.anchors import Anchors

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dt_viz.arm.robot import load_jaco
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.tasks import POTS, TASKS
 from dt_viz.ui.scene.drawing import PERIOD, STEP, Drawing
 from dt_viz.ui.scene.objects import Objects

@@ -10,13 +10,13 @@ from pages import Bound, frame_of, ignored, painted_at
 from PIL import Image
 from scenes import avoiding, changed
 
-from dt_viz.engine.frame import Stage
 from dt_viz.obstacles.shapes import Sphere, rotation
 from dt_viz.pictures.sketchbook import Pictures
 from dt_viz.pictures.slice_fields import ColourPicture, FieldPicture
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.tasks import TASKS
+from dt_viz.session.frame import Stage
 from dt_viz.ui.panel.slice import WHOLE_ARM_NOTE, SlicePanel
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, from_oklab, oklab, ramp

@@ -9,12 +9,12 @@ import pytest
 from pages import Bound, Edited, frame_of, ignored
 from scenes import avoiding, beside, biases, changed
 
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import IMITATION, WHOLE_ARM, anchored, avoiding_with, selected
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
 from dt_viz.ui.panel.avoid import add_avoid_and_imitate, avoids_with
 from dt_viz.ui.panel.stack import (
     BASE,

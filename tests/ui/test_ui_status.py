@@ -11,19 +11,19 @@ import pytest
 from pages import Edited, frame_of, panel_of
 from scenes import avoiding, beside, biases, changed
 
-from dt_viz.arm.collision import NOTHING, CollisionReport, Nearest
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Pace, Session
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.learning.demonstrations import DemonstrationError
 from dt_viz.motion.certificates import Certificates
 from dt_viz.obstacles.shapes import Sphere
+from dt_viz.robot.collision import NOTHING, CollisionReport, Nearest
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import avoiding_with
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.session import Pace, Session
 from dt_viz.ui.panel.remedies import remedy
 from dt_viz.ui.panel.status import CHANGED, HINT, LEADING, PALE, details_html, hint
 from dt_viz.ui.panel.status_line import BUTTON, HEIGHT

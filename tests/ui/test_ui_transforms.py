@@ -8,16 +8,16 @@ import pytest
 from pages import Bound, frame_of, wait_until
 from scenes import avoiding, biases, changing
 
-from dt_viz.engine import player as player_module
-from dt_viz.engine.engine import Engine
-from dt_viz.engine.player import Player
-from dt_viz.engine.session import Session
+from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.diffeomorphisms import Integration
 from dt_viz.obstacles.shapes import Sphere
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import IMITATION, anchored
 from dt_viz.scenario.tasks import TASKS
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session import player as player_module
+from dt_viz.session.engine import Engine
+from dt_viz.session.player import Player
+from dt_viz.session.session import Session
 from dt_viz.ui.panel import warp as warp_module
 from dt_viz.ui.panel.transform_settings import add_transform_settings, learned_html
 from dt_viz.ui.panel.warp import grown

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from dt_viz.engine.frame import Frame
-from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.session.frame import Frame
+from dt_viz.session.session import Session
 from dt_viz.ui.controls import Control, on_command
 
 KEEP: Any = object()

@@ -8,7 +8,7 @@ from typing import Literal, cast
 
 import viser
 
-from dt_viz.engine.session import Session
+from dt_viz.session.session import Session
 from dt_viz.ui.panel.bindings import Bindings
 
 MAX_DIGIT = 9

@@ -13,10 +13,10 @@ import viser
 from viser import uplot
 
 from dt_viz.baselines.base import INSTALL, Method
-from dt_viz.engine.comparison import OTHERS, OURS
-from dt_viz.engine.frame import Compared
 from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.session.comparison import OTHERS, OURS
+from dt_viz.session.frame import Compared
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.plots import LOOK, SMALL, columns
 from dt_viz.ui.scene import palette

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 import viser
 
-from dt_viz.engine.player import Play, Player
-from dt_viz.engine.session import Session
 from dt_viz.scenario.roaming import Chase, MovingGoal
+from dt_viz.session.player import Play, Player
+from dt_viz.session.session import Session
 from dt_viz.ui.panel.bindings import Bindings
 
 SPEEDS: Mapping[str, float] = {"Obstacle": 0.08, "Fast obstacle": 0.25}

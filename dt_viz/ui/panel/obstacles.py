@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from dt_viz.engine.session import Session
 from dt_viz.errors import Cancelled, never
 from dt_viz.obstacles import files as shapes
 from dt_viz.obstacles.files import (
@@ -30,6 +29,7 @@ from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.scenario.stack import with_avoidance
 from dt_viz.scenario.tasks import Task
+from dt_viz.session.session import Session
 from dt_viz.ui.chores import Later
 from dt_viz.ui.controls import Control, on_press
 from dt_viz.ui.panel.bindings import KEEP, Bindings

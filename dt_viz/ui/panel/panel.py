@@ -9,16 +9,16 @@ from typing import Any
 
 import viser
 
-from dt_viz.arm.robot import Robot
-from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Pace, Session
-from dt_viz.engine.worker import LatestWorker
 from dt_viz.errors import DataError
 from dt_viz.learning.imitation import ImitationError
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.paper_scenes import SCENES, PaperScene, offered
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import side_by_side
 from dt_viz.scenario.tasks import Task
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.session import Pace, Session
+from dt_viz.session.worker import LatestWorker
 from dt_viz.ui.chores import Chores
 from dt_viz.ui.controls import Control, on_press
 from dt_viz.ui.panel.about import add_about

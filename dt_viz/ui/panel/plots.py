@@ -10,9 +10,9 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
-from dt_viz.arm.robot import NUM_JOINTS, Robot
-from dt_viz.engine.engine import ArmMotion
 from dt_viz.flows.fields import Array
+from dt_viz.robot.robot import NUM_JOINTS, Robot
+from dt_viz.session.engine import ArmMotion
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.palette import css
 from dt_viz.ui.scene.picture import Following

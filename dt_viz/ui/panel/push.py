@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import viser
 
-from dt_viz.engine.frame import Stage
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.session.frame import Stage
 from dt_viz.ui.controls import on_press
 from dt_viz.ui.panel.bindings import Bindings
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dt_viz.engine.frame import Frame
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with, transform_of, with_avoidance, with_transform
+from dt_viz.session.frame import Frame
 from dt_viz.ui.panel.verdict import concerns
 from dt_viz.warning import Kind
 

@@ -8,12 +8,12 @@ from typing import Any, cast
 
 import viser
 
-from dt_viz.engine.frame import Frame
+from dt_viz.avoidance import registry
+from dt_viz.avoidance.transform import Choice, FlowIntegration, Number, Setting, Switch, Transform
 from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM, transform_of, with_transform
-from dt_viz.transforms import registry
-from dt_viz.transforms.base import Choice, FlowIntegration, Number, Setting, Switch, Transform
+from dt_viz.session.frame import Frame
 from dt_viz.ui.controls import Control
 from dt_viz.ui.panel.bindings import KEEP, Bindings
 

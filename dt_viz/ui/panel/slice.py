@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import viser
 
-from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import SLICE_COLOURS, Scenario, SliceColour
+from dt_viz.session.session import Session
 from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.scene.legend import OCCUPANCY, Legend, legend_of
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.frame import Frame
-from dt_viz.engine.session import Session
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.transform import Transform
 from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import (
@@ -24,9 +25,8 @@ from dt_viz.scenario.stack import (
     transform_of,
     tunable,
 )
-from dt_viz.transforms.avoidance import Avoidance
-from dt_viz.transforms.base import Transform
-from dt_viz.transforms.bias import BiasPoint
+from dt_viz.session.frame import Frame
+from dt_viz.session.session import Session
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.transform_settings import add_transform_settings
 from dt_viz.ui.panel.warp import WarpControls

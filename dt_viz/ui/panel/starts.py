@@ -9,13 +9,13 @@ from typing import Any
 
 import viser
 
-from dt_viz.arm.robot import load_jaco
-from dt_viz.arm.tracking import UnreachableError
-from dt_viz.engine.frame import Frame
-from dt_viz.engine.session import Session
 from dt_viz.motion.following import room_at_rest
+from dt_viz.robot.inverse_kinematics import UnreachableError
+from dt_viz.robot.robot import load_jaco
 from dt_viz.scenario.scenario import MAX_STARTS, Scenario
 from dt_viz.scenario.starts import followed, label_of, with_grid, with_label
+from dt_viz.session.frame import Frame
+from dt_viz.session.session import Session
 from dt_viz.ui.chores import Later
 from dt_viz.ui.panel.bindings import Bindings
 

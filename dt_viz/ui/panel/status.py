@@ -5,11 +5,11 @@ from __future__ import annotations
 import html
 from collections.abc import Iterator, Mapping
 
-from dt_viz.arm.collision import SELF_REACH, CollisionReport
-from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Pace
+from dt_viz.robot.collision import SELF_REACH, CollisionReport
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.session import Pace
 from dt_viz.ui.panel.verdict import Level, Verdict, concerns, shows_arm
 from dt_viz.ui.scene.palette import ink, paper
 from dt_viz.ui.scene.picture import Colour

@@ -6,9 +6,9 @@ import threading
 
 import viser
 
-from dt_viz.engine.frame import Frame
-from dt_viz.engine.session import Pace, Session
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.session.frame import Frame
+from dt_viz.session.session import Pace, Session
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.remedies import Remedy, remedy
 from dt_viz.ui.panel.status import COLOURS, PALE, details_html, line_html, place_html, progress_html

@@ -8,13 +8,13 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.frame import Frame
-from dt_viz.learning.choice import STATES
+from dt_viz.avoidance.transform import Number, Setting, Switch, Transform
 from dt_viz.learning.imitation import OBJECTIVES
+from dt_viz.learning.state import STATES
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION, tunable, tuned
 from dt_viz.scenario.tasks import STYLES
-from dt_viz.transforms.base import Number, Setting, Switch, Transform
+from dt_viz.session.frame import Frame
 from dt_viz.ui.panel.bindings import Bindings
 from dt_viz.ui.panel.settings import add_settings
 

@@ -7,11 +7,11 @@ from functools import partial
 
 import viser
 
-from dt_viz.engine.session import Session
+from dt_viz.avoidance import registry
+from dt_viz.avoidance.transform import Setting, Transform
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import added, selected, surroundings, with_added, without
-from dt_viz.transforms import registry
-from dt_viz.transforms.base import Setting, Transform
+from dt_viz.session.session import Session
 from dt_viz.ui.chores import Later
 from dt_viz.ui.panel.bindings import KEEP, Bindings
 from dt_viz.ui.panel.settings import add_settings

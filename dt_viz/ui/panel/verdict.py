@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from dt_viz.engine.frame import Frame, Stage
-from dt_viz.engine.session import Pace
 from dt_viz.scenario.scenario import Scenario, View
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.session import Pace
 from dt_viz.warning import ARM, Kind, MotionWarning
 
 COMPUTING = "computing …"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import viser
 
-from dt_viz.engine.player import Player
-from dt_viz.engine.session import Session
 from dt_viz.scenario.scenario import Scenario
+from dt_viz.session.player import Player
+from dt_viz.session.session import Session
 from dt_viz.ui.panel.bindings import Bindings
 
 SECONDS = 5.0

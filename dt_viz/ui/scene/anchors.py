@@ -12,13 +12,13 @@ import numpy as np
 import viser
 import viser.transforms
 
-from dt_viz.engine.frame import Frame
+from dt_viz.avoidance.registry import KINDS
+from dt_viz.avoidance.transform import Transform, axes_of
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.stack import anchored, selected
-from dt_viz.transforms.base import Transform, axes_of
-from dt_viz.transforms.registry import KINDS
+from dt_viz.session.frame import Frame
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene import palette

@@ -7,9 +7,9 @@ import trimesh
 import viser
 from viser import transforms
 
-from dt_viz.arm.cspace import LEVERS
-from dt_viz.arm.robot import NUM_JOINTS, Robot
+from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.fields import Array
+from dt_viz.robot.robot import NUM_JOINTS, Robot
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.links import bodies, light_shells
 from dt_viz.ui.scene.picture import Colour, Shown

@@ -9,12 +9,12 @@ import trimesh
 import viser
 from viser import transforms
 
-from dt_viz.arm.body_points import load_body_points
-from dt_viz.arm.robot import Robot
-from dt_viz.engine.engine import ArmMotion
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
+from dt_viz.robot.body_points import load_body_points
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import View
+from dt_viz.session.engine import ArmMotion
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import PEDESTAL, ArmPicture, GhostArm
 from dt_viz.ui.scene.links import light_shells

@@ -9,11 +9,11 @@ from itertools import cycle
 import numpy as np
 import viser
 
-from dt_viz.arm.robot import Robot
-from dt_viz.engine.comparison import OTHERS
-from dt_viz.engine.frame import Compared, Frame, Stage
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import distance_from_path
+from dt_viz.robot.robot import Robot
+from dt_viz.session.comparison import OTHERS
+from dt_viz.session.frame import Compared, Frame, Stage
 from dt_viz.ui.playback import Replay
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.arm import GhostArm

@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 import viser
 
-from dt_viz.arm.robot import Robot
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.slices import Slice
+from dt_viz.session.frame import Frame
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene import palette

@@ -9,9 +9,9 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike
 
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.slices import Slice
+from dt_viz.session.frame import Frame
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene.picture import Picture

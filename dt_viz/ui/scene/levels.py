@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import viser
 
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import IMITATION
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Picture
 from dt_viz.ui.scene.tubes import Tubes, middles_of

@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 import yourdfpy
 
-from dt_viz.arm.robot import package_folder, urdf_path
 from dt_viz.flows.fields import Array
+from dt_viz.robot.robot import package_folder, urdf_path
 
 CELL = 0.005
 """Edge length of the cells in which a light mesh keeps one vertex, metres."""

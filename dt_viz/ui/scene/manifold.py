@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import viser
 
-from dt_viz.engine.frame import Frame
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Arrows, Lines, Picture
 

@@ -11,11 +11,11 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Obstacle, Sphere
 from dt_viz.scenario.scenario import MAX_DIAMETER, Scenario
 from dt_viz.scenario.slices import Slice
+from dt_viz.session.frame import Frame
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Drag
 from dt_viz.ui.scene import palette

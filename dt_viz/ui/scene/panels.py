@@ -7,10 +7,10 @@ from typing import Any
 
 import viser
 
-from dt_viz.engine.frame import Frame
 from dt_viz.obstacles.shapes import Point
 from dt_viz.pictures.panels import PanelPicture
 from dt_viz.scenario.panels import directions
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Arrows, Lines, Picture
 from dt_viz.ui.scene.tubes import Tubes, middles_of

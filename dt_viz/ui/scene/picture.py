@@ -11,9 +11,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from dt_viz.engine.engine import ArmMotion
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
+from dt_viz.session.engine import ArmMotion
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 
 Colour = tuple[int, int, int]

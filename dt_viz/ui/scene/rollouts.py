@@ -13,8 +13,8 @@ import numpy as np
 import viser
 from scipy.spatial import KDTree
 
-from dt_viz.engine.frame import Frame, Stage
 from dt_viz.flows.fields import Array
+from dt_viz.session.frame import Frame, Stage
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Lines, Picture
 from dt_viz.ui.scene.tubes import Tubes, middles_of

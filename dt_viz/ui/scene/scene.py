@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import viser
 
-from dt_viz.arm.robot import Robot
-from dt_viz.engine.frame import Frame
 from dt_viz.motion.diagnostics import MAX_GOAL_MISS
+from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import anchored
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.anchors import BALL_RADIUS, Anchors
 from dt_viz.ui.scene.arm_layers import Onion

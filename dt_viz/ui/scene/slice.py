@@ -7,9 +7,9 @@ from contextlib import AbstractContextManager
 import numpy as np
 import viser
 
-from dt_viz.engine.frame import Frame
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.handles import Handles, Moved
 from dt_viz.ui.scene.picture import Lines, Picture

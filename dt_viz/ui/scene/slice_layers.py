@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from viser import transforms
 
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.pictures.slice_fields import ColourPicture
 from dt_viz.scenario.slices import Slice
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.colour_scale import NUM_SHADES, Scale, diverging, ramp
 from dt_viz.ui.scene.picture import Arrows, Lines, Picture, assign

@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from dt_viz.engine.frame import Frame
+from dt_viz.session.frame import Frame
 from dt_viz.ui.scene import palette
 from dt_viz.ui.scene.picture import Picture
 

@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 import viser
 
-from dt_viz.engine.frame import Frame
 from dt_viz.flows.fields import Array
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.starts import struck
+from dt_viz.session.frame import Frame
 from dt_viz.ui import gestures
 from dt_viz.ui.gestures import Clicks, Drag
 from dt_viz.ui.scene import palette

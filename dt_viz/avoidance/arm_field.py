@@ -1,0 +1,249 @@
+"""Whole-arm avoidance: diffeomorphisms of configuration space (sec. 4.5).
+
+A configuration is six joint angles, rad. `WholeArmField` is a generator V_q on R⁶ whose reverse flow carries the arm
+out of an obstacle; `JointLimits` bends R⁶ so that no flow leaves the joint limits. Derivatives are exact to rounding by
+complex steps: f(q + ih·u) = f(q) + ih·Df(q)·u + O(h²), with no difference of near numbers, so h can be tiny.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from dt_viz.flows.diffeomorphisms import Diffeomorphism
+from dt_viz.flows.fields import Array, CompiledField
+from dt_viz.kernels import escape
+from dt_viz.kernels.joint_limits import stretched
+from dt_viz.obstacles.arrays import records
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.inverse_kinematics import DIRECTION_WEIGHT
+from dt_viz.robot.robot import NUM_JOINTS, Robot, cross
+
+COMPLEX_STEP = 1e-30
+DIFFERENCE = 1e-4
+"""Step of the finite differences for the slope of an obstacle's distance, metres."""
+POSTURE_DIFFERENCE = 1e-5
+"""Step of those for the derivative of the field, rad."""
+
+REACH_PER_TEMPERATURE = 0.08 / 6
+"""Reach of an obstacle's field, metres, for each unit of the temperature T."""
+CORE = 0.5
+"""Depth at which the field has its full strength, as a part of the way from touching the obstacle to its middle; deeper
+inside the strength is constant, so the middle is not singular."""
+FAN = 4.0
+"""Distance of the source, from which escaping points fan out, behind the obstacle's middle, in the obstacle's radii."""
+BEHIND = 1.25
+"""Lower bound of that distance, in multiples of the field's outer radius, for no point may escape from the source."""
+DAMPING = 0.06
+"""Damping λ of the contact's pseudo-inverse, m/rad: contacts that joints can hardly move are not chased."""
+HAND_WEIGHT = 100.0
+"""Weight of the end effector's motion, rad²/m²: a contact of the forearm is resolved with the hand at rest."""
+LEVERS = np.array([0.5, 0.5, 0.35, 0.12, 0.14, 0.05])
+"""Approximate motion of the hand for each joint's turning, m/rad: converts a distance of postures to a length."""
+PIN = 0.03
+"""Size of the region around a pinned posture in which the field fades out, metres of that distance."""
+
+SPEED = 0.2
+"""Distance that a contact at full strength escapes in a unit of flow time, metres."""
+
+LIMIT_ZONE = 0.05
+"""Width of the zone before a joint limit in which joints are held back, rad."""
+NEAREST_TO_LIMIT = 0.9
+"""Part of that zone that a planned path may use."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmField:
+    """Base of the generators V_q on R⁶ of an arm and obstacles."""
+
+    robot: Robot
+    body: BodyPoints
+    """Body points that can be moved away."""
+    obstacles: tuple[Obstacle, ...]
+
+    @property
+    def dim(self) -> int:
+        """Dimension of configuration space."""
+        return NUM_JOINTS
+
+    def __call__(self, q: Array) -> Array:
+        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        raise NotImplementedError
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class WholeArmField(ArmField, CompiledField):
+    """Generator V_q whose reverse flow takes the arm out of obstacles, each along an escape direction.
+
+    A body point x_b with sphere radius r_b has the occupancy w_b = S(d(x_b) − r_b), d the distance from an obstacle's
+    surface and S a smooth step from 1 inside to 0 at `reach`. The arm's contact is the average of its body points with
+    weights ŵ_b = w_b²/Σw², with the Jacobian J_c = Σ ŵ_b J_b, the direction n_c = Σ ŵ_b n_b and the strength
+    m = √Σw_b². It escapes by the weighted pseudo-inverse
+
+        −V_q(q) = v · m · χ(q) · H⁻¹ J_cᵀ (J_c H⁻¹ J_cᵀ + λ²I)⁻¹ n_c,   H = I + w_d DᵀD + w_x JᵀJ,
+
+    which moves the contact along n_c with as little motion of the joints, the hand's direction (D) and the end effector
+    (J) as possible. χ vanishes at pinned postures, so start and goal do not move. Those of several obstacles add up.
+
+    The plain gradient ∇_q ΣU(x_b) of the paper (`GradientField`) follows the joints' mobility instead: it sweeps along
+    the path with the first joint and turns sharply, see dt_viz/README.md.
+    """
+
+    directions: Array
+    """(K, 3) unit vectors in which the arm escapes from the obstacles."""
+    pins: Array
+    """(M, 6) postures that do not move, rad."""
+    reach: float = 6 * REACH_PER_TEMPERATURE
+    """Distance from an obstacle's surface at which the field ends, metres."""
+
+    @cached_property
+    def _escape(self) -> escape.Escape:
+        radius = np.array([obstacle.radius for obstacle in self.obstacles])
+        depth = np.array([obstacle.depth for obstacle in self.obstacles])
+        behind = np.maximum(FAN * radius, BEHIND * (radius + self.reach + self.body.radius.max()))
+        places = np.array([obstacle.position for obstacle in self.obstacles])
+        shapes, values = records(self.obstacles)
+        return escape.Escape(
+            joints=self.robot.records,
+            points=self.body.records,
+            hand=np.array(self.robot.end_effector_offset),
+            shapes=shapes,
+            values=values,
+            sources=places - behind[:, None] * self.directions,
+            cores=-CORE * (depth[:, None] + self.body.radius),
+            reach=float(self.reach),
+            speed=SPEED,
+            damping=DAMPING,
+            direction_weight=DIRECTION_WEIGHT,
+            hand_weight=HAND_WEIGHT,
+            pins=np.array(self.pins, dtype=float),
+            levers=np.array(LEVERS),
+            pin=PIN,
+        )
+
+    def __call__(self, q: Array) -> Array:
+        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        return escape.velocities(self._escape, np.array(q, order="C"))
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6), by differences of fourth order, at configurations `q` (N, 6)."""
+        steps = POSTURE_DIFFERENCE * np.array([1, -1, 2, -2])[:, None, None] * np.eye(NUM_JOINTS)
+        shifted = (q[:, None, None] + steps).reshape(-1, NUM_JOINTS)
+        near, before, far, behind = np.moveaxis(self(shifted).reshape(len(q), 4, NUM_JOINTS, NUM_JOINTS), 1, 0)
+        slopes = (8 * (near - before) - (far - behind)) / (12 * POSTURE_DIFFERENCE)
+        return self(q), slopes.transpose(0, 2, 1)
+
+    def rk4(self, s: Array, duration: float, steps: int) -> Array:
+        return escape.flow(self._escape, np.array(s, order="C"), float(duration), steps)
+
+    def dormand_prince(self, s: Array, duration: float, tolerance: float, max_steps: int) -> Array:
+        points = np.array(s, order="C")
+        q, num_failed = escape.adaptive_flow(self._escape, points, float(duration), float(tolerance), max_steps)
+        if num_failed:
+            raise ArithmeticError(f"{num_failed} points need more than {max_steps} steps")
+        return q
+
+
+@dataclass(frozen=True, eq=False)
+class GradientField(ArmField):
+    """The paper's generator V_q = ∇_q Σ_b U(x_b), U the occupancy w_b of `WholeArmField` times the depth it grows over.
+
+    It moves start and goal, too, and ignores the motion of the hand. Those of several obstacles add up.
+    """
+
+    reach: float = 6 * REACH_PER_TEMPERATURE
+    """Distance from the obstacle's surface at which the field ends, metres."""
+
+    def __call__(self, q: Array) -> Array:
+        """Compute V_q at configurations `q` (N, 6), as (N, 6)."""
+        chain = self.robot.chain(q.T)
+        points = self.body.of_chain(chain)
+        force: Any = sum(self._force(obstacle, points) for obstacle in self.obstacles)
+        moment = self._beyond(cross(points, force)) - cross(chain.origins, self._beyond(force))
+        return (chain.axes[:, 2] * moment).sum(axis=1).T
+
+    def with_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Compute V_q (N, 6) and DV_q (N, 6, 6) at configurations `q` (N, 6)."""
+        num, d = q.shape
+        shifted: Any = (q + 1j * COMPLEX_STEP * np.eye(d)[:, None]).reshape(-1, d)  # fields take complex angles, too
+        values = self(shifted).reshape(d, num, d)
+        return values[0].real, values.imag.transpose(1, 2, 0) / COMPLEX_STEP
+
+    def _force(self, obstacle: Obstacle, points: Array) -> Array:
+        """Compute the forces (P, 3, N) of one obstacle on body points (P, 3, N): −30u²(1 − u)² times their way out."""
+        distance = obstacle.signed_distance(points.transpose(0, 2, 1)) - self.body.radius[:, None]
+        core = -CORE * (obstacle.depth + self.body.radius)[:, None]
+        u = _unit_interval((self.reach - distance) / (self.reach - core))
+        return -30 * (u * u * (1 - u) * (1 - u))[:, None] * _outward(obstacle, points)
+
+    def _beyond(self, values: Array) -> Array:
+        """Sum `values` (P, 3, N), for each joint over the points that it moves, (6, 3, N)."""
+        return (self.body.is_beyond @ values.reshape(len(values), -1)).reshape(NUM_JOINTS, *values.shape[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits(Diffeomorphism):
+    """Map from the configurations inside the joint limits onto R⁶: flows there correspond to flows inside the limits.
+
+    With e the depth of a joint in the zone of width m before its limit, ψ⁻¹ is the flow of ė = −e³ for the time
+    1/(2m²), which carries joints away from their limits:
+
+        ψ⁻¹(e) = e/√(1 + (e/m)²) < m,    ψ(e) = e/√(1 − (e/m)²).
+
+    Joints outside the zone, and continuous ones, are not changed.
+    """
+
+    lower: Array
+    """(6,) rad, −inf for continuous joints."""
+    upper: Array
+    """(6,) rad, +inf for continuous joints."""
+    zone: float = LIMIT_ZONE
+    """m, rad."""
+    fraction: float = 1.0
+    """Part s of that time: (e/m)² becomes s·(e/m)² in both formulas."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of configuration space."""
+        return len(self.lower)
+
+    def scaled(self, fraction: float) -> JointLimits:
+        """A part of the flow does not hold joints inside their limits."""
+        return replace(self, fraction=fraction * self.fraction)
+
+    def inside(self, q: Array) -> Array:
+        """Clip configurations (*B, 6) to a little less than the limits, where ψ is finite."""
+        lowest, highest = self._innermost
+        return np.minimum(np.maximum(q, lowest), highest)
+
+    @cached_property
+    def _innermost(self) -> tuple[Array, Array]:
+        """Bounds (6,) of what is inside."""
+        slack = (1 - NEAREST_TO_LIMIT) * self.zone
+        return self.lower + slack, self.upper - slack
+
+    def _map(self, s: Array, U: Array | None, *, inverse: bool) -> tuple[Array, Array | None]:
+        part = self.fraction if inverse else -self.fraction
+        mapped, factor = stretched(np.array(s, order="C"), self.lower, self.upper, self.zone, part)
+        return mapped, None if U is None else (factor**3)[..., None] * U
+
+
+def _unit_interval(u: Array) -> Array:
+    """Clip u, which may be complex, to the interval from 0 to 1."""
+    return np.where(u.real <= 0, 0.0, np.where(u.real >= 1, 1.0, u))
+
+
+def _outward(obstacle: Obstacle, points: Array) -> Array:
+    """Compute the slope (P, 3, N) of an obstacle's distance at `points` (P, 3, N) by differences, analytic."""
+    shifts = DIFFERENCE * np.eye(3)[:, None, None]
+    s = points.transpose(0, 2, 1)
+    near, far = (obstacle.signed_distance(s + k * shifts) - obstacle.signed_distance(s - k * shifts) for k in (1, 2))
+    return ((8 * near - far) / (12 * DIFFERENCE)).transpose(1, 0, 2)  # of (3, P, N)

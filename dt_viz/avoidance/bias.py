@@ -1,0 +1,481 @@
+"""Biasing a motion towards a point: the reverse flow of a field of unit vectors away from it (sec. 4.6).
+
+That flow gathers motions at the point, which they enter and leave in other directions: a corner. So they are shifted
+first, all alike in the middle of the region, by the flow of a field that has one direction, and only what then is left
+between them is gathered, by the field of unit vectors without its part along the motions: they have a waist there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from dt_viz.avoidance.transform import (
+    MOST_DURATION,
+    Built,
+    FlowIntegration,
+    MotionBelow,
+    Number,
+    Setting,
+    Surroundings,
+    Switch,
+    Transform,
+    axes_of,
+)
+from dt_viz.errors import check_between
+from dt_viz.flows.diffeomorphisms import AUTO, Chain, Diffeomorphism, Flow, Identity, Integration
+from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, PlacedField, PointField, Projected, VectorField
+from dt_viz.flows.integrators import integrate, rk4
+from dt_viz.kernels.fields import REGION, SHIFT, TERM, Terms
+from dt_viz.obstacles.shapes import Point, as_point
+from dt_viz.warning import Kind, MotionWarning
+
+NUM_SAMPLES = 400
+"""Number of unit vectors sampled in one octant of the region, or quadrant of the disc; the others mirror them."""
+KERNEL_WIDTH = 0.4
+"""Kernel width of the regression, in radii; about the size of the core in which it smooths the unit vectors, which are
+singular at the target."""
+REGULARISATION = 1e-3
+
+AIM = 0.0012
+"""Largest distance from the target at which `auto` lets the motions pass, metres, at the checked samples."""
+ACCEPTED = 0.002
+"""Largest accepted distance from the target, metres, also between those samples."""
+SAME_PLACE = 0.010
+"""Distance up to which the target is at a start, at the goal or in the plane of the motions, metres."""
+MAX_DURATION = 4.0
+"""Longest flow time that is tried: a point that has not arrived by then hardly lies in the region."""
+DEEPEST = 0.9
+"""Distance from the target, in radii, from which on a shift takes too long."""
+SNAPSHOT = 0.1
+"""Interval of flow time between two checks of the distance: less than half of the time that halves it."""
+LARGE, SMALL = 3.2, 1.5
+"""Largest `auto` radius, relative to the distance of the farthest motion, and smallest one that leaves starts and goal
+outside. On a straight path at 5 cm, these turn the motion by 10° and 40° on a centimetre."""
+SMALLER, WIDER = 1.25, 1.5
+"""Smallest radius, relative to that distance, in later attempts, and factor by which it grows in each one where starts
+or goal are in the region anyway."""
+MIN_RADIUS = 0.10
+"""Lower bound of the `auto` radius, metres."""
+OVERSHOOT = 2.0
+"""Factor by which the next attempt prolongs the duration beyond what the last one needed."""
+STEP = 2.2
+"""Step of the flow, in flow time, for each fourth root of a metre of tolerance. The field is mild everywhere, so RK4
+with equal steps is quicker here than steps of each point's own length, and there and back it errs less."""
+MAX_TARGET_MISS = 0.013
+"""Largest distance by which avoiding motions may miss the target without a warning, metres: a centimetre, and the
+error of the arm's joints, interpolated between samples, during a drag."""
+PLACED_BESIDE = 0.08
+"""Distance of a new bias point from the mean path, metres."""
+APART = 0.25
+"""Wanted distance of a new bias point from the others, metres: about the size of a region."""
+ROOM, LEAST_ROOM = 0.11, 0.04
+"""Distances of a new bias point from obstacles, metres: beyond what is carried aside, and where that is nowhere."""
+PLACES = (0.50, 0.30, 0.70, 0.20, 0.80, 0.40, 0.60)
+"""Places along the mean path, as fractions of its length, beside which new bias points are placed."""
+SMALLEST_REGION, LARGEST_REGION = 0.04, 0.40
+"""Smallest and largest radius of a region that can be chosen on the page, metres."""
+
+
+@dataclass(frozen=True)
+class BiasPoint(Transform):
+    """Motions are pulled towards a place.
+
+    With the goal where it is, every motion passes the place on its way. If the goal moves, it does so to the place.
+    It is made for the motions that have a demonstration: one that was started elsewhere changes nothing about it.
+
+    Raises:
+        FormatError: a number makes no sense, such as a negative radius.
+    """
+
+    position: Point
+    """The target, metres."""
+    radius: float | None = None
+    """Radius of the region S around it in which the field acts, metres; None chooses it by the distance of the motion.
+    """
+    strength: float | None = None
+    """t of the two flows, in which a point in the middle of the region moves by about t radii; None is the shortest
+    after which every motion passes within two millimetres."""
+    plane: tuple[Point, Point] | None = None
+    """Two orthonormal vectors: the field acts along these only, and alike at every depth. None is in space."""
+    moves_goal: bool = False
+    """Whether the goal is pulled along, or stays where it is."""
+    integration: Integration = AUTO
+    """Integration of the flow."""
+
+    title: ClassVar[str] = "Bias"
+    hint: ClassVar[str] = "a point that every motion passes, or ends at"
+    flow_time: ClassVar[str] = "strength"
+    settings: ClassVar[tuple[Setting, ...]] = (
+        Number(
+            "radius",
+            "Radius",
+            "[cm]",
+            100 * SMALLEST_REGION,
+            100 * LARGEST_REGION,
+            0.5,
+            15.0,
+            scale=100.0,
+            automatic=True,
+            hint="radius of the region in which it acts; auto: from the distance of the motion",
+        ),
+        Switch("moves_goal", "Moves the goal", "motions end here instead of at the goal"),
+        Number("strength", "Strength", "t", 0.0, MAX_DURATION, 0.01, 0.5, automatic=True, of_flow=True),
+        FlowIntegration(),
+    )
+
+    def __post_init__(self) -> None:
+        if self.radius is not None:
+            check_between("radius", self.radius, 1e-3, 100.0)
+        if self.strength is not None:
+            check_between("strength", self.strength, 0.0, MOST_DURATION)
+
+    @property
+    def anchor(self) -> Point:
+        return self.position
+
+    @property
+    def anchor_plane(self) -> tuple[Point, Point] | None:
+        return self.plane
+
+    def in_plane(self, plane: tuple[Point, Point]) -> BiasPoint:
+        return replace(self, plane=plane)
+
+    @property
+    def region(self) -> float | None:
+        return self.radius
+
+    @property
+    def ends_motions(self) -> bool:
+        return self.moves_goal
+
+    def anchored(self, place: Point) -> BiasPoint:
+        return replace(self, position=place)
+
+    def axes(self) -> Array:
+        """(3, 3) orthonormal columns, those of the plane first."""
+        return axes_of(self.plane)
+
+    def field(self, radius: float) -> PlacedField:
+        """The generator whose reverse flow leads to the target, from a regression done once for all targets."""
+        unit = unit_field(3 if self.plane is None else 2)
+        return PlacedField(unit, np.asarray(self.position), radius * self.axes())
+
+    def offsets(self, s: Array) -> Array:
+        """Offsets (*B, 2 or 3) from the target of the points `s` (*B, 3), metres, along the axes it acts on."""
+        return (s - np.asarray(self.position)) @ self.axes()[:, : 3 if self.plane is None else 2]
+
+    def build(self, motion: MotionBelow) -> Built:
+        """The automatic strength is the smallest that brings every motion to the target."""
+        point, motion, at_least = self, motion.demonstrated, motion.at_least
+        if motion.above is not None:  # what is above must not lead the motion past the target again
+            point = replace(point, position=as_point(motion.above.forward(np.asarray(point.position))))
+        nearest, tangents = closest_points(point, motion)
+        if point.moves_goal:
+            nearest, tangents = motion.goal[None], np.zeros((1, 3))
+        distance = float(np.linalg.norm(point.offsets(nearest), axis=1).max())
+        ends, others = point._room(motion)
+        radius = point.radius or point._auto_radius(motion.earlier, distance, ends, others)
+        warnings = self._misplaced(motion, nearest, radius)
+
+        # a shift carries starts and goal in the region along, and motions with them: then the paper's field acts alone
+        part = 1.0 if at_least == 0 else _rise(ends / max(distance, AIM), 1.0, SMALL)
+        along = part * tangents.mean(axis=0) * (at_least == 0)
+        passing = point._passing(nearest, tangents, along)
+        longest = MAX_DURATION if point.strength is None else point.strength
+        shift, shifting = point._shift(passing.mean(axis=0), radius, part)
+        shifting = min(shifting, longest)
+        flows = [self._flow(shift, shifting, motion.tolerance)] if shifting > 0 else []
+        passing = flows[0].inverse(passing) if flows else passing
+        spread = float(np.linalg.norm(point.offsets(passing), axis=1).max())
+        across = np.eye(3) - np.outer(along, along)
+        waist = Projected(point.field(min(radius, max(MIN_RADIUS, LARGE * spread))), across)
+        gathering, hopeless = longest - shifting, False
+        if point.strength is None:
+            least = max(at_least - shifting, 0.0)
+            if at_least > 0:  # the motion itself was not where the places beside the target led
+                moved = Chain([*flows, self._flow(waist, least, motion.tolerance)]).inverse(motion.positions)
+                passing = closest_points(point, replace(motion, positions=moved))[0]
+            more = pulling_duration(waist, point, passing, gathering - least)
+            hopeless = more is None
+            if more is not None:
+                # starts and goal in the region move the motion below, the farther the longer: converge sooner
+                gathering = min(least + (OVERSHOOT if at_least > 0 else 1.0) * more, gathering)
+        if gathering > 0:
+            flows.append(self._flow(waist, gathering, motion.tolerance))
+        duration = shifting + gathering
+        if hopeless:
+            warnings.append(_warning(motion, Kind.UNREACHED, _too_small(radius, distance)))
+        transform = Chain(flows) if flows else Identity(3)
+        goal = transform.inverse(motion.goal) if point.moves_goal else motion.goal
+        chosen = {"strength": duration, "radius": radius}
+        return Built(transform, duration, goal, hopeless, tuple(warnings), point.integration, chosen)
+
+    def _passing(self, nearest: Array, tangents: Array, along: Array) -> Array:
+        """Find where motions pass beside the target, (R, 3) metres: straight on from where they are nearest to it.
+
+        Args:
+            nearest: (R, 3) where they are nearest, metres.
+            tangents: (R, 3) unit vectors, their directions there.
+            along: (3,) mean of these directions.
+        """
+        speed = tangents @ along
+        behind = (np.asarray(self.position) - nearest) @ along
+        ahead = np.divide(behind, speed, out=np.zeros_like(speed), where=speed > 0.5)
+        return nearest + ahead[:, None] * tangents
+
+    def _shift(self, place: Array, radius: float, part: float) -> tuple[VectorField, float]:
+        """Make the field whose reverse flow shifts a place (3,) straight to the target, and the time for a part."""
+        offset = self.offsets(place)
+        distance = float(np.linalg.norm(offset))
+        direction = np.pad(offset, (0, 3 - len(offset))) / max(distance, 1e-12)
+        field = PlacedField(Shift(direction, len(offset)), np.asarray(self.position), radius * self.axes())
+        u = distance / radius
+        if u >= DEEPEST:
+            return field, MAX_DURATION
+        return field, _shifting_time(u) - _shifting_time((1 - part) * u)
+
+    def _flow(self, field: VectorField, duration: float, tolerance: float) -> Diffeomorphism:
+        steps = max(1, math.ceil(duration / (STEP * tolerance**0.25)))
+        return self.integration.of(Flow(field, duration, steps))
+
+    def satisfied(self, motion: MotionBelow) -> bool:
+        """Whether every motion passes close to the target, where that is to be seen to."""
+        if self.strength is not None:
+            return True
+        return bool((self.distances(motion) <= ACCEPTED).all())
+
+    def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
+        if satisfied or made.hopeless:
+            return ()
+        does = "ends" if self.moves_goal else "passes"
+        text = f"a motion {does} {1e3 * self.distances(motion).max():.0f} mm from it"
+        if min(self._room(motion)) < made.chosen["radius"]:
+            text += ": a start, the goal or another bias point is in its region"
+        return (_warning(motion, Kind.UNREACHED, text),)
+
+    def deflected(self, motion: MotionBelow, made: Built, who: str) -> tuple[MotionWarning, ...]:
+        """Warnings about motions that pass beside the target to avoid an obstacle; see `Transform`.
+
+        In a drawing this counts the depth, too: a motion may leave the plane to get around the obstacle.
+        """
+        if self.strength is not None:
+            return ()
+        off_plane = any(warning.kind is Kind.OFF_PLANE for warning in made.warnings)
+        point = self if off_plane else replace(self, plane=None)
+        missed = float(point.distances(motion).max())
+        if missed <= MAX_TARGET_MISS:
+            return ()
+        does = "ends" if self.moves_goal else "passes"
+        text = f"{who} gives way to the obstacle and {does} {1e3 * missed:.0f} mm from it"
+        return (_warning(motion, Kind.TARGET_MISSED, text),)
+
+    @classmethod
+    def beside(cls, surroundings: Surroundings) -> BiasPoint:
+        """A bias point beside the mean demonstration, in the middle or where other places and obstacles leave room."""
+        mean, plane = surroundings.mean_path, surroundings.plane
+        normal = np.array([0.0, 0.0, 1.0]) if plane is None else np.cross(*plane)
+        places = []
+        for u in PLACES:
+            k = round((len(mean) - 1) * u)
+            tangent = mean[k + 5] - mean[k - 5]
+            aside = np.cross(tangent, normal)
+            if np.linalg.norm(aside) < 0.1 * np.linalg.norm(tangent):  # straight up or down
+                aside = np.array([1.0, 0.0, 0.0])
+            sides = [mean[k] + sign * PLACED_BESIDE * aside / np.linalg.norm(aside) for sign in (-1, 1)]
+            # first the side that is farther from the rest of the motion
+            places += sorted(sides, key=lambda place: -np.linalg.norm(mean - place, axis=1).min())
+        # off other strokes
+        free = [place for place in places if np.linalg.norm(mean - place, axis=1).min() > PLACED_BESIDE / 2]
+        # two whose regions overlap pull against each other: first where no other one is near, then as far as there is
+        taken = np.asarray(surroundings.anchors).reshape(-1, 3)
+
+        def apart(place: Array) -> float:
+            return float(np.linalg.norm(place - taken, axis=1).min(initial=np.inf))
+
+        room = free
+        for least in (ROOM, LEAST_ROOM):  # where obstacles leave room
+            room = [place for place in free if surroundings.obstacle.signed_distance(place) > least]
+            far = [place for place in room if apart(place) > APART]
+            if far:
+                return cls(as_point(far[0]), plane=plane)
+        return cls(as_point(max(room or free or places, key=apart)), plane=plane)
+
+    def distances(self, motion: MotionBelow) -> Array:
+        """(R,) metres from the target: of the motions that have a demonstration, or of their ends if the goal moves."""
+        motion = motion.demonstrated
+        if motion.top is not None:
+            motion = replace(motion, positions=motion.top)
+        if self.moves_goal:
+            last = np.r_[np.flatnonzero(np.diff(motion.index)), len(motion.index) - 1]
+            return np.linalg.norm(self.offsets(motion.positions[last]), axis=1)
+        return closest_distances(self, motion)
+
+    def _auto_radius(self, earlier: Built | None, distance: float, ends: float, others: float) -> float:
+        """Large for gentle turns, but such that what is to stay where it is stays outside, where that is possible."""
+        if earlier is not None:  # ends in the region have moved the motion farther away: it must not grow with that
+            grown = WIDER if ends < distance else 1.0
+            return max(grown * earlier.chosen["radius"], SMALLER * distance)
+        return max(MIN_RADIUS, min(LARGE * distance, max(SMALL * distance, min(ends, others))))
+
+    def _room(self, motion: MotionBelow) -> tuple[float, float]:
+        """Distances of the nearest start, or goal that stays, and of the nearest other bias point, metres."""
+        ends = motion.starts if self.moves_goal else np.concatenate([motion.starts, motion.goal[None]])
+        others = np.asarray(motion.targets).reshape(-1, 3)
+        nearest = (np.linalg.norm(self.offsets(places), axis=1).min(initial=np.inf) for places in (ends, others))
+        to_ends, to_others = map(float, nearest)
+        return to_ends, to_others
+
+    def _misplaced(self, motion: MotionBelow, nearest: Array, radius: float) -> list[MotionWarning]:
+        """Warnings about the place of the bias point."""
+        texts = []
+        if np.linalg.norm(self.offsets(motion.goal)) < SAME_PLACE:
+            texts.append("the point is on the goal, where the motions end anyway")
+        if (np.linalg.norm(self.offsets(motion.starts), axis=1) < SAME_PLACE).any():
+            texts.append("the point is on a start, where the motion is anyway")
+        if any(np.linalg.norm(self.offsets(np.asarray(other))) < 0.9 * radius for other in motion.targets):
+            texts.append("the region covers a bias point below it in the stack: motions are pulled away from that")
+        warnings = [_warning(motion, Kind.MISPLACED, text) for text in texts]
+        depth = float(np.abs((nearest - self.position) @ self.axes()[:, 2]).max()) if self.plane else 0.0
+        if depth > SAME_PLACE:
+            text = f"the point lies {100 * depth:.0f} cm before or behind the plane: motions are not led to it"
+            warnings.append(_warning(motion, Kind.OFF_PLANE, text))
+        return warnings
+
+
+def _warning(motion: MotionBelow, kind: Kind, text: str) -> MotionWarning:
+    """A warning that begins with the name of the bias point, as there may be several."""
+    return motion.warning(kind, f"{motion.name}: {text}")
+
+
+@dataclass(frozen=True)
+class RegionField(PointField):
+    """A field on the unit ball (or on the cylinder over the unit disc) that fades out smoothly towards its border.
+
+    V(s) = (1 − ‖u‖²)³·V_fit(u), u the first k coordinates of s; the others are not moved.
+    """
+
+    directions: GridRBF
+    """V_fit, in R^k."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the space."""
+        return 3
+
+    def _terms(self) -> Terms:
+        return self.directions.grid.terms(self.directions.weights, REGION)
+
+
+@dataclass(frozen=True, eq=False)
+class Shift(PointField):
+    """A field of one direction on the unit ball (or on the cylinder over the unit disc): V(s) = (1 − ‖u‖²)³·n."""
+
+    direction: Array
+    """n, (3,), a unit vector."""
+    dim_of_region: int
+    """3 for the ball, 2 for the cylinder."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the space."""
+        return 3
+
+    def _terms(self) -> Terms:
+        term = np.zeros(1, TERM)
+        term["kind"], term["inward"] = SHIFT, np.diag([1.0, 1.0, self.dim_of_region - 2.0])
+        term["outward"][0, :, 0] = self.direction
+        return Terms(term, np.empty(0))
+
+
+def _rise(value: float, low: float, high: float) -> float:
+    """Rise from 0 at a low value to 1 at a high one."""
+    return min(max((value - low) / (high - low), 0.0), 1.0)
+
+
+def _shifting_time(u: float) -> float:
+    """Time in which a shift carries a place from the distance u, in radii, to the target: ∫ du / (1 − u²)³."""
+    room = 1 - u * u
+    return u / (4 * room * room) + 3 * u / (8 * room) + 3 / 8 * math.atanh(u)
+
+
+@lru_cache(maxsize=2)
+def unit_field(dim: int) -> RegionField:
+    """The field for the unit region, ridge regression of unit vectors away from the centre of the ball of `dim`.
+
+    With every sample come its mirror images, so the centre is at rest and no sampling noise turns the field.
+    """
+    rng = np.random.default_rng(0)
+    octant = np.abs(rng.normal(size=(NUM_SAMPLES, dim)))
+    octant *= rng.uniform(size=(NUM_SAMPLES, 1)) ** (1 / dim) / np.linalg.norm(octant, axis=1, keepdims=True)
+    samples = np.concatenate([octant * signs for signs in itertools.product((-1, 1), repeat=dim)])
+    away = samples / np.linalg.norm(samples, axis=1, keepdims=True)
+    grid = GaussianGrid.covering(np.stack([-np.ones(dim), np.ones(dim)]), KERNEL_WIDTH, pad=0)
+    features = grid.features(samples)
+    gram = features.T @ features / len(samples)
+    gram[np.diag_indices_from(gram)] += REGULARISATION
+    return RegionField(GridRBF(grid, cho_solve(cho_factor(gram), features.T @ away / len(samples))))
+
+
+def _too_small(radius: float, distance: float) -> str:
+    """Describe why not all motions arrive from the region."""
+    sizes = f"the region of {100 * radius:.0f} cm is too small: a motion is {100 * distance:.0f} cm from the target"
+    return sizes if distance >= radius else f"{sizes}, near the border, where the pull fades out"
+
+
+def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array]:
+    """Find where each rollout, as a polyline, comes closest to the target.
+
+    Returns:
+        (R, 3) these places, metres, and (R, 3) its directions there, unit vectors along the axes that the bias acts on.
+    """
+    offset = point.offsets(motion.positions)
+    start, step = offset[:-1], np.diff(offset, axis=0)
+    squared = (step * step).sum(axis=1)
+    same = np.diff(motion.index) == 0
+    part = np.clip(-(start * step).sum(axis=1) / np.maximum(squared, 1e-300), 0, 1) * same
+    miss = start + part[:, None] * step
+    miss = np.where(same, (miss * miss).sum(axis=1), np.inf)
+    first = np.flatnonzero(np.r_[True, ~same])
+    last = np.r_[first[1:], len(offset)] - 1
+    k = np.array([low + np.argmin(miss[low:high]) for low, high in zip(first, last, strict=True)])
+    nearest = motion.positions[k] + part[k, None] * (motion.positions[k + 1] - motion.positions[k])
+    tangents = step[k] @ point.axes()[:, : step.shape[1]].T / np.sqrt(np.maximum(squared[k], 1e-300))[:, None]
+    return nearest, tangents
+
+
+def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
+    """(R,) metres: how close each rollout comes to the target, in the plane if the bias acts in one."""
+    return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)
+
+
+def pulling_duration(field: VectorField, point: BiasPoint, points: Array, longest: float) -> float | None:
+    """The shortest duration after which the reverse flow has carried all `points` (N, 3) to the target.
+
+    γ is a one-parameter group, so one integration with snapshots passes every duration on its way.
+
+    Returns:
+        The duration, or None where some point has not arrived after the `longest`.
+    """
+    duration = 0.0
+    distance = np.linalg.norm(point.offsets(points), axis=1)
+    away = distance > AIM
+    points, distance = points[away], distance[away]
+    while len(points):
+        if duration >= longest:
+            return None
+        points, _ = integrate(rk4, field, points, None, -SNAPSHOT, 1)
+        before, distance = distance, np.linalg.norm(point.offsets(points), axis=1)
+        away = distance > AIM
+        if not away.any():
+            # the approach is exponential where it ends
+            fraction = np.log(before / AIM) / np.log(before / distance)
+            return duration + SNAPSHOT * float(np.clip(fraction, 0, 1).max())
+        points, distance, duration = points[away], distance[away], duration + SNAPSHOT
+    return duration

@@ -1,0 +1,418 @@
+"""Avoiding obstacles: the reverse flow out of what they occupy, for as long as it takes to be clear (sec. 4.4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+
+from dt_viz.avoidance.sides import Passes, held
+from dt_viz.avoidance.transform import (
+    MOST_DURATION,
+    ArmAvoidance,
+    Aside,
+    Built,
+    Choice,
+    FlowIntegration,
+    MotionBelow,
+    Number,
+    Setting,
+    Transform,
+    axes_of,
+    start_warnings,
+)
+from dt_viz.avoidance.ways import Way, remembered
+from dt_viz.errors import check_between
+from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
+from dt_viz.flows.fields import Array, Mask, Projected, VectorField
+from dt_viz.flows.integrators import integrate, integrate_adaptive, rk4
+from dt_viz.obstacles.occupancy import Generator
+from dt_viz.obstacles.shapes import Obstacle, Point
+from dt_viz.obstacles.union import Union
+from dt_viz.warning import Kind, MotionWarning, in_millimetres
+
+Space = Literal["task", "cspace"]
+"""Space of the avoidance: that of the end effector (sec. 4.4), or configuration space (sec. 4.5)."""
+SPACES: tuple[Space, ...] = get_args(Space)
+GENERATOR_NAMES: Mapping[Generator, str] = {
+    "free-space": "Free space (−∇log(1−p))",
+    "probability": "Probability (∇p, the paper's)",
+}
+"""Names of the generators."""
+MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
+MAX_MANUAL_DURATION = 2.0
+"""Longest flow time that can be chosen by hand."""
+MAX_DURATION = 2.5
+"""Longest flow time that is tried: a motion that still collides runs through the flow's centre."""
+SNAPSHOT = 0.05
+"""Interval of flow time between two checks of the clearance, one RK4 step. The field turns points around in about ten
+of them, so a step is off by micrometres; between the last two checks the duration is interpolated."""
+TOLERANCE = 1e-5
+"""Tolerance of a step of the integration up to the duration that is known to be needed, metres."""
+NUM_DEEPEST = 8
+"""Number of samples of each rollout that the duration is chosen for at first."""
+TINY = 1e-12
+"""Smallest distance between samples that counts as a step, metres."""
+ROUNDING = 1e-6
+"""Depth that counts as rounding, metres: a motion may end on the surface."""
+ACCEPTED_MARGIN = 0.9
+"""Smallest part of the margin that samples between the checked ones may keep."""
+BESIDE = 1e-3
+"""Tolerance of an obstacle's surface, metres, which is only nearly known, and of the depth of a covered start."""
+NUM_DIRECTIONS, MAX_STEPS_OUT = 360, 200
+"""Number of directions of a plane in which a way out of obstacles is searched, and largest number of steps."""
+SHORTEST = 1e-4
+"""Smallest of these steps, metres; bounds the overshoot beyond the surface."""
+TAIL = 2.0
+"""Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
+place: such a path arrives at up to 60° from the straight way out."""
+
+
+@dataclass(frozen=True, init=False)
+class Avoidance(Transform):
+    """Motions are led around obstacles: those of the end effector or those of the whole arm.
+
+    Raises:
+        FormatError: a number makes no sense, such as a negative margin.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    """Obstacles that are avoided together; there may be none."""
+    space: Space
+    """Who gives way: the end effector, or the whole arm."""
+    generator: Generator
+    temperature: float
+    """T of the occupancy potential; a higher one reaches farther and bends more gently."""
+    margin: float
+    """Clearance that the automatic flow time keeps, metres."""
+    duration: float | None
+    """t of the flow; None is the shortest that clears the obstacles by the margin."""
+    integration: Integration
+    """Integration of the flow."""
+    plane: tuple[Point, Point] | None
+    """Two orthonormal vectors: the flow acts along these only; None is in space."""
+
+    title: ClassVar[str] = "Avoidance"
+    hint: ClassVar[str] = "leads motions around the obstacles"
+    most: ClassVar[int] = 1
+    stays_outermost: ClassVar[bool] = True
+    yields_goal: ClassVar[bool] = True
+    settings: ClassVar[tuple[Setting, ...]] = (
+        Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
+        Number(
+            "temperature",
+            "Temperature",
+            "T",
+            MIN_TEMPERATURE,
+            MAX_TEMPERATURE,
+            0.5,
+            6.0,
+            hint="the higher, the more gently motions bend, and from farther away",
+        ),
+        Number(
+            "duration",
+            "Flow time",
+            "t",
+            0.0,
+            MAX_MANUAL_DURATION,
+            0.01,
+            0.5,
+            automatic=True,
+            of_flow=True,
+            hint="auto: the shortest flow that clears the obstacles by the margin",
+        ),
+        FlowIntegration(),
+    )
+
+    def __init__(
+        self,
+        obstacles: Obstacle | Iterable[Obstacle] = (),
+        *,
+        space: Space = "task",
+        generator: Generator = "free-space",
+        temperature: float = 6.0,
+        margin: float = 0.01,
+        duration: float | None = None,
+        integration: Integration = AUTO,
+        plane: tuple[Point, Point] | None = None,
+    ) -> None:
+        check_between("temperature", temperature, 0.1, 1000.0)
+        check_between("margin", margin, 0.0, 1.0)
+        if duration is not None:
+            check_between("duration", duration, 0.0, MOST_DURATION)
+        values = {
+            "obstacles": tuple(obstacles) if isinstance(obstacles, Iterable) else (obstacles,),
+            "space": space,
+            "generator": generator,
+            "temperature": temperature,
+            "margin": margin,
+            "duration": duration,
+            "integration": integration,
+            "plane": plane,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def acts(self) -> bool:
+        return self.space == "task" and bool(self.obstacles)
+
+    @property
+    def arm_avoidance(self) -> ArmAvoidance | None:
+        if self.space == "task":
+            return None
+        flow = self.generator, self.temperature, self.margin, self.duration, self.integration
+        return ArmAvoidance(self.avoided, *flow)
+
+    @property
+    def avoided(self) -> Union:
+        return Union(self.obstacles)
+
+    def in_plane(self, plane: tuple[Point, Point]) -> Avoidance:
+        return replace(self, plane=plane)
+
+    def _field(self) -> VectorField:
+        field = self.avoided.field(self.generator, self.temperature)
+        if self.plane is None:
+            return field
+        along = axes_of(self.plane)[:, :2]
+        return Projected(field, along @ along.T)
+
+    def _nearest_free(self, goal: Array) -> Array:
+        """Return the nearest free place (3,) to a covered goal (3,), metres; in the plane, if the flow acts there."""
+        obstacle = self.avoided
+        if self.plane is None or obstacle.signed_distance(goal) >= 0:
+            return obstacle.nearest_free(goal)
+        turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
+        directions = np.column_stack([np.cos(turn), np.sin(turn)]) @ axes_of(self.plane)[:, :2].T
+        length = np.zeros(NUM_DIRECTIONS)
+        for _ in range(MAX_STEPS_OUT):
+            depth = -obstacle.signed_distance(goal + length[:, None] * directions)
+            if depth[length.argmin()] <= 0:
+                break
+            length += np.where(depth > 0, np.maximum(depth, SHORTEST), 0)
+        return goal + length.min() * directions[length.argmin()]
+
+    def build(self, motion: MotionBelow) -> Built:
+        """The automatic flow time is the shortest that clears all avoidable samples of this motion.
+
+        The flow also moves the ends of the next attempt's motion, and the flow time only grows from one attempt to the
+        next: where a start or goal is close to the obstacle it may end up longer than needed.
+        """
+        obstacle = self.avoided
+        field = self._field()
+        ways, aside, motion = self._aside(motion)
+        spent = sum(flow.duration for flow in aside)
+        at_least = max(0.0, motion.at_least - spent)
+        if aside and motion.earlier is not None:
+            last = self.integration.of(AdaptiveFlow(field, at_least, motion.tolerance))
+            motion = replace(motion, positions=Chain([held(first, last) for first in aside]).inverse(motion.positions))
+        num_demonstrated = len(motion.demonstrated.starts)
+        covered = np.flatnonzero(_blocked(obstacle, motion))
+        warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
+        duration, hopeless = None if self.duration is None else self.duration - spent, False
+        if duration is None:
+            # the deepest samples leave last, or nearly so; if they were not enough at the last attempt, take all
+            depth = np.where(self._avoidable(motion), obstacle.signed_distance(motion.positions), np.inf)
+            if at_least:
+                points = motion.positions[np.isfinite(depth)]
+            else:
+                crests = _crests(motion, depth, field, self._kept_margin(motion))
+                points = np.concatenate([_deepest(motion, depth), crests])
+            margin = self._kept_margin(motion)
+            duration = clearing_duration(field, obstacle, points, margin, at_least=at_least)
+            # a coarse flow that is not clear after the time of the exact one needs more steps, not more time
+            hopeless = duration is None or (self.integration.by_hand and 0 < duration <= at_least)
+            if duration is None:
+                duration = MAX_DURATION
+                carried, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
+                if obstacle.signed_distance(carried).min() < 0:
+                    flat = self.generator == "probability"
+                    why = "∇p is flat inside it" if flat else "it runs through its dead centre"
+                    text = f"a motion does not leave the obstacle: {why}"
+                    warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
+        flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
+        if aside:
+            flow = Chain([*(held(first, flow) for first in aside), flow])
+        goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
+        if obstacle.signed_distance(motion.goal) < 0:
+            inside = -float(obstacle.signed_distance(goal))
+            end = "end beside it" if inside < BESIDE else f"end {1e3 * inside:.0f} mm deep in it"
+            warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
+        duration += spent
+        chosen = {"duration": duration}
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, ways, aside)
+
+    def _aside(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], tuple[Aside, ...], MotionBelow]:
+        """Return the ways out of the obstacles, the flows that carry all motions to one side of each, and these there.
+
+        Further attempts take those of the first, with the motion before them: for starts that the flows have moved into
+        the obstacle they would be longer, and move these farther. A flow time by hand is spent on these first. In a
+        plane no way out turns from one side to the other, so none is remembered there. The paper's generator acts
+        alone.
+        """
+        if motion.earlier is not None:
+            return motion.earlier.ways, motion.earlier.aside, motion
+        ways: list[Way | None] = [None] * len(self.obstacles)
+        aside: list[Aside] = []
+        if self.generator == "probability":
+            return tuple(ways), (), motion
+        plane = None if self.plane is None else axes_of(self.plane)[:, :2]
+        known = remembered(motion.ways if plane is None else (), self.obstacles)
+        margin = self._kept_margin(motion.demonstrated)
+        left = math.inf if self.duration is None else self.duration
+        for k, (obstacle, before) in enumerate(zip(self.obstacles, known, strict=True)):
+            seen = motion.demonstrated
+            passes = Passes.of(seen, self._avoidable(seen), obstacle, margin, self.obstacles[:k], plane)
+            if passes is None:
+                continue
+            ways[k] = way = passes.way(before, gradually=motion.gradual)
+            flow = passes.flow(way.direction, motion.tolerance)
+            flow = self.integration.of(replace(flow, duration=min(flow.duration, left)))
+            left -= flow.duration
+            if flow.duration > 0:
+                aside.append(flow)
+                motion = replace(motion, positions=flow.inverse(motion.positions))
+        return tuple(ways), tuple(aside), motion
+
+    def satisfied(self, motion: MotionBelow) -> bool:
+        """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""
+        if self.duration is not None:
+            return True
+        distance = self.avoided.signed_distance(motion.positions[self._avoidable(motion)])
+        return bool((distance >= ACCEPTED_MARGIN * self._kept_margin(motion) - ROUNDING).all())
+
+    def shortfall(self, motion: MotionBelow, made: Built, *, satisfied: bool) -> tuple[MotionWarning, ...]:
+        """Warnings about how near the end effector comes to the obstacle; see `Transform`."""
+        if satisfied and float(self.avoided.signed_distance(motion.positions).min()) >= 0:
+            return ()
+        kept = self.smallest_kept(motion)
+        covered = any(warning.kind is Kind.GOAL_COVERED for warning in made.warnings)
+        # motions to a covered goal end beside it, nearly on the surface
+        if kept < (-BESIDE if covered else -ROUNDING):
+            return (motion.warning(Kind.ENTERS, f"a motion enters the obstacle by {in_millimetres(-kept)}"),)
+        if satisfied or np.isinf(kept):
+            return ()
+        far = made.hopeless and not made.integration.by_hand
+        hotter = "" if self.generator == "probability" else "a higher T or "  # that of the paper has no T
+        why = f": the field does not reach farther; {hotter}a smaller margin helps" if far else ""
+        text = f"a motion keeps only {1e3 * kept:.1f} mm from the obstacle{why}"
+        return (motion.warning(Kind.TOO_NEAR, text),)
+
+    def smallest_kept(self, motion: MotionBelow) -> float:
+        """Return the smallest distance of avoidable samples from the obstacle, metres, negative inside.
+
+        Samples deeper than a covered start count, too, and for a covered goal all samples up to the end. Infinite if
+        nothing counts.
+        """
+        obstacle, motion = self.avoided, replace(motion, keeps_goal=False)
+        distance, at_start = obstacle.signed_distance(motion.positions), obstacle.signed_distance(motion.starts)
+        deeper = (at_start < 0)[motion.index] & (distance < at_start[motion.index] - BESIDE)
+        return float(distance[self._avoidable(motion) | deeper].min(initial=np.inf))
+
+    def _kept_margin(self, motion: MotionBelow) -> float:
+        """Return the clearance to keep, metres: the margin, or less where a start or goal is nearer to the surface.
+
+        A start may be on either side of it, so that nothing jumps while an obstacle is dragged over it.
+        """
+        ends = motion.starts
+        if motion.keeps_goal:
+            ends = np.concatenate([ends, self._nearest_free(motion.goal)[None]])
+        return float(np.abs(self.avoided.signed_distance(ends)).min(initial=self.margin))
+
+    def _avoidable(self, motion: MotionBelow) -> Mask:
+        """Return which samples (N,) can be kept out of the obstacle.
+
+        Excluded are the first samples of a motion that starts inside, until it keeps the margin; and, if the goal is
+        covered, the last samples, within `TAIL` distances from the end to where motions end instead.
+        """
+        obstacle = self.avoided
+        distance = obstacle.signed_distance(motion.positions)
+        free, clear = distance >= -ROUNDING, distance >= ACCEPTED_MARGIN * self._kept_margin(motion) - ROUNDING
+        goal_covered = motion.keeps_goal and obstacle.signed_distance(motion.goal) < 0
+        instead = self._nearest_free(motion.goal) if goal_covered else motion.goal
+        avoidable = np.ones(len(free), dtype=bool)
+        for rollout, blocked in enumerate(_blocked(obstacle, motion)):
+            if not (blocked or goal_covered):
+                continue
+            rows = np.flatnonzero(motion.index == rollout)
+            outside = np.flatnonzero((clear if clear[rows].any() else free)[rows])
+            if blocked:
+                avoidable[rows[: outside[0] if len(outside) else None]] = False
+            if goal_covered:
+                path = motion.positions[rows]
+                to_end = np.append(np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)[::-1])[::-1], 0)
+                tail = to_end <= TAIL * np.linalg.norm(path[-1] - instead) + BESIDE
+                tail[: outside[-1] + 1 if len(outside) else 0] = False
+                avoidable[rows[tail]] = False
+        return avoidable
+
+
+def _blocked(obstacle: Union, motion: MotionBelow) -> Mask:
+    """Return which rollouts (R,) start inside the obstacle."""
+    return obstacle.signed_distance(motion.starts) < 0
+
+
+def _deepest(motion: MotionBelow, depth: Array) -> Array:
+    """Return the deepest samples (M, 3) of each rollout; `depth` (N,), metres, is infinite for excluded ones."""
+    order = np.lexsort([depth, motion.index])
+    rank = np.arange(len(order)) - np.searchsorted(motion.index, motion.index)
+    return motion.positions[order[(rank < NUM_DEEPEST) & np.isfinite(depth[order])]]
+
+
+def _crests(motion: MotionBelow, depth: Array, field: VectorField, margin: float) -> Array:
+    """Find places (M, 3) between samples of the rollouts at which the field turns from leading onwards to leading back.
+
+    The field is a gradient, or nearly so: its potential is largest there, and points there leave last.
+    """
+    s, step = motion.positions, np.diff(motion.positions, axis=0)
+    near, same = depth < margin, np.diff(motion.index) == 0
+    k = np.flatnonzero(same & near[:-1] & near[1:])
+    here, there = (field(np.concatenate([s[k], s[k + 1]])) * np.tile(step[k], (2, 1))).sum(axis=1).reshape(2, -1)
+    turns = (here > 0) & (there < 0)
+    k, part = k[turns], (here / np.where(turns, here - there, 1))[turns, None]
+    # between two samples a path bends like the parabolas through them and the ones beside them; lengths tell them apart
+    length = np.maximum(np.linalg.norm(step, axis=1, keepdims=True), TINY)
+    bend, inner = np.zeros_like(s), (same[:-1] & same[1:])[:, None]
+    bend[1:-1] = np.diff(step / length, axis=0) / (length[:-1] + length[1:]) * inner
+    return s[k] + part * step[k] - part * (1 - part) * length[k] ** 2 * (bend[k] + bend[k + 1]) / 2
+
+
+def clearing_duration(
+    field: VectorField, obstacle: Union | Obstacle, points: Array, margin: float, *, at_least: float = 0.0
+) -> float | None:
+    """Find the shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
+
+    γ is a one-parameter group, so one integration with snapshots passes every duration on its way; and occupancy falls
+    along the reverse flow, so points that are clear stay clear and can be dropped.
+
+    Args:
+        field: generator of the flow.
+        obstacle: true shape.
+        points: (N, 3) points before the flow, metres.
+        margin: clearance wanted, metres.
+        at_least: duration to start from.
+
+    Returns:
+        The duration, or None where some point is not clear after `MAX_DURATION`.
+    """
+    duration = at_least
+    if duration > 0:
+        points, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
+    clearance = obstacle.signed_distance(points)
+    inside = clearance < margin
+    points, clearance = points[inside], clearance[inside]
+    while len(points):
+        if duration >= MAX_DURATION:
+            return None
+        points, _ = integrate(rk4, field, points, None, -SNAPSHOT, 1)
+        before, clearance = clearance, obstacle.signed_distance(points)
+        inside = clearance < margin
+        if not inside.any():
+            fraction = (margin - before) / np.maximum(clearance - before, 1e-12)
+            return duration + SNAPSHOT * float(np.clip(fraction, 0, 1).max())
+        points, clearance, duration = points[inside], clearance[inside], duration + SNAPSHOT
+    return duration

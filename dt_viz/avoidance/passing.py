@@ -1,0 +1,43 @@
+"""Sides on which motions pass obstacles, and stance of the arm: kept from one scenario to the next in a drag."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from dt_viz.avoidance.ways import Way, remembered, travel
+from dt_viz.obstacles.shapes import Obstacle
+
+Stance = tuple[float, float, float, float, float, float]
+"""Posture that the arm stays near to along all rollouts: six joint angles, rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class Passing:
+    """Sides and stance of a motion, which the next one keeps while an obstacle is dragged."""
+
+    hand: Mapping[int, tuple[Way | None, ...]] = field(default_factory=dict)
+    """Ways of the end effector out of the obstacles of each layer, by its place in the stack."""
+    arm: tuple[Way | None, ...] = ()
+    """Ways of the whole arm out of the obstacles."""
+    duration: float = 0.0
+    """t of the flow by which the whole arm avoids."""
+    cleared: bool = True
+    """Whether that flow clears the obstacles."""
+    stance: Stance | None = None
+    """Stance of the arm; None is its usual one."""
+    left_out: tuple[int, ...] = ()
+    """Numbers of the starts that have no motion."""
+
+    def goes_on(self, obstacles: Sequence[Obstacle]) -> bool:
+        """Return whether an obstacle that the whole arm passed is still there, or nearby."""
+        return any(remembered(self.arm, obstacles))
+
+    def follows(self, obstacles: Sequence[Obstacle]) -> bool:
+        """Return whether such an obstacle has moved a little."""
+        known = zip(remembered(self.arm, obstacles), obstacles, strict=True)
+        return any(way is not None and travel(way.obstacle, part) > 0 for way, part in known)
+
+
+ANEW = Passing()
+"""Nothing to keep: sides and stance are chosen anew."""

@@ -1,0 +1,116 @@
+"""Stances: postures that an arm may stay near to along the motions of a task, where the usual one has no room.
+
+The hand's position leaves three degrees of freedom, and several branches of the inverse kinematics. A stance chooses
+among them for all motions of a task at once, as the reference of one section x → q (`robot.inverse_kinematics.track`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dt_viz.avoidance.arm_field import LEVERS
+from dt_viz.flows.fields import Array, Mask
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.union import Union
+from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.inverse_kinematics import loses_branch, track
+from dt_viz.robot.robot import NUM_JOINTS, Robot
+
+NUM_TRIED = 384
+"""Number of random postures that stances are made from."""
+SPREAD = (0.2, 2.0)
+"""Smallest and largest standard deviation of their joints from the usual posture, rad."""
+REACHED = 1e-4
+"""Largest distance of the hand from a place that counts as reached, metres."""
+IN_THE_WAY = 10.0
+"""Cost of each metre that the mean motion lacks of the clearance that is asked for, against a metre from the usual
+postures."""
+ALIKE = 0.15
+"""Root mean square distance of postures, by `LEVERS`, up to which stances are alike, metres."""
+AT_ENDS, ENDS = 40.0, 0.06
+"""Factor by which that costs more at the ends of the motion, and distance from them over which this fades, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stances:
+    """Postures to stay near to, the usual one first, then the nearest to it."""
+
+    robot: Robot
+    body: BodyPoints
+    """Body points of the links that can move away."""
+    references: Array
+    """(K, 6) the postures, rad."""
+    at_starts: Array
+    """(K, R, 6) postures that the arm rests in at the starts with them, rad."""
+    on_path: Array
+    """(K, T, 6) postures along the mean motion, rad."""
+    away: Array
+    """(K,) root mean square distance of the postures from the usual ones, metres, by `LEVERS`."""
+
+    @cached_property
+    def _stuck(self) -> Array:
+        """(K, T) weight of what is in the way on the path: near its ends, where no flow moves the arm, it is large."""
+        ends = (self.on_path[:, [0, -1], None] - self.on_path[:, None]) * LEVERS
+        near = np.exp(-(ends**2).sum(axis=3) / (2 * ENDS**2)).max(axis=1)
+        return IN_THE_WAY * (1 + AT_ENDS * near)
+
+    def room(self, obstacle: Union | Obstacle) -> Array:
+        """Distances (K, R + 1), metres, of the covering spheres from an obstacle, at the starts and the goal."""
+        return self._clearance(np.concatenate([self.at_starts, self.on_path[:, -1:]], axis=1), obstacle)
+
+    def _clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
+        """Distances (K, N), metres, at postures (K, N, 6)."""
+        return self.body.clearance(self.robot, q.reshape(-1, NUM_JOINTS), obstacle).reshape(q.shape[:2])
+
+    def alike(self, stance: int) -> Mask:
+        """(K,) which stances are like one of them."""
+        apart = (self.on_path - self.on_path[stance]) * LEVERS
+        return np.sqrt((apart**2).sum(axis=2).mean(axis=1)) < ALIKE
+
+    def cost(self, obstacle: Union | Obstacle, asked: float) -> Array:
+        """Costs (K,), metres, of the detour from the usual postures and of what lies in the way on the path.
+
+        Args:
+            obstacle: what may be in the way.
+            asked: clearance that is asked for, metres.
+        """
+        lacking = np.maximum(asked - self._clearance(self.on_path, obstacle), 0)
+        return self.away + (self._stuck * lacking).mean(axis=1)
+
+
+def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: Array) -> Stances:
+    """Find stances for the motions of a task.
+
+    Random postures are brought to the mean start, then each follows all starts and the mean motion. Those stay that do
+    so on one branch, inside the joint limits, away from singularities, and no lower than the usual one or the table.
+
+    Args:
+        robot: the arm.
+        body: body points of the links that move.
+        usual: (6,) the posture that the arm usually stays near to, rad.
+        starts: (R, 3) places where motions start, metres.
+        path: (T, 3) the mean motion, metres; its end is the goal.
+
+    Returns:
+        The stances, whose pins are those at the starts and at the goal.
+    """
+    rng = np.random.default_rng(0)  # the same for each visitor
+    scale = rng.uniform(*SPREAD, size=(NUM_TRIED, 1))
+    tried = robot.clip(usual + scale * rng.normal(size=(NUM_TRIED, NUM_JOINTS)))
+    at_start = track(robot, np.broadcast_to(starts.mean(axis=0), (NUM_TRIED, 1, 3)), tried)
+    reaches = (at_start.error < REACHED) & ~at_start.limits_hit & ~at_start.damped
+    references = np.concatenate([usual[None], at_start.q[reaches[:, 0], 0]])
+    places = np.concatenate([starts, path])
+    paths = np.broadcast_to(places, (len(references), *places.shape))
+    tracked = track(robot, paths, references, reference=references)
+    heights = (body.positions(robot, tracked.q)[..., 2] - body.radius).min(axis=(1, 2))
+    follows = (tracked.error < REACHED) & ~tracked.limits_hit & ~tracked.damped
+    sound = follows.all(axis=1) & ~loses_branch(tracked.q, paths) & (heights >= min(0.0, heights[0]))
+    sound[0] = True
+    away = np.sqrt((((tracked.q - tracked.q[0]) * LEVERS) ** 2).sum(axis=2).mean(axis=1))
+    order = np.argsort(np.where(sound, away, np.inf), kind="stable")[: sound.sum()]
+    at_starts, on_path = np.split(tracked.q[order], [len(starts)], axis=1)
+    return Stances(robot, body, references[order], at_starts, on_path, away[order])

@@ -1,0 +1,13 @@
+"""The kinds of transforms that can be stacked on the imitation: what the page offers, in this order."""
+
+from __future__ import annotations
+
+from dt_viz.avoidance.bias import BiasPoint
+from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.transform import Transform
+
+KINDS: tuple[type[Transform], ...] = (
+    Avoidance,
+    BiasPoint,
+)
+"""All kinds of transforms. A new one is a line here."""

@@ -1,0 +1,429 @@
+"""Distances of the arm's links from an obstacle, from each other and from the table, one configuration at a time.
+
+The meshes are those of the URDF, taken as solids; coal measures distances to them, batched kinematics places them.
+Lengths are metres, angles radians, positions in the robot's base frame.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (coal has no stubs)
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, lru_cache
+from itertools import combinations
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import coal
+import numpy as np
+
+from dt_viz.obstacles.shapes import Box, Cylinder, Obstacle, Sphere, rotation
+from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
+from dt_viz.robot.robot import LinkMesh, Robot
+
+if TYPE_CHECKING:
+    from dt_viz.flows.fields import Array, Indices
+
+
+SHAPE_TOLERANCE = 1e-3
+"""Largest excess of a reported smallest distance from an obstacle that is no ball, metres."""
+SURFACE_SPACING = 2e-3
+"""Spacing of points on a link's surface, vertices included, at which its depth in an obstacle is measured, metres."""
+INNER_SPACING = 4e-3
+"""Spacing of such points inside the link, where an obstacle may be deepest, metres."""
+RESOLUTION = 3.5e-3
+"""Largest error of a reported depth in an obstacle that is no ball, metres; 1.5 mm on a link's surface."""
+CERTAIN = 3e-3
+"""Depth, metres, greater than the error of an obstacle's signed distance: a deeper point surely is inside."""
+SKIN_SPACING = 1.5e-3
+"""Size of the cells of which a `Skin` has one point each, metres."""
+SKIN_GROUP_SIZE = 0.012
+"""Size of the cells into which the points of a `Skin` are grouped, metres."""
+GROUP_SIZE = 0.02
+"""Size of the cells into which these points are grouped, metres."""
+BALL_SIZE = 0.06
+"""Size of the cells into which a link is divided for quick bounds, metres."""
+AT_ONCE = 8
+"""Number of groups whose points are measured in one step."""
+
+
+class Poses(NamedTuple):
+    """Frames of the base and the six joints, for N configurations; a link of joint j is at j + 1."""
+
+    rotations: Array  # (N, 7, 3, 3)
+    origins: Array  # (N, 7, 3), metres
+
+    @classmethod
+    def of(cls, robot: Robot, q: Array) -> Poses:
+        """Compute the poses at configurations q (N, 6), rad."""
+        rotations, origins = robot.forward_kinematics(q)
+        base = np.broadcast_to(np.eye(3), (len(q), 1, 3, 3))
+        return cls(np.concatenate([base, rotations], axis=1), np.pad(origins, [(0, 0), (1, 0), (0, 0)]))
+
+
+class _Groups(NamedTuple):
+    """Points in groups of neighbours; or balls, if they have radii."""
+
+    points: Array  # (N, 3), metres, one group after the other
+    ends: Indices  # (G,) ends of the groups in `points`
+    centres: Array  # (G, 3), metres
+    radii: Array  # (G,) radii of the balls around the centres that hold the groups, metres
+
+    @classmethod
+    def of(cls, points: Array, size: float, radii: Array | float = 0.0) -> _Groups:
+        """Group the points (N, 3) by the cells, of this size, of a grid."""
+        cell = np.floor((points - points.min(axis=0)) / size).astype(np.intp)
+        _, member = np.unique(cell, axis=0, return_inverse=True)
+        order = np.argsort(member.ravel(), kind="stable")
+        points, radii = points[order], np.broadcast_to(radii, len(points))[order]
+        ends = np.cumsum(np.bincount(member.ravel()))
+        begins = np.r_[0, ends[:-1]]
+        centres = (np.minimum.reduceat(points, begins) + np.maximum.reduceat(points, begins)) / 2
+        apart = np.linalg.norm(points - np.repeat(centres, ends - begins, axis=0), axis=1) + radii
+        return cls(points, ends, centres, np.maximum.reduceat(apart, begins))
+
+    def of_group(self, group: int) -> Array:
+        """Return the points (M, 3) of a group."""
+        return self.points[self.ends[group - 1] if group else 0 : self.ends[group]]
+
+
+class Link:
+    """A link as a solid, in the frame of its joint.
+
+    Attributes:
+        name: name on the page.
+        frame: index of its frame in `Poses`.
+        surface: coal's model of the mesh.
+        centre: (3,) centre of the box around the mesh, metres.
+        half_size: (3,) half the sides of that box, metres.
+        radius: radius of the ball around that centre that holds the mesh, metres.
+        corners: (8, 3) corners of that box, metres.
+        hull: (H, 3) vertices of the convex hull, metres.
+    """
+
+    def __init__(self, mesh: LinkMesh) -> None:
+        self.name = mesh.name.split("_link_")[-1].replace("_", " ")
+        if self.name.isdecimal():
+            self.name = f"link {self.name}"
+        self.frame = mesh.joint + 1
+        self._triangles = mesh.vertices[mesh.faces]  # (F, 3, 3)
+        self._vertices = mesh.vertices
+        self.surface = _bounding_volumes(mesh.vertices, mesh.faces)
+        lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        self.centre, self.half_size = (lower + upper) / 2, (upper - lower) / 2
+        self.radius = float(np.linalg.norm(mesh.vertices - self.centre, axis=1).max())
+        signs = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, -1).T
+        self.corners = self.centre + signs * self.half_size
+        self.surface.buildConvexHull(False, "Qt")
+        self.hull = np.array(self.surface.convex.points())
+
+    @cached_property
+    def on_surface(self) -> Array:
+        """Points (N, 3) of the surface, at most `SURFACE_SPACING` apart, metres."""
+        return np.concatenate([self._vertices, surface_samples(self._triangles, SURFACE_SPACING)[0]])
+
+    @cached_property
+    def groups(self) -> _Groups:
+        """Points of the solid, so dense that each place in it has one within `RESOLUTION`."""
+        shape = tuple(int(n) for n in np.ceil(2 * self.half_size / INNER_SPACING) + 1)
+        origin = self.centre - INNER_SPACING * (np.array(shape) - 1) / 2
+        inside = inside_of_grid(self._triangles, origin, INNER_SPACING, shape)
+        inner = grid_nodes(origin, INNER_SPACING, shape)[inside.ravel()]
+        return _Groups.of(np.concatenate([self.on_surface, inner]), GROUP_SIZE)
+
+    @cached_property
+    def balls(self) -> _Groups:
+        """A few balls that hold the mesh."""
+        return _Groups.of(self.groups.centres, BALL_SIZE, self.groups.radii)
+
+    def contains(self, point: Array) -> bool:
+        """Return whether a point (3,) is inside, by the winding number, as the hand's mesh has small holes."""
+        if np.any(np.abs(point - self.centre) > self.half_size):
+            return False
+        a, b, c = np.moveaxis(self._triangles - point, 1, 0)
+        la, lb, lc = (np.sqrt(np.einsum("ij,ij->i", side, side)) for side in (a, b, c))
+        # The winding number is the sum of the triangles' solid angles (van Oosterom and Strackee, 1983)
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+        ab, bc, ca = np.einsum("ij,ij->i", a, b), np.einsum("ij,ij->i", b, c), np.einsum("ij,ij->i", c, a)
+        winding = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2 * np.pi)
+        return bool(abs(winding) > 0.5)
+
+
+class Measure(Protocol):
+    """Distances of several items, each a link or a pair of links."""
+
+    lowest: float
+    """Lower bound of all distances, metres."""
+
+    @property
+    def bodies(self) -> Indices:
+        """Indices (I,) of the items' moving links."""
+        ...
+
+    @property
+    def bases(self) -> Indices:
+        """Indices (I,) of the frames that the items are measured from and their motion is relative to."""
+        ...
+
+    def names(self, item: int) -> tuple[str, ...]:
+        """Return the names of an item's links."""
+        ...
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        """Compute quick lower bounds (N,) of the distances of items (N,) at the poses in rows (N,)."""
+        ...
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        """Compute the distance of an item, exact below the ceiling; else any value between the ceiling and it."""
+        ...
+
+
+class _OfLinks:
+    """Base of the measures whose items are links, measured from something that does not move.
+
+    Attributes:
+        bodies: see `Measure`.
+        bases: see `Measure`.
+    """
+
+    def __init__(self, links: Sequence[Link], bodies: Sequence[int]) -> None:
+        self._links = [links[k] for k in bodies]
+        self._frames = np.array([link.frame for link in self._links])
+        self._centres = np.array([link.centre for link in self._links])
+        self._half_sizes = np.array([link.half_size for link in self._links])
+        self.bodies, self.bases = np.array(bodies), np.zeros(len(bodies), dtype=np.intp)
+
+    def names(self, item: int) -> tuple[str, ...]:
+        return (self._links[item].name,)
+
+
+class _FromBall(_OfLinks):
+    """Signed distances of the links from a ball, measured from its centre.
+
+    Coal's signed distance of a mesh from a ball is not its depth: once one triangle is inside, all other overlaps are
+    skipped. The distance from the centre is positive, and so exact.
+    """
+
+    def __init__(self, links: Sequence[Link], obstacle: Sphere) -> None:
+        super().__init__(links, range(len(links)))
+        self._point, self._position, self._radius = coal.Sphere(0.0), np.asarray(obstacle.position), obstacle.radius
+        self.lowest = -obstacle.radius
+        self._known: dict[int, list[tuple[Array, float, bool]]] = {}
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        frames = self._frames[items]
+        offset = self._position - poses.origins[rows, frames]
+        local = np.einsum("nji,nj->ni", poses.rotations[rows, frames], offset) - self._centres[items]
+        outside = np.maximum(np.abs(local) - self._half_sizes[items], 0.0)
+        return np.linalg.norm(outside, axis=1) - self._radius
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        link = self._links[item]
+        turn = poses.rotations[row, link.frame].T
+        centre = turn @ (self._position - poses.origins[row, link.frame])
+        place = coal.Transform3s(turn, centre)
+        gap = _coal_distance(link.surface, coal.Transform3s(), self._point, place, ceiling + self._radius)
+        return (0.0 if gap > 0 and self._inside(item, centre, gap) else gap) - self._radius
+
+    def _inside(self, item: int, point: Array, gap: float) -> bool:
+        """Return whether a point is inside the link, whose surface is at least `gap` away."""
+        known = self._known.setdefault(item, [])
+        for other, free, inside in known:
+            if np.linalg.norm(point - other) < free:  # no surface in between
+                return inside
+        inside = self._links[item].contains(point)  # slow, so remembered
+        known.append((point, gap, inside))
+        return inside
+
+
+class _FromShape(_OfLinks):
+    """Signed distances of the links from an obstacle of any shape.
+
+    Outside, it is coal's exact distance between the surfaces of obstacle and link; the surface of a mesh or a cloud is
+    the drawn one. Where they intersect, it is the obstacle's smallest signed distance at points that fill the link; the
+    depth may be larger by up to `RESOLUTION`.
+    """
+
+    def __init__(self, links: Sequence[Link], obstacle: Obstacle) -> None:
+        super().__init__(links, range(len(links)))
+        self._obstacle, self._core = obstacle, _coal_shape(obstacle)
+        self._turn, self._position = rotation(obstacle.wxyz), np.asarray(obstacle.position)
+        self._on_surface = self._turn @ obstacle.surface()[0][0] + self._position
+        # the balls of all links, padded to the same number
+        most = max(len(link.balls.radii) for link in links)
+        fill = [np.minimum(np.arange(most), len(link.balls.radii) - 1) for link in links]
+        self._ball_centres = np.stack([link.balls.centres[k] for link, k in zip(links, fill, strict=True)])
+        self._ball_radii = np.stack([link.balls.radii[k] for link, k in zip(links, fill, strict=True)])
+        self.lowest = SHAPE_TOLERANCE - obstacle.depth
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        frames = self._frames[items]
+        turned = np.einsum("nij,nkj->nki", poses.rotations[rows, frames], self._ball_centres[items])
+        centres = turned + poses.origins[rows, frames][:, None]
+        return (self._obstacle.signed_distance(centres) - self._ball_radii[items]).min(axis=1)
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        link = self._links[item]
+        turn, origin = poses.rotations[row, link.frame], poses.origins[row, link.frame]
+        deepest = self._deepest(link, turn, origin)
+        if deepest < -CERTAIN:
+            return deepest
+        place = coal.Transform3s(turn.T @ self._turn, turn.T @ (self._position - origin))
+        gap = _coal_distance(link.surface, coal.Transform3s(), self._core, place, max(ceiling, CERTAIN))
+        if gap > 0 and not (deepest < 0 and link.contains(turn.T @ (self._on_surface - origin))):
+            return gap
+        return min(deepest, 0.0)
+
+    def _deepest(self, link: Link, turn: Array, origin: Array) -> float:
+        """Return the smallest signed distance of the link's points, at most 0."""
+        groups, deepest = link.groups, 0.0
+        lower = self._obstacle.signed_distance(groups.centres @ turn.T + origin) - groups.radii
+        order = np.argsort(lower)
+        order = order[lower[order] < 0]
+        for first in range(0, len(order), AT_ONCE):
+            some = [group for group in order[first : first + AT_ONCE] if lower[group] < deepest]
+            if not some:
+                break
+            points = np.concatenate([groups.of_group(group) for group in some])
+            deepest = min(deepest, float(self._obstacle.signed_distance(points @ turn.T + origin).min()))
+        return deepest
+
+
+class Skin:
+    """Points on the surfaces of links that move together, so dense that distances of obstacles outside are known.
+
+    An obstacle at the distance d appears farther away by `SKIN_SPACING`²/d at most.
+    """
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        (self.frame,) = {link.frame for link in links}
+        points = np.concatenate([link.on_surface for link in links])
+        x, y, z = np.floor((points - points.min(axis=0)) / SKIN_SPACING).astype(np.intp).T
+        _, kept = np.unique((x * (y.max() + 1) + y) * (z.max() + 1) + z, return_index=True)  # quicker than of rows
+        self._groups = _Groups.of(points[kept], SKIN_GROUP_SIZE)
+
+    def gaps(self, poses: Poses, obstacle: Obstacle, enough: Array) -> Array:
+        """Compute the smallest distances (N,), metres, of the points from an obstacle, where below `enough` (N,)."""
+        turns, origins, groups = poses.rotations[:, self.frame], poses.origins[:, self.frame], self._groups
+        centres = groups.centres @ turns.transpose(0, 2, 1) + origins[:, None]
+        distance, gaps = obstacle.signed_distance(centres), enough.copy()
+        nearest = np.minimum(gaps, (distance + groups.radii).min(axis=1))
+        rows, found = np.nonzero(distance - groups.radii < nearest[:, None])
+        if not len(rows):
+            return gaps
+        begins, sizes = np.r_[0, groups.ends[:-1]][found], np.diff(groups.ends, prepend=0)[found]
+        firsts = np.cumsum(sizes) - sizes
+        members = np.repeat(begins - firsts, sizes) + np.arange(sizes.sum())
+        of_row = np.repeat(rows, sizes)
+        points = np.einsum("nij,nj->ni", turns[of_row], groups.points[members]) + origins[of_row]
+        np.minimum.at(gaps, rows, np.minimum.reduceat(obstacle.signed_distance(points), firsts))
+        return gaps
+
+
+def _coal_shape(obstacle: Obstacle) -> coal.CollisionGeometry:
+    """Return coal's model of the obstacle's surface in its own frame."""
+    if isinstance(obstacle, Box):
+        return coal.Box(*obstacle.sizes)
+    if isinstance(obstacle, Cylinder):
+        return coal.Cylinder(obstacle.diameter / 2, obstacle.height)
+    return _drawn(obstacle.moved((0.0, 0.0, 0.0)))
+
+
+@lru_cache(maxsize=16)
+def _drawn(obstacle: Obstacle) -> coal.CollisionGeometry:
+    return _bounding_volumes(*obstacle.surface())
+
+
+def _bounding_volumes(vertices: Array, faces: Indices) -> coal.CollisionGeometry:
+    """Return coal's model of triangles."""
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(len(faces), len(vertices))
+    model.addVertices(vertices)
+    model.addTriangles(faces)
+    model.endModel()
+    return model
+
+
+def measure_from(links: Sequence[Link], obstacle: Obstacle) -> Measure:
+    """Return the measure of the links' signed distances from an obstacle."""
+    return _FromBall(links, obstacle) if isinstance(obstacle, Sphere) else _FromShape(links, obstacle)
+
+
+class BetweenLinks:
+    """Distances of those pairs of links that can come near each other."""
+
+    lowest = 0.0
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        # Neighbours touch by design; each other pair is apart in at least 96 % of random postures.
+        apart = [(a, b) for a, b in combinations(range(len(links)), 2) if links[b].frame - links[a].frame > 1]
+        self._links = links
+        self._pairs = np.array(apart)
+        self._centres = np.array([link.centre for link in links])
+        self._radii = np.array([link.radius for link in links])
+        self._frames = np.array([link.frame for link in links])
+        self.bodies = self._pairs[:, 1]
+        self.bases = self._frames[self._pairs[:, 0]]
+
+    def names(self, item: int) -> tuple[str, ...]:
+        """See `Measure`."""
+        first, second = self._pairs[item]
+        return self._links[first].name, self._links[second].name
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        """See `Measure`."""
+        a, b = self._pairs[items].T
+        apart = np.linalg.norm(self._centre(poses, rows, a) - self._centre(poses, rows, b), axis=1)
+        return apart - self._radii[a] - self._radii[b]
+
+    def _centre(self, poses: Poses, rows: Indices, links: Indices) -> Array:
+        frames = self._frames[links]
+        turned = np.einsum("nij,nj->ni", poses.rotations[rows, frames], self._centres[links])
+        return turned + poses.origins[rows, frames]
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        """See `Measure`."""
+        first, second = (self._links[k] for k in self._pairs[item])
+        place, other_place = (
+            coal.Transform3s(poses.rotations[row, link.frame], poses.origins[row, link.frame])
+            for link in (first, second)
+        )
+        return _coal_distance(first.surface, place, second.surface, other_place, ceiling)
+
+
+class AboveTable(_OfLinks):
+    """Heights of the links' lowest points above the table, on which the base and link 1 stand."""
+
+    lowest = -np.inf
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        super().__init__(links, [k for k, link in enumerate(links) if link.frame > 1])
+
+    def lower(self, poses: Poses, rows: Indices, items: Indices) -> Array:
+        """See `Measure`."""
+        up = poses.rotations[rows, self._frames[items], 2]  # (N, 3)
+        sag = (up * self._centres[items] - np.abs(up) * self._half_sizes[items]).sum(axis=1)
+        return poses.origins[rows, self._frames[items], 2] + sag
+
+    def distance(self, poses: Poses, row: int, item: int, ceiling: float) -> float:
+        """See `Measure`."""
+        link = self._links[item]
+        heights = link.hull @ poses.rotations[row, link.frame, 2]
+        return float(heights.min() + poses.origins[row, link.frame, 2])
+
+
+_REQUEST = coal.DistanceRequest()
+_REQUEST.enable_signed_distance = False
+
+
+def _coal_distance(
+    a: coal.CollisionGeometry,
+    place_a: coal.Transform3s,
+    b: coal.CollisionGeometry,
+    place_b: coal.Transform3s,
+    ceiling: float,
+) -> float:
+    """Return the distance of two shapes, 0 where they intersect, or the ceiling if that is smaller."""
+    result = coal.DistanceResult()
+    result.min_distance = ceiling  # farther pairs are skipped
+    return max(0.0, coal.distance(a, place_a, b, place_b, _REQUEST, result))

@@ -1,0 +1,296 @@
+"""Other methods beside ours, around the obstacles of a page's scenario: their motions, and how all of them fare."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Planner, Problem
+from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.errors import Cancelled, end_if, never
+from dt_viz.flows.fields import Array, Indices
+from dt_viz.memo import Memo
+from dt_viz.metrics import discrete_frechet, distance_from_path, maximum_collision_distance, resample_by_arc_length
+from dt_viz.motion.following import ArmMotion, Follower, arm_samples
+from dt_viz.motion.nominal import Learned
+from dt_viz.motion.profiles import NUM_SAMPLES
+from dt_viz.motion.solve import Solved
+from dt_viz.obstacles.union import Union
+from dt_viz.robot.collision import load_collision_model
+from dt_viz.robot.inverse_kinematics import UnreachableError, track
+from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.tasks import Task
+from dt_viz.session.compose import arm_along
+from dt_viz.session.frame import Compared, Frame, Scores
+
+OURS = METHODS["ours"]
+OTHERS = tuple(method for method in METHODS.values() if method is not OURS)
+"""Methods that a page can show beside ours."""
+NEWEST = 32
+"""Number of plans that are kept."""
+TOLERANCE = 1e-4
+"""By how much a maximum collision distance may be too small, metres."""
+WAITS, NEXT, NO_WAY = "waits for the obstacle to rest", "waits for its turn", "finds no way"
+
+
+@dataclass(frozen=True, eq=False)
+class _Motions:
+    """Motions of a method, from the starts of the demonstrations."""
+
+    paths: tuple[Array, ...] = ()
+    """(N_i, 3), metres; none where there are no motions."""
+    times: tuple[Array, ...] = ()
+    """(N_i,), s."""
+    joints: tuple[Array, ...] | None = None
+    """(N_i, 6), rad, where the method plans them."""
+    scores: Scores | None = None
+    note: str = ""
+
+
+@dataclass(eq=False)
+class _Record:
+    """What is known of a method around an obstacle; it grows while the obstacle rests."""
+
+    motions: _Motions | None = None
+    """None until they are planned."""
+    arm_depth: float | None = None
+    """Maximum collision distance of the arm's meshes, metres; None until it is known, or where there is no motion."""
+    is_complete: bool = False
+    """Whether nothing is left to work out."""
+    curves: dict[int, Array] = field(default_factory=dict)
+    """Those of `Compared`, by the rollout."""
+    arms: dict[int, ArmMotion] = field(default_factory=dict)
+    """Motions of the arm, by the rollout that they follow."""
+
+
+class Comparison:
+    """Motions of other methods, for one engine and on its thread; what an edit leaves unchanged is kept."""
+
+    def __init__(self, follower: Follower, memo: Memo) -> None:
+        """Compare methods for this arm."""
+        self._follower, self._memo = follower, memo
+
+    def of(self, frame: Frame, learned: Learned, notes: Mapping[str, str] | None = None) -> tuple[Compared, ...]:
+        """The methods that the view of a frame shows, ours first; those that do not follow a drag as far as known.
+
+        Args:
+            frame: ours, at any stage.
+            learned: its task, learned.
+            notes: what is said of methods, by their names, while they are not planned.
+        """
+        chosen = _chosen(frame.scenario)
+        rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
+        for method in chosen:
+            if method.live:
+                self._plan(method, frame, learned)
+        return tuple(
+            self._compared(method, frame, learned, rollout, (notes or {}).get(method.name, WAITS))
+            for method in ((OURS, *chosen) if chosen else ())
+        )
+
+    def complete(
+        self, frame: Frame, learned: Learned, solved: Solved | None, cancelled: Cancelled
+    ) -> Iterator[Mapping[str, str]]:
+        """Work out what is left for a scenario that rests; stops whenever `of` would tell more.
+
+        Args:
+            frame: ours.
+            learned: its task, learned.
+            solved: our motion; None where there is none.
+            cancelled: asked between parts of the work.
+
+        Yields:
+            Notes for `of`: which method is planned next, and how many are left.
+
+        Raises:
+            UnwantedError: it is cancelled.
+        """
+        chosen = _chosen(frame.scenario)
+        slow = [method for method in chosen if self._record(method, frame, learned).motions is None]
+        for k, method in enumerate(slow):
+            left = {later.name: NEXT for later in slow[k + 1 :]}
+            yield {method.name: f"planning … ({k + 1} of {len(slow)})", **left}
+            self._plan(method, frame, learned, cancelled)
+        if slow:
+            yield {}
+        if not frame.scenario.obstacle.parts:
+            return
+        for method in (OURS, *chosen) if chosen else ():
+            record = self._record(method, frame, learned)
+            if not record.is_complete:
+                record.arm_depth = self._arm_depth(method, record, frame, learned, solved, cancelled)
+                record.is_complete = True
+                yield {}
+
+    def _record(self, method: Method, frame: Frame, learned: Learned) -> _Record:
+        """What is known of a method around the obstacle of a frame: one place for all that is kept."""
+        obstacle = frame.scenario.obstacle
+        if method is not OURS:
+            return self._memo("compared", (method.name, learned, obstacle), _Record, newest=NEWEST)
+        shown = tuple(path.tobytes() for path in frame.rollouts), bool(frame.blocked)
+        return self._memo("ours", (learned, frame.scenario.motion, shown), lambda: _Record(_ours(frame)), newest=NEWEST)
+
+    def _compared(self, method: Method, frame: Frame, learned: Learned, rollout: int, waiting: str) -> Compared:
+        """What is known of a method; `waiting` is its note while its motions are not."""
+        record, obstacle = self._record(method, frame, learned), frame.scenario.obstacle
+        motions = record.motions or _Motions(note=waiting)
+        if motions.paths and rollout not in record.curves:
+            record.curves[rollout] = curves(motions.paths[rollout], learned.task.paths[rollout], obstacle)
+        shows_arm = frame.scenario.view.their_arm == method.name
+        if shows_arm and rollout not in record.arms and motions.times and len(motions.times[rollout]) > 1:
+            record.arms[rollout] = self._arm(motions, learned, rollout)
+        return Compared(
+            method,
+            motions.paths,
+            motions.scores and replace(motions.scores, arm_depth=record.arm_depth),
+            record.curves.get(rollout),
+            rollout,
+            motions.note,
+            record.arms.get(rollout) if shows_arm else None,
+        )
+
+    def _plan(self, method: Method, frame: Frame, learned: Learned, cancelled: Cancelled = never) -> None:
+        """Plan a method's motions unless they are known; those that do not avoid are the same around all obstacles."""
+        record, obstacle = self._record(method, frame, learned), frame.scenario.obstacle
+        if record.motions is not None:
+            return
+        if method.avoids:
+            record.motions = self._planned(method, learned, obstacle, cancelled)
+            return
+        motions = self._memo(
+            "motions", (method.name, learned), lambda: self._planned(method, learned, Union(), cancelled)
+        )
+        scores = motions.scores and replace(motions.scores, hand_depth=hand_depth(motions.paths, obstacle))
+        record.motions = replace(motions, scores=scores)
+
+    def _planned(self, method: Method, learned: Learned, obstacle: Union, cancelled: Cancelled) -> _Motions:
+        planner = self._memo("planner", (method.name, learned), lambda: self._fitted(method, learned), newest=NEWEST)
+        if isinstance(planner, str):
+            return _Motions(note=planner)
+        try:
+            plan = planner.plan(obstacle, learned.task.starts, cancelled)
+        except UnreachableError as error:
+            return _Motions(note=str(error))
+        stays = sum(len(path) < 2 for path in plan.paths)
+        notes = (*plan.warnings, *([f"{NO_WAY} from {stays} of {len(plan.paths)} starts"] if stays else []))
+        paths = tuple(path if len(path) > 1 else np.repeat(path, 2, axis=0) for path in plan.paths)
+        scores = scored(paths, learned.task, learned.goal, obstacle)
+        return _Motions(paths, plan.times, plan.joints, scores, "; ".join(notes))
+
+    def _fitted(self, method: Method, learned: Learned) -> Planner | str:
+        """The planner of a method for a task, or why there is none."""
+        if method.missing:
+            return f"needs {', '.join(method.missing)}: {INSTALL}"
+        try:
+            return method.fit(self._problem(learned))
+        except (NotFittedError, UnreachableError) as error:
+            return str(error)
+
+    def _problem(self, learned: Learned) -> Problem:
+        return self._memo("problem", learned, lambda: problem_of(learned, self._follower), newest=NEWEST)
+
+    def _arm(self, motions: _Motions, learned: Learned, rollout: int) -> ArmMotion:
+        """The arm's motion along a rollout of a method."""
+        q, times = self._joints(motions, learned, rollout), motions.times[rollout]
+        if motions.joints is None:
+            times = times[_tracked(len(times))]
+        return ArmMotion(within_velocity_limits(times, q, self._follower.robot.velocity_limits), q, q)
+
+    def _joints(self, motions: _Motions, learned: Learned, rollout: int) -> Array:
+        """Postures (N, 6), rad, along a rollout: planned, or tracking it from the demonstration's first posture."""
+        if motions.joints is not None:
+            return motions.joints[rollout]
+        path = motions.paths[rollout]
+        start = self._problem(learned).postures[rollout][0]
+        return track(self._follower.robot, path[_tracked(len(path))], start).q
+
+    def _arm_depth(
+        self,
+        method: Method,
+        record: _Record,
+        frame: Frame,
+        learned: Learned,
+        solved: Solved | None,
+        cancelled: Cancelled,
+    ) -> float | None:
+        """How deep the arm's meshes enter the obstacle along a method's motions, metres; None where there are none."""
+        motions, obstacle = record.motions, frame.scenario.obstacle
+        if motions is None or not motions.paths:
+            return None
+        if method is not OURS:
+            return _deepest([self._joints(motions, learned, k) for k in range(len(motions.paths))], obstacle, cancelled)
+        if solved is None:
+            return None
+        try:
+            arms = [arm_along(frame, solved, k, self._follower)[0] for k in range(len(frame.rollouts))]
+        except UnreachableError:
+            return None
+        return _deepest([arm.q for arm in arms], obstacle, cancelled)
+
+
+def _deepest(joints: list[Array], obstacle: Union, cancelled: Cancelled) -> float:
+    """How deep the arm's meshes enter an obstacle along postures (N_i, 6), rad, metres; 0 when they are clear."""
+    model, depth = load_collision_model(), 0.0
+    for q in joints:
+        end_if(cancelled)
+        depth = max(depth, -model.nearest_to_obstacle(q, obstacle).distance)
+    return depth
+
+
+def scored(paths: tuple[Array, ...], task: Task, goal: Array, obstacle: Union) -> Scores:
+    """Score motions from a task's starts.
+
+    Args:
+        paths: (N_i, 3) of the end effector, metres, each of at least two samples.
+        task: whose demonstrations they are compared with.
+        goal: (3,) where they are to end, metres.
+        obstacle: what they are to keep clear of.
+    """
+    even = np.stack([resample_by_arc_length(path, NUM_SAMPLES) for path in paths])
+    demonstrated = np.stack([resample_by_arc_length(path, NUM_SAMPLES) for path in task.paths])
+    return Scores(
+        float(discrete_frechet(even, demonstrated).mean()),
+        hand_depth(paths, obstacle),
+        float(max(np.linalg.norm(path[-1] - goal) for path in paths)),
+    )
+
+
+def hand_depth(paths: tuple[Array, ...], obstacle: Union) -> float:
+    """Maximum collision distance of the end effector on paths (N_i, 3), metres; 0 when all are clear."""
+    if not obstacle.parts:
+        return 0.0
+    return max(maximum_collision_distance(path, obstacle.signed_distance, TOLERANCE) for path in paths) + 0.0
+
+
+def curves(path: Array, demonstration: Array, obstacle: Union) -> Array:
+    """The curves of figure 6 (`NUM_SAMPLES`, 2), metres: distance to the demonstration, and depth in the obstacle.
+
+    They are sampled at even distances along the path (N, 3), metres, of the end effector.
+    """
+    even = resample_by_arc_length(path, NUM_SAMPLES)
+    depth = np.maximum(-obstacle.signed_distance(even), 0.0) if obstacle.parts else np.zeros(len(even))
+    return np.column_stack([distance_from_path(even, demonstration), depth])
+
+
+def _tracked(num: int) -> Indices:
+    """Indices of the samples that the arm follows, of the `num` of a path."""
+    return np.unique(arm_samples(num))
+
+
+def _chosen(scenario: Scenario) -> list[Method]:
+    return [method for method in OTHERS if method.name in scenario.view.compared]
+
+
+def _ours(frame: Frame) -> _Motions:
+    """Our motions, those from the starts of the demonstrations that have one."""
+    if frame.blocked:
+        return _Motions(note="; ".join(warning.text for warning in frame.blocked[:1]))
+    paths = frame.rollouts[: len(frame.rollouts) - frame.num_added]
+    if len(paths) < len(frame.task.starts):
+        return _Motions(note=f"{NO_WAY} from some starts")
+    return _Motions(
+        paths, frame.times[: len(paths)], None, scored(paths, frame.task, frame.goal, frame.scenario.obstacle)
+    )

@@ -1,0 +1,377 @@
+"""One visitor: owns a scenario, edits it, and has it computed. Knows no browser."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Protocol
+
+from dt_viz.avoidance.passing import ANEW
+from dt_viz.errors import DataError, UnwantedError
+from dt_viz.learning.imitation import ImitationError
+from dt_viz.scenario.paper_scenes import SCENES
+from dt_viz.scenario.scenario import Scenario
+from dt_viz.scenario.stack import IMITATION, as_fresh
+from dt_viz.scenario.tasks import Task
+from dt_viz.session.engine import Engine
+from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.worker import LatestWorker
+
+logger = logging.getLogger(__name__)
+
+GESTURE_PAUSE = 1.0
+"""Time without an edit, seconds, after which the next edit of the same control is a step of its own for undo."""
+MAX_UNDO = 200
+LIVE_PAUSE, LIVE_LATENCIES = 0.05, 2.0
+"""Shortest time between two drawings of the field while edits come faster, in seconds and in latencies of the rollouts:
+these are drawn more often, the more so the longer they take."""
+HABITS = ("playing", "replay", "speed", "joint_plots", "health_plots")
+"""Fields of the view that are a visitor's way of working, and stay when a scene of the paper comes or goes."""
+REST = 0.1
+"""Time that a scenario must rest before it is refined, seconds: while a hand moves, edits come faster."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How rebuilding goes."""
+
+    latency: float
+    """Time from the last edit until its live frame was ready, seconds."""
+    rate: float
+    """Live frames in the last second."""
+    num_skipped: int
+    """Edits that a newer one overtook, since the session began."""
+
+
+_Job = tuple[Scenario, float]
+"""A scenario to compute, and when it was asked for, seconds."""
+
+
+def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
+    """The scenario, its view naming no level that is gone: another layer may get its name."""
+    level = scenario.view.level
+    if not level or level in (IMITATION, *(layer.name for layer in scenario.stack)):
+        return scenario
+    return replace(scenario, view=replace(scenario.view, level=""))
+
+
+def _is_step(after: Scenario, before: Scenario) -> bool:
+    """Whether the change from one to the other is a step for undo: what moves is, and where the slice lies."""
+    return not after.moves_like(before) or after.view.slice != before.view.slice
+
+
+class Display(Protocol):
+    """Receiver of a session's results: a page, or a measurement."""
+
+    def draw(self, frame: Frame, pace: Pace) -> None:
+        """Show a frame. Called on the worker thread, in the order of the edits."""
+
+    def adopt(self, scenario: Scenario) -> None:
+        """Show the scenario's choices on the controls, and what is to be visible."""
+
+    def learning(self, fraction: float, message: str) -> None:
+        """Show how far learning a task is, from 0 to 1."""
+
+    def fail(self, error: Exception) -> None:
+        """Show that the scenario could not be computed, and why."""
+
+    def cancelled(self, task: str) -> None:
+        """Show that learning this task was cancelled. What is adopted was shown before."""
+
+
+class Session:
+    """A scenario with its history, and the worker that computes its frames."""
+
+    def __init__(self, engine: Engine, initial: Callable[[str], Scenario], task: str, display: Display) -> None:
+        """Start with a task.
+
+        Args:
+            engine: used by this session only.
+            initial: the scenario that a task begins with. It may raise what `Engine.task` raises.
+            task: the first task's name.
+            display: where results go.
+        """
+        self._engine = engine
+        self._initial = initial
+        self._display = display
+        self._lock = threading.Lock()
+        self._adopting = threading.RLock()
+        self.scenario = initial(task)
+        self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
+        self._future: list[Scenario] = []
+        self._gesture: tuple[str, float] = ("", 0.0)
+        self._held = False
+        self._unadopted = False
+        """Whether the scenario was edited by a drag and is not shown on the controls yet."""
+        self._learning = self._stopped = self._closed = False
+        self._failed = False
+        """Whether the last computation ended by an error, so that what is shown is not all that the scenario asks for.
+        """
+        self._shown: Scenario | None = None
+        self._passing = ANEW
+        """How the motions that are shown pass the obstacles."""
+        self._latency = 0.0
+        self._live_frames: deque[float] = deque(maxlen=120)
+        self._worker = LatestWorker[_Job](self._compute, display.fail, name="session")
+        display.adopt(self.scenario)
+        self._submit()
+
+    @property
+    def task(self) -> Task:
+        """The scenario's task. Raises what `Engine.task` raises."""
+        return self._engine.task(self.scenario.task)
+
+    def edit(self, gesture: str, *, anew: bool = False, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
+        """Replace some values of the scenario and have it computed anew.
+
+        Args:
+            gesture: which control is being moved; edits by one control in quick succession are undone together.
+            anew: whether sides and stance are chosen anew, not kept from the motion that is shown.
+            **changes: fields of `Scenario`, without `passing`.
+        """
+        now = time.monotonic()
+        with self._lock:
+            edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
+            if edited == self.scenario and not self._failed:
+                return
+            if not edited.passes_like(self.scenario):
+                edited = replace(edited, passing=ANEW if anew else None)
+            if _is_step(edited, self.scenario):
+                name, when = self._gesture
+                # another control is moved, so whatever was held has been let go, even if nobody said so
+                self._held = self._held and name in {"", gesture}
+                if name != gesture or (now - when > GESTURE_PAUSE and not self._held):
+                    self._past.append(self.scenario)
+                self._gesture = (gesture, now)
+                self._future.clear()
+            needs_frames = self._failed or not edited.computes_like(self.scenario)
+            self.scenario = edited
+            if needs_frames:
+                self._submit()
+            # a drag sends edits faster than the controls can show them: they are shown with the next frame
+            self._unadopted = self._held and needs_frames
+        if not self._unadopted:
+            self._adopt()
+
+    def begin_gesture(self) -> None:
+        """The user took hold of something: edits until `end_gesture` are undone together, however slow."""
+        with self._lock:
+            self._gesture, self._held = ("", 0.0), True
+
+    def take_phase(self) -> None:
+        """Show augmented motions on the slice at the phase at which the arm is."""
+        self.edit("phase", view=replace(self.scenario.view, phase=round(self._engine.arm.left, 2)))
+        self.end_gesture()
+
+    def end_gesture(self) -> None:
+        """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
+        with self._lock:
+            if self._held and self._gesture[0] and self._past and not _is_step(self.scenario, self._past[-1]):
+                self._past.pop()
+            self._gesture, self._held = ("", 0.0), False
+        self._catch_up()
+
+    def choose_task(self, name: str) -> None:
+        """Begin another task, with what else was chosen.
+
+        Raises:
+            DemonstrationError: its demonstrations cannot be used; the session stays with its task.
+        """
+        if name != self.scenario.task:
+            fresh = self._initial(name)
+            if self.scenario.scene:  # of the paper: leaves nothing behind
+                self._begin("task", self._as_seen(fresh))
+                return
+            self.edit(
+                "task",
+                task=name,
+                arm_rollout=0,
+                starts=fresh.starts,
+                stack=as_fresh(self.scenario, fresh),
+                view=replace(self.scenario.view, slice=None),
+            )
+            self.end_gesture()
+
+    def reset(self) -> None:
+        """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
+        scene = SCENES.get(self.scenario.scene)
+        self._begin("reset", self._initial(self.scenario.task) if scene is None else scene.scenario(self.task))
+
+    def leave_scene(self) -> None:
+        """Back to how the task of the scene begins; can be undone. Nothing is done while there is no scene."""
+        if self.scenario.scene:
+            self._begin("scene", self._as_seen(self._initial(self.scenario.task)))
+
+    def load(self, task: str, scenario: Callable[[Task], Scenario]) -> None:
+        """Begin with a scenario for a task, seen as its scene wants it, or else as what is shown now; can be undone.
+
+        Raises:
+            DemonstrationError: the task's demonstrations cannot be used; the session stays with its own.
+        """
+        self._begin("load", self._as_seen(scenario(self._engine.task(task))))
+
+    def _begin(self, gesture: str, fresh: Scenario) -> None:
+        changes = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "passing"}
+        self.edit(gesture, anew=True, **changes)
+        self.end_gesture()
+
+    def _as_seen(self, other: Scenario) -> Scenario:
+        """Another scenario, looked at as this one, on the slice that it had.
+
+        If it is of a scene of the paper that this is not of, or the other way round, it is looked at as it was itself.
+        """
+        if other.scene != self.scenario.scene:
+            return self._with_habits(other)
+        view = replace(self.scenario.view, slice=other.view.slice)
+        return _with_a_level_of_its_own(replace(other, view=view))
+
+    def _with_habits(self, other: Scenario) -> Scenario:
+        """Another scenario, looked at as it was itself, but for what stays whatever is shown."""
+        kept = {name: getattr(self.scenario.view, name) for name in HABITS}
+        return _with_a_level_of_its_own(replace(other, view=replace(other.view, **kept)))
+
+    def undo(self) -> None:
+        """Take the last gesture back."""
+        self._travel(self._past, self._future)
+
+    def redo(self) -> None:
+        """Do again what was undone last."""
+        self._travel(self._future, self._past)
+
+    def cancel(self) -> None:
+        """Stop learning a task and go back to what was shown before. Nothing is done while nothing is learned."""
+        with self._lock:
+            abandoned = self.scenario
+            if not self._learning or (self._shown is not None and abandoned.learns_like(self._shown)):
+                return
+            self._stopped = not self._retreat(abandoned)
+        self._adopt()
+        self._display.cancelled(abandoned.task)
+
+    def wait_idle(self, timeout: float | None = None) -> bool:
+        """Wait until the newest scenario is computed to the end; False if that took longer than `timeout` seconds."""
+        return self._worker.wait_idle(timeout)
+
+    def close(self) -> None:
+        """Stop computing and let go of everything."""
+        self._closed = True
+        self._worker.close()
+
+    def _travel(self, source: Any, target: Any) -> None:  # noqa: ANN401 - both kinds of history
+        with self._lock:
+            if not source:
+                return
+            target.append(self.scenario)
+            self.scenario = self._as_seen(source.pop())
+            self._gesture = ("", 0.0)
+            self._submit()
+        self._adopt()
+
+    def _adopt(self) -> None:
+        """Show the newest scenario on the controls: one thread after the other, so that the newest is shown last."""
+        with self._adopting:
+            self._unadopted = False
+            self._display.adopt(self.scenario)
+
+    def _catch_up(self) -> None:
+        """Show what a drag has edited."""
+        if self._unadopted:
+            self._adopt()
+
+    def _retreat(self, abandoned: Scenario) -> bool:
+        """Go back from a scenario that has no picture to the one shown last, as if it had never been chosen.
+
+        Called with the lock held. False if there is none, or if `abandoned` is not what is wanted any more.
+        """
+        shown = self._shown
+        if shown is None or shown.learns_like(abandoned) or not self.scenario.learns_like(abandoned):
+            return False
+        while self._past and self._past[-1].learns_like(abandoned):
+            self._past.pop()  # edits of what was never seen
+        before = shown
+        for history in (self._past, self._future):
+            if history and history[-1].learns_like(shown):
+                before = history.pop()
+                break
+        self.scenario = self._as_seen(before)
+        self._gesture = ("", 0.0)
+        self._submit()
+        return True
+
+    def _submit(self) -> None:
+        self._stopped = False
+        self._engine.see(self.scenario)
+        self._worker.submit((self.scenario, time.perf_counter()))
+
+    def _compute(self, job: _Job, superseded: Callable[[], bool]) -> None:
+        self._failed = False
+        try:
+            self._show_frames(job, superseded)
+        except UnwantedError:
+            pass
+        except Exception as error:
+            with self._lock:
+                self._failed = True
+                returned = isinstance(error, DataError | ImitationError) and self._retreat(job[0])
+                if not returned and self.scenario != job[0] and not superseded():
+                    self._submit()  # it was edited meanwhile, and seemed to need no frames of its own
+            if returned:
+                self._adopt()
+            raise
+        finally:
+            self._learning = False
+
+    def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
+        """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
+        with self._lock:
+            if self._stopped or self._closed or not self.scenario.learns_like(scenario):
+                raise UnwantedError
+            self._learning = True
+        self._display.learning(fraction, message)
+
+    def _decided(self, scenario: Scenario) -> Scenario:
+        """The scenario with a passing: that of the motion that is shown, of the same fit, where none is decided yet."""
+        if scenario.passing is not None:
+            return scenario
+        alike = self._shown is not None and scenario.learned == self._shown.learned
+        passing = self._passing if alike else ANEW
+        with self._lock:
+            if self.scenario.passing is None and self.scenario.passes_like(scenario):
+                self.scenario = replace(self.scenario, passing=passing)
+        return replace(scenario, passing=passing)
+
+    def _show_frames(self, job: _Job, superseded: Callable[[], bool]) -> None:
+        scenario, edited = self._decided(job[0]), job[1]
+        self._catch_up()
+        for frame in self._engine.frames(scenario, partial(self._learn, scenario), superseded):
+            now = time.perf_counter()
+            if self._learning:
+                edited = now - frame.seconds  # learning is no rebuild
+            drawn = self._shown is not None and scenario.moves_like(self._shown)
+            self._learning, self._shown, self._passing = False, scenario, frame.passing
+            if frame.stage is Stage.ROLLOUTS and drawn:
+                continue  # it is only looked at in another way: the next stage is what changes
+            if frame.stage <= Stage.LIVE:
+                self._latency = now - edited
+            if frame.stage is Stage.LIVE:
+                self._live_frames.append(now)
+            rate = sum(now - t <= 1.0 for t in self._live_frames)
+            self._display.draw(frame, Pace(self._latency, rate, self._worker.num_skipped))
+            if frame.stage in (Stage.ROLLOUTS, Stage.FINE):
+                self._engine.drive(frame)
+            if frame.stage is Stage.LIVE:
+                self._worker.rest(REST)
+            elif frame.stage is Stage.ROLLOUTS:
+                last = self._live_frames[-1] if self._live_frames else -math.inf
+                pause = last + max(LIVE_PAUSE, LIVE_LATENCIES * self._latency) - now
+                if pause <= 0:
+                    continue  # the field is due, whatever is waiting
+                self._worker.rest(pause)
+            if superseded():
+                return

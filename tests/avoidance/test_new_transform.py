@@ -1,0 +1,70 @@
+"""A new kind of transform, as the README shows it: one file with a subclass like this one, one line in the registry."""
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from pages import Bound
+from scenes import avoiding, changed, frame_at
+from twirl import shown_in_the_readme
+
+from dt_viz.avoidance import registry
+from dt_viz.scenario.stack import anchored, listed, shifted, surroundings, switched, tunable, with_added
+from dt_viz.session.frame import Stage
+from dt_viz.ui.panel.transforms import add, add_transform_controls, addable
+
+
+@pytest.fixture(params=[("Twirl 1", "Avoidance"), ("Avoidance", "Twirl 1")], ids=" below ".join)
+def scenario(request, engine, initial, monkeypatch):
+    """The kind is looked up and added as the page does."""
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))  # the one line
+    plain = initial("lift_box")
+    twirl = next(kind for kind in registry.KINDS if kind.title == "Twirl").beside(
+        surroundings(engine.task("lift_box"), plain)
+    )
+    stack, name = with_added(plain, twirl)
+    scenario = replace(plain, stack=stack)
+    if request.param[1] == name:
+        scenario = replace(scenario, stack=shifted(scenario, name, 1))
+    assert listed(scenario) == request.param
+    return scenario
+
+
+def test_a_new_transform_needs_a_file_and_a_line(engine, scenario):
+    assert set(listed(scenario)) < set(tunable(scenario))
+    assert not anchored(scenario)  # it has no handles
+    frame = frame_at(engine, scenario, Stage.CERTIFIED)
+    for path, before in zip(frame.rollouts, frame.ghost, strict=True):
+        assert np.isfinite(path).all()
+        np.testing.assert_allclose(path[0], before[0], atol=1e-6)
+        np.testing.assert_allclose(path[-1], frame.goal, atol=1e-3)
+    assert dict(zip([layer.name for layer in scenario.stack], frame.durations, strict=True))["Twirl 1"] == 0.8
+    assert frame.certificates.min_det_jacobian > 0
+    assert frame.certificates.round_trip_error < 1e-6
+    assert frame.certificates.lyapunov_falls
+
+
+def test_it_turns_motions_as_it_says_and_not_when_it_is_off(engine, scenario):
+    alone = changed(scenario, avoids=False)
+    frame = frame_at(engine, alone, Stage.LIVE)
+    below, turned = frame.levels
+    moved = max(np.linalg.norm(a - b, axis=1).max() for a, b in zip(below, turned, strict=True))
+    assert 0.02 < moved < 0.2
+    off = replace(alone, stack=switched(alone, "Twirl 1"))
+    frame = frame_at(engine, off, Stage.LIVE)
+    for path, before in zip(frame.rollouts, frame.ghost, strict=True):
+        assert max(np.linalg.norm(before - point, axis=1).min() for point in path) < 1e-3
+
+
+def test_the_page_offers_it_and_has_its_controls(server, monkeypatch):
+    monkeypatch.setattr(registry, "KINDS", (*registry.KINDS, shown_in_the_readme()))
+    bound = Bound(avoiding("lift_box"))
+    session: Any = bound.edited
+    add_transform_controls(server.gui, bound, later=lambda work: work())
+    assert list(addable()) == ["Bias", "Twirl"]
+    add(session, addable()["Twirl"])
+    assert bound["Angle [rad]"].control.value == 0.8
+    bound.set("Angle [rad]", -0.5)
+    assert [layer.name for layer in session.scenario.stack] == ["Twirl 1", "Avoidance"]
+    assert cast(Any, session.scenario.stack[0].transform).angle == -0.5

@@ -1,0 +1,121 @@
+"""Kinematics and link shapes against pinocchio and yourdfpy."""
+
+# pyright: reportAttributeAccessIssue=false
+# (pinocchio has no stubs)
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin  # noqa: TID251, here it is the oracle
+import pytest
+import yourdfpy
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from pinocchio_arm import pinocchio_configuration, pinocchio_model, placed_vertices, random_configurations
+
+from dt_viz.robot.robot import (
+    END_EFFECTOR_FRAME,
+    NUM_JOINTS,
+    collision_meshes,
+    load_jaco,
+    package_folder,
+    urdf_path,
+)
+
+
+class TestModel:
+    def test_limits_are_those_of_the_urdf(self, robot):
+        np.testing.assert_array_equal(np.isinf(robot.lower), [True, False, False, True, False, True])
+        np.testing.assert_allclose(robot.lower[[1, 2, 4]], [0.820, 0.332, 0.524], atol=1e-3)
+        np.testing.assert_allclose(robot.upper[[1, 2, 4]], [5.463, 5.952, 5.760], atol=1e-3)
+        np.testing.assert_allclose(robot.velocity_limits, [0.628] * 3 + [0.838] * 3, atol=1e-3)
+
+    def test_home_is_a_ready_pose(self, robot):
+        _, origins = robot.forward_kinematics(robot.home)
+        assert ((robot.home > robot.lower) & (robot.home < robot.upper)).all()
+        assert origins[2, 2] == origins[:, 2].max()  # elbow up
+        assert robot.end_effector(robot.home)[1] < -0.3  # ahead of the base
+        assert robot.hand_direction(robot.home)[2] < 0.0
+
+    def test_arrays_cannot_be_changed(self, robot):
+        with pytest.raises(ValueError, match="read-only"):
+            robot.lower[1] = 0.0
+
+    def test_meshes_resolve_in_the_package_folder(self):
+        meshes = [mesh.get("filename", "") for mesh in ElementTree.parse(urdf_path()).iter("mesh")]
+        assert len(meshes) > 10
+        for mesh in meshes:
+            assert (package_folder() / mesh.removeprefix("package://")).is_file()
+
+    @pytest.mark.parametrize(
+        ("package", "words"),
+        [
+            ("no-such-robot-data", "pip install no-such-robot-data"),
+            ("numpy", r"numpy .* holds no .*kinova\.urdf"),
+        ],
+    )
+    def test_what_is_missing_is_named(self, monkeypatch, package, words):
+        monkeypatch.setattr("dt_viz.robot.robot.DISTRIBUTION", package)
+        with pytest.raises(FileNotFoundError, match=words):
+            urdf_path()
+
+
+class TestKinematics:
+    @given(q=arrays(np.float64, (NUM_JOINTS,), elements=st.floats(-2 * np.pi, 2 * np.pi)))
+    def test_places_and_their_derivatives_are_those_of_pinocchio(self, q):
+        robot, (model, data, *_) = load_jaco(), pinocchio_model()
+        hand, turned = model.getFrameId(END_EFFECTOR_FRAME), pinocchio_configuration(q)
+        expected = pin.computeFrameJacobian(model, data, turned, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        np.testing.assert_allclose(robot.jacobian(q), expected[:3], atol=1e-12)
+        pin.framesForwardKinematics(model, data, turned)
+        rotations, origins = robot.forward_kinematics(q)
+        for i in range(NUM_JOINTS):
+            np.testing.assert_allclose(rotations[i], data.oMi[i + 1].rotation, atol=1e-12)
+            np.testing.assert_allclose(origins[i], data.oMi[i + 1].translation, atol=1e-12)
+        np.testing.assert_allclose(robot.end_effector(q), data.oMf[hand].translation, atol=1e-12)
+
+    def test_batch_axes_lead(self, robot):
+        q = random_configurations(robot, 0, (2, 3))
+        rotations, origins = robot.forward_kinematics(q)
+        assert rotations.shape == (2, 3, 6, 3, 3)
+        for index in np.ndindex(2, 3):
+            for together, alone in zip((rotations, origins), robot.forward_kinematics(q[index]), strict=True):
+                np.testing.assert_allclose(together[index], alone, atol=1e-13)
+            for function in (robot.end_effector, robot.hand_direction, robot.jacobian, robot.joint_frames):
+                np.testing.assert_allclose(function(q)[index], function(q[index]), atol=1e-13)
+
+    def test_joint_frames_equal_the_viewers_scene_tree(self, robot):
+        urdf = yourdfpy.URDF.load(str(urdf_path()), load_meshes=False, build_scene_graph=True)
+        assert tuple(urdf.actuated_joint_names) == robot.joint_names
+        for q in random_configurations(robot, 1, (10,)):
+            urdf.update_cfg(q)
+            np.testing.assert_allclose(np.linalg.norm(robot.joint_frames(q), axis=-1), 1, rtol=0, atol=1e-12)
+            for name, wxyz in zip(robot.joint_names, robot.joint_frames(q), strict=True):
+                joint = urdf.joint_map[name]
+                expected = urdf.get_transform(joint.child, joint.parent)[:3, :3]
+                np.testing.assert_allclose(pin.Quaternion(*wxyz).matrix(), expected, atol=1e-9)
+
+
+class TestLinkMeshes:
+    def test_they_move_as_in_pinocchio(self, robot):
+        for q in random_configurations(robot, 2, (5,)):
+            rotations, origins = robot.forward_kinematics(q)
+            for mesh, expected in zip(collision_meshes(), placed_vertices(q), strict=True):
+                vertices = mesh.vertices
+                if mesh.joint >= 0:
+                    vertices = vertices @ rotations[mesh.joint].T + origins[mesh.joint]
+                np.testing.assert_allclose(vertices, expected, atol=1e-12)
+
+    def test_they_are_the_links_of_the_urdf(self):
+        root = ElementTree.parse(urdf_path()).getroot()
+        with_shape = {
+            link.get("name") for link in root.iter("link") if link.find("collision/geometry/mesh") is not None
+        }
+        assert {mesh.name for mesh in collision_meshes()} == with_shape
+        assert [mesh.joint for mesh in collision_meshes()] == [-1, 0, 1, 2, 3, 4, 5, 5, 5, 5, 5]
+
+    def test_faces_join_vertices_that_each_occur_once(self):
+        for mesh in collision_meshes():
+            assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
+            np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))

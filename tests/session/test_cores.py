@@ -1,0 +1,155 @@
+"""Slots: no more at once than there are, who follows a hand first, and nobody is left out."""
+
+import threading
+
+import pytest
+
+from dt_viz.errors import UnwantedError, never
+from dt_viz.session.cores import Cores
+
+PATIENCE = 30
+"""Seconds after which a test gives up; nothing takes that long."""
+
+
+class Crowd:
+    """Threads that want slots, and the order in which they get them; each keeps its own until it is let go."""
+
+    def __init__(self, num, num_hands=None):
+        self.cores, self.order, self.threads, self.let_go = Cores(num, num_hands or num), [], {}, {}
+        self._got = threading.Condition()
+
+    def come(self, name, cancelled=None):
+        """Returns when this one waits or has a slot. Those whose names are upper case refine."""
+        cancelled = never if name.isupper() and cancelled is None else cancelled
+        self.let_go[name] = threading.Event()
+
+        def want():
+            with self.cores.slot(cancelled):
+                with self._got:
+                    self.order.append(name)
+                    self._got.notify_all()
+                self.let_go[name].wait(PATIENCE)
+
+        def try_it():
+            try:
+                want()
+            except UnwantedError:
+                self.order.append(f"{name} left")
+
+        self.threads[name] = threading.Thread(target=try_it, daemon=True)
+        self.threads[name].start()
+        while not self.cores.queue and name not in self.order and self.threads[name].is_alive():
+            threading.Event().wait(0.001)
+        threading.Event().wait(0.05)  # it got the slot by now, if it gets one
+
+    def go(self, *names):
+        """Returns when they are gone and who comes next has had the time to come."""
+        for name in names:
+            self.let_go[name].set()
+            self.threads[name].join(PATIENCE)
+            assert not self.threads[name].is_alive()
+            threading.Event().wait(0.05)
+
+    def close(self):
+        for event in self.let_go.values():
+            event.set()
+        for thread in self.threads.values():
+            thread.join(PATIENCE)
+        assert not any(thread.is_alive() for thread in self.threads.values())
+
+
+@pytest.fixture(name="crowd")
+def _crowd(request):
+    crowd = Crowd(*getattr(request, "param", [2]))
+    yield crowd
+    crowd.close()
+
+
+@pytest.mark.parametrize("crowd", [[1]], indirect=True)
+def test_who_follows_a_hand_goes_first_and_else_who_came_first(crowd):
+    for name in "xAbCd":
+        crowd.come(name)
+    crowd.go("x", "b", "d", "A")
+    assert crowd.order == ["x", "b", "d", "A", "C"]
+
+
+@pytest.mark.parametrize("crowd", [[2], [3]], indirect=True)
+def test_refinements_leave_a_slot_to_who_follows_a_hand(crowd):
+    num = crowd.cores._free
+    for name in "ABC":
+        crowd.come(name)
+    assert crowd.order == list("ABC")[: num - 1]
+    crowd.come("d")
+    assert crowd.order[-1] == "d"  # it waits for no refinement
+    crowd.come("e")
+    assert crowd.order[-1] == "d"
+    crowd.go("A")
+    assert crowd.order[-1] == "e"  # though a refinement came before it
+
+
+@pytest.mark.parametrize("crowd", [[2]], indirect=True)
+def test_all_slots_serve_hands(crowd):
+    for name in "abc":
+        crowd.come(name)
+    assert crowd.order == ["a", "b"]
+
+
+@pytest.mark.parametrize("crowd", [[2, 1]], indirect=True)
+def test_a_refinement_begins_beside_a_hand_but_not_while_another_one_waits(crowd):
+    for name in "abC":
+        crowd.come(name)
+    assert crowd.order == ["a"]
+    crowd.go("a")
+    assert crowd.order == ["a", "b", "C"]
+    crowd.go("b")
+    crowd.come("d")
+    assert crowd.order[-1] == "d"  # beside the refinement
+
+
+@pytest.mark.parametrize("crowd", [[1], [2]], indirect=True)
+def test_a_refinement_that_is_cancelled_leaves_the_queue_and_takes_nobodys_slot(crowd):
+    unwanted = threading.Event()
+    crowd.come("A")
+    crowd.come("B", unwanted.is_set)
+    crowd.come("C")
+    unwanted.set()
+    crowd.threads["B"].join(PATIENCE)
+    assert crowd.order == ["A", "B left"] and len(crowd.cores.queue) == 1
+    crowd.go("A")
+    assert crowd.order == ["A", "B left", "C"]
+    crowd.come("D", unwanted.is_set)
+    assert crowd.order[-1] == "D left"  # nor does it begin
+
+
+def test_a_slot_ends_with_an_exception(crowd):
+    with pytest.raises(ZeroDivisionError), crowd.cores.slot(), crowd.cores.slot(never):
+        raise ZeroDivisionError
+    crowd.come("A")
+    crowd.come("b")
+    assert crowd.order == ["A", "b"]
+
+
+@pytest.mark.parametrize("num", [1, 2, 3])
+def test_in_a_storm_no_more_than_the_slots_are_taken_and_all_get_one(num):
+    free, free_to_refine = threading.Semaphore(num), threading.Semaphore(max(1, num - 1))
+    cores, crowded = Cores(num, num), []
+
+    def want(refines):
+        for _ in range(100):
+            with cores.slot(never if refines else None):
+                for semaphore in (free, *([free_to_refine] if refines else [])):
+                    if not semaphore.acquire(blocking=False):
+                        crowded.append(threading.current_thread().name)
+                        return
+                threading.Event().wait(0)
+                free.release()
+                if refines:
+                    free_to_refine.release()
+
+    threads = [threading.Thread(target=want, args=(k % 2 == 0,), daemon=True) for k in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+        assert not thread.is_alive()
+    assert crowded == []
