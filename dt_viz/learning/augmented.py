@@ -8,8 +8,8 @@ it started, and a label if there is one. The motion c(s; a) predicted for a is
 
 the mean demonstration, an offset that fades, and a Gaussian process over the starts. The shear along it
 (see `flows.augmented_systems`) is ψ; the base system runs s down on a clock that is predicted for a, too. Where
-demonstrations fall into groups of different shapes, each has a mean and a process of its own, and a start follows the group that
-begins nearest: for each a ψ is a diffeomorphism of (y, s), but from group to group it jumps with a.
+demonstrations fall into groups of different shapes, each has a mean and a process of its own, and a start follows the
+group that begins nearest: for each a ψ is a diffeomorphism of (y, s), but from group to group it jumps with a.
 """
 
 from __future__ import annotations
