@@ -15,8 +15,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dt_viz.avoidance.avoidance import ArmAvoidance
     from dt_viz.avoidance.bias import BiasPoint
-    from dt_viz.avoidance.hand import Avoidance
+    from dt_viz.avoidance.hand import Avoidance, HandAvoidance
     from dt_viz.avoidance.transform import Transform
     from dt_viz.errors import DataError, FormatError
     from dt_viz.flows.diffeomorphisms import Integration
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Arm",
+    "ArmAvoidance",
     "Avoidance",
     "BiasPoint",
     "BlockedError",
@@ -39,6 +41,7 @@ __all__ = [
     "DataError",
     "Demonstration",
     "FormatError",
+    "HandAvoidance",
     "HandController",
     "ImitationError",
     "Integration",
@@ -71,7 +74,8 @@ _MODULES = {
     ),
     "motion.certificates": ("Certificates",),
     "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
-    "avoidance.hand": ("Avoidance",),
+    "avoidance.avoidance": ("ArmAvoidance",),
+    "avoidance.hand": ("Avoidance", "HandAvoidance"),
     "avoidance.transform": ("Transform",),
     "avoidance.bias": ("BiasPoint",),
     "warning": ("MotionWarning",),

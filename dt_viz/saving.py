@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 
 from dt_viz.avoidance import registry
+from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import DataError, FormatError, check_between, parsing
 from dt_viz.files.checks import read_bytes
@@ -203,6 +204,12 @@ def _object(plain: Any, hint: Any, where: str, arrays: dict[str, np.ndarray]) ->
     name = held.pop(CLASS, None)
     if hint in CLASSES:
         kinds = {kind.__name__: kind for kind in CLASSES[hint]()}
+        if name == Avoidance.__name__:  # versions before 0.1 had one kind, with a field
+            space = held.pop("space", "task")
+            name = Avoidance.kinds[
+                _checked(space, space in list(SPACES), f"{where}.space", " or ".join(SPACES))
+            ].__name__
+            held = {name: held[name] for name in held if space == "task" or name != "plane"}
         hint = kinds[_checked(name, name in list(kinds), f"{where}.{CLASS}", " or ".join(kinds))]
     hints = {field.name: get_type_hints(hint)[field.name] for field in fields(hint)}
     for name in held:

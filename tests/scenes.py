@@ -13,7 +13,7 @@ from dt_viz.scenario.slices import SlicePose
 from dt_viz.scenario.stack import avoidance_layer, with_avoidance
 
 RANDOM_TASKS = ("draw_s", "lift_box", "push_box")
-OF_AVOIDANCE = {field.name for field in fields(Avoidance)}
+OF_AVOIDANCE = {field.name for field in fields(Avoidance)} | {"space"}
 
 
 def changing(scenario, *, avoids=None, layers=None, level=None, **changes):

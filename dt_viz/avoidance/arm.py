@@ -23,10 +23,10 @@ from dt_viz.avoidance.arm_field import (
     JointLimits,
     WholeArmField,
 )
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.detour import Detour, escape_directions, remembered, travel
 from dt_viz.avoidance.passing import ANEW, Passing
-from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
@@ -276,7 +276,7 @@ class WholeArm:
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
             passing: detours to keep while obstacles are dragged.
         """
-        parts = avoidance.obstacle.parts
+        parts = avoidance.avoided.parts
         known = remembered(passing.arm, parts)
         sides, pins = self._sides(lifted, avoidance, known), self._pins(lifted)
         best = None
@@ -317,7 +317,7 @@ class WholeArm:
             spacing: as in `avoiding`.
             passing: the detours of the motions where the obstacles were just before, and the duration of their flow.
         """
-        parts = avoidance.obstacle.parts
+        parts = avoidance.avoided.parts
         known = remembered(passing.arm, parts)
         failed = not passing.cleared and passing.duration >= MAX_DURATION
         detours: list[Detour | None] = []
@@ -404,7 +404,7 @@ class WholeArm:
         Obstacles that one posture comes near to are left in one direction where their own ones are opposed: else their
         flows would hold each other up, and motions turn back between them.
         """
-        q, parts, margin = lifted.tracked.q[: lifted.num_shaping], avoidance.obstacle.parts, avoidance.margin
+        q, parts, margin = lifted.tracked.q[: lifted.num_shaping], avoidance.avoided.parts, avoidance.margin
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
@@ -463,7 +463,7 @@ class _Solver:
         self._spacing = spacing
         self._coarse = coarse and generator is not None
         self._shortest, self._longest = between
-        self._room = arm.clearance(lifted.pins, avoidance.obstacle) - ROUNDING
+        self._room = arm.clearance(lifted.pins, avoidance.avoided) - ROUNDING
 
     def solution(self) -> ArmSolution:
         duration = self._avoidance.duration
@@ -517,7 +517,7 @@ class _Solver:
     def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float) -> ArmSolution:
         p = bundle.positions / LEVERS
         shaping, near = self._shaping(bundle), self._lack(p) > ROUNDING
-        clearance = float(self._arm.clearance(p[shaping], self._avoidance.obstacle).min())
+        clearance = float(self._arm.clearance(p[shaping], self._avoidance.avoided).min())
         q = self._lifted.at(bundle.index, bundle.fraction)
         stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
         away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
@@ -559,7 +559,7 @@ class _Solver:
     def _lack(self, p: Array) -> Array:
         """(N,) metres by which the spheres at configurations (N, 6) miss the clearance that is asked for."""
         margin = max(self._avoidance.margin - OVERSHOOT, 2 * ROUNDING)
-        return self._asked(p, margin, self._room) - self._arm.clearance(p, self._avoidance.obstacle)
+        return self._asked(p, margin, self._room) - self._arm.clearance(p, self._avoidance.avoided)
 
     def _mesh_lack(self, p: Array, beyond: float = 0.0) -> Array:
         """(N,) metres by which the meshes at configurations (N, 6) miss the clearance that is asked for, and less.
@@ -567,12 +567,12 @@ class _Solver:
         They are exact down to −`beyond`.
         """
         asked = self._asked(p, self._avoidance.margin, self._mesh_room)
-        return asked - self._arm.mesh_clearance(p, self._avoidance.obstacle, asked + beyond)
+        return asked - self._arm.mesh_clearance(p, self._avoidance.avoided, asked + beyond)
 
     @cached_property
     def _mesh_room(self) -> Array:
         pins, margin = self._lifted.pins, self._avoidance.margin
-        return self._arm.mesh_clearance(pins, self._avoidance.obstacle, np.full(len(pins), margin)) - ROUNDING
+        return self._arm.mesh_clearance(pins, self._avoidance.avoided, np.full(len(pins), margin)) - ROUNDING
 
     def _asked(self, p: Array, margin: float, room: Array) -> Array:
         """(N,) metres of clearance that are asked for at configurations (N, 6), with this room (K,) at the pins."""

@@ -3,49 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import Any
 
 import numpy as np
 
+from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
 from dt_viz.avoidance.detour import Detour, remembered
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
-from dt_viz.avoidance.transform import (
-    MOST_DURATION,
-    ArmAvoidance,
-    Aside,
-    Built,
-    Choice,
-    FlowIntegration,
-    MotionBelow,
-    Number,
-    Setting,
-    Transform,
-    axes_of,
-    start_warnings,
-)
-from dt_viz.errors import check_between
-from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
+from dt_viz.avoidance.transform import Aside, Built, MotionBelow, axes_of, start_warnings
+from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
 from dt_viz.flows.integrators import integrate_adaptive
-from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
 from dt_viz.warning import Kind, MotionWarning, in_millimetres
 
-Space = Literal["task", "cspace"]
-"""Space of the avoidance: that of the end effector (sec. 4.4), or configuration space (sec. 4.5)."""
-SPACES: tuple[Space, ...] = get_args(Space)
-GENERATOR_NAMES: Mapping[Generator, str] = {
-    "free-space": "Free space (−∇log(1−p))",
-    "probability": "Probability (∇p, the paper's)",
-}
-"""Names of the generators."""
-MIN_TEMPERATURE, MAX_TEMPERATURE = 1.0, 20.0
-MAX_MANUAL_DURATION = 2.0
-"""Longest flow time that can be chosen by hand."""
 MAX_DURATION = 2.5
 """Longest flow time that is tried: a motion that still collides runs through the flow's centre."""
 SNAPSHOT = 0.05
@@ -71,106 +46,28 @@ place: such a path arrives at up to 60° from the straight way out."""
 
 
 @dataclass(frozen=True, init=False)
-class Avoidance(Transform):
-    """Motions are led around obstacles: those of the end effector or those of the whole arm.
+class HandAvoidance(Avoidance, space="task"):
+    """The end effector avoids (sec. 4.4)."""
 
-    Raises:
-        FormatError: a number makes no sense, such as a negative margin.
-    """
-
-    obstacles: tuple[Obstacle, ...]
-    """Obstacles that are avoided together; there may be none."""
-    space: Space
-    """Who gives way: the end effector, or the whole arm."""
-    generator: Generator
-    temperature: float
-    """T of the occupancy potential; a higher one reaches farther and bends more gently."""
-    margin: float
-    """Clearance that the automatic flow time keeps, metres."""
-    duration: float | None
-    """t of the flow; None is the shortest that clears the obstacles by the margin."""
-    integration: Integration
-    """Integration of the flow."""
     plane: tuple[Point, Point] | None
     """Two orthonormal vectors: the flow acts along these only; None is in space."""
 
-    title: ClassVar[str] = "Avoidance"
-    hint: ClassVar[str] = "leads motions around the obstacles"
-    most: ClassVar[int] = 1
-    stays_outermost: ClassVar[bool] = True
-    yields_goal: ClassVar[bool] = True
-    settings: ClassVar[tuple[Setting, ...]] = (
-        Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
-        Number(
-            "temperature",
-            "Temperature",
-            "T",
-            MIN_TEMPERATURE,
-            MAX_TEMPERATURE,
-            0.5,
-            6.0,
-            hint="the higher, the more gently motions bend, and from farther away",
-        ),
-        Number(
-            "duration",
-            "Flow time",
-            "t",
-            0.0,
-            MAX_MANUAL_DURATION,
-            0.01,
-            0.5,
-            automatic=True,
-            of_flow=True,
-            hint="auto: the shortest flow that clears the obstacles by the margin",
-        ),
-        FlowIntegration(),
-    )
-
     def __init__(
         self,
-        obstacles: Obstacle | Iterable[Obstacle] = (),
+        obstacles: Obstacle | Iterable[Obstacle] | Union = (),
         *,
-        space: Space = "task",
-        generator: Generator = "free-space",
-        temperature: float = 6.0,
-        margin: float = 0.01,
-        duration: float | None = None,
-        integration: Integration = AUTO,
         plane: tuple[Point, Point] | None = None,
+        **others: Any,  # noqa: ANN401 - those of Avoidance
     ) -> None:
-        check_between("temperature", temperature, 0.1, 1000.0)
-        check_between("margin", margin, 0.0, 1.0)
-        if duration is not None:
-            check_between("duration", duration, 0.0, MOST_DURATION)
-        values = {
-            "obstacles": tuple(obstacles) if isinstance(obstacles, Iterable) else (obstacles,),
-            "space": space,
-            "generator": generator,
-            "temperature": temperature,
-            "margin": margin,
-            "duration": duration,
-            "integration": integration,
-            "plane": plane,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        """Take what `Avoidance` takes, and a plane."""
+        super().__init__(obstacles, **others)
+        object.__setattr__(self, "plane", plane)
 
     @property
     def acts(self) -> bool:
-        return self.space == "task" and bool(self.obstacles)
+        return bool(self.obstacles)
 
-    @property
-    def arm_avoidance(self) -> ArmAvoidance | None:
-        if self.space == "task":
-            return None
-        flow = self.generator, self.temperature, self.margin, self.duration, self.integration
-        return ArmAvoidance(self.avoided, *flow)
-
-    @property
-    def avoided(self) -> Union:
-        return Union(self.obstacles)
-
-    def in_plane(self, plane: tuple[Point, Point]) -> Avoidance:
+    def in_plane(self, plane: tuple[Point, Point]) -> HandAvoidance:
         return replace(self, plane=plane)
 
     def _field(self) -> VectorField:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.hand import HandAvoidance
 from dt_viz.avoidance.transform import Transform
 
 KINDS: tuple[type[Transform], ...] = (
-    Avoidance,
+    HandAvoidance,
+    ArmAvoidance,
     BiasPoint,
 )
 """All kinds of transforms. A new one is a line here."""

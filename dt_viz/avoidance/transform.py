@@ -16,7 +16,6 @@ import numpy as np
 from dt_viz.avoidance.detour import Detour
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Point
 from dt_viz.obstacles.union import Union
 from dt_viz.warning import Kind, MotionWarning
@@ -170,21 +169,6 @@ class Surroundings:
     """Places of other transforms, metres."""
 
 
-@dataclass(frozen=True)
-class ArmAvoidance:
-    """Avoidance by the whole arm in configuration space (sec. 4.5)."""
-
-    obstacle: Union
-    generator: Generator = "free-space"
-    temperature: float = 6.0
-    """T of the occupancy potential."""
-    margin: float = 0.01
-    """Clearance that the automatic flow time keeps, metres."""
-    duration: float | None = None
-    """t of the flow; None is the shortest that clears the obstacle by the margin."""
-    integration: Integration = AUTO
-
-
 @lru_cache(maxsize=64)
 def axes_of(plane: tuple[Point, Point] | None) -> Array:
     """Return orthonormal columns (3, 3), read only, those of a plane first, if there is one."""
@@ -229,11 +213,6 @@ class Transform(ABC):
     def acts(self) -> bool:
         """Whether it changes the end effector's motion; if not it is left out of the stack."""
         return True
-
-    @property
-    def arm_avoidance(self) -> ArmAvoidance | None:
-        """Avoidance by the whole arm that it asks for, if any."""
-        return None
 
     @property
     def avoided(self) -> Union:

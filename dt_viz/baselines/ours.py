@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array
@@ -71,9 +71,8 @@ class _WholeArmPlanner:
 
     def _moving(self, nominal: Nominal, obstacle: Union) -> dict[int, tuple[Array, Array]]:
         """Joints (N, 6), rad, and times (N,), s, of the rollouts that the arm finds a way for, by their number."""
-        avoidance = Avoidance(obstacle.parts, space="cspace")
-        assert avoidance.arm_avoidance is not None
-        admission = self.follower.admission(nominal, avoidance.arm_avoidance)
+        avoidance = ArmAvoidance(obstacle.parts)
+        admission = self.follower.admission(nominal, avoidance)
         if admission.blocked:
             return {}
         scenario = Scenario(nominal.task.name, (Layer(avoidance, name=avoidance.title),))

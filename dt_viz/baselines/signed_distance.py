@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.hand import HandAvoidance
 from dt_viz.avoidance.transform import axes_of
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.ours import from_starts
@@ -59,7 +59,7 @@ class SignedDistanceField:
 
 
 @dataclass(frozen=True, init=False)
-class SignedDistanceAvoidance(Avoidance):
+class SignedDistanceAvoidance(HandAvoidance):
     """Avoidance of the end effector whose generator is `SignedDistanceField`."""
 
     def _field(self) -> VectorField:

@@ -15,8 +15,8 @@ import numpy as np
 from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm
 from dt_viz.avoidance.arm import clearing as clearing_time
 from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, WholeArmField
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import escape_directions, turned
-from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import room_asked
@@ -78,9 +78,9 @@ def clearing(
         turn: largest angle by which a direction turns away from that before, rad.
         end: (6,) free posture beside which the clearance may be what it has itself; None is none.
     """
-    if avoidance is None or not avoidance.obstacle.parts:
+    if avoidance is None or not avoidance.avoided.parts:
         return Clearing()
-    q, parts = arm.limits.inside(q), avoidance.obstacle.parts
+    q, parts = arm.limits.inside(q), avoidance.avoided.parts
     known = before.directions if len(before.directions) == len(parts) else (None,) * len(parts)
     chain = arm.robot.chain(q.T)
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
@@ -130,7 +130,7 @@ def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) ->
     That is the margin, or beside a free posture `end` (6,) that has less itself, what it has.
     """
     pins = NO_PINS if end is None else end[None]
-    room = arm.clearance(pins, avoidance.obstacle) - ROUNDING
+    room = arm.clearance(pins, avoidance.avoided) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
     asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin - OVERSHOOT))
-    return asked - arm.clearance(p, avoidance.obstacle)
+    return asked - arm.clearance(p, avoidance.avoided)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dt_viz.avoidance.arm_field import LEVERS
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.control.courses import Course, resting, towards

@@ -45,7 +45,7 @@ class Dodge:
         moving = np.flatnonzero(speeds > settings.slow)
         if seen.avoidance is None or not len(moving):
             return None
-        shapes, values = records(tuple(seen.avoidance.obstacle.parts[k] for k in moving))
+        shapes, values = records(tuple(seen.avoidance.avoided.parts[k] for k in moving))
         times = np.linspace(0, settings.horizon, settings.num_ahead + 1)[1:]
         moved = np.stack([seen.motions[k].ahead(times + late, settings.returning) for k in moving], axis=1)
         deviation = settings.unsure + settings.doubt * times

@@ -86,9 +86,9 @@ class ObstacleLimit:
 
     def rows(self, q: Array, seen: Sighting, dt: float) -> tuple[Array, Array, float]:
         """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,), and the distance from the nearest obstacle."""
-        if seen.avoidance is None or not seen.avoidance.obstacle.parts:
+        if seen.avoidance is None or not seen.avoidance.avoided.parts:
             return np.empty((0, len(q))), np.empty(0), np.inf
-        shapes, values = records(seen.avoidance.obstacle.parts)
+        shapes, values = records(seen.avoidance.avoided.parts)
         robot, links = self.arm.robot, self.arm.links
         part, distance, slopes, outward = proximity(robot.records, links.records, shapes, values, q, self.reach)
         if not len(distance):

@@ -7,11 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Obstacle, as_point
-from dt_viz.obstacles.union import Union
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +79,15 @@ class Sighting:
             return self.avoidance
         moved = tuple(
             part.moved(as_point(np.asarray(part.position) + motion.ahead(np.array([seconds]), rate)[0]), part.wxyz)
-            for part, motion in zip(self.avoidance.obstacle.parts, self.motions, strict=True)
+            for part, motion in zip(self.avoidance.avoided.parts, self.motions, strict=True)
         )
-        return replace(self.avoidance, obstacle=Union(moved), margin=self.avoidance.margin + room * self.speed)
+        return replace(self.avoidance, obstacles=moved, margin=self.avoidance.margin + room * self.speed)
 
     def then(self, avoidance: ArmAvoidance | None, time: float, settings: ControllerSettings) -> Sighting:
         """What is seen at a later time: each obstacle goes on with the motion of the nearest one of its kind."""
-        parts = avoidance.obstacle.parts if avoidance is not None else ()
+        parts = avoidance.avoided.parts if avoidance is not None else ()
         passed, motions = time - self.time, []
-        known = [] if self.avoidance is None else list(zip(self.avoidance.obstacle.parts, self.motions, strict=True))
+        known = [] if self.avoidance is None else list(zip(self.avoidance.avoided.parts, self.motions, strict=True))
         for part in parts:
             alike = [(_between(old, part), k) for k, (old, _) in enumerate(known) if _alike(part, old)]
             motion = ObstacleMotion()

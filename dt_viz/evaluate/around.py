@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dt_viz.avoidance.hand import SPACES, Avoidance
+from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
     Row,

@@ -25,8 +25,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from dt_viz.avoidance.arm_field import REACH_PER_TEMPERATURE
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.hand import Avoidance
-from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.control.arm_system import ArmSystem, Section
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
@@ -193,7 +193,7 @@ class Bench:
         self.robot: Robot = engine.follower.robot
         self._task = engine.task(task)
         self._solve = lambda scenario: engine.solved(scenario, LIVE)
-        self.scenario = avoiding(self._task, Avoidance((), space="cspace", margin=margin))
+        self.scenario = avoiding(self._task, ArmAvoidance((), margin=margin))
         self.solved: Solved = self._solve(self.scenario)
         self.section = Section(self.robot, self.follower.reference(self.solved.nominal))
         self.goal = self.solved.nominal.goal
@@ -217,7 +217,7 @@ class Bench:
 
     def avoidance(self, obstacles: tuple[Obstacle, ...]) -> ArmAvoidance | None:
         """What the whole arm is to avoid."""
-        return avoiding(self._task, Avoidance(obstacles, space="cspace", margin=self.margin)).arm_avoidance
+        return ArmAvoidance(obstacles, margin=self.margin)
 
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""

@@ -29,7 +29,7 @@ def run(motion: dt.Motion, arm: dt.Arm, seconds: float = 12.0) -> tuple[np.ndarr
         place = BALL + PERIOD * command * VELOCITY
         if command % SEEN == 0:
             ball = dt.Sphere((place[0], place[1], place[2]), diameter=0.15)
-            controller.motion = motion.stack(dt.Avoidance(ball, space="cspace", margin=MARGIN))
+            controller.motion = motion.stack(dt.ArmAvoidance(ball, margin=MARGIN))
         joints.append(q)
         places.append(place)
         q = q + PERIOD * controller.step(q, PERIOD)  # a robot would be told the velocity, and tell where it is

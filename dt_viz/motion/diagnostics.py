@@ -50,10 +50,8 @@ def motion_warnings(solved: Solved, missed: float) -> tuple[MotionWarning, ...]:
     if arm is not None:
         warnings += _of_arm(solved)
     for applied in stack.built:
-        # where the arm gives way, how near the end effector comes is not the question
-        if arm is None or applied.transform.arm_avoidance is None:
-            top = _top(solved, applied, stack.bundle.index, stack.bundle.positions)
-            warnings += applied.transform.shortfall(top, applied.made, satisfied=applied.satisfied)
+        top = _top(solved, applied, stack.bundle.index, stack.bundle.positions)
+        warnings += applied.transform.shortfall(top, applied.made, satisfied=applied.satisfied)
     warnings += integration
     if missed > MAX_GOAL_MISS and not _moves_goal(nominal, stack):
         # what an integrator loses there and back it loses at the goal, too

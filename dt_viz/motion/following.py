@@ -9,9 +9,10 @@ from functools import lru_cache, partial
 import numpy as np
 
 from dt_viz.avoidance.arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.passing import Stance
 from dt_viz.avoidance.postures import Stances, stances
-from dt_viz.avoidance.transform import ArmAvoidance, start_warnings
+from dt_viz.avoidance.transform import start_warnings
 from dt_viz.flows.fields import Array, Indices, Mask
 from dt_viz.memo import Memo
 from dt_viz.metrics import arc_length
@@ -170,12 +171,12 @@ class Follower:
                 the usual one.
             keeps: whether it is kept while it leaves the goal and any start free.
         """
-        asked = avoidance.obstacle, avoidance.margin, stance, keeps
+        asked = avoidance.avoided, avoidance.margin, stance, keeps
         return self._memo("admission", (nominal, asked), lambda: self._admission(nominal, *asked), newest=2)
 
     def alternatives(self, nominal: Nominal, avoidance: ArmAvoidance) -> Iterator[Nominal]:
         """The same motions in other stances that have room at as many starts and at the goal, the best first."""
-        ranked = self._stances(nominal.learned, avoidance.obstacle, avoidance.margin, nominal.stance, keeps=False)
+        ranked = self._stances(nominal.learned, avoidance.avoided, avoidance.margin, nominal.stance, keeps=False)
         _, free = next(ranked)
         for stance, others in ranked:
             if not (others >= free).all():

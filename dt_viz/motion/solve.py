@@ -75,7 +75,7 @@ def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: 
     if avoidance is None or avoidance.duration is not None:
         return _solved(scenario, nominal, precision, follower)
     passing = scenario.passing or ANEW
-    if precision is LIVE and passing.follows(avoidance.obstacle.parts):
+    if precision is LIVE and passing.follows(avoidance.avoided.parts):
         return _solved(scenario, _as_many(nominal, passing), precision, follower, follows=True)
     solved = _with_a_way(scenario, nominal, follower)
     if precision is not LIVE:
@@ -118,7 +118,7 @@ def _unless_it_touches(solved: Solved, follower: Follower) -> Solved:
     avoidance = solved.scenario.arm_avoidance
     if solved.cleared or solved.arm is None or avoidance is None:
         return solved
-    if not follower.whole_arm.touches(solved.arm, solved.nominal.num_shaping, avoidance.obstacle):
+    if not follower.whole_arm.touches(solved.arm, solved.nominal.num_shaping, avoidance.avoided):
         return solved
     text = "the arm finds no way around the obstacle between starts and goal"
     return replace(solved, blocked=(MotionWarning(Kind.NO_WAY, text, ARM),))

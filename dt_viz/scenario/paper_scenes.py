@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.hand import Avoidance
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
@@ -119,7 +119,7 @@ def bottle() -> Solid:
 def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
     x, y, _ = task.mean_path[round(100 * BOTTLE_PLACES[task.name])]
-    return _avoiding(task, Avoidance(MeshObstacle((float(x), float(y), 0.0), bottle()), space="cspace"))
+    return _avoiding(task, ArmAvoidance(MeshObstacle((float(x), float(y), 0.0), bottle())))
 
 
 def _sphere_in_the_letter(task: Task) -> Scenario:
@@ -195,7 +195,7 @@ def release(pot: Pot) -> Point:
 
 def _beside_others(task: Task) -> Scenario:
     """Fig. 6."""
-    return _avoiding(task, Avoidance(Sphere(FIG_6_PLACES[task.name], FIG_6_DIAMETER), space="cspace"))
+    return _avoiding(task, ArmAvoidance(Sphere(FIG_6_PLACES[task.name], FIG_6_DIAMETER)))
 
 
 def _comparison(name: str, title: str, task: str) -> PaperScene:

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
-from dt_viz.avoidance.hand import Avoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance, Avoidance
+from dt_viz.avoidance.hand import HandAvoidance
 from dt_viz.avoidance.passing import Passing
-from dt_viz.avoidance.transform import ArmAvoidance, Transform
+from dt_viz.avoidance.transform import Transform
 from dt_viz.learning.imitation import Objective
 from dt_viz.learning.state import State
 from dt_viz.obstacles.shapes import Obstacle, Point
@@ -127,7 +128,7 @@ class Layer:
     """Name on the page, unique in the stack."""
 
 
-AVOIDING = (Layer(Avoidance(space="cspace"), name=Avoidance.title),)
+AVOIDING = (Layer(ArmAvoidance(), name=Avoidance.title),)
 """The stack that a scenario begins with: the whole arm avoids."""
 
 
@@ -175,7 +176,8 @@ class Scenario:
     @property
     def avoidance(self) -> Avoidance:
         """The transform that the page's obstacles belong to; one without obstacles if the stack has none."""
-        return next((layer.transform for layer in self.stack if isinstance(layer.transform, Avoidance)), Avoidance())
+        of_stack = (layer.transform for layer in self.stack if isinstance(layer.transform, Avoidance))
+        return next(of_stack, HandAvoidance())
 
     @cached_property
     def arm_avoidance(self) -> ArmAvoidance | None:
@@ -183,12 +185,10 @@ class Scenario:
 
         Where several layers ask for one, all their obstacles are avoided, with the settings of the outermost.
         """
-        asked = [layer.transform.arm_avoidance for layer in self.stack if layer.on]
-        avoidances = [avoidance for avoidance in asked if avoidance is not None]
-        if not avoidances:
-            return None
-        parts = [part for avoidance in avoidances for part in avoidance.obstacle.parts]
-        return replace(avoidances[-1], obstacle=Union(tuple(parts)))
+        asked = [layer.transform for layer in self.stack if layer.on and isinstance(layer.transform, ArmAvoidance)]
+        if len(asked) < 2:
+            return asked[0] if asked else None
+        return replace(asked[-1], obstacles=tuple(part for avoidance in asked for part in avoidance.obstacles))
 
     @property
     def avoids(self) -> bool:

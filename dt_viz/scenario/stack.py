@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.hand import Avoidance, Space
+from dt_viz.avoidance.avoidance import Avoidance, Space
 from dt_viz.avoidance.transform import Surroundings, Transform
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.obstacles.shapes import Point, as_point
@@ -46,9 +46,9 @@ def with_transform(scenario: Scenario, name: str, transform: Transform) -> Stack
 
 
 def with_avoidance(scenario: Scenario, **changes: Any) -> Stack:  # noqa: ANN401 - the fields of Avoidance
-    """Return the stack with fields of the page's avoidance replaced; it is added if there is none."""
+    """Return the stack with fields of the page's avoidance, or its space, replaced; it is added if there is none."""
     layer = avoidance_layer(scenario)
-    after = replace(scenario.avoidance, **changes)
+    after = scenario.avoidance.changed(**changes)
     if place_of(scenario, layer.name) is None:
         return (*scenario.stack, Layer(after, name=layer.name))
     return _changed(scenario, layer.name, transform=after)
@@ -124,7 +124,7 @@ def side_by_side(scenario: Scenario) -> tuple[Panel, ...]:
 
 def tunable(scenario: Scenario) -> tuple[str, ...]:
     """Names of all transforms, also of those that are off, from the outermost to the imitation."""
-    arm = (WHOLE_ARM,) if scenario.avoidance.arm_avoidance is not None and scenario.obstacles else ()
+    arm = (WHOLE_ARM,) if scenario.avoidance.space == "cspace" and scenario.obstacles else ()
     return (*arm, *reversed(listed(scenario)), IMITATION)
 
 

@@ -67,7 +67,7 @@ def _certified_arm(frame: Frame, fine: Solved, arm: ArmSolution, follower: Follo
     shown = DrawnSamples(arm.index, arm.fraction, times, robot.end_effector(q))
     known = certified(known, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
     shaping = arm.index < len(frame.rollouts) - fine.nominal.num_added
-    kept = float(whole_arm.clearance(p[shaping], avoidance.obstacle).min())
+    kept = float(whole_arm.clearance(p[shaping], avoidance.avoided).min())
     return known.warning(*clearance_warnings(known.clearance, kept))
 
 
@@ -82,5 +82,5 @@ def with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates
     if fine.arm is None or avoidance is None:
         return known
     shaping = range(len(frame.rollouts) - fine.nominal.num_added)
-    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == k], avoidance.obstacle) for k in shaping]
+    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == k], avoidance.avoided) for k in shaping]
     return known.warning(*margin_warnings(scenario, nearest, fine.nominal.numbers))

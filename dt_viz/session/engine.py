@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
+from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.augmented_systems import frozen
@@ -218,7 +219,7 @@ class Engine:
         if avoidance is None:
             return Admission(nominal)
         passing = scenario.passing
-        if passing is None or not passing.goes_on(avoidance.obstacle.parts):
+        if passing is None or not passing.goes_on(avoidance.avoided.parts):
             return self.follower.admission(nominal, avoidance)
         return self.follower.admission(nominal, avoidance, passing.stance, keeps=precision is LIVE)
 
@@ -383,7 +384,7 @@ def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
 
 
 def _avoids(transform: Transform) -> bool:
-    return transform.arm_avoidance is not None or bool(transform.avoided.parts)
+    return isinstance(transform, Avoidance) or bool(transform.avoided.parts)
 
 
 def _sketchbook(learned: Learned, rest: Array) -> Sketchbook:

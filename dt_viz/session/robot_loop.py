@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.flows.fields import Array
 from dt_viz.motion.following import Follower

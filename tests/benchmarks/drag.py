@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.avoidance.hand import Avoidance, Space
+from dt_viz.avoidance.avoidance import Avoidance, Space
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.evaluate.options import (
     Row,

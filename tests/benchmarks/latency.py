@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
+from dt_viz.avoidance.avoidance import SPACES, Avoidance
 from dt_viz.avoidance.bias import BiasPoint
-from dt_viz.avoidance.hand import SPACES, Avoidance
 from dt_viz.evaluate.options import (
     InputError,
     add_task,

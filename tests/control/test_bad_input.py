@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import changed
 
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.limits import ContactLimit
 from dt_viz.control.settings import ControllerSettings

@@ -7,11 +7,10 @@ import pytest
 
 from dt_viz.avoidance.arm import OVERSHOOT
 from dt_viz.avoidance.arm_field import LEVERS
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.flows.fields import Array
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.obstacles.union import Union
 
 MARGIN = 0.03
 RESTS = np.zeros((1, 3))
@@ -29,7 +28,7 @@ def _q(engine, initial):
 
 def around(arm, posture, offset=(0, 0, 0), diameter=0.15):
     place = arm.robot.end_effector(posture) + np.asarray(offset)
-    return ArmAvoidance(Union((Sphere(as_point(place), diameter),)), margin=MARGIN)
+    return ArmAvoidance((Sphere(as_point(place), diameter),), margin=MARGIN)
 
 
 def made(arm, q, avoidance, before=None, turn=0.0, velocities: Array = RESTS):
@@ -53,8 +52,8 @@ def way_out(found):
 def test_all_that_lies_ahead_is_cleared_and_the_end_stays(arm, q):
     avoidance = around(arm, q[50])
     found, p = made(arm, q, avoidance)
-    assert found.cleared and arm.clearance(q, avoidance.obstacle).min() < -0.05
-    assert arm.clearance(p, avoidance.obstacle).min() > MARGIN - OVERSHOOT - 1.5e-3
+    assert found.cleared and arm.clearance(q, avoidance.avoided).min() < -0.05
+    assert arm.clearance(p, avoidance.avoided).min() > MARGIN - OVERSHOOT - 1.5e-3
     np.testing.assert_allclose(p[-1], q[-1], atol=1e-9)
 
 
@@ -75,8 +74,8 @@ def test_nothing_near_or_nothing_to_avoid_changes_nothing(arm, q):
 def test_a_margin_wider_than_the_reach_of_the_temperature_is_kept(arm, q):
     avoidance = replace(around(arm, q[50], (0, -0.14, 0.1)), margin=0.1, temperature=0.5)
     found, p = made(arm, q, avoidance)
-    assert 0.02 < arm.clearance(q, avoidance.obstacle).min() < avoidance.margin - OVERSHOOT
-    assert found.cleared and arm.clearance(p, avoidance.obstacle).min() > 0.1 - OVERSHOOT - 2e-3
+    assert 0.02 < arm.clearance(q, avoidance.avoided).min() < avoidance.margin - OVERSHOOT
+    assert found.cleared and arm.clearance(p, avoidance.avoided).min() > 0.1 - OVERSHOOT - 2e-3
 
 
 def test_the_way_out_turns_no_further_than_it_may(arm, q):
@@ -103,7 +102,7 @@ def test_a_way_out_that_has_to_turn_round_turns_over_the_top(arm, q):
 
 def test_what_is_nearly_far_enough_away_stays(arm, q):
     """Nearer than the margin, but by no more than bodies stick out of the spheres that cover them."""
-    apart = arm.clearance(q, around(arm, q[50], (0, 0, 0.3)).obstacle).min()
+    apart = arm.clearance(q, around(arm, q[50], (0, 0, 0.3)).avoided).min()
     avoidance = replace(around(arm, q[50], (0, 0, 0.3)), margin=apart + 0.5 * OVERSHOOT, temperature=0.5)
     found, p = made(arm, q, avoidance)
     assert found.field is not None and found.cleared and found.duration == 0
@@ -132,7 +131,7 @@ def test_a_free_end_with_less_room_than_the_margin_stays(arm, q):
     gap = 0.02
     direction = np.array([0.0, -0.6, 0.8])
     places = np.linspace(0.05, 0.3, 500)
-    free = [arm.clearance(q[-1:], around(arm, q[-1], d * direction).obstacle)[0] for d in places]
+    free = [arm.clearance(q[-1:], around(arm, q[-1], d * direction).avoided)[0] for d in places]
     avoidance = around(arm, q[-1], places[int(np.argmin(np.abs(np.array(free) - gap)))] * direction)
     _, p = made(arm, q[[-1, -1]], avoidance)
     np.testing.assert_allclose(p[-1], q[-1], atol=1e-9)

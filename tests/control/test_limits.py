@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
 from dt_viz.control.obstacle_motion import ObstacleMotion, Sighting
 from dt_viz.obstacles.shapes import Box, Cylinder, Sphere, as_point
@@ -29,7 +29,7 @@ def _barrier(arm):
 
 def distances(arm: WholeArm, q, seen, moved=0.0):
     """Distances h of the moving links' spheres from the parts, for all pairs, after the parts have moved for a time."""
-    points, parts = arm.links.positions(arm.robot, q), seen.avoidance.obstacle.parts
+    points, parts = arm.links.positions(arm.robot, q), seen.avoidance.avoided.parts
     moving = zip(parts, moved * seen.velocities, strict=True)
     return np.concatenate([part.signed_distance(points - shift) - arm.links.radius for part, shift in moving]) + (
         OVERSHOOT - min(KEPT, seen.avoidance.margin / 2)
@@ -74,7 +74,7 @@ def test_less_is_kept_where_less_is_asked_for_and_nothing_without_obstacles(arm,
     assert nearest == as_near
     np.testing.assert_array_equal(slopes, same)
     np.testing.assert_allclose(bounds - lower, GAIN * KEPT, atol=1e-12)
-    for nothing in (None, ArmAvoidance(Union(()))):
+    for nothing in (None, ArmAvoidance(())):
         slopes, bounds, nearest = barrier.rows(q, replace(seen, avoidance=nothing, motions=()), TICK)
         assert slopes.shape == (0, 6) and not len(bounds) and nearest == np.inf
 

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.obstacle_motion import NOTHING_SEEN, ObstacleMotion, Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
-from dt_viz.obstacles.union import Union
 
 VELOCITY = np.array([0.1, -0.05, 0.02])
 PERIOD = 0.03
@@ -18,7 +17,7 @@ RATE = SETTINGS.returning
 def seen(places, period=PERIOD):
     sighting = NOTHING_SEEN
     for k, place in enumerate(places):
-        avoidance = ArmAvoidance(Union((Sphere(as_point(place), 0.1),)), margin=0.02)
+        avoidance = ArmAvoidance((Sphere(as_point(place), 0.1),), margin=0.02)
         sighting = sighting.then(avoidance, k * period, SETTINGS)
     return sighting
 
@@ -37,7 +36,7 @@ def test_the_obstacle_is_expected_ahead_with_more_room():
     places = moving()
     expected = seen(places).expected(0.2, 0.1, RATE)
     assert expected is not None
-    np.testing.assert_allclose(expected.obstacle.parts[0].position, places[-1] + 0.2 * VELOCITY)
+    np.testing.assert_allclose(expected.avoided.parts[0].position, places[-1] + 0.2 * VELOCITY)
     assert expected.margin == pytest.approx(0.02 + 0.1 * np.linalg.norm(VELOCITY))
 
 
@@ -67,9 +66,9 @@ def test_a_bend_is_followed_better_than_straight_on():
 def test_obstacles_keep_their_motion_while_others_come_and_go():
     sighting = seen(moving())
     assert sighting.avoidance is not None
-    (known,) = sighting.avoidance.obstacle.parts
+    (known,) = sighting.avoidance.avoided.parts
     another = Sphere(as_point(np.asarray(known.position) + 0.3), 0.1)
-    both = sighting.then(ArmAvoidance(Union((another, known))), sighting.time + PERIOD / 10, SETTINGS)
+    both = sighting.then(ArmAvoidance((another, known)), sighting.time + PERIOD / 10, SETTINGS)
     assert not both.velocities[0].any() and both.motions[1].age > sighting.motions[0].age
     alone = both.then(sighting.avoidance, both.time, SETTINGS)
     assert alone.motions[0] is both.motions[1]
@@ -78,7 +77,12 @@ def test_obstacles_keep_their_motion_while_others_come_and_go():
 def test_what_is_put_elsewhere_or_replaced_is_not_moving():
     last = moving()[-1]
     assert seen([*moving(), last + 0.5]).speed == 0
-    other = ArmAvoidance(Union((Box(as_point(last), (0.1, 0.1, 0.1)),)))
+    other = ArmAvoidance(
+        Box(
+            as_point(last),
+            (0.1, 0.1, 0.1),
+        )
+    )
     assert seen(moving()).then(other, 20 * PERIOD, SETTINGS).speed == 0
     assert seen(moving()).then(None, 20 * PERIOD, SETTINGS).expected(1, 1, RATE) is None
 

@@ -8,7 +8,7 @@ import trimesh
 from laws.registry import OBSTACLES, PLACE, SIMILAR, TILTED
 from oracles import central_differences
 
-from dt_viz.avoidance.hand import clearing_duration
+from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.obstacles.shapes import MAX_BALLS, SHAPES, UPRIGHT, Box, CloudObstacle, MeshObstacle, Obstacle, rotation
 from dt_viz.obstacles.union import Union
@@ -158,7 +158,8 @@ def test_every_point_inside_leaves_along_the_reverse_flow(obstacle, temperature)
 def test_a_motion_through_it_is_cleared(obstacle):
     along = np.array([0.6, 0.64, 0.48])
     path = np.asarray(obstacle.position) + np.array([1e-3, 2e-3, 1e-3]) + np.linspace(-0.4, 0.4, 401)[:, None] * along
-    duration = clearing_duration(obstacle.field("free-space", 3.0), obstacle, path, 0.01)
+    field = obstacle.field("free-space", 3.0)
+    duration = clearing_duration(field, path, lambda s: 0.01 - obstacle.signed_distance(s), 0.05, 2.5)
     assert duration is not None and 0 < duration < 2.5
 
 

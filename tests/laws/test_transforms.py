@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from laws.registry import TRANSFORMS
 
+from dt_viz.avoidance.avoidance import ArmAvoidance  # its flow is one of joints: see tests/avoidance/test_arm.py
 from dt_viz.avoidance.registry import KINDS
 from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Flow, Integration, min_det_jacobian, round_trip_error
@@ -36,7 +37,7 @@ def motion(positions=None, **changes) -> MotionBelow:
 
 
 def test_every_kind_of_transform_has_an_example():
-    assert set(KINDS) == {type(transform) for transform in TRANSFORMS.values()}
+    assert set(KINDS) - {ArmAvoidance} == {type(transform) for transform in TRANSFORMS.values()}
 
 
 @pytest.fixture(params=TRANSFORMS, name="transform")

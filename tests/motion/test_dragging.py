@@ -9,15 +9,14 @@ import pytest
 from scenes import changed, frame_at
 
 from dt_viz.avoidance.arm import DURATION_CHANGE
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import STAYING, TURNING, escape_directions
 from dt_viz.avoidance.passing import ANEW
-from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import solve
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Sphere, as_point
-from dt_viz.obstacles.union import Union
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
 
@@ -189,7 +188,7 @@ def beside_goal(nominal, distance):
 
 def test_a_stance_is_kept_while_it_leaves_as_many_starts_free(engine, robot, initial):
     nominal, follower = engine.nominal(initial("push_box")), Follower(robot)
-    near, farther = (ArmAvoidance(Union((beside_goal(nominal, distance),))) for distance in (0.11, 0.19))
+    near, farther = (ArmAvoidance((beside_goal(nominal, distance),)) for distance in (0.11, 0.19))
     stance = follower.admission(nominal, near).nominal.stance
     assert stance is not None and follower.admission(nominal, farther).nominal.stance is None
     assert follower.admission(nominal, farther, stance).nominal.stance == stance

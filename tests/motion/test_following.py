@@ -7,7 +7,7 @@ import pytest
 from scenes import changed, frame_at, kinds, starts_at
 
 from dt_viz.avoidance.arm import LONG, NUM_CONFIGURATIONS
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.arm_system import Section
 from dt_viz.errors import UnwantedError
 from dt_viz.motion.following import MAX_TRACKING_ERROR, NUM_ARM_SAMPLES, Follower
@@ -126,11 +126,11 @@ class TestStance:
         nominal = engine.nominal(initial(request.param))
         mean = np.mean(nominal.paths, axis=0)
         place = mean[np.argmin(np.abs(np.linalg.norm(mean - nominal.goal, axis=1) - 0.11))]
-        return nominal, ArmAvoidance(Union((around(place),)))
+        return nominal, ArmAvoidance((around(place),))
 
     def truth(self, q, avoidance):
         """Distance of the meshes from the obstacle at each posture."""
-        (part,) = avoidance.obstacle.parts
+        (part,) = avoidance.avoided.parts
         return load_collision_model().obstacle_distance(q, part)[0]
 
     def test_the_arm_rests_elsewhere_with_the_hand_where_it_was_and_can_be_taken_there(self, follower, beside, robot):
@@ -155,7 +155,7 @@ class TestStance:
 
     def test_the_motion_ends_at_the_goal_around_the_obstacle(self, engine, beside, robot):
         nominal, avoidance = beside
-        scenario = changed(Scenario(nominal.task.name), obstacles=avoidance.obstacle.parts, space="cspace")
+        scenario = changed(Scenario(nominal.task.name), obstacles=avoidance.avoided.parts, space="cspace")
         solved = engine.solved(scenario, FINE)
         assert solved.cleared and solved.nominal.stance is not None
         rows = np.r_[np.diff(solved.arm.index) > 0, True]

@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from dt_viz.avoidance.hand import Space
+from dt_viz.avoidance.avoidance import Space
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with
 from dt_viz.ui.panel.bindings import Bindings

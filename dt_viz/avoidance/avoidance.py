@@ -1,0 +1,149 @@
+"""Avoidance of obstacles: what that of the hand (sec. 4.4) and that of the whole arm (sec. 4.5) have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar, Literal, TypeVar, get_args
+
+from dt_viz.avoidance.transform import (
+    MOST_DURATION,
+    Built,
+    Choice,
+    FlowIntegration,
+    MotionBelow,
+    Number,
+    Setting,
+    Transform,
+)
+from dt_viz.errors import FormatError, check_between
+from dt_viz.flows.diffeomorphisms import AUTO, Identity, Integration
+from dt_viz.obstacles.occupancy import Generator
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.union import Union
+
+Space = Literal["task", "cspace"]
+"""Space of the avoidance: that of the end effector, or configuration space."""
+SPACES: tuple[Space, ...] = get_args(Space)
+GENERATOR_NAMES: Mapping[Generator, str] = {
+    "free-space": "Free space (−∇log(1−p))",
+    "probability": "Probability (∇p, the paper's)",
+}
+"""Names of the generators."""
+_Kind = TypeVar("_Kind", bound="Avoidance")
+
+
+@dataclass(frozen=True, init=False)
+class Avoidance(Transform):
+    """Motions are led around obstacles, by a flow on the gradient of their occupancy.
+
+    It is the base of `HandAvoidance` and `ArmAvoidance`. Called itself it makes one of them: the one of a `space`,
+    "task" (that of the hand) or "cspace".
+
+    Raises:
+        FormatError: a number makes no sense, such as a negative margin.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    """Obstacles that are avoided together; there may be none."""
+    generator: Generator
+    temperature: float
+    """T of the occupancy potential; a higher one reaches farther and bends more gently."""
+    margin: float
+    """Clearance that the automatic flow time keeps, metres."""
+    duration: float | None
+    """t of the flow; None is the shortest that clears the obstacles by the margin."""
+    integration: Integration
+    """Integration of the flow."""
+
+    title: ClassVar[str] = "Avoidance"
+    hint: ClassVar[str] = "leads motions around the obstacles"
+    most: ClassVar[int] = 1
+    stays_outermost: ClassVar[bool] = True
+    yields_goal: ClassVar[bool] = True
+    settings: ClassVar[tuple[Setting, ...]] = (
+        Choice("generator", "Generator", GENERATOR_NAMES, "the vector field whose flow avoids"),
+        Number(
+            "temperature",
+            "Temperature",
+            "T",
+            low=1.0,
+            high=20.0,
+            step=0.5,
+            initial=6.0,
+            hint="the higher, the more gently motions bend, and from farther away",
+        ),
+        Number(
+            "duration",
+            "Flow time",
+            "t",
+            low=0.0,
+            high=2.0,
+            step=0.01,
+            initial=0.5,
+            automatic=True,
+            of_flow=True,
+            hint="auto: the shortest flow that clears the obstacles by the margin",
+        ),
+        FlowIntegration(),
+    )
+    kinds: ClassVar[dict[Space, type[Avoidance]]] = {}
+    """The kinds, by the space in which they act."""
+    space: ClassVar[Space]
+
+    def __init_subclass__(cls, space: Space | None = None) -> None:
+        if space is not None:
+            cls.space = space
+            Avoidance.kinds[space] = cls
+
+    def __new__(cls: type[_Kind], *_: object, space: Space = "task", **__: Any) -> _Kind:  # noqa: ANN401 - any fields
+        if space not in SPACES:
+            raise FormatError("space", repr(space)[:40], " or ".join(map(repr, SPACES)))
+        kind: Any = cls.kinds[space] if cls is Avoidance else cls
+        return object.__new__(kind)
+
+    def __init__(
+        self,
+        obstacles: Obstacle | Iterable[Obstacle] | Union = (),
+        *,
+        generator: Generator = "free-space",
+        temperature: float = 6.0,
+        margin: float = 0.01,
+        duration: float | None = None,
+        integration: Integration = AUTO,
+        space: Space = "task",
+    ) -> None:
+        check_between("temperature", temperature, 0.1, 1000.0)
+        check_between("margin", margin, 0.0, 1.0)
+        if duration is not None:
+            check_between("duration", duration, 0.0, MOST_DURATION)
+        several = obstacles.parts if isinstance(obstacles, Union) else obstacles
+        own = {"obstacles": tuple(several) if isinstance(several, Iterable) else (several,)}
+        numbers = {"temperature": temperature, "margin": margin, "duration": duration}
+        for name, value in (own | numbers | {"generator": generator, "integration": integration}).items():
+            object.__setattr__(self, name, value)
+
+    def changed(self, space: Space | None = None, **changes: Any) -> Avoidance:  # noqa: ANN401 - any fields
+        """Return the avoidance with fields replaced, of the kind that acts in a space; None keeps its kind."""
+        if space is None or space == self.space:
+            return replace(self, **changes)
+        kept = {field.name: getattr(self, field.name) for field in fields(Avoidance)}
+        return Avoidance.kinds[space](**(kept | changes))
+
+    @cached_property
+    def avoided(self) -> Union:
+        """The obstacles as one."""
+        return Union(self.obstacles)
+
+    @property
+    def acts(self) -> bool:
+        return False
+
+    def build(self, motion: MotionBelow) -> Built:
+        """Leave places where they are."""
+        return Built(Identity(3), 0.0, motion.goal)
+
+
+class ArmAvoidance(Avoidance, space="cspace"):
+    """The whole arm avoids, in configuration space (sec. 4.5), see `dt_viz.avoidance.arm`."""
