@@ -328,7 +328,7 @@ class WholeArm:
                 detours.append(_on_side(part, found[0], last))
             else:
                 side = found[1] if failed and last.is_there and len(found) > 1 else found[0]
-                detours.append(_on_side(part, side, last).turned_from(last, found))
+                detours.append(_on_side(part, side, last).turned_from(last, found, avoidance.detour.turning))
         if not any(detours):
             return self.undisturbed(lifted, avoidance, spacing)
         moved = max(travel(last.obstacle, part) for last, part in zip(known, parts, strict=True) if last is not None)
@@ -423,6 +423,7 @@ class WholeArm:
                 Union(tuple(parts[k] for k in which)),
                 margin,
                 num=NUM_WAYS,
+                settings=avoidance.detour,
                 previous=next((last.side for last in (known[k] for k in which) if last is not None), None),
             )
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
+from dt_viz.avoidance.detour import DETOUR, DetourSettings
 from dt_viz.avoidance.transform import (
     MOST_DURATION,
     Built,
@@ -56,6 +57,8 @@ class Avoidance(Transform):
     """t of the flow; None is the shortest that clears the obstacles by the margin."""
     integration: Integration
     """Integration of the flow."""
+    detour: DetourSettings
+    """Choice of the side on which motions pass."""
 
     title: ClassVar[str] = "Avoidance"
     hint: ClassVar[str] = "leads motions around the obstacles"
@@ -112,23 +115,26 @@ class Avoidance(Transform):
         margin: float = 0.01,
         duration: float | None = None,
         integration: Integration = AUTO,
+        detour: DetourSettings = DETOUR,
         space: Space = "task",
+        plane: object = None,
     ) -> None:
         check_between("temperature", temperature, 0.1, 1000.0)
         check_between("margin", margin, 0.0, 1.0)
         if duration is not None:
             check_between("duration", duration, 0.0, MOST_DURATION)
         several = obstacles.parts if isinstance(obstacles, Union) else obstacles
-        own = {"obstacles": tuple(several) if isinstance(several, Iterable) else (several,)}
-        numbers = {"temperature": temperature, "margin": margin, "duration": duration}
-        for name, value in (own | numbers | {"generator": generator, "integration": integration}).items():
+        own: dict[str, object] = {"obstacles": tuple(several) if isinstance(several, Iterable) else (several,)}
+        own |= {"temperature": temperature, "margin": margin, "duration": duration}
+        own |= {"generator": generator, "integration": integration, "detour": detour}
+        for name, value in own.items():
             object.__setattr__(self, name, value)
 
     def changed(self, space: Space | None = None, **changes: Any) -> Avoidance:  # noqa: ANN401 - any fields
         """Return the avoidance with fields replaced, of the kind that acts in a space; None keeps its kind."""
         if space is None or space == self.space:
             return replace(self, **changes)
-        kept = {field.name: getattr(self, field.name) for field in fields(Avoidance)}
+        kept = {field.name: getattr(self, field.name) for field in fields(Avoidance) if field.name != "detour"}
         return Avoidance.kinds[space](**(kept | changes))
 
     @cached_property

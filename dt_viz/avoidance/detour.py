@@ -8,37 +8,59 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.detours import detours, distinct
 from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 from dt_viz.obstacles.union import Union
 
-NUM_DIRECTIONS = 128
-"""Number of directions that are compared."""
-COMING, STRIDE = 1.5, 0.04
-"""Time (s) for which a moving obstacle is in the way also of where it will be, and spacing (m) of these places."""
-FARTHEST = 0.16
-"""Largest distance of these places from where it is, metres."""
-TABLE_WEIGHT = 3.0
-"""Cost of each metre by which an escape leads below the table, against a metre of detour."""
-ON_THE_WAY = 0.10
-"""Length of an escape, metres, beyond which nothing new is in its way: the arm also turns as it moves."""
-ALIKE = math.cos(math.radians(40.0))
-"""Cosine of the largest angle between two directions of one escape."""
-SELECTIVITY = 0.03
-"""Relative difference in cost over which a direction's share in its escape falls by a factor e, for smooth drags."""
-STAYING = 1.5
-"""Cost of the previous escape, relative to the least one, up to which it is kept."""
-TURNING = 5.0
-"""Angle, rad, by which a detour turns while its obstacle moves by its radius."""
 NEARBY = 0.1
 """Distance that an obstacle may move from one motion to the next for its detour to be kept, metres."""
 OPPOSITE = -0.7
 """Cosine of the angle between two directions beyond which the one turns to the other through a third."""
+
+
+@dataclass(frozen=True)
+class DetourSettings:
+    """Choice of the way out of an obstacle.
+
+    Raises:
+        FormatError: a number is not positive, or there are too many directions.
+    """
+
+    along: float = 2.0
+    """Relative extra cost of a direction along the motion against one across it, which bends the path less."""
+    below_table: float = 3.0
+    """Cost of each metre by which an escape leads below the table, against a metre of detour."""
+    staying: float = 1.5
+    """Cost of the previous escape, relative to the least one, up to which it is kept."""
+    turning: float = 5.0
+    """Angle, rad, by which a detour turns while its obstacle moves by its radius."""
+    on_the_way: float = 0.10
+    """Length of an escape, metres, beyond which nothing new is in its way: the arm also turns as it moves."""
+    seconds_ahead: float = 1.5
+    """Time for which a moving obstacle is in the way also of where it will be, s."""
+    metres_ahead: float = 0.16
+    """Largest distance of these places from where it is, metres."""
+    stride: float = 0.04
+    """Spacing of these places, metres."""
+    num_directions: int = 128
+    """Number of directions that are compared."""
+    alike: float = 40.0
+    """Largest angle between two directions of one escape, degrees."""
+    selectivity: float = 0.03
+    """Relative difference in cost over which a direction's share in its escape falls by e, for smooth drags."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            check_between(f"detour.{field.name}", getattr(self, field.name), 1e-6, 1e4)
+
+
+DETOUR = DetourSettings()
 
 
 def escape_directions(
@@ -52,7 +74,7 @@ def escape_directions(
     velocity: Array | None = None,
     previous: Array | None = None,
     plane: Array | None = None,
-    along: float = 2.0,
+    settings: DetourSettings = DETOUR,
 ) -> list[Array]:
     """Find directions in which a body can escape, the one with the least detour first.
 
@@ -69,38 +91,39 @@ def escape_directions(
         velocity: (3,) the obstacle's, m/s; None where it rests. Directions along it are costly: the obstacle
             would follow the body.
         previous: (3,) escape that was chosen just before. What is nearest to it comes first, or second where it costs
-            more than `STAYING` times the least.
+            more than `settings.staying` times the least.
         plane: (3, 2) orthonormal columns of the plane that escapes lie in; None is space.
-        along: relative extra cost of a direction along the motion against one across it, which bends the path less.
+        settings: costs of directions, and how the previous one is kept.
 
     Returns:
         Unit vectors (3,), one for each distinct escape; all of them where there is a previous one.
     """
-    directions = _around(plane)
+    directions = _around(plane, settings.num_directions)
     centres, radii = obstacle.cover()
     if velocity is not None and (speed := float(np.linalg.norm(velocity))) > 0:
-        ahead = np.arange(0, min(COMING * speed, FARTHEST), STRIDE)
+        ahead = np.arange(0, min(settings.seconds_ahead * speed, settings.metres_ahead), settings.stride)
         centres = (centres + ahead[:, None, None] * velocity / speed).reshape(-1, 3)
         radii = np.tile(radii, len(ahead))
-    detour, below = detours(directions, np.ascontiguousarray(points), radius, centres, radii, float(margin), ON_THE_WAY)
+    points, length = np.ascontiguousarray(points), float(settings.on_the_way)
+    detour, below = detours(directions, points, radius, centres, radii, float(margin), length)
     parallel = np.abs(directions @ tangents.T).mean(axis=1)
-    cost = detour * (1 + along * parallel) + TABLE_WEIGHT * below
+    cost = detour * (1 + settings.along * parallel) + settings.below_table * below
 
     most = num if previous is None else len(directions)
-    means, costs = distinct(directions, cost, ALIKE, SELECTIVITY, most)
+    means, costs = distinct(directions, cost, math.cos(math.radians(settings.alike)), float(settings.selectivity), most)
     found = list(means)
     if previous is not None:
         kept = int(np.argmax(means @ previous))
         if kept:
-            found.insert(0 if costs[kept] < STAYING * costs[0] else 1, found.pop(kept))
+            found.insert(0 if costs[kept] < settings.staying * costs[0] else 1, found.pop(kept))
     return found
 
 
-def _around(plane: Array | None) -> Array:
-    """Unit vectors (`NUM_DIRECTIONS`, 3) all around, in space or in a plane."""
+def _around(plane: Array | None, num: int) -> Array:
+    """Unit vectors (num, 3) all around, in space or in a plane."""
     if plane is None:
-        return golden_spiral(NUM_DIRECTIONS, 0.5)
-    turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
+        return golden_spiral(num, 0.5)
+    turn = np.linspace(0, 2 * np.pi, num, endpoint=False)
     return np.stack([np.cos(turn), np.sin(turn)], axis=1) @ plane.T
 
 
@@ -128,14 +151,15 @@ class Detour:
         """(3,) that motion's displacement, metres."""
         return self.length * self.direction
 
-    def turned_from(self, previous: Detour, escapes: Sequence[Array]) -> Detour:
+    def turned_from(self, previous: Detour, escapes: Sequence[Array], turning: float) -> Detour:
         """The detour on its way here from the previous one, by an angle for each metre that the obstacle has moved.
 
         Args:
             previous: the detour around the same obstacle where it was just before.
             escapes: (3,) unit vectors, the best one first; see `turned`.
+            turning: angle, rad, while the obstacle moves by its radius.
         """
-        angle = TURNING * travel(previous.obstacle, self.obstacle) / self.obstacle.radius
+        angle = turning * travel(previous.obstacle, self.obstacle) / self.obstacle.radius
         direction = turned(previous.direction, self.side, angle, escapes)
         return self if direction is self.side else replace(self, direction=direction)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
-from dt_viz.avoidance.detour import Detour, remembered
+from dt_viz.avoidance.detour import Detour, DetourSettings, remembered
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.transform import Aside, Built, MotionBelow, axes_of, start_warnings
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Chain, Diffeomorphism
@@ -57,10 +57,11 @@ class HandAvoidance(Avoidance, space="task"):
         obstacles: Obstacle | Iterable[Obstacle] | Union = (),
         *,
         plane: tuple[Point, Point] | None = None,
+        detour: DetourSettings = DetourSettings(along=1.0),  # noqa: B008 - it is frozen
         **others: Any,  # noqa: ANN401 - those of Avoidance
     ) -> None:
-        """Take what `Avoidance` takes, and a plane."""
-        super().__init__(obstacles, **others)
+        """Take what `Avoidance` takes, and a plane; a side along the motions costs the hand less than the arm."""
+        super().__init__(obstacles, detour=detour, **others)
         object.__setattr__(self, "plane", plane)
 
     @property
@@ -167,7 +168,7 @@ class HandAvoidance(Avoidance, space="task"):
             met = Encounter.of(seen, self._avoidable(seen), obstacle, margin, self.obstacles[:k], plane)
             if met is None:
                 continue
-            detours[k] = detour = met.detour(previous, gradually=motion.gradual)
+            detours[k] = detour = met.detour(previous, self.detour, gradually=motion.gradual)
             flow = met.flow(detour.direction, motion.tolerance)
             flow = self.integration.of(replace(flow, duration=min(flow.duration, left)))
             left -= flow.duration

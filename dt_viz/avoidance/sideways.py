@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dt_viz.avoidance.clearing import escape_lengths
-from dt_viz.avoidance.detour import Detour, escape_directions
+from dt_viz.avoidance.detour import Detour, DetourSettings, escape_directions
 from dt_viz.avoidance.transform import Aside, MotionBelow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, PointField
@@ -28,8 +28,6 @@ from dt_viz.obstacles.union import Union
 
 MAX_SAMPLES = 96
 """Largest number of samples that sides are compared by."""
-ALONG = 1.0
-"""Relative extra cost of a side along the motions against one across them."""
 BREADTH = 0.7
 """Smallest half size of A⁻¹, relative to the longest way to the side; else it is the obstacle's plus the margin."""
 GAIN = 2.0
@@ -126,7 +124,7 @@ class Encounter:
         ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
-    def detour(self, previous: Detour | None, *, gradually: bool) -> Detour:
+    def detour(self, previous: Detour | None, settings: DetourSettings, *, gradually: bool) -> Detour:
         """Choose the way out, on the side with the least detour, or the previous one while that costs little more.
 
         Where turning there gradually would move the motions farther than going there at once, it is there at once: what
@@ -134,6 +132,7 @@ class Encounter:
 
         Args:
             previous: the detour around the obstacle where it was just before; None where there was none.
+            settings: how it is chosen.
             gradually: whether it turns there as the obstacle moves on; else it is there at once.
         """
         found = escape_directions(
@@ -145,12 +144,12 @@ class Encounter:
             num=1,
             previous=None if previous is None else previous.side,
             plane=self.plane,
-            along=ALONG,
+            settings=settings,
         )
         there = self._measured(Detour(self.obstacle, found[0], found[0], kept=previous is not None))
         if previous is None or not gradually:
             return there
-        both = there, self._measured(there.turned_from(previous, found))
+        both = there, self._measured(there.turned_from(previous, found, settings.turning))
         return min(both, key=lambda detour: float(np.linalg.norm(detour.offset - previous.offset)))
 
     def _measured(self, detour: Detour) -> Detour:

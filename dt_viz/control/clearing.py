@@ -86,7 +86,7 @@ def clearing(
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
     tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     directions = tuple(
-        _direction(arm, points, tangents, part, velocity, avoidance.margin, way, turn)
+        _direction(arm, points, tangents, part, velocity, avoidance, way, turn)
         for part, velocity, way in zip(parts, velocities, known, strict=True)
     )
     met = [(part, way) for part, way in zip(parts, directions, strict=True) if way is not None]
@@ -105,21 +105,29 @@ def _direction(
     tangents: Array,
     part: Obstacle,
     velocity: Array,
-    margin: float,
+    avoidance: ArmAvoidance,
     before: Array | None,
     turn: float,
 ) -> Array | None:
     """Choose the escape direction (3,) from one obstacle; that before where no body point (P, 3, N) is too near it."""
     distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.body.radius[:, None]
     clearance = distance.min(axis=0)
-    near = np.flatnonzero(clearance < margin)
+    near = np.flatnonzero(clearance < avoidance.margin)
     if not len(near):
         return before
     bent = np.flatnonzero(clearance < BESIDE)
     num = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
     compared = points[:, :, near[:: max(1, len(near) // num)]]
     escapes = escape_directions(
-        compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity, previous=before
+        compared,
+        arm.body.radius,
+        tangents[bent],
+        part,
+        avoidance.margin,
+        num=1,
+        velocity=velocity,
+        previous=before,
+        settings=avoidance.detour,
     )
     return escapes[0] if before is None else turned(before, escapes[0], turn, escapes)
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.avoidance.detour import ALIKE, ON_THE_WAY, escape_directions
+from dt_viz.avoidance.detour import DETOUR, escape_directions
 from dt_viz.obstacles.shapes import Sphere
 
 NOWHERE = np.zeros((1, 3))  # tangents that make no direction dearer than another
@@ -28,7 +28,7 @@ def detour(points, radius, obstacle, direction):
     offset = (points - np.array(obstacle.position)[:, None]).transpose(0, 2, 1)
     moved = offset[..., None, :] + SHIFTS[:, None] * direction
     inside = np.linalg.norm(moved, axis=-1) < (obstacle.radius + radius)[:, None, None]
-    inside &= inside[..., SHIFTS < ON_THE_WAY].any(axis=-1, keepdims=True)
+    inside &= inside[..., DETOUR.on_the_way > SHIFTS].any(axis=-1, keepdims=True)
     return SHIFTS[np.flatnonzero(inside.any(axis=(0, 1)))[-1]]
 
 
@@ -48,7 +48,7 @@ def test_directions_are_unit_vectors_no_two_alike_the_least_detour_first(seed):
     assert 2 <= len(found) <= 4
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=0, atol=1e-12)
     between = angle(found, found.T)[np.triu_indices(len(found), k=1)]
-    assert between.min() > np.degrees(np.arccos(ALIKE)) / 2  # each is a mean of what is alike
+    assert between.min() > DETOUR.alike / 2  # each is a mean of what is alike
     detours = [detour(points, radius, obstacle, n) for n in found[:3]]
     assert (np.diff(detours) > -0.05 * detours[0] - 2e-3).all()
     assert detours[0] < 1.03 * min(detour(points, radius, obstacle, n) for n in some_directions()) + 2e-3

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dt_viz.avoidance.detour import NEARBY, TURNING, Detour, remembered
+from dt_viz.avoidance.detour import NEARBY, Detour, remembered
+from dt_viz.avoidance.hand import HandAvoidance
 from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.transform import MotionBelow
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow
@@ -17,6 +18,8 @@ from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
 
 seeds = st.integers(0, 2**32 - 1)
 X, Y, Z = np.eye(3)
+HAND = HandAvoidance().detour
+TURNING = HAND.turning
 RADIUS, HEIGHT = 0.08, 2.0  # far above the table
 
 
@@ -49,7 +52,7 @@ def motion_past(*offsets, end=0.4):
 def test_a_way_turns_by_an_angle_for_each_metre_and_arrives(seed, travel):
     start, side, *across = some_directions(seed, 5)
     before = Detour(ball(), start, start)
-    way = Detour(ball(travel, 0.0, 0.0), side, side, kept=True).turned_from(before, across)
+    way = Detour(ball(travel, 0.0, 0.0), side, side, kept=True).turned_from(before, across, TURNING)
     assert np.linalg.norm(way.direction) == pytest.approx(1, abs=1e-12)
     assert angle(way.direction, start) <= TURNING * travel / RADIUS + 1e-6
     assert way.kept and way.side is side
@@ -57,7 +60,7 @@ def test_a_way_turns_by_an_angle_for_each_metre_and_arrives(seed, travel):
         if way.direction is side:
             break
         farther = ball(way.obstacle.position[0] + 0.005, 0.0, 0.0)
-        turned = Detour(farther, side, side).turned_from(way, across)
+        turned = Detour(farther, side, side).turned_from(way, across, TURNING)
         assert angle(turned.direction, way.direction) <= TURNING * 0.005 / RADIUS + 1e-6
         way = turned
     assert way.direction is side
@@ -65,7 +68,7 @@ def test_a_way_turns_by_an_angle_for_each_metre_and_arrives(seed, travel):
 
 def test_a_way_turns_to_the_opposite_over_what_is_across():
     before, way = Detour(ball(), Z, Z), Detour(ball(0.0, 0.0, 0.005), -Z, -Z)
-    turned = way.turned_from(before, [Z, Y])
+    turned = way.turned_from(before, [Z, Y], TURNING)
     assert turned.direction @ Y == pytest.approx(np.sin(TURNING * 0.005 / RADIUS))
 
 
@@ -108,11 +111,11 @@ def blocks(seed):
 
 
 def test_without_a_way_before_it_is_the_nearest_one_across_the_motions_and_in_their_plane():
-    way = passes_of(motion_past(0.02 * Z, 0.01 * Z)).detour(None, gradually=True)
+    way = passes_of(motion_past(0.02 * Z, 0.01 * Z)).detour(None, HAND, gradually=True)
     assert not way.kept
     assert way.direction @ Z > 0.9 and abs(way.direction @ X) < 0.1
     in_plane = passes_of(motion_past(0.001 * Z), plane=np.stack([X, Y], axis=1))
-    assert abs(in_plane.detour(None, gradually=False).direction @ Y) > 0.99
+    assert abs(in_plane.detour(None, HAND, gradually=False).direction @ Y) > 0.99
 
 
 @pytest.mark.parametrize("corner", [False, True])
@@ -123,7 +126,7 @@ def test_a_single_sample_is_led_out_however_far_out_it_is(corner):
     counts[np.abs(motion.positions[:, 0] - (0.045 if corner else 0.0)).argmin()] = True
     passes = Encounter.of(motion, counts, cube, 0.01)
     assert passes is not None
-    assert np.linalg.norm(passes.detour(None, gradually=False).direction) == pytest.approx(1)
+    assert np.linalg.norm(passes.detour(None, HAND, gradually=False).direction) == pytest.approx(1)
 
 
 def test_what_does_not_count_or_is_clear_does_not_pass():
@@ -141,7 +144,7 @@ def test_all_motions_are_carried_clear_on_one_side(seed):
     least = (0.009, -1e-3, 0.006)  # beside a box's corners, samples lack
     for obstacle, clearance in zip(blocks(seed), least, strict=True):
         passes = passes_of(motion, obstacle)
-        direction = passes.detour(None, gradually=False).direction
+        direction = passes.detour(None, HAND, gradually=False).direction
         flow = passes.flow(direction, 1e-9)
         moved = flow.inverse(motion.positions)
         assert obstacle.signed_distance(moved).min() > clearance
@@ -157,7 +160,7 @@ def test_no_motion_is_turned_sharply_however_near_to_the_middle_it_passes(seed):
     s = np.linspace(-0.4, 0.4, 801)
     for obstacle in blocks(seed):
         passes = passes_of(motion, obstacle)
-        flow = passes.flow(passes.detour(None, gradually=False).direction, 1e-9)
+        flow = passes.flow(passes.detour(None, HAND, gradually=False).direction, 1e-9)
         assert sharpest_turn(flow.inverse(np.outer(s, X) + motion.starts[0] * [0, 1, 1]), 0.015) < 25
 
 
@@ -173,9 +176,9 @@ def test_starts_and_goal_stay_where_they_are(seed):
 def test_the_way_out_does_not_end_in_an_obstacle_that_is_passed_already():
     beside = ball(0.0, 0.0, 0.1)
     motion = motion_past(0.02 * Z)
-    assert passes_of(motion).detour(None, gradually=False).direction @ Z > 0.9
+    assert passes_of(motion).detour(None, HAND, gradually=False).direction @ Z > 0.9
     passes = passes_of(motion, others=(beside,))
-    direction = passes.detour(None, gradually=False).direction
+    direction = passes.detour(None, HAND, gradually=False).direction
     assert direction @ Z < 0.5
     assert beside.signed_distance(passes.flow(Z, 1e-9).inverse(motion.positions)).min() > 0.007
 
@@ -187,7 +190,7 @@ def test_motions_keep_their_side_until_another_costs_much_less_then_turn_togethe
         obstacle = ball(0.0, 0.0, 0.001 * k)  # moved as a drag moves it; the motions are told relative to it
         passes = passes_of(motion_past((height + 0.002) * Z, (height - 0.002) * Z))
         moved = replace(passes, obstacle=obstacle, points=passes.points + 0.001 * k * Z)
-        way = moved.detour(way, gradually=True)
+        way = moved.detour(way, HAND, gradually=True)
         directions.append(way.direction)
         durations.append(passes.flow(way.direction, 1e-9).duration)
     beyond = np.array([direction @ Z for direction in directions])
@@ -201,7 +204,7 @@ def test_a_turn_that_would_lead_far_around_is_made_at_once():
     """What has come near on the other side makes the way before a long one."""
     before = Detour(ball(), Y, Y, kept=True, length=0.001)
     passes = passes_of(motion_past((RADIUS + 0.009) * Y, -(RADIUS + 0.009) * Y), ball(0.001, 0.0, 0.0))
-    way = passes.detour(before, gradually=True)
+    way = passes.detour(before, HAND, gradually=True)
     assert abs(way.direction @ Z) > 0.8 and way.length < 0.03
 
 
@@ -217,5 +220,5 @@ def test_a_side_is_held_where_what_is_stacked_on_it_moves_the_ends():
 
 
 def test_at_rest_the_way_is_on_its_side_at_once():
-    way = passes_of(motion_past(-0.03 * Z)).detour(Detour(ball(), Z, Z, kept=True), gradually=False)
+    way = passes_of(motion_past(-0.03 * Z)).detour(Detour(ball(), Z, Z, kept=True), HAND, gradually=False)
     assert way.direction @ Z < -0.97

@@ -10,7 +10,7 @@ from scenes import changed, frame_at
 
 from dt_viz.avoidance.arm import DURATION_CHANGE
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.detour import STAYING, TURNING, escape_directions
+from dt_viz.avoidance.detour import DETOUR, escape_directions
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.following import Follower
@@ -174,7 +174,7 @@ def test_the_escape_before_comes_first_unless_it_costs_much_more():
         found = escape_directions(points, radius, tangents, ball, previous=np.array([0.0, 0.0, -1.0]))
         assert usual[0][2] > 0.9
         nearest = min(found, key=lambda direction: direction[2])
-        cheap = (0.1 + depth) < STAYING * (0.1 - depth)
+        cheap = (0.1 + depth) < DETOUR.staying * (0.1 - depth)
         assert cheap == (depth < 0.01)
         assert nearest is found[0 if cheap else 1] and found[1 if cheap else 0][2] == pytest.approx(usual[0][2])
 
@@ -238,7 +238,7 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
             assert abs(arm.duration - before.duration) <= 1.001e-3 * DURATION_CHANGE
             for way, last in zip(arm.detours, before.detours, strict=True):
                 if way is not None and last is not None:
-                    assert way.direction @ last.direction > np.cos(1.1 * TURNING * 1e-3 / ball.radius)
+                    assert way.direction @ last.direction > np.cos(1.1 * DETOUR.turning * 1e-3 / ball.radius)
         before, stance = arm, engine.solved(scenario, LIVE).nominal.stance
 
 
