@@ -12,7 +12,7 @@ import dt_viz
 
 PACKAGE = Path(dt_viz.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-FOUNDATION = {"errors", "folders", "memo", "metrics", "shipped", "warning"}
+FOUNDATION = {"errors", "folders", "memo", "metrics", "numerics", "shipped", "warning"}
 """Modules of no package, which import each other only."""
 BELOW_SCENARIO = {"foundation", "flows", "files", "learning", "obstacles", "robot", "avoidance"}
 BELOW_SESSION = BELOW_SCENARIO | {"scenario", "motion", "control", "pictures"}

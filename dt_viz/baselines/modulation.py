@@ -23,6 +23,7 @@ from dt_viz.errors import Cancelled, never
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 
@@ -71,8 +72,7 @@ def modulated(obstacle: Union, y: Array, v: Array) -> tuple[Array, Array]:
     velocities, gammas, distances = [], [], []
     for part in obstacle.parts:
         distance, n = distance_and_normal(Union((part,)), y)
-        r = y - np.array(part.position)
-        r = r / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), np.finfo(float).tiny)
+        r = unit(y - np.array(part.position))
         towards = np.einsum("nd,nd->n", n, v)
         along_r = towards / np.maximum(np.einsum("nd,nd->n", n, r), LEAST_SLANT)
         tangential = v - along_r[:, None] * r  # n·(v − a·r) = 0

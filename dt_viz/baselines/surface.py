@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.flows.fields import Array
+from dt_viz.numerics import unit
 from dt_viz.obstacles.union import Union
 
 STEP = 1e-20
@@ -19,5 +20,4 @@ def distance_and_normal(obstacle: Union, y: Array) -> tuple[Array, Array]:
     places: Array = y + 1j * STEP * np.eye(3)[:, None]  # pyright: ignore[reportAssignmentType]
     ahead = obstacle.signed_distance(places)  # (3, N)
     slope = ahead.imag.T / STEP
-    length = np.linalg.norm(slope, axis=1, keepdims=True)
-    return ahead[0].real, np.divide(slope, length, out=np.zeros_like(slope), where=length > 0)
+    return ahead[0].real, unit(slope)

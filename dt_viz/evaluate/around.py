@@ -53,6 +53,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import refined
 from dt_viz.metrics import maximum_collision_distance, sharpest_turn
 from dt_viz.motion.stack import FINE, Solution
+from dt_viz.numerics import unit
 from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -259,8 +260,7 @@ def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, 
     drawn = []
     for nth in range(0 if options.obstacle else options.number):
         rng = np.random.default_rng(options.seed + SEEDS * nth)
-        direction = rng.normal(size=(count, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        direction = unit(rng.normal(size=(count, 3)))
         offset = options.spread * rng.uniform(size=(count, 1)) ** (1 / 3) * direction
         along, sizes = rng.uniform(begin, end, size=count), rng.uniform(low, high, size=(count, 3))
         turns = np.roll(Rotation.from_rotvec(np.pi * rng.normal(size=(count, 3))).as_quat(), 1, axis=1)

@@ -38,7 +38,7 @@ def repaired(vertices: Array, faces: Indices) -> tuple[Array, Indices, tuple[str
     vertices = vertices[used]
     lower = vertices.min(axis=0)
     size = float(np.ptp(vertices, axis=0).max())
-    mesh = trimesh.Trimesh((vertices - lower) / max(size, 1e-300), faces.reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh((vertices - lower) / (size or 1.0), faces.reshape(-1, 3), process=False)
     _merge(mesh)
     if not size > 0 or not len(mesh.faces):
         raise FormatError("faces", "only triangles without area", "a closed mesh of triangles")

@@ -20,6 +20,7 @@ from trimesh.triangles import closest_point
 from dt_viz.errors import check_between
 from dt_viz.files.checks import check_triangles
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.numerics import divisor, unit
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 
 SMALLEST = 1e-9
@@ -279,12 +280,11 @@ class _Surface:
         """
         offset = nodes - points
         a, b, c = self._triangles[owner].swapaxes(0, 1)
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        normal = unit(np.cross(b - a, c - a))
         aside = offset - np.einsum("ni,ni->n", offset, normal)[:, None] * normal
         squared, step = np.einsum("ni,ni->n", offset, offset), WALK * np.linalg.norm(aside, axis=1)
         far = np.flatnonzero(step**2 > 1e-4 * squared)
-        aside *= (WALK * np.minimum(1, longest / np.maximum(step, 1e-300)))[:, None]
+        aside *= (WALK * np.minimum(1, longest / divisor(step)))[:, None]
         new = self._owner[self._tree.query(points[far] + aside[far])[1]]
         reached = closest_point(self._triangles[new], nodes[far])
         nearer = ((reached - nodes[far]) ** 2).sum(axis=1) < squared[far]

@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.numerics import divisor
 
 MAX_DISPUTED = 0.02
 """Largest number of nodes off the surface on which the directions may disagree, relative to that inside. Meshes that
@@ -27,7 +28,7 @@ def surface_samples(triangles: Array, spacing: float) -> tuple[Array, Indices]:
     turned = (longest[:, None] + np.arange(3)) % 3  # its longest side first
     a, b, c = np.take_along_axis(triangles, turned[..., None], axis=1).swapaxes(0, 1)
     base = np.linalg.norm(b - a, axis=1)
-    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(base, 1e-300)
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / divisor(base)
     along, across = (np.maximum(1, np.ceil(size / spacing)).astype(np.intp) for size in (base, height))
     count = along * across
     owner = np.repeat(np.arange(len(triangles)), count)

@@ -9,6 +9,7 @@ import numpy as np
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import resample_by_arc_length
+from dt_viz.numerics import unit
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import Stack, plane_of, with_added, with_avoidance, with_transform
@@ -54,8 +55,7 @@ def crossings(task: Task, size: float, rng: np.random.Generator) -> Array:
 
 def _smoothness(way: Array) -> float:
     """Cosine of the sharpest angle between neighbouring pieces of a way."""
-    pieces = np.diff(np.concatenate([way, way[1:2]]), axis=0)
-    pieces /= np.linalg.norm(pieces, axis=1, keepdims=True)
+    pieces = unit(np.diff(np.concatenate([way, way[1:2]]), axis=0))
     return float((pieces[1:] * pieces[:-1]).sum(axis=1).min())
 
 
