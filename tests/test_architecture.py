@@ -44,7 +44,7 @@ ONLY_IMPORTERS: Mapping[str, set[str]] = {
     "pinocchio": {"robot/robot.py"},
     "coal": {"robot/link_distances.py"},
     "matplotlib": {"examples/plot.py", "evaluate/figures.py"},
-    "torch": {"baselines/eflow_training.py", "baselines/mpnet_training.py"},
+    "torch": {"baselines/eflow_training.py"},
     "ompl": {"baselines/mpnet_rrt.py"},
     "jax": set(),
     "numba": {"kernels/compiled.py"},

@@ -22,7 +22,8 @@ from dt_viz.avoidance.ways import Way
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
-from dt_viz.obstacles.shapes import Obstacle, golden_spiral
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.surfaces import golden_spiral
 from dt_viz.obstacles.union import Union
 
 NUM_DIRECTIONS, MAX_SAMPLES = 128, 96

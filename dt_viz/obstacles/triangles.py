@@ -16,8 +16,6 @@ REMEDY = (
     "close it in a mesh editor, or give its walls a thickness; if its hollows do not matter, load its convex hull "
     "(Blender, MeshLab and trimesh make one)"
 )
-CHUNK = 100_000
-"""Number of pairs of a triangle and a line that are tested in one step."""
 MAX_CROSSINGS = 3_000_000
 """Largest number of pairs of a triangle and a line near it; 500,000 even triangles have some 10,000."""
 
@@ -97,7 +95,7 @@ def _winding(triangles: Array, origin: Array, cell: float, shape: tuple[int, ...
     start = 0
     while start < len(hit):
         done = ends[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
+        stop = max(start + 1, int(np.searchsorted(ends, done + 100_000, side="right")))
         some = hit[start:stop]
         owner = np.repeat(some, count[some])
         rank = np.arange(len(owner)) - np.repeat(np.cumsum(count[some]) - count[some], count[some])

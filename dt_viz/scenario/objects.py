@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.shapes import Box, Sphere, lathe
+from dt_viz.obstacles.shapes import Box, Sphere
+from dt_viz.obstacles.surfaces import lathe
 
 GRAVITY = 9.81
 """Acceleration of gravity, m/s²."""

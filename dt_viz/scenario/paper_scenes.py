@@ -14,8 +14,9 @@ from dt_viz.avoidance.hand import Avoidance
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
-from dt_viz.obstacles.shapes import Box, CloudObstacle, MeshObstacle, Point, Sphere, as_point, lathe
+from dt_viz.obstacles.shapes import Box, CloudObstacle, MeshObstacle, Point, Sphere, as_point
 from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.surfaces import lathe
 from dt_viz.scenario.objects import Pot
 from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario, View

@@ -17,7 +17,6 @@ from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.sides import Sideways
 from dt_viz.avoidance.transform import Transform
 from dt_viz.baselines.eflow import Coupling, Normalisation
-from dt_viz.baselines.signed_distance import SignedDistanceField
 from dt_viz.flows.augmented_systems import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
 from dt_viz.flows.diffeomorphisms import (
     AdaptiveFlow,
@@ -47,7 +46,6 @@ from dt_viz.obstacles.shapes import (
     unit_sphere_map,
 )
 from dt_viz.obstacles.solids import Solid
-from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import HOME, NUM_JOINTS, load_jaco
 from dt_viz.scenario.tasks import DRAWING_AXES
@@ -293,7 +291,6 @@ FIELDS: dict[str, Generator] = {
     ),
     "shift": Generator(Shift(np.array([0.6, 0.0, 0.8]), 3), uniform(3, 0.7), 1e-4, 1e-6),
     "sideways": Generator(sideways(), uniform(3, 0.5)),
-    "signed distance": Generator(SignedDistanceField(Union((HAND,))), around_hand, 1e-5, 1e-4),
     "escape of the hand": Generator(WholeArmField(ROBOT, BODY, (HAND,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5),
     "escape of the elbow": Generator(
         WholeArmField(ROBOT, BODY, (ELBOW,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5

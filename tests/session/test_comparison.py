@@ -12,6 +12,7 @@ from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.eflow import EFlow
 from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.baselines.repulsive import EFlowRepulsive
 from dt_viz.errors import UnwantedError
 from dt_viz.evaluate.table1 import drawn
 from dt_viz.metrics import frechet
@@ -75,7 +76,8 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
 
 @pytest.mark.usefixtures("quick")
 def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
-    engine, first, second = new_engine(), "eflow-repulsive-fine", SLOW
+    engine, first, second = new_engine(), "eflow-repulsive", SLOW
+    monkeypatch.setattr(EFlowRepulsive, "live", False)
     planned = type(engine.comparison)._planned
     begun = []
 
