@@ -50,28 +50,39 @@ from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.robot import Robot
 from dt_viz.session.engine import Engine
 
-TICK = 0.01
-"""Time between two ticks, seconds."""
-LOOK_PERIOD = 0.03
-"""Time between two looks at the sphere, seconds."""
-HALF_LENGTH = 0.40
-"""Half the length of a sphere's path, metres."""
-WIGGLE, WAVELENGTH = 0.04, 0.5
-"""Amplitude and length of a path's waves, metres."""
-BOX = np.array([1.0, 0.8, 0.6])
-"""Sides of a box, in diameters."""
-PEDESTAL_ROOM = 0.10
-"""Distance, metres, that a path keeps from the base and link 1, which no joint moves out of its way."""
-TABLE_ROOM = 0.01
-"""Height of the obstacle above the table, metres."""
-START_ROOM = 0.05
-"""Distance of the arm from an obstacle that comes, where the arm is undisturbed, metres."""
-COMING_ROOM = 0.03
-"""That distance from the arm as it is, which may have given way to another obstacle: with less, others are drawn."""
-LONGEST = 30.0
-"""Time after the sphere has gone within which the goal has to be reached, seconds."""
-AT_GOAL = 1e-3
-"""Distance from the goal that counts as reached, metres."""
+
+@dataclass(frozen=True)
+class CrossingSettings:
+    """How obstacles cross, and what is a success; lengths in metres, times in seconds."""
+
+    tick: float = 0.01
+    """Time between two ticks."""
+    look_period: float = 0.03
+    """Time between two looks at the obstacles."""
+    half_length: float = 0.40
+    """Half the length of an obstacle's path."""
+    wiggle: float = 0.04
+    """Amplitude of a path's waves."""
+    wavelength: float = 0.5
+    """Length of a path's waves."""
+    box: tuple[float, float, float] = (1.0, 0.8, 0.6)
+    """Sides of a box, in diameters."""
+    pedestal_room: float = 0.10
+    """Distance that a path keeps from the base and link 1, which no joint moves out of its way."""
+    table_room: float = 0.01
+    """Height of the obstacle above the table."""
+    start_room: float = 0.05
+    """Distance of the arm from an obstacle that comes, where the arm is undisturbed."""
+    coming_room: float = 0.03
+    """That distance from the arm as it is, which may have given way to another one: with less, others are drawn."""
+    longest: float = 30.0
+    """Time after the obstacle has gone within which the goal has to be reached."""
+    at_goal: float = 1e-3
+    """Distance from the goal that counts as reached."""
+
+
+SETTINGS = CrossingSettings()
+TICK = SETTINGS.tick
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +161,7 @@ class Arm:
             self._went = True
         parts = self._bench.obstacles(crossing, t)
         if t >= self._looks and (parts or self._present):
-            self._present, self._looks = bool(parts), t + LOOK_PERIOD
+            self._present, self._looks = bool(parts), t + SETTINGS.look_period
             self.controller.see(self._bench.avoidance(parts))
         began = time.thread_time()
         velocity = self.controller.step(q, TICK)
@@ -182,7 +193,7 @@ class Bench:
     def shape(self, place: Array, wxyz: Quaternion = UPRIGHT) -> Obstacle:
         """The sphere, or box, with its centre at a place (3,), metres."""
         if self._boxes:
-            a, b, c = self.diameter * BOX
+            a, b, c = (self.diameter * side for side in SETTINGS.box)
             return Box(as_point(place), (a, b, c), wxyz)
         return Sphere(as_point(place), self.diameter)
 
@@ -202,7 +213,7 @@ class Bench:
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
         controller, q, passed = ArmController(self.follower, self.solved), self.starts[start], []
-        while len(passed) < LONGEST / TICK:
+        while len(passed) < SETTINGS.longest / TICK:
             passed.append(q)
             q = q + TICK * controller.step(q, TICK)
             if controller.phase is Phase.RESTING:
@@ -251,9 +262,9 @@ def _drawn(
         room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - first.radius
         passing = joints[max(0, at - round(length / 2 / speed / TICK))]
         if (
-            path[:, 2].min() >= first.radius + TABLE_ROOM
-            and room.min() >= PEDESTAL_ROOM
-            and body.clearance(passing[None], first)[0] >= START_ROOM
+            path[:, 2].min() >= first.radius + SETTINGS.table_room
+            and room.min() >= SETTINGS.pedestal_room
+            and body.clearance(passing[None], first)[0] >= SETTINGS.start_room
         ):
             return at, path, length, wxyz
 
@@ -261,15 +272,15 @@ def _drawn(
 def _path(middle: Array, rng: np.random.Generator) -> Array:
     """A wavy path (N, 3) through a place (3,), evenly sampled."""
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    s, phase = np.linspace(-HALF_LENGTH, HALF_LENGTH, 201), rng.uniform(0, 2 * np.pi)
-    wave = WIGGLE * (np.sin(2 * np.pi * s / WAVELENGTH + phase) - np.sin(phase))
+    s, phase = np.linspace(-SETTINGS.half_length, SETTINGS.half_length, 201), rng.uniform(0, 2 * np.pi)
+    wave = SETTINGS.wiggle * (np.sin(2 * np.pi * s / SETTINGS.wavelength + phase) - np.sin(phase))
     return resample_by_arc_length(middle + np.outer(s, axes[:, 0]) + np.outer(wave, axes[:, 1]), 401)
 
 
 def simulated(bench: Bench, crossing: Crossing) -> Run:
-    """Run the arm until it rests at the goal, or `LONGEST` seconds after the obstacles have gone."""
+    """Run the arm until it rests at the goal, or so many seconds after the obstacles have gone."""
     arm, run, q = Arm(bench, crossing), Run(), bench.starts[crossing.start].copy()
-    for k in range(int((crossing.gone + crossing.begins + LONGEST) / TICK)):
+    for k in range(int((crossing.gone + crossing.begins + SETTINGS.longest) / TICK)):
         t = k * TICK
         run.q.append(q)
         run.t.append(t)
@@ -349,7 +360,7 @@ def run(options: argparse.Namespace) -> int:
     figures: list[RunFigures] = []
     for crossing, seconds in crossings(bench, options.speed, options.seed, options.obstacles):
         found = simulated(bench, crossing)
-        if room_at_coming(bench, found, crossing) < COMING_ROOM:
+        if room_at_coming(bench, found, crossing) < SETTINGS.coming_room:
             continue
         i, places = len(figures), np.array(found.obstacle)
         figures.append(RunFigures.of(bench, crossing, found, seconds))
@@ -411,7 +422,7 @@ def summary(found: Sequence[RunFigures]) -> Row:
         "": "in the loop",
         "without contact": f"{sum(f.distance > 0 for f in found)} of {num}",
         "clearance mm": f"{1e3 * min(f.distance for f in found):.1f}",
-        "goal reached": f"{sum(f.missed <= AT_GOAL for f in found)} of {num}",
+        "goal reached": f"{sum(f.missed <= SETTINGS.at_goal for f in found)} of {num}",
         "velocity": f"{max(f.velocity for f in found):.3f}",
         "acceleration": f"{max(f.acceleration for f in found):.3f}",
         "time lost s": f"{np.median([f.lost for f in found]):.1f} ({max(f.lost for f in found):.1f})",

@@ -67,8 +67,8 @@ def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
             assert np.isnan(passage.at(passage.gone)).all() and np.isnan(passage.at(passage.comes - 1e-9)).all()
             there = joints[max(0, int((passage.comes - crossing.begins) / reactive.TICK))]
             gap = bench.follower.whole_arm.clearance(there[None], bench.shape(passage.path[0]))[0]
-            assert gap >= reactive.START_ROOM - 0.01
-            assert passage.path[:, 2].min() >= 0.075 + reactive.TABLE_ROOM
+            assert gap >= reactive.SETTINGS.start_room - 0.01
+            assert passage.path[:, 2].min() >= 0.075 + reactive.SETTINGS.table_room
 
 
 def test_a_second_obstacle_and_a_turned_box_count(engine):
