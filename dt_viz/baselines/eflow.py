@@ -226,15 +226,10 @@ class EFlowSystem:
 
     def velocity(self, y: Array) -> Array:
         """ẏ (N, 3), m/s, at `y` (N, 3), metres."""
-        return self.velocity_and_time(y)[0]
-
-    def velocity_and_time(self, y: Array) -> tuple[Array, Array]:
-        """ẏ (N, 3), m/s, at `y` (N, 3), metres, and the time (N,) to the goal at the speed there, seconds."""
         z, J = self.transform.jacobian(y)
-        offset = self.latent_goal - z
+        descent = unit(self.latent_goal - z)
         rate = self.scale * self.speed(self.normalised(y))
-        velocity = np.linalg.solve(J, (rate[:, None] * unit(offset))[..., None])[..., 0]
-        return velocity, np.linalg.norm(offset, axis=1) / rate
+        return rate[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
 
     def lyapunov(self, y: Array) -> Array:
         """‖ψ(y) − ψ(y_e)‖ (N,), in the normalised unit."""

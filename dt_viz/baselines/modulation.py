@@ -6,7 +6,7 @@ Written from the published equations, since the authors' library `dynamic_obstac
 
 Motions are integrated in base space, where the imitation's own are straight: y = ψ⁻¹(z) and ż = (Dψ⁻¹)⁻¹ẏ need ψ⁻¹
 only, the quick side of ψ. The modulation is linear in the velocity, so that its paths do not depend on the imitation's
-pace: they are integrated by the length of the path in the world, with the time as one more coordinate.
+pace: they are integrated by the length of the path in the world, and timed afterwards.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import cumulative_trapezoid, solve_ivp
 
 from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.errors import Cancelled, never
@@ -91,44 +91,47 @@ class _Planner:
 
     def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
-        settings, goal, inverse = self.settings, self.system.base.goal, self.system.transform.inverse
+        settings, base, num = self.settings, self.system.base, len(starts)
 
-        def rate(_: float, states: Array) -> Array:
-            return self._rate(obstacle, states.reshape(-1, 4)).ravel()
+        def rate(_: float, z: Array) -> Array:
+            return self._evaluated(obstacle, z.reshape(num, 3))[1].ravel()
 
-        def left(_: float, states: Array) -> float:
-            distances = np.linalg.norm(states.reshape(-1, 4)[:, :3] - goal, axis=1)
-            return float(distances.max()) - settings.near_goal
+        def left(_: float, z: Array) -> float:
+            return float(base.distance(z.reshape(num, 3)).max()) - settings.near_goal
 
         left.terminal = True  # pyright: ignore[reportFunctionMemberAccess] - as scipy wants it
-        begin = np.column_stack([self.system.transform.forward(starts), np.zeros(len(starts))])
+        begin = self.system.transform.forward(starts).ravel()
         span, bounds = (0.0, settings.longest), {"atol": settings.tolerance, "max_step": settings.longest_step}
-        solved = solve_ivp(rate, span, begin.ravel(), "RK23", events=left, dense_output=True, **bounds)
+        solved = solve_ivp(rate, span, begin, "RK23", events=left, dense_output=True, **bounds)
         at = np.interp(np.arange(0, len(solved.t) - 0.75, 0.25), np.arange(len(solved.t)), solved.t)  # and between
-        states = solved.sol(at).T.reshape(len(at), len(starts), 4)
-        places = inverse(states[..., :3].reshape(-1, 3)).reshape(len(at), -1, 3).swapaxes(0, 1)
-        goal_place, ends = inverse(goal[None]), states[-1, :, :3]
-        arrives = np.linalg.norm(ends - goal, axis=1) <= 1.01 * settings.near_goal
-        paths, times = [], []
-        for k, path in enumerate(places):
-            length, clock = arc_length(path), states[:, k, 3]
-            num = 1 + int((length < length[-1] - settings.near_goal).sum())  # from there on it rests
-            arrival = clock[num - 1] + max(self.system.base.arrival_time(states[num - 1, k, :3], ARRIVED), ARRIVED)
-            paths.append(np.vstack([path[:num], goal_place]) if arrives[k] else path[:num])
-            times.append(np.append(clock[:num], arrival) if arrives[k] else clock[:num])
+        z = solved.sol(at).T.reshape(-1, 3)
+        y, _, step = self._evaluated(obstacle, z)
+        pace = np.linalg.norm(base.velocity(z), axis=1)
+        clocks = cumulative_trapezoid((step / divisor(pace)).reshape(len(at), num), at, axis=0, initial=0)
+        arrives = base.distance(z[-num:]) <= 1.01 * settings.near_goal
+        paths, times, goal = [], [], self.system.transform.inverse(base.goal[None])
+        for k, (path, clock) in enumerate(zip(y.reshape(-1, num, 3).swapaxes(0, 1), clocks.T, strict=True)):
+            length = arc_length(path)
+            last = int((length < length[-1] - settings.near_goal).sum())  # from there on it rests
+            arrival = clock[last] + max(base.arrival_time(z[last * num + k], ARRIVED), ARRIVED)
+            paths.append(np.vstack([path[: last + 1], goal]) if arrives[k] else path[: last + 1])
+            times.append(np.append(clock[: last + 1], arrival) if arrives[k] else clock[: last + 1])
         return Plan(tuple(paths), tuple(times))
 
-    def _rate(self, obstacle: Union, states: Array) -> Array:
-        """Rate of change of states (z, t), (N, 4), by the length of the path, 1/m and s/m; less towards the goal."""
-        z, settings = states[:, :3], self.settings
+    def _evaluated(self, obstacle: Union, z: Array) -> tuple[Array, Array, Array]:
+        """Evaluate the modulated motion at points of base space `z` (N, 3), by the length of its path.
+
+        Returns:
+            Places (N, 3), metres; dz/ds (N, 3), shorter towards the goal; and the distance (N,) that the imitation
+            would go in base space meanwhile.
+        """
         y, D = self.system.transform.inverse_jacobian(z)
         offset = self.system.base.goal - z
         nominal = np.einsum("nij,nj->ni", D, unit(offset))
         v, _ = modulated(obstacle, y, nominal)
-        speed = np.linalg.norm(v, axis=1) + settings.slowest * np.linalg.norm(nominal, axis=1)
-        step = np.tanh(np.linalg.norm(offset, axis=1) / settings.approach) / divisor(speed)
-        pace = np.linalg.norm(self.system.base.velocity(z), axis=1)
-        return step[:, None] * np.column_stack([np.linalg.solve(D, v[..., None])[..., 0], 1 / divisor(pace)])
+        speed = np.linalg.norm(v, axis=1) + self.settings.slowest * np.linalg.norm(nominal, axis=1)
+        step = np.tanh(np.linalg.norm(offset, axis=1) / self.settings.approach) / divisor(speed)
+        return y, step[:, None] * np.linalg.solve(D, v[..., None])[..., 0], step
 
 
 class Modulation(Method):

@@ -1,7 +1,8 @@
 """EFlow with a repulsive potential of the obstacle's distance overlaid, as Zhi et al. compare with (sec. 5).
 
 ẏ = v(y) + η·(1/d − 1/d₀)/d²·∇d within the range d₀ of the obstacle (Khatib, 1986), d the distance from its
-surface; beyond it nothing but EFlow's v. Motions are stepped by Euler's method.
+surface; beyond it nothing but EFlow's v. Only the stretches within the range are stepped, by Euler's method; before and
+after them motions are EFlow's own rollouts, exactly.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.eflow import EFlow, EFlowSystem
 from dt_viz.baselines.weights import FOLDER
 from dt_viz.errors import Cancelled, end_if, never
-from dt_viz.flows.fields import Array
+from dt_viz.flows.fields import Array, Mask
+from dt_viz.motion.stack import LIVE
 from dt_viz.numerics import divisor
 from dt_viz.obstacles.union import Union
 
@@ -37,14 +39,14 @@ class RepulsionSettings:
     """η, m⁴/s: two centimetres from the surface the repulsion is 0.075 m/s."""
     strongest: float = 0.5
     """Largest speed of the repulsion, m/s; also inside the obstacle, where the potential is not defined."""
-    longest: float = 40.0
-    """Time after which a motion is given up, seconds."""
+    longest: float = 20.0
+    """Time after which a motion that has not left the range is given up, seconds."""
+    max_visits: int = 5
+    """Largest number of times that a motion enters the range."""
     stuck_distance: float = 0.005
     """Distance that a motion gains in `stuck_time` if it is not stuck between goal and obstacle, metres."""
     stuck_time: float = 1.0
     """Seconds."""
-    at_goal: float = 1e-6
-    """Distance from the goal at which a motion has arrived, metres."""
 
     def repulsion(self, obstacle: Union, y: Array) -> tuple[Array, Array]:
         """Distance (N,), metres, of points `y` (N, 3) from the obstacle, and velocities (N, 3), m/s, away from it."""
@@ -61,27 +63,55 @@ class _Planner:
 
     def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan motions of the end effector; see `Planner`."""
-        settings, system = self.settings, self.system
+        pieces: list[list[tuple[Array, Array]]] = [[] for _ in starts]
+        rows, y = np.arange(len(starts)), starts
+        for _ in range(self.settings.max_visits):
+            entering = []
+            for row, path, times in zip(rows, *self.system.rollouts(y, LIVE.spacing), strict=True):
+                inside = obstacle.signed_distance(path) < self.settings.range
+                last = max(int(inside.argmax()) - 1, 0) if inside.any() else len(path) - 1
+                pieces[row].append((path[: last + 1], times[: last + 1]))
+                entering += [row] if inside.any() else []
+            if not entering:
+                break
+            walks, leave = self._stepped(obstacle, np.stack([pieces[row][-1][0][-1] for row in entering]), cancelled)
+            for row, walk in zip(entering, walks, strict=True):
+                pieces[row].append((walk, np.arange(len(walk)) / self.settings.rate))
+            rows = np.array(entering)[leave]
+            if not len(rows):
+                break
+            y = np.stack([pieces[row][-1][0][-1] for row in rows])
+        motions = [_joined(some) for some in pieces]
+        return Plan(tuple(path for path, _ in motions), tuple(times for _, times in motions))
+
+    def _stepped(self, obstacle: Union, y: Array, cancelled: Cancelled) -> tuple[list[Array], Mask]:
+        """Step motions from `y` (N, 3) while they are within the range: paths (N_i, 3), and which leave it (N,)."""
+        settings = self.settings
         interval, window = 1 / settings.rate, round(settings.stuck_time * settings.rate)
-        places, times = [starts], [np.zeros(len(starts))]
-        moving = np.full(len(starts), True)
-        while moving.any() and len(places) < settings.longest * settings.rate:
+        places, lengths = [y], np.ones(len(y), dtype=int)
+        leave, within = np.zeros(len(y), dtype=bool), np.ones(len(y), dtype=bool)
+        before, force = settings.repulsion(obstacle, y)
+        while within.any() and len(places) < settings.longest * settings.rate:
             end_if(cancelled)
-            y, step = places[-1].copy(), np.zeros(len(starts))
-            velocity, left = system.velocity_and_time(y[moving])
-            step[moving] = np.minimum(interval, left)  # the last one ends at the goal
-            y[moving] += step[moving, None] * (velocity + settings.repulsion(obstacle, y[moving])[1])
+            y = y.copy()
+            y[within] += interval * (self.system.velocity(y[within]) + force[within])
             places.append(y)
-            times.append(times[-1] + step)
-            moving = moving & (np.linalg.norm(y - system.goal, axis=1) > settings.at_goal)
+            lengths[within] += 1
+            distance, force = settings.repulsion(obstacle, y)
+            leave |= within & (distance >= settings.range) & (distance >= before)
+            within &= ~leave
             if len(places) > window:
-                gained = np.linalg.norm(y - places[-1 - window], axis=1)
-                moving &= gained > settings.stuck_distance
-        paths, clocks = np.stack(places, axis=1), np.stack(times, axis=1)
-        lengths = 1 + np.count_nonzero(np.diff(clocks), axis=1)
-        ends = zip(paths, clocks, lengths, strict=True)
-        motions = [(path[:length], clock[:length]) for path, clock, length in ends]
-        return Plan(tuple(path for path, _ in motions), tuple(clock for _, clock in motions))
+                within &= np.linalg.norm(y - places[-1 - window], axis=1) >= settings.stuck_distance
+            before = distance
+        return [path[:length] for path, length in zip(np.stack(places, axis=1), lengths, strict=True)], leave
+
+
+def _joined(pieces: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Join pieces of a motion, each of which begins where and when the one before ends."""
+    path, times = pieces[0]
+    for further, later in pieces[1:]:
+        path, times = np.concatenate([path, further[1:]]), np.concatenate([times, times[-1] + later[1:]])
+    return path, times
 
 
 class EFlowRepulsive(Method):
