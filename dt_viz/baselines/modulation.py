@@ -101,8 +101,16 @@ class _Planner:
 
         left.terminal = True  # pyright: ignore[reportFunctionMemberAccess] - as scipy wants it
         begin = self.system.transform.forward(starts).ravel()
-        span, bounds = (0.0, settings.longest), {"atol": settings.tolerance, "max_step": settings.longest_step}
-        solved = solve_ivp(rate, span, begin, "RK23", events=left, dense_output=True, **bounds)
+        solved = solve_ivp(
+            rate,
+            (0.0, settings.longest),
+            begin,
+            "RK23",
+            dense_output=True,
+            events=left,
+            atol=settings.tolerance,
+            max_step=settings.longest_step,
+        )
         at = np.interp(np.arange(0, len(solved.t) - 0.75, 0.25), np.arange(len(solved.t)), solved.t)  # and between
         z = solved.sol(at).T.reshape(-1, 3)
         y, _, step = self._evaluated(obstacle, z)

@@ -95,6 +95,7 @@ class _Turned:
     wxyz: Quaternion
 
     def moved(self: T, position: Point, wxyz: Quaternion = UPRIGHT) -> T:
+        """See `Obstacle`."""
         return replace(self, position=position, wxyz=wxyz)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def _to_own(self, s: Array) -> Array:
@@ -144,9 +145,11 @@ class Sphere:
 
     @property
     def depth(self) -> float:
+        """See `Obstacle`."""
         return self.radius
 
     def moved(self, position: Point, wxyz: Quaternion = UPRIGHT) -> Sphere:
+        """See `Obstacle`."""
         return Sphere(position, self.diameter)
 
     def signed_distance(self, s: Array) -> Array:
@@ -160,9 +163,11 @@ class Sphere:
         return PlacedField(local, np.asarray(self.position), self.radius * np.eye(3))
 
     def cover(self) -> tuple[Array, Array]:
+        """See `Obstacle`."""
         return np.array([self.position]), np.array([self.radius])
 
     def surface(self) -> tuple[Array, Indices]:
+        """See `Obstacle`."""
         turn = np.linspace(0, np.pi, 25)
         vertices, faces = lathe(list(zip(np.sin(turn), -np.cos(turn), strict=True)))
         return self.radius * vertices, faces
@@ -193,23 +198,28 @@ class Box(_Turned):
 
     @property
     def depth(self) -> float:
+        """See `Obstacle`."""
         return float(self._half.min())
 
     def signed_distance(self, s: Array) -> Array:
+        """See `Obstacle`."""
         own = self._to_own(s)
         x, y, z = (_magnitude(own[..., i]) - self._half[i] for i in range(3))
         return _beyond_faces(x, y, z)
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
+        """See `Obstacle`."""
         unit = unit_sizes(self._half)
         x, y, z = (2 * half for half in unit)
         return self._placed(unit_map(Box(ORIGIN, (x, y, z))), generator, temperature, np.diag(self._half / unit))
 
     def cover(self) -> tuple[Array, Array]:
+        """See `Obstacle`."""
         centres, radii = box_cover(self._half)
         return self._to_world(centres), radii
 
     def surface(self) -> tuple[Array, Indices]:
+        """See `Obstacle`."""
         return box_surface(self._half)
 
 
@@ -240,24 +250,29 @@ class Cylinder(_Turned):
 
     @property
     def depth(self) -> float:
+        """See `Obstacle`."""
         return float(self._half.min())
 
     def signed_distance(self, s: Array) -> Array:
+        """See `Obstacle`."""
         own = self._to_own(s)
         x, y, z = (own[..., i] for i in range(3))
         return _beyond_faces(np.sqrt(x * x + y * y) - self._half[0], _magnitude(z) - self._half[2])
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
+        """See `Obstacle`."""
         unit = unit_sizes(self._half)
         return self._placed(
             unit_map(Cylinder(ORIGIN, 2 * unit[0], 2 * unit[2])), generator, temperature, np.diag(self._half / unit)
         )
 
     def cover(self) -> tuple[Array, Array]:
+        """See `Obstacle`."""
         centres, radii = cylinder_cover(self._half[0], self._half[2])
         return self._to_world(centres), radii
 
     def surface(self) -> tuple[Array, Indices]:
+        """See `Obstacle`."""
         radius, _, half = self._half
         return lathe([(0, -half), (radius, -half), (radius, half), (0, half)])
 
@@ -287,10 +302,12 @@ class _Triangles(_Turned):
 
     @property
     def radius(self) -> float:
+        """See `Obstacle`."""
         return self.scale * self.solid.radius
 
     @property
     def depth(self) -> float:
+        """See `Obstacle`."""
         return self.scale * self.solid.distances.depth
 
     def signed_distance(self, s: Array) -> Array:
@@ -298,14 +315,17 @@ class _Triangles(_Turned):
         return self.scale * self.solid.distances(self._to_own(s))
 
     def field(self, generator: Generator, temperature: float) -> PlacedField:
+        """See `Obstacle`."""
         occupancy, axes, centre = solid_map(self.solid)
         return self._placed(occupancy, generator, temperature, axes, centre, self.scale)
 
     def cover(self) -> tuple[Array, Array]:
+        """See `Obstacle`."""
         centres, radii = self.solid.balls
         return self._to_world(centres), self.scale * radii
 
     def surface(self) -> tuple[Array, Indices]:
+        """See `Obstacle`."""
         return self.scale * self.solid.vertices, self.solid.faces
 
     def _to_own(self, s: Array) -> Array:
@@ -345,6 +365,7 @@ class CloudObstacle(_Triangles):
 
     @property
     def solid(self) -> Solid:
+        """See `Obstacle`."""
         return self.cloud.solid
 
     def labelled(self) -> tuple[Array, Mask]:

@@ -36,7 +36,8 @@ class Union:
         A vector is zero where the distance has no slope; without an obstacle the distance is infinite and all are.
         """
         step = 1e-20  # imaginary: signed distances are analytic
-        ahead = self.signed_distance(s + 1j * step * np.eye(3)[:, None])  # (3, N)
+        beside: Array = s + 1j * step * np.eye(3)[:, None]  # pyright: ignore[reportAssignmentType]
+        ahead = self.signed_distance(beside)  # (3, N)
         return ahead[0].real, unit(ahead.imag.T / step)
 
     def nearest_free(self, s: Array) -> Array:
