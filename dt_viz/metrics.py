@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-_DIAGONALS = 32  # of a Fréchet table computed together: few enough to stay in the processor's cache
+from dt_viz.numerics import divisor
 
 
 def arc_length(points: np.ndarray) -> np.ndarray:
@@ -81,12 +81,13 @@ def discrete_frechet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     padded_b = np.pad(np.moveaxis(b, -1, 0), margins, constant_values=np.inf)
     places = np.moveaxis(sliding_window_view(padded_b, n, axis=-1), -2, 1)  # (d, n + m − 1, *B, n)
 
+    num = 32  # diagonals computed together: few enough to stay in the processor's cache
     last, before = np.full((2, *batch, n + 1), np.inf)  # F² on the last two anti-diagonals; column n is i = −1
     before[..., n] = 0.0  # from where F(0, 0) is reached; infinity ever after
-    for k in range(0, n + m - 1, _DIAGONALS):
-        low, high = max(0, n - k - _DIAGONALS), n - max(0, k - m + 1)  # the columns that lie in the table
+    for k in range(0, n + m - 1, num):
+        low, high = max(0, n - k - num), n - max(0, k - m + 1)  # the columns that lie in the table
         squared = np.zeros(())
-        for place, point in zip(places[:, k : k + _DIAGONALS, ..., low:high], reversed_a[..., low:high], strict=True):
+        for place, point in zip(places[:, k : k + num, ..., low:high], reversed_a[..., low:high], strict=True):
             squared = squared + np.square(place - point)
         for distances in squared:
             reached = np.minimum(last[..., low:high], last[..., low + 1 : high + 1])
@@ -95,101 +96,6 @@ def discrete_frechet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             before[..., n] = np.inf
             last, before = before, last
     return np.sqrt(last[..., 0])
-
-
-def frechet(a: np.ndarray, b: np.ndarray, tolerance: float = 1e-6) -> float:
-    """Return the Fréchet distance of two polylines, also between their points.
-
-    The least, over all ways of moving forward along both from their first to their last points, of the largest
-    distance met (Alt and Godau, 1995). Whether a distance ε suffices is decided exactly, in the free space: on the
-    borders of each cell (a segment of ``a`` × a segment of ``b``) lie intervals where the two are at most ε apart, and
-    those parts of them are passed on that a monotone way can reach. ε is then found by bisection between the discrete
-    distance and that less the longest segment.
-
-    Args:
-        a: shape ``(n, d)``; successive points may coincide.
-        b: shape ``(m, d)``.
-        tolerance: how far the result may be above the distance, in the unit of the points.
-    """
-    a, b = (path[np.concatenate([[True], (np.diff(path, axis=0) != 0).any(axis=1)])] for path in (a, b))
-    if min(len(a), len(b)) == 1:
-        return float(np.linalg.norm(a - b, axis=1).max())
-    longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) for path in (a, b))
-    high = float(discrete_frechet(a, b))
-    low = max(high - longest, *(float(np.linalg.norm(a[end] - b[end])) for end in (0, -1)))
-    left, bottom = _Borders(a, b), _Borders(b, a)
-    while high - low > tolerance:
-        middle = (low + high) / 2
-        if _passes(left.free(middle), bottom.free(middle)):
-            high = middle
-        else:
-            low = middle
-    return high
-
-
-class _Borders:
-    """Borders of the cells of the free space on which a point of one path moves along a segment of the other."""
-
-    def __init__(self, path: np.ndarray, points: np.ndarray) -> None:
-        """Take the path (n, d) whose segments are moved along, no two successive points alike, and points (m, d)."""
-        step = np.diff(path, axis=0)
-        self._length = np.linalg.norm(step, axis=1)[:, None]
-        from_start = points[None] - path[:-1, None]
-        self._nearest = np.einsum("ikd,id->ik", from_start, step) / self._length**2  # (n − 1, m), in segments
-        beside = from_start - self._nearest[..., None] * step[:, None]
-        self._squared = np.square(beside).sum(axis=-1)
-
-    def free(self, distance: float) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the ends (n − 1, m) of the free interval of each border, from 0 to 1; infinity to 0 if empty."""
-        squared = distance**2 - self._squared
-        half = np.sqrt(np.maximum(squared, 0)) / self._length
-        low, high = np.maximum(self._nearest - half, 0.0), np.minimum(self._nearest + half, 1.0)
-        empty = (squared < 0) | (low > high)
-        return np.where(empty, np.inf, low), np.where(empty, 0.0, high)
-
-
-def _passes(left: tuple[np.ndarray, np.ndarray], bottom: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Decide whether a monotone way leads through the free space, from one corner to the other.
-
-    A cell passes on all of a free border that faces one which is not reached at a right angle; otherwise what lies
-    ahead of the first place reached on the border opposite. Cells of an anti-diagonal are computed at once.
-
-    Args:
-        left: free intervals (n − 1, m) on the left borders of the cells (i, j), and on the right ones of the last.
-        bottom: free intervals (m − 1, n) on the lower borders, by j and i.
-    """
-    rows, columns = left[0].shape[0], bottom[0].shape[0]
-    if left[0][0, 0] > 0 or left[1][-1, -1] < 1:
-        return False
-    # on diagonal k, cell i is (i, k − i): the borders behind it have j + 1 and i + 1
-    right_low, right_high = (_skewed(ends[:, 1:], fill) for ends, fill in zip(left, (np.inf, 0.0), strict=True))
-    top_low, top_high = (_skewed(ends.T[1:], fill) for ends, fill in zip(bottom, (np.inf, 0.0), strict=True))
-    # places first reached on the left and lower borders of the cells of a diagonal; along the first ones of all from 0
-    first_left = np.where(np.logical_and.accumulate(_whole(left, 0)), left[0][:, 0], np.inf)
-    first_bottom = np.where(np.logical_and.accumulate(_whole(bottom, 0)), bottom[0][:, 0], np.inf)
-    on_left, on_bottom = np.full(rows, np.inf), np.full(rows, np.inf)
-    on_left[0], on_bottom[0] = first_left[0], first_bottom[0]
-    for k in range(rows + columns - 1):
-        right = np.where(on_bottom < np.inf, right_low[k], np.maximum(right_low[k], on_left))
-        top = np.where(on_left < np.inf, top_low[k], np.maximum(top_low[k], on_bottom))
-        right[right > right_high[k]] = np.inf
-        top[top > top_high[k]] = np.inf
-        if k == rows + columns - 2:
-            return bool(right[-1] < np.inf or top[-1] < np.inf)
-        on_left, on_bottom = right, np.concatenate([[np.inf], top[:-1]])
-        if k + 1 < rows:
-            on_left[k + 1] = first_left[k + 1]
-        if k + 1 < columns:
-            on_bottom[0] = first_bottom[k + 1]
-        if not (on_left.min() < np.inf or on_bottom.min() < np.inf):
-            return False
-    return False
-
-
-def _whole(ends: tuple[np.ndarray, np.ndarray], column: int) -> np.ndarray:
-    """Return which borders (n,) of a column can be reached from the corner: all before are free, this at its start."""
-    low, high = ends[0][:, column], ends[1][:, column]
-    return (low <= 0) & np.concatenate([[True], high[:-1] >= 1])
 
 
 def _skewed(table: np.ndarray, fill: float) -> np.ndarray:
@@ -263,8 +169,7 @@ def distance_from_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
     """
     step = np.diff(path, axis=0)
     from_start = points[:, None] - path[:-1]
-    squared = np.maximum((step**2).sum(axis=1), np.finfo(float).tiny)
-    share = ((from_start * step).sum(axis=2) / squared).clip(0, 1)
+    share = ((from_start * step).sum(axis=2) / divisor((step**2).sum(axis=1))).clip(0, 1)
     return np.linalg.norm(from_start - share[..., None] * step, axis=2).min(axis=1)
 
 

@@ -33,7 +33,8 @@ from dt_viz.learning import demonstrations as demos
 from dt_viz.learning.imitation import ImitationSettings, fit
 from dt_viz.obstacles import clouds, solids
 from dt_viz.obstacles import files as shapes
-from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, Sphere, _solid_map, unit_sphere_map
+from dt_viz.obstacles.learned_maps import solid_map, unit_map
+from dt_viz.obstacles.shapes import ORIGIN, Box, CloudObstacle, Cylinder, MeshObstacle, Sphere
 from dt_viz.saving import SavedMotion, save_motion
 from dt_viz.scenario.scenario import Layer
 
@@ -336,28 +337,28 @@ def read(kind: str, name: str, content: bytes) -> None:
 
 def forget() -> None:
     """Forget what was computed of meshes and clouds."""
-    for kept in (solids._surface, solids._distances, solids._balls, clouds._solid, _solid_map):
+    for kept in (solids._distances, solids._balls, clouds._solid, solid_map):
         kept.cache_clear()
 
 
 @contextmanager
 def coarsely() -> Iterator[None]:
     """Within this block the distances of meshes and clouds are coarse, and soon computed."""
-    fine = solids.NUM_NODES, solids.NUM_SAMPLES, solids.NUM_PROBES, clouds.NUM_NODES, clouds.NUM_SAMPLES
-    solids.NUM_NODES = clouds.NUM_NODES = 10**3
-    solids.NUM_SAMPLES = solids.NUM_PROBES = clouds.NUM_SAMPLES = 1000
+    fine = solids.SETTINGS, clouds.SETTINGS
+    solids.SETTINGS = solids.GridSettings(num_nodes=10**3, num_samples=1000)
+    clouds.SETTINGS = clouds.CloudSettings(num_nodes=10**3, num_samples=1000)
     forget()
     try:
         yield
     finally:
-        solids.NUM_NODES, solids.NUM_SAMPLES, solids.NUM_PROBES, clouds.NUM_NODES, clouds.NUM_SAMPLES = fine
+        solids.SETTINGS, clouds.SETTINGS = fine
         forget()
 
 
 def main() -> None:
     import resource  # not on every system
 
-    unit_sphere_map().logit(np.zeros((1, 3)))  # compiling is not reading
+    unit_map(Sphere(ORIGIN, 2.0)).logit(np.zeros((1, 3)))  # compiling is not reading
     resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESS_SPACE, MAX_ADDRESS_SPACE))
     with coarsely() if "--coarse" in sys.argv else nullcontext():
         read_what_is_given()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dt_viz.baselines.eflow import NUM_BLOCKS, NUM_FEATURES, NUM_HIDDEN
+from dt_viz.baselines.eflow import ARCHITECTURE
 
 
 def joints_of(plan):
@@ -15,16 +15,20 @@ def eflow_weights(task, seed=0, amplitude=0.01):
     """Some weights, as training leaves them; the goal is that of the task."""
     rng = np.random.default_rng(seed)
     dim, goal = task.demonstrations[0].dimension, task.demonstrations[0].positions[-1]
-    moved = (dim + 1) // 2
+    features, moved, num_hidden = (
+        (ARCHITECTURE.num_blocks, 2, ARCHITECTURE.num_features),
+        (dim + 1) // 2,
+        ARCHITECTURE.num_hidden,
+    )
     points = np.concatenate([d.positions for d in task.demonstrations])
     scale = 1 / np.ptp(points, axis=0)
     return {
-        "frequencies": rng.normal(size=(NUM_BLOCKS, 2, NUM_FEATURES, moved)) / 0.45,
-        "phases": rng.uniform(0, 6.28, size=(NUM_BLOCKS, 2, NUM_FEATURES)),
-        "weights": rng.normal(size=(NUM_BLOCKS, 2, NUM_FEATURES, moved)) * amplitude,
+        "frequencies": rng.normal(size=(*features, moved)) / 0.45,
+        "phases": rng.uniform(0, 6.28, size=features),
+        "weights": rng.normal(size=(*features, moved)) * amplitude,
         "normalisation": np.stack([scale, -points.min(axis=0) * scale - 0.5]),
         "goal": goal,
-        "speed_0": rng.normal(size=(NUM_HIDDEN, dim + 1)) * 0.1,
-        "speed_1": rng.normal(size=(NUM_HIDDEN, NUM_HIDDEN + 1)) * 0.1,
-        "speed_2": rng.normal(size=(1, NUM_HIDDEN + 1)) * 0.1,
+        "speed_0": rng.normal(size=(num_hidden, dim + 1)) * 0.1,
+        "speed_1": rng.normal(size=(num_hidden, num_hidden + 1)) * 0.1,
+        "speed_2": rng.normal(size=(1, num_hidden + 1)) * 0.1,
     }

@@ -13,7 +13,6 @@ from dt_viz.metrics import (
     arc_length,
     discrete_frechet,
     dynamic_time_warping,
-    frechet,
     maximum_collision_distance,
     resample_by_arc_length,
     rms_at_equal_times,
@@ -120,43 +119,6 @@ class TestDiscreteFrechet:
         single = [[float(discrete_frechet(a[i, j], b[j])) for j in range(4)] for i in range(2)]
         np.testing.assert_array_equal(batch, single)
         np.testing.assert_array_equal(discrete_frechet(b[0], a)[1, 3], discrete_frechet(a[1, 3], b[0]))
-
-
-class TestFrechet:
-    @given(paths(2, 1, 6), paths(2, 1, 6))
-    def test_lies_below_the_discrete_distance_of_many_points_by_at_most_their_spacing(self, a, b):
-        dense, spacing = zip(*(densely(path, 0.25) for path in (a, b)), strict=True)
-        discrete = float(discrete_frechet(*dense))
-        assert discrete - max(spacing) - 1e-9 <= frechet(a, b) <= discrete + 1e-5
-
-    @pytest.mark.parametrize(("n", "m"), [(2, 40), (30, 3), (60, 45)])
-    def test_lies_there_on_long_walks_too(self, n, m):
-        a, b = walks(n, m)
-        dense, spacing = zip(*(densely(path, 0.05) for path in (a, b)), strict=True)
-        discrete = float(discrete_frechet(*dense))
-        assert discrete - max(spacing) <= frechet(a, b) <= discrete + 1e-5
-
-    @pytest.mark.parametrize(
-        ("a", "b", "expected"),
-        [
-            pytest.param([[0, 0], [0.5, 0.1], [1, 0]], LINE, 0.1, id="between points"),
-            pytest.param(
-                [[0, 0], [3, 0], [1, 0], [4, 0]], 4 * LINE, 1.0, id="waiting halfway where the other goes back"
-            ),
-            pytest.param(LINE[::-1], LINE, 1.0, id="the other way round"),
-            pytest.param(np.ones((4, 2)), [[1, 1], [4, 5], [1, 2]], 5.0, id="from one place"),
-        ],
-    )
-    def test_is_known_for_simple_paths(self, a, b, expected):
-        assert frechet(np.array(a, float), np.array(b, float)) == pytest.approx(expected, abs=1e-5)
-
-    @given(paths(2, 1), paths(2, 1))
-    def test_is_symmetric_and_sees_no_points_on_segments(self, a, b):
-        assert frechet(with_middles(a), b) == pytest.approx(frechet(b, a), abs=3e-6)
-
-    @given(paths(2), arrays(np.float64, 2, elements=COORDINATE))
-    def test_of_a_shifted_path_is_the_shift(self, path, shift):
-        assert frechet(path, path + shift) == pytest.approx(np.linalg.norm(shift), abs=2e-6)
 
 
 @given(paths(2, 1, 8), paths(2, 1, 8))

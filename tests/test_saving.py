@@ -104,7 +104,7 @@ DIGEST = """
 import hashlib, sys
 import dt_viz as dt
 from dt_viz.obstacles import clouds, solids
-solids.NUM_NODES = clouds.NUM_NODES = 1000  # soon computed
+solids.SETTINGS, clouds.SETTINGS = solids.GridSettings(num_nodes=1000), clouds.CloudSettings(num_nodes=1000)  # quick
 motion = dt.Motion.load(sys.argv[1])
 digest = hashlib.sha256(repr(motion.certificates()).encode())
 for path in motion.rollouts():

@@ -15,7 +15,8 @@ import numpy as np
 from dt_viz.errors import check_between
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.detours import detours, distinct
-from dt_viz.obstacles.shapes import Obstacle, golden_spiral
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.surfaces import golden_spiral
 from dt_viz.obstacles.union import Union
 
 NEARBY = 0.1

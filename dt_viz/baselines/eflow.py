@@ -8,46 +8,49 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
-from dt_viz.baselines.weights import FOLDER, load_weights
+from dt_viz.baselines.base import Method, Plan, Planner, Problem
+from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
 from dt_viz.errors import Cancelled, never
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Placed
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import evenly_sampled, refined
 from dt_viz.motion.stack import LIVE
+from dt_viz.numerics import unit
 from dt_viz.obstacles.union import Union
 from dt_viz.scenario.tasks import Task
 
 VERSION = 1
 """Version of the weights, raised with every change to what they mean."""
-NUM_BLOCKS, NUM_FEATURES = 10, 200
-"""Number of coupling layers, and of random Fourier features of each of a layer's two functions."""
-LENGTH_SCALE = 0.45
-"""Length scale of the features, in the unit of the normalised demonstrations: their extent along each axis is 1."""
-NUM_HIDDEN = 100
-"""Width of the two hidden layers of the speed."""
-SLOPE = 0.01
-"""Slope of their leaky rectifiers below zero."""
-BLOCK = 100
-"""Number of points whose cosines are computed together: few enough to stay in the processor's cache."""
-NUM_SAMPLES = 50
-"""Number of samples of a rollout before refinement."""
-NUM_KEPT = 4
-"""Number of sets of starts whose rollouts are kept."""
-AT_GOAL = 1e-9
-"""Distance from the latent goal within which the velocity is zero, in the normalised unit."""
 
 
-EVEN, ODD = slice(0, None, 2), slice(1, None, 2)
-"""Coordinates of even and of odd number, counted from 0."""
-MASKS = tuple((ODD, EVEN) if k % 2 == 0 else (EVEN, ODD) for k in range(NUM_BLOCKS))
-"""Coordinates that each layer reads, and those that it moves."""
+@dataclass(frozen=True)
+class EFlowSettings:
+    """Architecture of the networks, the authors'."""
+
+    num_blocks: int = 10
+    """Number of coupling layers."""
+    num_features: int = 200
+    """Number of random Fourier features of each of a layer's two functions."""
+    length_scale: float = 0.45
+    """Length scale of the features, in the unit of the normalised demonstrations: their extent along each axis is 1."""
+    num_hidden: int = 100
+    """Width of the two hidden layers of the speed."""
+    slope: float = 0.01
+    """Slope of their leaky rectifiers below zero."""
+
+    @property
+    def masks(self) -> tuple[tuple[slice, slice], ...]:
+        """Coordinates that each layer reads, and those that it moves: of odd and of even number in turn."""
+        even, odd = slice(0, None, 2), slice(1, None, 2)
+        return tuple((odd, even) if k % 2 == 0 else (even, odd) for k in range(self.num_blocks))
+
+
+ARCHITECTURE = EFlowSettings()
 
 
 def num_of(coordinates: slice, dim: int) -> int:
@@ -119,11 +122,12 @@ class Coupling(Diffeomorphism):
         extended[:, :-1] = x
         values = np.empty((len(x), self.amplitudes.shape[1]))
         slopes = np.empty((len(x) if with_slopes else 0, self.slopes.shape[1]))
-        for k in range(0, len(x), BLOCK):
-            phase = extended[k : k + BLOCK] @ self.frequencies
+        num = 100  # points whose cosines stay in the processor's cache
+        for k in range(0, len(x), num):
+            phase = extended[k : k + num] @ self.frequencies
             if with_slopes:
-                slopes[k : k + BLOCK] = np.sin(phase) @ self.slopes
-            values[k : k + BLOCK] = np.cos(phase, out=phase) @ self.amplitudes
+                slopes[k : k + num] = np.sin(phase) @ self.slopes
+            values[k : k + num] = np.cos(phase, out=phase) @ self.amplitudes
         return values, slopes.reshape(len(slopes), values.shape[1], len(self.frequencies) - 1)
 
 
@@ -159,7 +163,7 @@ class Speed:
         """σ (N,), in normalised units a second, at normalised points `x` (N, k)."""
         for W, c in self.layers[:-1]:
             x = x @ W.T + c
-            x = np.maximum(x, SLOPE * x)
+            x = np.maximum(x, ARCHITECTURE.slope * x)
         W, c = self.layers[-1]
         return np.exp(x @ W.T + c)[:, 0]
 
@@ -192,26 +196,23 @@ class EFlowSystem:
         Raises:
             NotFittedError: an array is missing, or of another shape.
         """
-        dim = task.demonstrations[0].dimension
-        num_moved = (dim + 1) // 2
+        dim, num_hidden = task.demonstrations[0].dimension, ARCHITECTURE.num_hidden
+        features = (ARCHITECTURE.num_blocks, 2, ARCHITECTURE.num_features)
         shapes = {
-            "frequencies": (NUM_BLOCKS, 2, NUM_FEATURES, num_moved),
-            "phases": (NUM_BLOCKS, 2, NUM_FEATURES),
-            "weights": (NUM_BLOCKS, 2, NUM_FEATURES, num_moved),
+            "frequencies": (*features, (dim + 1) // 2),
+            "phases": features,
+            "weights": (*features, (dim + 1) // 2),
             "normalisation": (2, dim),
             "goal": (dim,),
-            "speed_0": (NUM_HIDDEN, dim + 1),
-            "speed_1": (NUM_HIDDEN, NUM_HIDDEN + 1),
-            "speed_2": (1, NUM_HIDDEN + 1),
+            "speed_0": (num_hidden, dim + 1),
+            "speed_1": (num_hidden, num_hidden + 1),
+            "speed_2": (1, num_hidden + 1),
         }
-        for name, shape in shapes.items():
-            found = arrays[name].shape if name in arrays else "nothing"
-            if found != shape:
-                raise NotFittedError(f"eflow: array {name!r}: found {found}; accepted: {shape}")
+        check_shapes("eflow", arrays, shapes)
         couplings = [
             Coupling.of(a, b, W[..., : num_of(a, dim)], phases, w[..., : num_of(b, dim)])
             for (a, b), W, phases, w in zip(
-                MASKS,
+                ARCHITECTURE.masks,
                 *(arrays[name].astype(precision) for name in ("frequencies", "phases", "weights")),
                 strict=True,
             )
@@ -226,9 +227,7 @@ class EFlowSystem:
     def velocity(self, y: Array) -> Array:
         """ẏ (N, 3), m/s, at `y` (N, 3), metres."""
         z, J = self.transform.jacobian(y)
-        offset = (z - self.latent_goal) / self.scale
-        r = np.linalg.norm(offset, axis=1, keepdims=True)
-        descent = -np.divide(offset, r, out=np.zeros_like(offset), where=r > AT_GOAL)
+        descent = unit(self.latent_goal - z)
         rate = self.scale * self.speed(self.normalised(y))
         return rate[:, None] * np.linalg.solve(J, descent[..., None])[..., 0]
 
@@ -239,8 +238,6 @@ class EFlowSystem:
     def rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Motions to the goal, exact but for their times, whose integral is a sum of trapezia.
 
-        Those asked for lately are kept: while an obstacle is dragged the starts stay. Nobody may change them.
-
         Args:
             starts: (R, 3), metres.
             spacing: largest distance between neighbouring samples, metres.
@@ -248,21 +245,12 @@ class EFlowSystem:
         Returns:
             For each start a path (T, 3), metres, and its times (T,), seconds.
         """
-        return self._kept_rollouts(starts.tobytes(), spacing)
-
-    @cached_property
-    def _kept_rollouts(self) -> Callable[[bytes, float], tuple[tuple[Array, ...], tuple[Array, ...]]]:
-        return lru_cache(NUM_KEPT)(
-            lambda content, spacing: self._rollouts(np.frombuffer(content).reshape(-1, 3), spacing)
-        )
-
-    def _rollouts(self, starts: Array, spacing: float) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         rays = self.transform.forward(starts) - self.latent_goal
 
         def evaluate(index: Indices, fraction: Array) -> Array:
             return self.transform.inverse(self.latent_goal + (1 - fraction)[:, None] * rays[index])[:, None]
 
-        bundle = refined(evenly_sampled(evaluate, len(starts), NUM_SAMPLES), evaluate, spacing)
+        bundle = refined(evenly_sampled(evaluate, len(starts), 50), evaluate, spacing)
         slowness = bundle.split(1 / self.speed(self.normalised(bundle.positions)))
         lengths = np.linalg.norm(rays, axis=1) / self.scale
         steps = (

@@ -6,6 +6,8 @@ An epoch is one step on all points, as theirs is with random Fourier features.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,24 +15,33 @@ import torch  # pyright: ignore[reportMissingImports] - an extra
 from scipy.signal import savgol_filter
 
 from dt_viz.baselines.base import NotFittedError, Problem
-from dt_viz.baselines.eflow import LENGTH_SCALE, MASKS, NUM_BLOCKS, NUM_FEATURES, NUM_HIDDEN, SLOPE, num_of
+from dt_viz.baselines.eflow import ARCHITECTURE, num_of
 from dt_viz.flows.fields import Array
 from dt_viz.learning.demonstrations import Demonstration
 from dt_viz.learning.preparation import ImitationError, prepare
 from dt_viz.metrics import interpolate
 
-RATE, DECAY, LARGEST_GRADIENT = 1e-4, 1e-10, 0.1
-"""Learning rate and weight decay of Adam, and the norm at which the gradient is clipped."""
-NUM_POINTS = 150
-"""Number of points of a demonstration, evenly in time."""
-WINDOW = 25 / 150
-"""Part of them that is smoothed over, by cubic polynomials (Savitzky and Golay)."""
-LEARNED = slice(6, NUM_POINTS - 3, 2)
-"""Points that are learned from: at the first and the last the polynomials of a motion at rest turn back. Every second
-tells as much as all, in half the time."""
-REPORT_EVERY = 25
-"""Number of epochs between two reports."""
 
+@dataclass(frozen=True)
+class TrainingSettings:
+    """What is learned from, and how quickly."""
+
+    rate: float = 1e-4
+    """Learning rate of Adam."""
+    decay: float = 1e-10
+    """Weight decay of Adam."""
+    largest_gradient: float = 0.1
+    """Norm at which the gradient is clipped."""
+    num_points: int = 150
+    """Number of points of a demonstration, evenly in time."""
+    window: int = 25
+    """Number of points that are smoothed over, by cubic polynomials (Savitzky and Golay)."""
+    learned: slice = slice(6, -2, 2)
+    """Points that are learned from: at the first and the last the polynomials of a motion at rest turn back. Every
+    second tells as much as all, in half the time."""
+
+
+SETTINGS = TrainingSettings()
 Tensors = dict[str, "torch.Tensor"]
 
 
@@ -54,7 +65,7 @@ def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed
     fixed, learned = initial(x.shape[1], rng)
     points, velocities = (torch.tensor(array, dtype=torch.float32) for array in (x, v))
     centre = torch.tensor(goal * normalisation[0] + normalisation[1], dtype=torch.float32)
-    optimiser = torch.optim.Adam(learned.values(), lr=RATE, weight_decay=DECAY)
+    optimiser = torch.optim.Adam(learned.values(), lr=SETTINGS.rate, weight_decay=SETTINGS.decay)
     best, least = learned, np.inf
     for epoch in range(num_epochs):
         loss = torch.nn.functional.smooth_l1_loss(velocity(points, centre, fixed, learned), velocities)
@@ -62,9 +73,9 @@ def train(problem: Problem, num_epochs: int, report: Callable[[str], None], seed
             best, least = {name: tensor.detach().clone() for name, tensor in learned.items()}, loss.item()
         optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(learned.values(), LARGEST_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(learned.values(), SETTINGS.largest_gradient)
         optimiser.step()
-        if (epoch + 1) % REPORT_EVERY == 0:
+        if (epoch + 1) % 25 == 0:
             report(f"epoch {epoch + 1} of {num_epochs}, loss {loss.item():.3g}")
     arrays = {name: tensor.detach().numpy().astype(float) for name, tensor in {**fixed, **best}.items()}
     return {**arrays, "normalisation": normalisation, "goal": goal}
@@ -84,13 +95,12 @@ def samples(demonstrations: tuple[Demonstration, ...]) -> tuple[Array, Array, Ar
         motions = prepare(demonstrations)
     except ImitationError as error:
         raise NotFittedError(str(error)) from error
-    window = 2 * int(WINDOW * NUM_POINTS / 2) + 1
     points, rates = [], []
     for times, positions in zip(motions.times, motions.positions, strict=True):
-        even = np.linspace(times[0], times[-1], NUM_POINTS)
-        path = np.asarray(savgol_filter(interpolate(even, times, positions), window, 3, axis=0))
-        points.append(path[LEARNED])
-        rates.append(np.diff(path, axis=0)[LEARNED] / even[1])
+        even = np.linspace(times[0], times[-1], SETTINGS.num_points)
+        path = np.asarray(savgol_filter(interpolate(even, times, positions), SETTINGS.window, 3, axis=0))
+        points.append(path[:-1][SETTINGS.learned])
+        rates.append(np.diff(path, axis=0)[SETTINGS.learned] / even[1])
     every = np.concatenate(points)
     lowest, extent = every.min(axis=0), np.ptp(every, axis=0)
     scale = 1 / np.maximum(extent, 1e-6 * extent.max())
@@ -100,14 +110,14 @@ def samples(demonstrations: tuple[Demonstration, ...]) -> tuple[Array, Array, Ar
 
 def initial(dim: int, rng: np.random.Generator) -> tuple[Tensors, Tensors]:
     """Fixed features, and what is learned: coupling layers that are the identity, a random speed."""
-    num_moved = (dim + 1) // 2
+    features, num_moved = (ARCHITECTURE.num_blocks, 2, ARCHITECTURE.num_features), (dim + 1) // 2
     tensor = lambda array: torch.tensor(array, dtype=torch.float32)  # noqa: E731
     fixed = {
-        "frequencies": tensor(rng.normal(size=(NUM_BLOCKS, 2, NUM_FEATURES, num_moved)) / LENGTH_SCALE),
-        "phases": tensor(rng.uniform(0, 2 * np.pi, size=(NUM_BLOCKS, 2, NUM_FEATURES))),
+        "frequencies": tensor(rng.normal(size=(*features, num_moved)) / ARCHITECTURE.length_scale),
+        "phases": tensor(rng.uniform(0, 2 * np.pi, size=features)),
     }
-    learned = {"weights": torch.zeros(NUM_BLOCKS, 2, NUM_FEATURES, num_moved)}
-    for k, (num_in, num_out) in enumerate([(dim, NUM_HIDDEN), (NUM_HIDDEN, NUM_HIDDEN), (NUM_HIDDEN, 1)]):
+    learned = {"weights": torch.zeros(*features, num_moved)}
+    for k, (num_in, num_out) in enumerate(pairwise((dim, *2 * (ARCHITECTURE.num_hidden,), 1))):
         bound = num_in**-0.5
         learned[f"speed_{k}"] = tensor(rng.uniform(-bound, bound, size=(num_out, num_in + 1)))
     return fixed, {name: value.requires_grad_() for name, value in learned.items()}
@@ -119,7 +129,7 @@ def velocity(x: torch.Tensor, goal: torch.Tensor, fixed: Tensors, learned: Tenso
     J⁻¹ is applied layer by layer, from the last to the first: that of a coupling layer is triangular.
     """
     dim, z, passed = x.shape[1], torch.cat([x, goal[None]]), []
-    for k, (a, b) in enumerate(MASKS):
+    for k, (a, b) in enumerate(ARCHITECTURE.masks):
         num_a, num_b = num_of(a, dim), num_of(b, dim)
         W, w = fixed["frequencies"][k, ..., :num_a], learned["weights"][k, ..., :num_b]
         phase = torch.addmm(fixed["phases"][k].flatten(), z[:, a], W.flatten(0, 1).T)
@@ -136,7 +146,7 @@ def velocity(x: torch.Tensor, goal: torch.Tensor, fixed: Tensors, learned: Tenso
     for k in range(3):
         layer = learned[f"speed_{k}"]
         x = x @ layer[:, :-1].T + layer[:, -1]
-        x = torch.nn.functional.leaky_relu(x, SLOPE) if k < 2 else x
+        x = torch.nn.functional.leaky_relu(x, ARCHITECTURE.slope) if k < 2 else x
     return x.exp() * U
 
 

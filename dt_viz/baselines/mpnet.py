@@ -1,15 +1,15 @@
 """MPNet: a network that plans the arm's next posture (Qureshi et al., Motion Planning Networks, T-RO 2021).
 
-An encoder takes an obstacle's point cloud to a latent vector Z; a planning network with dropout takes (Z, q, q_goal) to
-the next posture. It plans from both ends in turn until a straight line between these is free, at most `MAX_STEPS`
-steps; then waypoints that straight lines can do without are left out (lazy states contraction), and stretches that
-collide are planned again, at most `MAX_ROUNDS` times. Dropout stays active: every attempt is another one.
+A planning network with dropout takes (Z, q, q_goal), with Z an encoding of the obstacle's point cloud, to the next
+posture. It plans from both ends in turn until a straight line between these is free; then waypoints that straight lines
+can do without are left out (lazy states contraction), and stretches that collide are planned again. Dropout stays
+active, so that every attempt differs.
 
 It is trained on a task's few demonstrations (`dt_viz.baselines.mpnet_training`), as in the comparison of Zhi et al.
-(L4DC 2022). These hold no obstacle, so that the encoder, a contractive autoencoder, is trained on a single cloud, the
-empty one: contraction is all that its loss asks of it beyond one constant, and Z does not tell where an obstacle is.
-MPNet avoids only as far as dropout happens to find a free way. A network trained on thousands of planned paths among
-random obstacles, as its authors' is, would do better; that is another comparison.
+(L4DC 2022). These hold no obstacle: the encoder, a contractive autoencoder, would see a single cloud, the empty one,
+and its loss is least where all of its weights are zero. Z is then a constant, part of the bias of the first layer, and
+there is no encoder here. MPNet avoids only as far as dropout happens to find a free way. A network trained on thousands
+of planned paths among random obstacles, as its authors' is, would do better; that is another comparison.
 """
 
 from __future__ import annotations
@@ -21,66 +21,83 @@ from pathlib import Path
 
 import numpy as np
 
-from dt_viz.baselines.base import Method, NotFittedError, Plan, Planner, Problem
+from dt_viz.baselines.base import Method, Plan, Planner, Problem
 from dt_viz.baselines.postures import PlanningScene, Query, planned
-from dt_viz.baselines.weights import FOLDER, load_weights
+from dt_viz.baselines.weights import FOLDER, check_shapes, load_weights
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import rotation
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.robot import NUM_JOINTS
 
-VERSION = 1
+VERSION = 2
 """Version of the weights, raised with every change to what they mean."""
-NUM_POINTS = 100
-"""Number of points of a cloud."""
-ENCODER = (3 * NUM_POINTS, 64, 28)
-"""Widths of the encoder's layers, from the cloud to Z."""
-LAYERS = (ENCODER[-1] + 2 * NUM_JOINTS, 256, 256, 128, 64, 32, NUM_JOINTS)
-"""Widths of the planning network's layers, from (Z, q, q_goal) to the next posture; the authors' has twelve."""
-NUM_CERTAIN = 2
-"""Number of its last layers that no dropout comes before."""
-DROPOUT = 0.5
-"""Probability that a neuron is left out, in training and in planning."""
-MAX_STEPS = 80
-"""Largest number of postures planned for one stretch, from both ends together."""
-MAX_ROUNDS = 3
-"""Largest number of times that colliding stretches are planned again."""
-SEED = 0
-"""Seed of the dropout of each motion."""
+
+
+@dataclass(frozen=True)
+class MPNetSettings:
+    """Architecture of the planning network, and bounds of the search."""
+
+    hidden: tuple[int, ...] = (112, 96, 64, 32)
+    """Widths of the hidden layers; the authors' network has eleven, up to 1280 wide."""
+    num_certain: int = 2
+    """Number of its last layers that no dropout comes before."""
+    dropout: float = 0.5
+    """Probability that a neuron is left out, in training and in planning."""
+    max_steps: int = 80
+    """Largest number of postures planned for one stretch, from both ends together."""
+    max_rounds: int = 3
+    """Largest number of times that colliding stretches are planned again."""
+    seed: int = 0
+    """Seed of the dropout of each motion."""
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Widths of all layers, from (q, q_goal) to the next posture."""
+        return 2 * NUM_JOINTS, *self.hidden, NUM_JOINTS
+
+
+ARCHITECTURE = MPNetSettings()
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Linear layers with parametric rectifiers between them."""
+    """Linear layers with parametric rectifiers between them, and dropout after the first of these."""
 
     weights: tuple[Array, ...]
     """Of each layer, (out, in)."""
     biases: tuple[Array, ...]
-    slopes: tuple[float, ...]
+    slopes: Array
     """Slope of the rectifier after each layer but the last, below zero."""
 
-    def __call__(self, x: Array, masks: Sequence[Array] = ()) -> Array:
-        """Compute the output (out,) for `x` (in,).
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array]) -> Network:
+        """Make the network of arrays ``W_k``, ``c_k`` and ``slopes``."""
+        layers = range(len(arrays["slopes"]) + 1)
+        weights, biases = (tuple(arrays[f"{kind}_{k}"] for k in layers) for kind in "Wc")
+        return cls(weights, biases, arrays["slopes"])
 
-        Args:
-            x: the input.
-            masks: factors for the outputs of the first layers: 0 where dropout leaves a neuron out, else 1/(1 − p).
-        """
+    def masks(self, rng: np.random.Generator, num: int) -> list[Array]:
+        """Factors (num, out) for the outputs of the first layers: 0 for neurons that are left out, else 1/(1 − p)."""
+        kept = 1 - ARCHITECTURE.dropout
+        return [(rng.random((num, len(c))) < kept) / kept for c in self.biases[: -ARCHITECTURE.num_certain]]
+
+    def traced(self, x: Array, masks: Sequence[Array]) -> tuple[list[Array], list[Array]]:
+        """Compute each layer's inputs (N, in) and sums (N, out) for `x` (N, in); the last sums are the output."""
+        inputs, sums = [], []
         for k, (W, c) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = W @ x + c
+            inputs.append(x)
+            sums.append(x @ W.T + c)
             if k < len(self.slopes):
-                x = np.where(x > 0, x, self.slopes[k] * x)
+                x = np.where(sums[k] > 0, sums[k], self.slopes[k] * sums[k])
             if k < len(masks):
                 x = x * masks[k]
-        return x
+        return inputs, sums
 
 
 @dataclass(frozen=True, eq=False)
 class MPNetModel:
-    """Encoder and planning network of one task."""
+    """Planning network of one task."""
 
-    encoder: Network
     planning: Network
     centre: Array
     """(6,) rad, the postures' place in the network's unit."""
@@ -89,54 +106,28 @@ class MPNetModel:
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> MPNetModel:
-        """Make the networks that weights describe, as `dt_viz.baselines.mpnet_training.train` returns them.
+        """Make the network that weights describe, as `dt_viz.baselines.mpnet_training.train` returns them.
 
         Raises:
             NotFittedError: an array is missing, or of another shape.
         """
         shapes: dict[str, tuple[int, ...]] = {"centre": (NUM_JOINTS,), "scale": (NUM_JOINTS,)}
-        for name, widths in (("encoder", ENCODER), ("planning", LAYERS)):
-            for k, (num_in, num_out) in enumerate(pairwise(widths)):
-                shapes |= {f"{name}_W_{k}": (num_out, num_in), f"{name}_c_{k}": (num_out,)}
-            shapes[f"{name}_slopes"] = (len(widths) - 2,)
-        for name, shape in shapes.items():
-            found = arrays[name].shape if name in arrays else "nothing"
-            if found != shape:
-                raise NotFittedError(f"mpnet: array {name!r}: found {found}; accepted: {shape}")
+        for k, (num_in, num_out) in enumerate(pairwise(ARCHITECTURE.widths)):
+            shapes |= {f"W_{k}": (num_out, num_in), f"c_{k}": (num_out,)}
+        check_shapes("mpnet", arrays, shapes | {"slopes": (len(ARCHITECTURE.hidden),)})
+        return cls(Network.of(arrays), arrays["centre"], arrays["scale"])
 
-        def network(name: str, widths: tuple[int, ...]) -> Network:
-            layers = range(len(widths) - 1)
-            weights, biases = (tuple(arrays[f"{name}_{kind}_{k}"] for k in layers) for kind in "Wc")
-            return Network(weights, biases, tuple(map(float, arrays[f"{name}_slopes"])))
-
-        return cls(network("encoder", ENCODER), network("planning", LAYERS), arrays["centre"], arrays["scale"])
-
-    def encoded(self, obstacle: Union) -> Array:
-        """Z (28,) of an obstacle."""
-        return self.encoder(cloud(obstacle).ravel())
-
-    def next(self, encoded: Array, q: Array, goal: Array, rng: np.random.Generator) -> Array:
+    def next(self, q: Array, goal: Array, rng: np.random.Generator) -> Array:
         """The next posture (6,), rad, on the way from q (6,) to a goal (6,).
 
         Args:
-            encoded: Z (28,).
             q: posture, rad.
             goal: posture, rad.
             rng: draws the neurons that are left out.
         """
-        widths = LAYERS[1:-NUM_CERTAIN]
-        masks = [(rng.random(width) >= DROPOUT) / (1 - DROPOUT) for width in widths]
-        x = np.concatenate([encoded, (q - self.centre) / self.scale, (goal - self.centre) / self.scale])
-        return self.centre + self.scale * self.planning(x, masks)
-
-
-def cloud(obstacle: Union) -> Array:
-    """Points (`NUM_POINTS`, 3), metres, on the obstacle's surface; all at the origin if there is none."""
-    if not obstacle.parts:
-        return np.zeros((NUM_POINTS, 3))
-    parts = [part.surface()[0] @ rotation(part.wxyz).T + np.asarray(part.position) for part in obstacle.parts]
-    points = np.concatenate(parts)
-    return points[np.linspace(0, len(points) - 1, NUM_POINTS).round().astype(int)]
+        x = np.concatenate([(q - self.centre) / self.scale, (goal - self.centre) / self.scale])
+        _, sums = self.planning.traced(x[None], self.planning.masks(rng, 1))
+        return self.centre + self.scale * sums[-1][0]
 
 
 Replan = Callable[[Array, Array], list[Array]]
@@ -148,8 +139,6 @@ class Search:
     """The search for one motion."""
 
     model: MPNetModel
-    encoded: Array
-    """Z (28,) of the obstacle."""
     surroundings: PlanningScene
     rng: np.random.Generator
     cancelled: Cancelled = never
@@ -165,11 +154,11 @@ class Search:
         return self.known[line]
 
     def bidirectional(self, start: Array, goal: Array) -> list[Array]:
-        """Plan from both ends in turn until they can be joined; after `MAX_STEPS` they are joined all the same."""
+        """Plan from both ends in turn until they can be joined; after `max_steps` they are joined all the same."""
         own, other = [start], [goal]
-        for _ in range(MAX_STEPS):
+        for _ in range(ARCHITECTURE.max_steps):
             robot = self.surroundings.robot
-            own.append(robot.clip(self.model.next(self.encoded, own[-1], other[-1], self.rng)))
+            own.append(robot.clip(self.model.next(own[-1], other[-1], self.rng)))
             joined = self.free(own[-1], other[-1])
             own, other = other, own
             if joined:
@@ -202,7 +191,7 @@ class Search:
     def way(self, query: Query) -> list[Array]:
         """Plan a motion; it may collide."""
         way = self.contracted(self.bidirectional(query.start, query.goal))
-        for _ in range(MAX_ROUNDS):
+        for _ in range(ARCHITECTURE.max_rounds):
             if self.is_free(way):
                 break
             way = self.contracted(self.replanned(way, self.bidirectional))
@@ -218,11 +207,11 @@ class MPNetPlanner:
 
     def plan(self, obstacle: Union, starts: Array, cancelled: Cancelled = never) -> Plan:
         """Plan around an obstacle as far as that succeeds; see `Planner`."""
-        encoded, surroundings = self.model.encoded(obstacle), PlanningScene.of(self.problem.robot, obstacle)
+        surroundings = PlanningScene.of(self.problem.robot, obstacle)
         queries, ways, warnings = [], [], []
         for number, start in enumerate(starts):
             query = Query.of(self.problem, start)
-            search = Search(self.model, encoded, surroundings, np.random.default_rng(SEED), cancelled)
+            search = Search(self.model, surroundings, np.random.default_rng(ARCHITECTURE.seed), cancelled)
             way = self.way(search, query)
             if not search.is_free(way):
                 warnings.append(f"the motion from start {number + 1} collides: no free way was found")
@@ -254,5 +243,5 @@ class MPNet(Method):
         return MPNetPlanner(problem, self.model(problem))
 
     def model(self, problem: Problem) -> MPNetModel:
-        """Load the task's networks. Raises NotFittedError as `Method.fit`."""
+        """Load the task's network. Raises NotFittedError as `Method.fit`."""
         return MPNetModel.of(load_weights(MPNet.name, VERSION, problem.task, self.folder))

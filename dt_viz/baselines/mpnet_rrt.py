@@ -14,15 +14,10 @@ from typing import Any
 import numpy as np
 
 from dt_viz.baselines.base import Planner, Problem
-from dt_viz.baselines.mpnet import SEED, MPNet, MPNetPlanner, Search
+from dt_viz.baselines.mpnet import ARCHITECTURE, MPNet, MPNetPlanner, Search
 from dt_viz.baselines.postures import Query
 from dt_viz.flows.fields import Array
 from dt_viz.robot.robot import NUM_JOINTS, Robot
-
-SECONDS = 10.0
-"""Time for a stretch, seconds; where none is found in it, the stretch stays in collision."""
-BEYOND = np.pi
-"""Angle beyond both ends up to which a joint without limits may turn, rad."""
 
 _one_at_a_time = threading.Lock()
 """OMPL's random numbers have one seed for the whole process."""
@@ -61,8 +56,8 @@ class MPNetRRT(MPNet):
     )
     needs = ("ompl",)
 
-    def __init__(self, seconds: float = SECONDS) -> None:
-        """Choose the time for a stretch."""
+    def __init__(self, seconds: float = 10.0) -> None:
+        """Choose the time for a stretch, seconds; where none is found in it, the stretch stays in collision."""
         super().__init__()
         self.seconds = seconds
 
@@ -82,7 +77,7 @@ def _rrt_connect(watch: _Watch, robot: Robot, start: Array, goal: Array) -> list
             return watch.is_free(_posture(start), _posture(end))
 
     util.setLogLevel(util.LOG_NONE)
-    util.RNG.setSeed(SEED + 1)  # 0 would be random
+    util.RNG.setSeed(ARCHITECTURE.seed + 1)  # 0 would be random
     space = base.RealVectorStateSpace(NUM_JOINTS)
     space.setBounds(_bounds(base.RealVectorBounds(NUM_JOINTS), robot, start, goal))
     setup = geometric.SimpleSetup(space)
@@ -104,9 +99,9 @@ def _rrt_connect(watch: _Watch, robot: Robot, start: Array, goal: Array) -> list
 
 
 def _bounds(bounds: Any, robot: Robot, start: Array, goal: Array) -> Any:  # noqa: ANN401 - OMPL's
-    """The joint limits, or `BEYOND` the ends where there are none, in OMPL's bounds."""
-    lowest = np.where(np.isinf(robot.lower), np.minimum(start, goal) - BEYOND, robot.lower)
-    highest = np.where(np.isinf(robot.upper), np.maximum(start, goal) + BEYOND, robot.upper)
+    """The joint limits, or half a turn beyond the ends where there are none, in OMPL's bounds."""
+    lowest = np.where(np.isinf(robot.lower), np.minimum(start, goal) - np.pi, robot.lower)
+    highest = np.where(np.isinf(robot.upper), np.maximum(start, goal) + np.pi, robot.upper)
     for joint in range(NUM_JOINTS):
         bounds.setLow(joint, float(lowest[joint]))
         bounds.setHigh(joint, float(highest[joint]))

@@ -17,12 +17,8 @@ from dt_viz.robot.inverse_kinematics import IK_TOLERANCE, inverse_kinematics
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
 
-NUM_SAMPLES = 200
-"""Number of even samples of a motion; its corners come on top."""
 SPACING = 0.01
 """Largest distance, metres, that a point of the arm moves between two postures that are tried for a quick answer."""
-NUM_TRIED = 3
-"""Number of postures, those with the deepest spheres, whose meshes are tried before the whole line's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +83,7 @@ class PlanningScene:
         room = (self.obstacle.signed_distance(points) - self.body.radius).min(axis=1)
         if room.min() > SPACING / 2:
             return True
-        deepest = line[np.argsort(room)[:NUM_TRIED]]
+        deepest = line[np.argsort(room)[:3]]  # tried before the whole line
         if any((self.model.obstacle_distance(deepest, part)[0] <= 0).any() for part in self.obstacle.parts):
             return False
         return self.model.nearest_to_obstacle(line[[0, -1]], self.obstacle).distance > 0
@@ -106,7 +102,7 @@ def planned(problem: Problem, queries: Sequence[Query], ways: Sequence[Array], w
     for query, way in zip(queries, ways, strict=True):
         length = arc_length(way)
         kept = np.concatenate([[True], np.diff(length) > 0])
-        at = np.union1d(np.linspace(0, length[-1], NUM_SAMPLES), length[kept])
+        at = np.union1d(np.linspace(0, length[-1], 200), length[kept])
         q = interpolate(at, length[kept], way[kept])
         even = query.duration * at / length[-1] if length[-1] else at
         joints.append(q)

@@ -14,8 +14,7 @@ from dt_viz.baselines.modulation import Modulation
 from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.mpnet_rrt import MPNetRRT
 from dt_viz.baselines.ours import Ours, OursAlone
-from dt_viz.baselines.repulsive import EFlowRepulsive, EFlowRepulsiveFine
-from dt_viz.baselines.signed_distance import SignedDistance
+from dt_viz.baselines.repulsive import EFlowRepulsive
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Learned
 
@@ -26,12 +25,10 @@ METHODS: Mapping[str, Method] = {
         OursAlone(),
         EFlow(),
         EFlowRepulsive(),
-        EFlowRepulsiveFine(),
         MPNet(),
         MPNetRRT(),
         Linear(),
         Modulation(),
-        SignedDistance(),
     )
 }
 """Every method, in the order of the tables."""
@@ -44,8 +41,8 @@ class Trained:
     version: int
     """Version of its weights."""
     training: str
-    """Module with `train(problem, num_epochs, report, seed)`, which gives the arrays of the weights; it needs more than
-    DT-Viz itself."""
+    """Module with `train(problem, num_epochs, report, seed)`, which gives the arrays of the weights; it may need
+    more than DT-Viz itself."""
     num_epochs: int
     """Default number of epochs."""
     from_folder: Callable[[Path], Method]

@@ -18,8 +18,10 @@ from dt_viz.shipped import ASSETS
 
 FOLDER = ASSETS / "baselines"
 """Folder of the weights that ship with DT-Viz."""
-MAX_FILE, MAX_BYTES = 10**6, 10**7
+MAX_BYTES = 10**7
 """Largest number of bytes of a file, and of its arrays when unpacked."""
+HALF_FROM = 100
+"""Number of numbers from which on an array is stored in half precision; single goals and scales need more digits."""
 MADE_BY = "python -m dt_viz.evaluate train"
 """Command that makes the weights."""
 
@@ -29,7 +31,7 @@ class WeightsError(DataError):
 
 
 def save_weights(path: Path, method: str, version: int, task: Task, arrays: Mapping[str, Array]) -> None:
-    """Write the weights of a method for a task; arrays of floats are stored in single precision.
+    """Write the weights of a method for a task, floats in single precision, large arrays of them in half.
 
     Args:
         path: the file; `weights_file` names the one that `load_weights` reads.
@@ -41,10 +43,11 @@ def save_weights(path: Path, method: str, version: int, task: Task, arrays: Mapp
     Raises:
         OSError: the file cannot be written.
     """
-    values = {name: np.asarray(array) for name, array in arrays.items()}
-    single = {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in values.items()}
-    stamp = {"_method": method, "_version": version, "_demonstrations": _demonstrations(task)}
-    write_whole(path, npz_bytes({**{name: np.array(value) for name, value in stamp.items()}, **single}))
+    stored = {
+        name: array.astype(np.float32 if array.size < HALF_FROM else np.float16) if array.dtype.kind == "f" else array
+        for name, array in arrays.items()
+    }
+    write_whole(path, npz_bytes({**_stamp(method, version, task), **stored}))
 
 
 def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -> dict[str, Array]:
@@ -60,9 +63,8 @@ def load_weights(method: str, version: int, task: Task, folder: Path = FOLDER) -
         raise NotFittedError(text)
     try:
         with parsing(WeightsError, path, "file", accepted):
-            arrays = arrays_of(read_bytes(path, MAX_FILE), max_bytes=MAX_BYTES)
-            asked = {"_method": method, "_version": version, "_demonstrations": _demonstrations(task)}
-            for field, wanted in asked.items():
+            arrays = arrays_of(read_bytes(path, MAX_BYTES), max_bytes=MAX_BYTES)
+            for field, wanted in _stamp(method, version, task).items():
                 found = arrays.pop(field).item()
                 if found != wanted:
                     raise FormatError(field[1:], repr(found)[:80], repr(wanted))
@@ -79,6 +81,14 @@ def weights_file(folder: Path, method: str, task: Task) -> Path:
     return folder / f"{method}_{task.name}.npz"
 
 
-def _demonstrations(task: Task) -> str:
-    """Digest of the task's demonstrations."""
-    return fingerprint(task.demonstrations, "weights")
+def check_shapes(method: str, arrays: Mapping[str, Array], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise NotFittedError if a method's array is missing, or of another shape."""
+    for name, shape in shapes.items():
+        found = arrays[name].shape if name in arrays else "nothing"
+        if found != shape:
+            raise NotFittedError(f"{method}: array {name!r}: found {found}; accepted: {shape}")
+
+
+def _stamp(method: str, version: int, task: Task) -> dict[str, str | int]:
+    """What a file says about itself: method, version, and a digest of the task's demonstrations."""
+    return {"_method": method, "_version": version, "_demonstrations": fingerprint(task.demonstrations, "weights")}

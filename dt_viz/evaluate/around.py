@@ -53,6 +53,7 @@ from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import refined
 from dt_viz.metrics import maximum_collision_distance, sharpest_turn
 from dt_viz.motion.stack import FINE, Solution
+from dt_viz.numerics import unit
 from dt_viz.obstacles.occupancy import GENERATORS
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Cylinder, Obstacle, Quaternion, Sphere, as_point
 from dt_viz.obstacles.union import Union
@@ -64,15 +65,9 @@ from dt_viz.warning import Kind, MotionWarning
 
 TURN_ARC = 0.015
 """Length of the path over which a turn is measured, metres."""
-SHARP = 90.0
-"""Turn over `TURN_ARC` beyond which it is sharp, degrees."""
 ALLOWANCE = 1e-3
 """Shortfall of a clearance, metres, with which the margin counts as kept."""
-SPACING = 1e-3
-"""Distance between the samples of an end effector's path, metres, where it avoids alone."""
 SHAPES = ("sphere", "box", "cylinder")
-SEEDS = 1_000_003
-"""Difference of the seeds of the first and the second obstacle of a place."""
 
 
 @dataclass(frozen=True)
@@ -245,9 +240,9 @@ def _clearance(path: Array, obstacle: Union) -> float:
 
 
 def _finely(solution: Solution) -> tuple[Array, ...]:
-    """Rollouts (T, 3) of a stack at a fine spacing, metres."""
+    """Rollouts (T, 3) of a stack, sampled every millimetre."""
     bundle = replace(solution.bundle, levels=solution.bundle.positions[:, None])
-    return refined(bundle, lambda i, u: solution.positions_at(i, u)[:, None], SPACING).paths
+    return refined(bundle, lambda i, u: solution.positions_at(i, u)[:, None], 1e-3).paths
 
 
 def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, ...]]:
@@ -258,9 +253,8 @@ def _obstacles(task: Task, options: argparse.Namespace) -> list[tuple[Obstacle, 
     middle = _shaped(first, centre, np.full(3, (low + high) / 2), UPRIGHT)
     drawn = []
     for nth in range(0 if options.obstacle else options.number):
-        rng = np.random.default_rng(options.seed + SEEDS * nth)
-        direction = rng.normal(size=(count, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        rng = np.random.default_rng(options.seed + 1_000_003 * nth)  # not the seed of another place
+        direction = unit(rng.normal(size=(count, 3)))
         offset = options.spread * rng.uniform(size=(count, 1)) ** (1 / 3) * direction
         along, sizes = rng.uniform(begin, end, size=count), rng.uniform(low, high, size=(count, 3))
         turns = np.roll(Rotation.from_rotvec(np.pi * rng.normal(size=(count, 3))).as_quat(), 1, axis=1)
@@ -353,8 +347,8 @@ def _shares(places: Sequence[Place]) -> Iterator[Row]:
     yield share("from some of the starts only", [len(place.rollouts) < len(place.ends) - 1 for place in moved])
     yield share("collisions", [place.clearance < 0 for place in moved])
     yield share(f"at least {1e3 * margin:.0f} mm kept", [place.clearance >= margin for place in moved])
-    yield share(f"turns sharper than {SHARP:.0f}°", [place.largest(lambda r: r.turn) > SHARP for place in moved])
-    yield share("the same without avoidance", [place.largest(lambda r: r.turn_without) > SHARP for place in moved])
+    yield share("turns sharper than 90°", [place.largest(lambda r: r.turn) > 90 for place in moved])
+    yield share("the same without avoidance", [place.largest(lambda r: r.turn_without) > 90 for place in moved])
     if ratios := [place.ratio for place in moved if place.ratio > 0]:
         median, p95 = np.percentile(ratios, [50, 95])
         yield {

@@ -28,8 +28,6 @@ from dt_viz.metrics import arc_length, discrete_frechet, resample_by_arc_length,
 WAYS = ("learned", "mean", "nearest")
 AT_GOAL = 5e-5
 """Distance from the goal at which a rollout ends, metres."""
-NUM_SAMPLES = 1000
-"""Number of samples of a rollout, evenly in time."""
 Learned = Imitation | AugmentedImitation
 Learn = Callable[[Sequence[Demonstration]], Learned]
 NUM_COMPARED = 400
@@ -134,7 +132,7 @@ def rollouts_from(imitation: Learned, starts: Array) -> tuple[Array, Array]:
     for start in starts:
         system, state = begun(imitation, start)
         (end,) = arrival_times(system, system.transform.forward(state)[None])
-        times = end * np.linspace(0.0, 1.0, NUM_SAMPLES)
+        times = end * np.linspace(0.0, 1.0, 1000)
         rollouts.append(system.rollout(state, times)[:, : len(start)])
         all_times.append(times)
     return np.stack(rollouts), np.stack(all_times)

@@ -46,13 +46,7 @@ from dt_viz.learning.imitation import OBJECTIVES, ImitationError, ImitationSetti
 from dt_viz.learning.state import learn as learn_in_state
 from dt_viz.metrics import rms_at_equal_times
 
-GRID = {2: 101, 3: 25}
-"""Number of points on each side of the certificates' grid, by dimension."""
-NUM_PHASES = 7
-"""Number of phases at which the certificates of augmented motions are computed."""
 STATES = ("plain", "augmented")
-NUM_WORST = 9
-"""Number of held-out demonstrations that are drawn."""
 
 
 @dataclass(frozen=True)
@@ -194,13 +188,13 @@ def measured(
 
 
 def _states(imitation: Learned, paths: Sequence[Array]) -> Array:
-    """States (N, d) of the certificates' grid; augmented ones at each of `NUM_PHASES`."""
-    grid = grown_grid(np.concatenate(paths), GRID[len(imitation.goal)])
+    """States (N, d) of the certificates' grid; augmented ones at each of several phases."""
+    grid, num_phases = grown_grid(np.concatenate(paths), 101 if len(imitation.goal) == 2 else 25), 7
     if not isinstance(imitation, AugmentedImitation):
         return grid
-    states = np.tile(imitation.states(imitation.starts[0]), (NUM_PHASES * len(grid), 1))
-    states[:, : imitation.dim] = np.tile(grid, (NUM_PHASES, 1))
-    states[:, imitation.dim] = np.repeat(np.linspace(0, imitation.top, NUM_PHASES), len(grid))
+    states = np.tile(imitation.states(imitation.starts[0]), (num_phases * len(grid), 1))
+    states[:, : imitation.dim] = np.tile(grid, (num_phases, 1))
+    states[:, imitation.dim] = np.repeat(np.linspace(0, imitation.top, num_phases), len(grid))
     return states
 
 
@@ -251,7 +245,7 @@ def cases_of(name: str, source: Source, followed: Sequence[Followed]) -> list[tu
     return cases
 
 
-def worst_of(cases: Sequence[tuple[float, FigurePanel]], num: int = NUM_WORST) -> list[tuple[float, FigurePanel]]:
+def worst_of(cases: Sequence[tuple[float, FigurePanel]], num: int = 9) -> list[tuple[float, FigurePanel]]:
     """The cases in which what was learned is farthest off, the worst first."""
     return sorted(cases, key=lambda case: -case[0])[:num]
 

@@ -60,16 +60,26 @@ from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.panel.avoid import OFF, SPACES
 
-EDITS_PER_SECOND = 20
-"""Rate of a drag's edits; no page sends more."""
-RADIUS, LAP = 0.06, 5.0
-"""Radius of the circle around the obstacle's place, in the task's slice, metres, and the time for one lap, seconds."""
-FIRST_PICTURE = 60.0
-"""Longest accepted time until a visitor has a picture, seconds."""
-SETTLED = 10.0
-"""Time after the first pictures until nothing is refined any more, seconds."""
-PATIENCE = 60.0
-"""Longest time to wait for the picture of the last edit, seconds."""
+
+@dataclass(frozen=True)
+class LoadSettings:
+    """How visitors drag, and how long they wait; times in seconds."""
+
+    edits_per_second: int = 20
+    """Rate of a drag's edits; no page sends more."""
+    radius: float = 0.06
+    """Radius of the circle around the obstacle's place, in the task's slice, metres."""
+    lap: float = 5.0
+    """Time for one lap of it."""
+    first_picture: float = 60.0
+    """Longest accepted time until a visitor has a picture."""
+    settled: float = 10.0
+    """Time after the first pictures until nothing is refined any more."""
+    patience: float = 60.0
+    """Longest time to wait for the picture of the last edit."""
+
+
+SETTINGS = LoadSettings()
 
 
 @dataclass
@@ -104,7 +114,7 @@ class Visit:
         await self.client.grab()
         began = time.perf_counter()
         for number, place in enumerate(places):
-            await asyncio.sleep(max(0.0, began + number / EDITS_PER_SECOND - time.perf_counter()))
+            await asyncio.sleep(max(0.0, began + number / SETTINGS.edits_per_second - time.perf_counter()))
             self.edits[place] = number
             self.sent.append(time.perf_counter())
             await self.client.move(place)
@@ -167,9 +177,9 @@ def run(options: argparse.Namespace) -> int:
 def places_of(task: Task, number: int, num_edits: int) -> list[Point]:
     """Return where one of several visitors drags the obstacle: a circle in the task's slice, no place twice."""
     edits = np.arange(num_edits)
-    angles = 2 * np.pi * edits / (EDITS_PER_SECOND * LAP) + number
+    angles = 2 * np.pi * edits / (SETTINGS.edits_per_second * SETTINGS.lap) + number
     widening = 1e-7 * edits  # so that no place comes twice, metres
-    circle = (RADIUS + widening)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    circle = (SETTINGS.radius + widening)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return [as_point(place) for place in np.asarray(task.obstacle_position) + circle @ task.slice.axes.T]
 
 
@@ -184,8 +194,11 @@ async def _visited(
         figures: dict[str, Any] = {"clients": number, "first_picture_s": firsts, "visitors": []}
         if None in firsts:
             return figures
-        await asyncio.sleep(SETTLED)
-        visits, num_edits = [Visit(client) for client in clients], max(1, round(EDITS_PER_SECOND * options.seconds))
+        await asyncio.sleep(SETTINGS.settled)
+        visits, num_edits = (
+            [Visit(client) for client in clients],
+            max(1, round(SETTINGS.edits_per_second * options.seconds)),
+        )
         before, num_before = _processor_seconds(process), sum(client.num_messages for client in clients)
         began = time.perf_counter()
         drags = [() if options.rest else places_of(task, k, num_edits) for k in range(number)]
@@ -195,8 +208,8 @@ async def _visited(
         num_messages = sum(client.num_messages for client in clients) - num_before
         for visit in visits if not options.rest else ():
             with suppress(LostError):
-                await visit.client.wait_for(lambda visit=visit: visit.last_shown, PATIENCE)
-        seconds = num_edits / EDITS_PER_SECOND
+                await visit.client.wait_for(lambda visit=visit: visit.last_shown, SETTINGS.patience)
+        seconds = num_edits / SETTINGS.edits_per_second
         return figures | {
             "visitors": [{"lost": visit.lost} if options.rest else visit.figures(seconds) for visit in visits],
             "ping_ms": _spread(np.array([ping for visit in visits for ping in visit.pings])),
@@ -213,7 +226,7 @@ async def _first_picture(
     try:
         await stack.enter_async_context(client)
         await client.look()
-        if await client.wait_for(lambda: client.has_picture, FIRST_PICTURE):
+        if await client.wait_for(lambda: client.has_picture, SETTINGS.first_picture):
             elapsed = time.perf_counter() - began
             if avoid is not None:
                 await client.set("Avoid", avoid.capitalize())

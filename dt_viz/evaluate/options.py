@@ -83,19 +83,15 @@ def whole_number(minimum: int) -> Callable[[str], int]:
 
 def positive_number(unit: str, maximum: float) -> Callable[[str], float]:
     """Return a type for argparse: a number above 0 and up to `maximum`."""
-
-    def convert(text: str) -> float:
-        (number,) = _numbers(text, (1,), f"{unit}, more than 0, at most {maximum:g}", math.ulp(0), maximum)
-        return number
-
-    return convert
+    return number(unit, math.ulp(0), maximum)
 
 
 def number(unit: str, minimum: float, maximum: float) -> Callable[[str], float]:
     """Return a type for argparse: a number between two others."""
+    least = "more than 0" if minimum == math.ulp(0) else f"at least {minimum:g}"
 
     def convert(text: str) -> float:
-        (found,) = _numbers(text, (1,), f"{unit}, at least {minimum:g} and at most {maximum:g}", minimum, maximum)
+        (found,) = _numbers(text, (1,), f"{unit}, {least} and at most {maximum:g}", minimum, maximum)
         return found
 
     return convert
@@ -182,17 +178,14 @@ def unit_ms() -> float:
 
 
 def report(rows: Sequence[Row]) -> None:
-    """Print rows, if there are any, as a table whose header is the columns of the first."""
+    """Print rows, if there are any, as a table whose header is the columns of the first, aligned left, then right."""
     if not rows:
         return
     PRINTED.append([{column: row.get(column) for column in rows[0]} for row in rows])
-    _print_aligned(tuple(rows[0]), [[as_text(cell) for cell in row.values()] for row in PRINTED[-1]])
-
-
-def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows of texts under a header."""
-    PRINTED.append([dict(zip(header, row, strict=True)) for row in rows])
-    _print_aligned(header, rows)
+    texts = [[*rows[0]], *([as_text(cell) for cell in row.values()] for row in PRINTED[-1])]
+    first, *widths = (max(map(len, column)) for column in zip(*texts, strict=True))
+    for name, *cells in texts:
+        print("  ".join([name.ljust(first), *map(str.rjust, cells, widths)]).rstrip())
 
 
 def write_tables(path: Path) -> None:
@@ -212,14 +205,6 @@ def as_text(value: str | float | None) -> str:
     if isinstance(value, float):
         return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
     return str(value)
-
-
-def _print_aligned(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table, the first column aligned left, the others right."""
-    widths = [max(len(row[k]) for row in (header, *rows)) for k in range(len(header))]
-    for row in (header, *rows):
-        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
-        print("  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip())
 
 
 def _numbers(text: str, counts: tuple[int, ...], accepted: str, minimum: float, maximum: float) -> list[float]:

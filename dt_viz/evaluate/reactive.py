@@ -8,79 +8,80 @@ be. The npz file holds for run i:
 ``wxyz_i`` (P, 4)
     orientations of boxes.
 
-and ``diameter``, metres. With `--beside`, ``potential_q_i`` and ``stepped_q_i`` with their ``_t_i`` and ``_obstacle_i``
-are those of the same arm with a repulsive potential field, and of its field stepped at the paper's 20 Hz.
+and ``diameter``, metres.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import REACH_PER_TEMPERATURE
 from dt_viz.avoidance.avoidance import ArmAvoidance
-from dt_viz.avoidance.hand import Avoidance
-from dt_viz.control.arm_system import ArmSystem, Section
+from dt_viz.control.arm_system import Section
 from dt_viz.control.controller import ArmController, Phase
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.evaluate.options import (
-    InputError,
+    Row,
     add_task,
     avoiding,
     chosen_task,
+    new_engine,
     positive_number,
-    print_table,
     ready_to_write,
+    report,
     whole_number,
     write_npz,
 )
 from dt_viz.flows.fields import Array
-from dt_viz.folders import default_cache_folder
-from dt_viz.learning.store import FitStore
 from dt_viz.metrics import resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import LIVE
 from dt_viz.obstacles.shapes import UPRIGHT, Box, Obstacle, Quaternion, Sphere, as_point, as_quaternion
 from dt_viz.robot.collision import load_collision_model
-from dt_viz.robot.robot import NUM_JOINTS, Robot, cross, load_jaco
+from dt_viz.robot.robot import Robot
 from dt_viz.session.engine import Engine
 
-TICK = 0.01
-"""Time between two ticks, seconds."""
-LOOK_PERIOD = 0.03
-"""Time between two looks at the sphere, seconds."""
-HALF_LENGTH = 0.40
-"""Half the length of a sphere's path, metres."""
-WIGGLE, WAVELENGTH = 0.04, 0.5
-"""Amplitude and length of a path's waves, metres."""
-BOX = np.array([1.0, 0.8, 0.6])
-"""Sides of a box, in diameters."""
-PEDESTAL_ROOM = 0.10
-"""Distance, metres, that a path keeps from the base and link 1, which no joint moves out of its way."""
-TABLE_ROOM = 0.01
-"""Height of the obstacle above the table, metres."""
-START_ROOM = 0.05
-"""Distance of the arm from an obstacle that comes, where the arm is undisturbed, metres."""
-COMING_ROOM = 0.03
-"""That distance from the arm as it is, which may have given way to another obstacle: with less, others are drawn."""
-LONGEST = 30.0
-"""Time after the sphere has gone within which the goal has to be reached, seconds."""
-AT_GOAL = 1e-3
-"""Distance from the goal that counts as reached, metres."""
-SUBDIVISIONS = 6
-"""Number of parts of a tick at whose borders the smallest distance is looked for."""
-PAPER_PERIOD = 0.05
-"""Time between two velocities of the paper's controller, seconds: 20 Hz."""
-REPULSION = 1.5
-"""Velocity of a body point that touches the sphere, m/s, in the potential field."""
+
+@dataclass(frozen=True)
+class CrossingSettings:
+    """How obstacles cross, and what is a success; lengths in metres, times in seconds."""
+
+    tick: float = 0.01
+    """Time between two ticks."""
+    look_period: float = 0.03
+    """Time between two looks at the obstacles."""
+    half_length: float = 0.40
+    """Half the length of an obstacle's path."""
+    wiggle: float = 0.04
+    """Amplitude of a path's waves."""
+    wavelength: float = 0.5
+    """Length of a path's waves."""
+    box: tuple[float, float, float] = (1.0, 0.8, 0.6)
+    """Sides of a box, in diameters."""
+    pedestal_room: float = 0.10
+    """Distance that a path keeps from the base and link 1, which no joint moves out of its way."""
+    table_room: float = 0.01
+    """Height of the obstacle above the table."""
+    start_room: float = 0.05
+    """Distance of the arm from an obstacle that comes, where the arm is undisturbed."""
+    coming_room: float = 0.03
+    """That distance from the arm as it is, which may have given way to another one: with less, others are drawn."""
+    longest: float = 30.0
+    """Time after the obstacle has gone within which the goal has to be reached."""
+    at_goal: float = 1e-3
+    """Distance from the goal that counts as reached."""
+
+
+SETTINGS = CrossingSettings()
+TICK = SETTINGS.tick
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,21 +144,8 @@ class Run:
     phases: set[Phase] = field(default_factory=set)
 
 
-class Driver(Protocol):
-    """What moves the robot."""
-
-    def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
-        """Joint velocities (6,), rad/s, at t."""
-        ...
-
-    @property
-    def resting(self) -> bool:
-        """Whether it is at the goal."""
-        ...
-
-
-class InTheLoop(Driver):
-    """The controller, which looks at the obstacles now and then."""
+class Arm:
+    """The robot, driven by the controller, which looks at the obstacles now and then."""
 
     def __init__(self, bench: Bench, crossing: Crossing) -> None:
         self._bench, self.controller = bench, ArmController(bench.follower, bench.solved)
@@ -166,12 +154,13 @@ class InTheLoop(Driver):
         self._looks, self._went, self._present = 0.0, False, True
 
     def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
+        """Joint velocities (6,), rad/s, at t."""
         if not self._went and t >= crossing.begins:
             self.controller.go()
             self._went = True
         parts = self._bench.obstacles(crossing, t)
         if t >= self._looks and (parts or self._present):
-            self._present, self._looks = bool(parts), t + LOOK_PERIOD
+            self._present, self._looks = bool(parts), t + SETTINGS.look_period
             self.controller.see(self._bench.avoidance(parts))
         began = time.thread_time()
         velocity = self.controller.step(q, TICK)
@@ -181,6 +170,7 @@ class InTheLoop(Driver):
 
     @property
     def resting(self) -> bool:
+        """Whether it is at the goal."""
         return self._went and not self._present and self.controller.phase is Phase.RESTING
 
 
@@ -202,7 +192,7 @@ class Bench:
     def shape(self, place: Array, wxyz: Quaternion = UPRIGHT) -> Obstacle:
         """The sphere, or box, with its centre at a place (3,), metres."""
         if self._boxes:
-            a, b, c = self.diameter * BOX
+            a, b, c = (self.diameter * side for side in SETTINGS.box)
             return Box(as_point(place), (a, b, c), wxyz)
         return Sphere(as_point(place), self.diameter)
 
@@ -222,7 +212,7 @@ class Bench:
     def undisturbed(self, start: int) -> tuple[Array, Array]:
         """The hand's places (T, 3), metres, and joints (T, 6) at all ticks without a sphere."""
         controller, q, passed = ArmController(self.follower, self.solved), self.starts[start], []
-        while len(passed) < LONGEST / TICK:
+        while len(passed) < SETTINGS.longest / TICK:
             passed.append(q)
             q = q + TICK * controller.step(q, TICK)
             if controller.phase is Phase.RESTING:
@@ -271,9 +261,9 @@ def _drawn(
         room = np.linalg.norm(path[:, None] - pedestal, axis=2) - wall.radius - first.radius
         passing = joints[max(0, at - round(length / 2 / speed / TICK))]
         if (
-            path[:, 2].min() >= first.radius + TABLE_ROOM
-            and room.min() >= PEDESTAL_ROOM
-            and body.clearance(passing[None], first)[0] >= START_ROOM
+            path[:, 2].min() >= first.radius + SETTINGS.table_room
+            and room.min() >= SETTINGS.pedestal_room
+            and body.clearance(passing[None], first)[0] >= SETTINGS.start_room
         ):
             return at, path, length, wxyz
 
@@ -281,15 +271,15 @@ def _drawn(
 def _path(middle: Array, rng: np.random.Generator) -> Array:
     """A wavy path (N, 3) through a place (3,), evenly sampled."""
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    s, phase = np.linspace(-HALF_LENGTH, HALF_LENGTH, 201), rng.uniform(0, 2 * np.pi)
-    wave = WIGGLE * (np.sin(2 * np.pi * s / WAVELENGTH + phase) - np.sin(phase))
+    s, phase = np.linspace(-SETTINGS.half_length, SETTINGS.half_length, 201), rng.uniform(0, 2 * np.pi)
+    wave = SETTINGS.wiggle * (np.sin(2 * np.pi * s / SETTINGS.wavelength + phase) - np.sin(phase))
     return resample_by_arc_length(middle + np.outer(s, axes[:, 0]) + np.outer(wave, axes[:, 1]), 401)
 
 
-def simulated(bench: Bench, crossing: Crossing, arm: Driver) -> Run:
-    """Run an arm until it rests at the goal, or `LONGEST` seconds after the obstacles have gone."""
-    run, q = Run(), bench.starts[crossing.start].copy()
-    for k in range(int((crossing.gone + crossing.begins + LONGEST) / TICK)):
+def simulated(bench: Bench, crossing: Crossing) -> Run:
+    """Run the arm until it rests at the goal, or so many seconds after the obstacles have gone."""
+    arm, run, q = Arm(bench, crossing), Run(), bench.starts[crossing.start].copy()
+    for k in range(int((crossing.gone + crossing.begins + SETTINGS.longest) / TICK)):
         t = k * TICK
         run.q.append(q)
         run.t.append(t)
@@ -339,90 +329,12 @@ def _smallest_distance(bench: Bench, q: Array, places: Array, wxyz: Quaternion) 
         np.diff(places, axis=0), axis=1
     )
     for k in np.flatnonzero(np.minimum(gaps[:-1], gaps[1:]) - travel / 2 < best):
-        for u in np.linspace(0, 1, SUBDIVISIONS + 1)[1:-1]:
+        for u in np.linspace(0, 1, 7)[1:-1]:
             joints, place = (1 - u) * q[k] + u * q[k + 1], (1 - u) * places[k] + u * places[k + 1]
             near = still.signed_distance(cover.positions(bench.robot, joints) - place) - cover.radius
             if near.min() < best:
                 best = min(best, measured(joints, place))
     return best
-
-
-class _FieldDriver(Driver):
-    """An arm that is given velocities of a field at equal times, within the limits."""
-
-    def __init__(self, bench: Bench, period: float) -> None:
-        self._bench, self._period, self._next = bench, period, 0.0
-        self._wanted, self._velocity = np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS)
-        self._q = np.zeros(NUM_JOINTS)
-
-    def tick(self, t: float, q: Array, crossing: Crossing, run: Run) -> Array:
-        if t >= self._next - TICK / 2:
-            sphere = next(iter(self._bench.obstacles(crossing, t)), None)
-            self._wanted = self._at(q, sphere) if t >= crossing.begins else self._away(q, sphere)
-            self._next += self._period
-        limits = self._bench.robot.velocity_limits
-        wanted = self._wanted * min(1.0, float((limits / np.maximum(np.abs(self._wanted), 1e-9)).min()))
-        change = ControllerSettings().acceleration * TICK
-        self._velocity = np.clip(wanted, self._velocity - change, self._velocity + change)
-        room = self._bench.robot.lower - q, self._bench.robot.upper - q
-        self._velocity, self._q = np.clip(self._velocity, room[0] / TICK, room[1] / TICK), q
-        return self._velocity
-
-    @property
-    def resting(self) -> bool:
-        missed = np.linalg.norm(self._bench.robot.end_effector(self._q) - self._bench.goal)
-        return bool(missed < AT_GOAL / 10)
-
-    def _at(self, q: Array, sphere: Obstacle | None) -> Array:
-        raise NotImplementedError
-
-    def _away(self, q: Array, sphere: Obstacle | None) -> Array:
-        return np.zeros(NUM_JOINTS)
-
-
-class Potential(_FieldDriver):
-    """The undisturbed motion's velocity plus the repulsion of all body points (Khatib's field)."""
-
-    def __init__(self, bench: Bench) -> None:
-        super().__init__(bench, 2 * TICK)
-        self._hand = bench.solved.stack.system
-
-    def _at(self, q: Array, sphere: Obstacle | None) -> Array:
-        velocity = self._hand.velocity(self._bench.robot.end_effector(q))
-        return self._bench.section.velocities(q, velocity) + self._away(q, sphere)
-
-    def _away(self, q: Array, sphere: Obstacle | None) -> Array:
-        if sphere is None:
-            return np.zeros(NUM_JOINTS)
-        robot, body = self._bench.robot, self._bench.follower.whole_arm.body
-        chain = robot.chain(q[:, None])
-        points = body.of_chain(chain)[:, :, 0]
-        offset = points - np.asarray(sphere.position)
-        distance = np.linalg.norm(offset, axis=1)
-        reach = REACH_PER_TEMPERATURE * Avoidance().temperature + self._bench.margin
-        u = np.clip(1 - (distance - body.radius - sphere.radius) / reach, 0, None)
-        force = (u**2)[:, None] * offset / distance[:, None]
-        total, wanted = np.zeros(NUM_JOINTS), force * REPULSION
-        for point, joint, push in zip(points, body.joint, wanted, strict=True):
-            if push.any():
-                lever = cross(chain.axes[:, 2], (point[:, None] - chain.origins))[: joint + 1, :, 0]
-                total[: joint + 1] += np.linalg.solve(lever @ lever.T + 0.05 * np.eye(joint + 1), lever @ push)
-        return total
-
-
-class Stepped(_FieldDriver):
-    """Eq. (4) of the newest stack at the posture where the arm is, held for the paper's 20 Hz."""
-
-    def __init__(self, bench: Bench) -> None:
-        super().__init__(bench, PAPER_PERIOD)
-        self._dodging = ArmController(bench.follower, bench.solved)
-
-    def _at(self, q: Array, sphere: Obstacle | None) -> Array:
-        bench = self._bench
-        self._dodging.see(bench.avoidance(() if sphere is None else (sphere,)))
-        self._dodging.step(q, self._period)
-        system: ArmSystem = self._dodging.system
-        return system.velocity(bench.follower.whole_arm.limits.inside(q))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -435,7 +347,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--boxes", action="store_true", help="boxes of D × 0.8 D × 0.6 D, turned, not spheres")
     parser.add_argument("--diameter", type=positive_number("metres", 1), default=0.15, metavar="D", help="metres")
     parser.add_argument("--margin", type=positive_number("metres", 1), default=0.03, metavar="M", help="metres")
-    parser.add_argument("--beside", action="store_true", help="also a potential field, and stepping at 20 Hz")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz")
 
 
@@ -443,41 +354,27 @@ def run(options: argparse.Namespace) -> int:
     """Run the subcommand."""
     tasks, task = chosen_task(options)
     out = ready_to_write(options.out, ".npz")
-    if options.beside and (options.boxes or options.obstacles > 1):
-        raise InputError("--beside", "several obstacles, or boxes", "one sphere")
-    engine = Engine(tasks, FitStore(default_cache_folder()), load_jaco())
-    bench = Bench(engine, task.name, options.diameter, options.margin, boxes=options.boxes)
-    kinds: dict[str, Callable[[Crossing], Driver]] = {"": lambda crossing: InTheLoop(bench, crossing)}
-    if options.beside:
-        kinds |= {"potential_": lambda _: Potential(bench), "stepped_": lambda _: Stepped(bench)}
+    bench = Bench(new_engine(tasks), task.name, options.diameter, options.margin, boxes=options.boxes)
     arrays: dict[str, Any] = {"diameter": options.diameter}
-    figures: dict[str, list[RunFigures]] = {kind: [] for kind in kinds}
-    crossed = crossings(bench, options.speed, options.seed, options.obstacles)
-    while (i := len(figures[""])) < options.runs:
-        crossing, seconds = next(crossed)
-        for kind, make in kinds.items():
-            found = simulated(bench, crossing, make(crossing))
-            if not kind and room_at_coming(bench, found, crossing) < COMING_ROOM:
-                break
-            figures[kind].append(RunFigures.of(bench, crossing, found, seconds))
-            places = np.array(found.obstacle)[:, 0] if options.obstacles == 1 else found.obstacle
-            arrays |= {f"{kind}q_{i}": found.q, f"{kind}t_{i}": found.t, f"{kind}obstacle_{i}": places}
-            if not kind:
-                arrays[f"wxyz_{i}"] = [passage.wxyz for passage in crossing.passages]
-                print(i, *figures[kind][-1].cells(), " ".join(sorted(p.value for p in found.phases)), flush=True)
+    figures: list[RunFigures] = []
+    for crossing, seconds in crossings(bench, options.speed, options.seed, options.obstacles):
+        found = simulated(bench, crossing)
+        if room_at_coming(bench, found, crossing) < SETTINGS.coming_room:
+            continue
+        i, places = len(figures), np.array(found.obstacle)
+        figures.append(RunFigures.of(bench, crossing, found, seconds))
+        arrays |= {f"q_{i}": found.q, f"t_{i}": found.t}
+        arrays |= {f"obstacle_{i}": places[:, 0] if options.obstacles == 1 else places}
+        arrays[f"wxyz_{i}"] = [passage.wxyz for passage in crossing.passages]
+        print(i, figures[i], " ".join(sorted(phase.value for phase in found.phases)), flush=True)
+        if len(figures) == options.runs:
+            break
     write_npz(out, **arrays)
     shape = "box" if options.boxes else "sphere"
     size = f"{options.obstacles} {shape}(s) of {options.diameter:g} m"
     print(f"\n{task.name}, {size} at {options.speed:g} m/s, margin {options.margin:g} m")
-    names = {"": "in the loop", "potential_": "potential field", "stepped_": "stepped at 20 Hz"}
-    print_table(HEADER, [(names[kind], *summary(found)) for kind, found in figures.items()])
+    report([summary(figures)])
     return 0
-
-
-HEADER = (
-    "", "without contact", "clearance mm", "goal reached", "velocity", "acceleration",
-    "time lost s", "tick ms",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -510,22 +407,23 @@ class RunFigures:
             np.array(run.ticks),
         )
 
-    def cells(self) -> tuple[str, ...]:
-        """For a table."""
+    def __str__(self) -> str:
         return (
-            f"{1e3 * self.distance:.1f}", f"{1e3 * self.missed:.2f}", f"{self.velocity:.3f}",
-            f"{self.acceleration:.3f}", f"{self.lost:.1f}",
-        )  # fmt: skip
+            f"{1e3 * self.distance:.1f} mm, missed {1e3 * self.missed:.2f} mm, limits {self.velocity:.3f} "
+            f"{self.acceleration:.3f}, {self.lost:.1f} s lost;"
+        )
 
 
-def summary(found: list[RunFigures]) -> tuple[str, ...]:
-    """The figures of all runs."""
-    num = len(found)
-    free, reached = sum(f.distance > 0 for f in found), sum(f.missed <= AT_GOAL for f in found)
-    ticks = 1e3 * np.concatenate([f.ticks for f in found])
-    timed = f"{np.median(ticks):.2f} ({np.percentile(ticks, 95):.1f}, {ticks.max():.0f})" if len(ticks) else ""
-    return (
-        f"{free} of {num}", f"{1e3 * min(f.distance for f in found):.1f}", f"{reached} of {num}",
-        f"{max(f.velocity for f in found):.3f}", f"{max(f.acceleration for f in found):.3f}",
-        f"{np.median([f.lost for f in found]):.1f} ({max(f.lost for f in found):.1f})", timed,
-    )  # fmt: skip
+def summary(found: Sequence[RunFigures]) -> Row:
+    """Row of the table: the figures of all runs; velocity and acceleration relative to the limits."""
+    num, ticks = len(found), 1e3 * np.concatenate([f.ticks for f in found])
+    return {
+        "": "in the loop",
+        "without contact": f"{sum(f.distance > 0 for f in found)} of {num}",
+        "clearance mm": f"{1e3 * min(f.distance for f in found):.1f}",
+        "goal reached": f"{sum(f.missed <= SETTINGS.at_goal for f in found)} of {num}",
+        "velocity": f"{max(f.velocity for f in found):.3f}",
+        "acceleration": f"{max(f.acceleration for f in found):.3f}",
+        "time lost s": f"{np.median([f.lost for f in found]):.1f} ({max(f.lost for f in found):.1f})",
+        "tick ms": f"{np.median(ticks):.2f} ({np.percentile(ticks, 95):.1f}, {ticks.max():.0f})",
+    }

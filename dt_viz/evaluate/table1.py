@@ -14,15 +14,15 @@ the cells are made from: ``obstacle_k`` (4,), centre and diameter of the sphere 
 ``perturbed_k`` (P, 3) and ``ends_k`` (P, 3), perturbed starts and where their motions end. Columns:
 
 ``frechet``, ``dtw``
-    Fréchet distance of the hand's path to the demonstration, between points, too (Alt and Godau); and mean distance of
-    points matched by dynamic time warping, between `NUM_WARPED` points each, evenly by arc length.
+    discrete Fréchet distance of the hand's path to the demonstration, between 400 points each; and mean distance of
+    points matched by dynamic time warping, between 200 points each, all evenly by arc length.
 ``arm_depth``, ``hand_depth``, ``clearance``
     maximum collision distance of the arm's meshes and of the end effector, and the meshes' smallest distance.
 ``goal_error``, ``turn``, ``jerk``
     distance of the end from the demonstrations' goal; sharpest turn over `TURN_ARC`, degrees; root mean square of
     the third derivative at 20 Hz, m/s³.
 ``reached``
-    share of motions from perturbed starts that end within `REACHED` of the goal; worst is that of a place.
+    share of motions from perturbed starts that end within 1 cm of the goal; worst is that of a place.
 ``seconds``
     processor time to plan all motions of a place, without tracking them.
 
@@ -45,6 +45,7 @@ from dt_viz.baselines.base import INSTALL, NotFittedError, Plan, Planner, Proble
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.evaluate import figures
 from dt_viz.evaluate.around import TURN_ARC
+from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.options import (
     InputError,
     Row,
@@ -58,7 +59,6 @@ from dt_viz.evaluate.options import (
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import (
     dynamic_time_warping,
-    frechet,
     maximum_collision_distance,
     resample_by_arc_length,
     rms_jerk,
@@ -73,16 +73,25 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.comparison import curves
 
 PAPER_TASKS = ("push_box", "lift_box", "draw_s")
-ALONG, WITHIN = (0.2, 0.8), 0.05
-"""Part of the mean demonstration that spheres are drawn along, and largest distance from it, metres."""
-MAX_DRAWN = 2000
-"""Largest number of spheres drawn for a task."""
-PERTURBED_BY = 0.05
-"""Largest distance of a perturbed start from a demonstrated one, metres."""
-REACHED = 0.01
-"""Distance from the goal at which a motion counts as having reached it, metres."""
-NUM_WARPED = 200
-"""Number of points of each path that are matched by dynamic time warping."""
+
+
+@dataclass(frozen=True)
+class Table1Settings:
+    """Where spheres and starts are drawn; lengths in metres."""
+
+    along: tuple[float, float] = (0.2, 0.8)
+    """Part of the mean demonstration that spheres are drawn along."""
+    within: float = 0.05
+    """Largest distance of a sphere from it."""
+    perturbed_by: float = 0.05
+    """Largest distance of a perturbed start from a demonstrated one."""
+    max_drawn: int = 2000
+    """Largest number of spheres drawn for a task."""
+    reached: float = 0.01
+    """Distance from the goal at which a motion counts as having reached it."""
+
+
+SETTINGS = Table1Settings()
 SMALLEST = ("clearance", "reached")
 """Columns whose worst value is the smallest."""
 UNITS = {"turn": (1.0, "°"), "reached": (100.0, "%"), "seconds": (1.0, "s"), "jerk": (1.0, "m/s³")}
@@ -187,10 +196,10 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
     rng, mean, undisturbed = np.random.default_rng(seed), task.mean_path, problem.learned.demonstrated.paths
     at_ends = np.concatenate([path[[0, -1]] for path in problem.postures])
     places: list[RandomPlace] = []
-    for _ in range(MAX_DRAWN):
+    for _ in range(SETTINGS.max_drawn):
         if len(places) == count:
             return places
-        centre = mean[round(rng.uniform(*ALONG) * (len(mean) - 1))] + _in_ball(rng, WITHIN)
+        centre = mean[round(rng.uniform(*SETTINGS.along) * (len(mean) - 1))] + _in_ball(rng, SETTINGS.within)
         sphere = Sphere(as_point(centre), 0.15)
         if any(sphere.signed_distance(path).min() >= 0 for path in undisturbed):
             continue
@@ -199,19 +208,19 @@ def drawn(problem: Problem, count: int, num_perturbed: int, seed: int) -> list[R
         share = (len(places) + 1) * num_perturbed // count - len(places) * num_perturbed // count
         beside = np.random.default_rng([seed, len(places)])  # places do not depend on how many starts there are
         places.append(RandomPlace(sphere, _perturbed(problem, sphere, share, beside)))
-    found = f"{len(places)} of {task.title!r} among {MAX_DRAWN} spheres"
+    found = f"{len(places)} of {task.title!r} among {SETTINGS.max_drawn} spheres"
     raise InputError("--count", found, "places at which each motion collides and the ends are free, fewer of them")
 
 
 def _perturbed(problem: Problem, sphere: Sphere, num: int, rng: np.random.Generator) -> Array:
-    """Starts (num, 3), metres, beside the demonstrated ones: reached by the arm, which is free there."""
+    """Starts (num, 3), beside the demonstrated ones: reached by the arm, which is free there."""
     starts, model, robot = problem.task.starts, load_collision_model(), problem.robot
     found: list[Array] = []
-    for _ in range(MAX_DRAWN):
+    for _ in range(SETTINGS.max_drawn):
         if len(found) == num:
             break
         nearest = int(rng.integers(len(starts)))
-        start = starts[nearest] + _in_ball(rng, PERTURBED_BY)
+        start = starts[nearest] + _in_ball(rng, SETTINGS.perturbed_by)
         posture = track(robot, start[None], problem.postures[nearest][0])
         if posture.error[0] < 1e-3 and model.obstacle_distance(posture.q, sphere)[0].min() > 0:
             found.append(start)
@@ -246,7 +255,9 @@ def measured(planner: Planner, problem: Problem, places: Sequence[RandomPlace]) 
         ends = _ends(planner, place)
         arrays |= {f"obstacle_{k}": np.array([*place.sphere.position, place.sphere.diameter])}
         arrays |= {f"perturbed_{k}": place.perturbed, f"ends_{k}": ends}
-        table["reached"].append(np.mean(np.linalg.norm(ends - goal, axis=1) <= REACHED) if len(ends) else np.nan)
+        table["reached"].append(
+            np.mean(np.linalg.norm(ends - goal, axis=1) <= SETTINGS.reached) if len(ends) else np.nan
+        )
         table["seconds"].append(seconds)
     return {**arrays, "goal": goal, **{column: np.array(values) for column, values in table.items()}}
 
@@ -264,10 +275,10 @@ def measure(x: Array, t: Array, q: Array, demonstration: Array, goal: Array, obs
     """
     nearest = load_collision_model().nearest_to_obstacle(q, obstacle)
     path = x if len(x) > 1 else np.repeat(x, 2, axis=0)
-    warped = (resample_by_arc_length(p, NUM_WARPED) for p in (path, demonstration))
+    warped, matched = [resample_by_arc_length(p, 200) for p in (path, demonstration)]
     return Measured(
-        frechet=frechet(path, demonstration, 1e-5),
-        dtw=dynamic_time_warping(*warped) / NUM_WARPED,
+        frechet=float(frechet([path], [demonstration])[0]),
+        dtw=dynamic_time_warping(warped, matched) / len(matched),
         arm_depth=max(0.0, -nearest.distance),
         hand_depth=maximum_collision_distance(path, obstacle.signed_distance) + 0.0,  # never -0
         clearance=nearest.distance,

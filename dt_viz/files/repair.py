@@ -15,11 +15,6 @@ from scipy.sparse.csgraph import connected_components
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices, Mask
 
-DIGITS = 5
-"""Decimal digits of the coordinates of merged vertices, which are at most 1."""
-MAX_OPEN_EDGES = 100_000
-"""Largest number of open edges around which holes are looked for."""
-
 
 def repaired(vertices: Array, faces: Indices) -> tuple[Array, Indices, tuple[str, ...]]:
     """Merge coinciding vertices, turn triangles as most of their neighbours, outwards, and fill holes of 3 or 4 edges.
@@ -38,7 +33,7 @@ def repaired(vertices: Array, faces: Indices) -> tuple[Array, Indices, tuple[str
     vertices = vertices[used]
     lower = vertices.min(axis=0)
     size = float(np.ptp(vertices, axis=0).max())
-    mesh = trimesh.Trimesh((vertices - lower) / max(size, 1e-300), faces.reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh((vertices - lower) / (size or 1.0), faces.reshape(-1, 3), process=False)
     _merge(mesh)
     if not size > 0 or not len(mesh.faces):
         raise FormatError("faces", "only triangles without area", "a closed mesh of triangles")
@@ -48,7 +43,7 @@ def repaired(vertices: Array, faces: Indices) -> tuple[Array, Indices, tuple[str
         mesh.faces = np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces)
         notes += ["triangles that faced inwards were turned"] if turned.any() else []
     before, area = len(mesh.faces), mesh.area
-    if not mesh.is_watertight and np.sum(np.bincount(mesh.edges_unique_inverse) == 1) <= MAX_OPEN_EDGES:
+    if not mesh.is_watertight and np.sum(np.bincount(mesh.edges_unique_inverse) == 1) <= 100_000:  # more take too long
         trimesh.repair.fill_holes(mesh)
     if (added := len(mesh.faces) - before) > 0:
         notes.append(
@@ -63,11 +58,11 @@ def _merge(mesh: trimesh.Trimesh) -> None:
 
     Borders of cells separate some near vertices, so the cells are shifted until nothing is open, or nothing changes.
     """
-    before = 0
+    before, digits = 0, 5  # decimals of the coordinates, which are at most 1
     for shift in itertools.product((0.0, 0.5), repeat=3):
-        mesh.vertices += np.multiply(shift, 10.0**-DIGITS)
-        mesh.merge_vertices(digits_vertex=DIGITS)
-        mesh.vertices -= np.multiply(shift, 10.0**-DIGITS)
+        mesh.vertices += np.multiply(shift, 10.0**-digits)
+        mesh.merge_vertices(digits_vertex=digits)
+        mesh.vertices -= np.multiply(shift, 10.0**-digits)
         a, b, c = mesh.faces.T
         mesh.update_faces(mesh.unique_faces() & (a != b) & (b != c) & (c != a))
         if len(mesh.vertices) == before or mesh.is_watertight:

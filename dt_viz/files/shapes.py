@@ -9,6 +9,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,14 +22,21 @@ from dt_viz.files.npz import arrays_of
 from dt_viz.files.repair import repaired
 from dt_viz.flows.fields import Array, Indices
 
-MAX_VERTICES = 3 * MAX_FACES
-MAX_POINTS = 1_000_000
-MAX_LINES = 2_000_000
-"""Largest number of lines of a text, each of which takes a hundred bytes and more while it is read."""
-MAX_UNPACKED = 40 * 10**6
-"""Largest number of bytes that an archive of points unpacks to."""
-MAX_MODEL = 200 * 10**6
-"""Largest number of bytes that a 3MF file, which is text in an archive, unpacks to."""
+
+@dataclass(frozen=True)
+class ShapeLimits:
+    """The largest files; those of text take a hundred bytes and more for each line while they are read."""
+
+    vertices: int = 3 * MAX_FACES
+    points: int = 1_000_000
+    lines: int = 2_000_000
+    unpacked: int = 40 * 10**6
+    """Bytes that an archive of points unpacks to."""
+    model: int = 200 * 10**6
+    """Bytes that a 3MF file, which is text in an archive, unpacks to."""
+
+
+LIMITS = ShapeLimits()
 LABELS = ("occupied", "occupancy", "label", "labels")
 """Names of the labels in a file of points."""
 TEXTS = (".obj", ".off", ".csv", ".stl", ".ply", ".gltf")
@@ -67,7 +75,7 @@ def read_points(content: bytes, suffix: str) -> Answer:
     """
     _check_text(content, suffix)
     columns, notes = {".npz": _npz_points, ".csv": _csv_points, ".ply": _ply_points}[suffix](content)
-    check_at_most("points", len(columns[0]), MAX_POINTS)
+    check_at_most("points", len(columns[0]), LIMITS.points)
     for array in columns:
         if array.dtype.kind not in "biuf":
             raise FormatError("points", f"values of type {array.dtype}", "integers or real numbers")
@@ -79,14 +87,14 @@ KINDS: Mapping[str, Callable[[bytes, str], Answer]] = {"mesh": read_mesh, "point
 
 
 def _check_text(content: bytes, suffix: str) -> None:
-    if suffix in TEXTS and content.count(b"\n") > MAX_LINES:
-        raise too_many("file", MAX_LINES, "lines")
+    if suffix in TEXTS and content.count(b"\n") > LIMITS.lines:
+        raise too_many("file", LIMITS.lines, "lines")
 
 
 def _check_model(content: bytes, suffix: str) -> None:
     """Raise FormatError if a file would unpack to very much, or needs an extension."""
     if suffix == ".3mf":
-        arrays_of(content, max_bytes=MAX_MODEL, names=())
+        arrays_of(content, max_bytes=LIMITS.model, names=())
     if suffix == ".gltf":
         json.loads(content)  # trimesh would look for another file
     if suffix in (".glb", ".gltf"):
@@ -121,8 +129,8 @@ def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
             num_vertices, num_faces = num_vertices + len(part.vertices), num_faces + len(part.faces)
             if num_faces > MAX_FACES:
                 raise too_many("faces", MAX_FACES, "of all parts")
-            if num_vertices > MAX_VERTICES:
-                raise too_many("vertices", MAX_VERTICES, "of all parts")
+            if num_vertices > LIMITS.vertices:
+                raise too_many("vertices", LIMITS.vertices, "of all parts")
             parts.append((part, place))
     vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], 0
     for part, place in parts:
@@ -134,7 +142,7 @@ def _triangles(content: bytes, suffix: str) -> tuple[Array, Indices]:
 
 
 def _npz_points(content: bytes) -> Answer:
-    arrays = arrays_of(content, max_bytes=MAX_UNPACKED, names=("points", "labels"))
+    arrays = arrays_of(content, max_bytes=LIMITS.unpacked, names=("points", "labels"))
     if "points" not in arrays:
         raise FormatError("arrays", "no 'points'", "'points' and optionally 'labels'")
     return tuple(arrays[name] for name in ("points", "labels") if name in arrays), ()
@@ -151,7 +159,7 @@ def _csv_points(content: bytes) -> Answer:
         raise FormatError("points", "0", "one line per point")
     columns = [header.index(name) for name in wanted]
     table = np.loadtxt(
-        io.StringIO(rows), delimiter=",", usecols=columns, ndmin=2, max_rows=MAX_POINTS + 1, comments=None
+        io.StringIO(rows), delimiter=",", usecols=columns, ndmin=2, max_rows=LIMITS.points + 1, comments=None
     )
     others = [name for name in header if name not in wanted]
     notes = (f"columns {', '.join(others)[:80]} are not used",) if others else ()

@@ -24,22 +24,19 @@ START = 60.0
 """Longest time until a process is ready for a file, seconds; a busy machine takes ten to import what it needs."""
 PATIENCE = 20.0
 """Longest time for a file from then on, seconds."""
-LOOK = 0.1
-"""Interval of the checks whether it is still wanted, seconds."""
-ROOT = Path(__file__).parents[2]
-"""Folder that holds this package."""
 
 
 class _Process:
     """A process of `dt_viz.files.worker`, which may read one file."""
 
     def __init__(self) -> None:
-        path = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
+        root = Path(__file__).parents[2]  # holds this package
+        path = os.pathsep.join([str(root), *filter(None, sys.path)])
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `end`; a pipe could be filled without end
         self._process = subprocess.Popen(
             [sys.executable, "-m", worker.__name__],
-            cwd=ROOT,  # where -m looks first
+            cwd=root,  # where -m looks first
             env=os.environ | threads | {"PYTHONPATH": path},
             stdin=subprocess.PIPE,
             stdout=self._answer,
@@ -85,7 +82,7 @@ class _Process:
             if not ready and os.fstat(self._answer.fileno()).st_size:
                 deadline, ready = time.monotonic() + PATIENCE, True
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(timeout=LOOK)
+                self._process.wait(timeout=0.1)  # seconds until it may be unwanted
                 return
             end_if(cancelled)
             if time.monotonic() > deadline:

@@ -10,6 +10,7 @@ import numpy as np
 from dt_viz.errors import FormatError
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
+from dt_viz.numerics import ZERO, divisor
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Attractor:
         offset = z - self.goal
         r = np.linalg.norm(offset, axis=-1, keepdims=True)
         # tanh(r/ρ)/r tends to 1/ρ at the goal
-        gain = np.where(r > 1e-12, np.tanh(r / self.smoothing) / np.maximum(r, 1e-12), 1 / self.smoothing)
+        gain = np.where(r > ZERO, np.tanh(r / self.smoothing) / divisor(r), 1 / self.smoothing)
         return -self.speed * gain * offset
 
     def flow(self, z0: Array, times: Array) -> Array:

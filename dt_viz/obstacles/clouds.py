@@ -18,18 +18,28 @@ from dt_viz.obstacles.solids import Solid
 from dt_viz.obstacles.triangles import grid_nodes
 
 MIN_POINTS = 50
-NUM_NODES = 44**3
-"""Approximate number of nodes of the grid on which the surface is found."""
-REACH = 1.2
-"""Radius of the occupied ball around an unlabelled point, in units of the ninth decile of the distance from the sixth
-nearest point: random points on a surface then leave no hole."""
-FEWEST_CELLS = 1.2
-"""Smallest such radius in cells of the grid: thinner walls would have holes."""
-KERNELS_ACROSS = 5
-"""Number of kernel widths along the largest side of the occupied points."""
-NUM_SAMPLES = 2000
-"""Largest number of labelled points that the map is learned from."""
-REGULARISATION = 0.1
+
+
+@dataclass(frozen=True)
+class CloudSettings:
+    """How the space that a cloud occupies is found."""
+
+    num_nodes: int = 44**3
+    """Approximate number of nodes of the grid on which the surface is found."""
+    reach: float = 1.2
+    """Radius of the occupied ball around an unlabelled point, in units of the ninth decile of the distance from the
+    sixth nearest point: random points on a surface then leave no hole."""
+    fewest_cells: float = 1.2
+    """Smallest such radius in cells of the grid: thinner walls would have holes."""
+    kernels_across: float = 5
+    """Number of kernel widths along the largest side of the occupied points, where they are labelled."""
+    num_samples: int = 2000
+    """Largest number of labelled points that the map is learned from."""
+    regularisation: float = 0.1
+    """Weight of ½‖w‖² of that map."""
+
+
+SETTINGS = CloudSettings()
 
 
 def check_points(points: Array, labels: Array | None) -> None:
@@ -108,16 +118,16 @@ def _solid(cloud: Cloud) -> Solid:
     if cloud.labels is None:
         tree = KDTree(occupied)
         spacing = float(np.quantile(tree.query(occupied, k=7)[0][:, 6], 0.9))
-        cell = _cell(upper - lower + 4 * REACH * spacing)
-        reach = max(REACH * spacing, FEWEST_CELLS * cell)
+        cell = _cell(upper - lower + 4 * SETTINGS.reach * spacing)
+        reach = max(SETTINGS.reach * spacing, SETTINGS.fewest_cells * cell)
         origin, nodes, shape = _grid(lower - reach, upper + reach, cell)
         level = (tree.query(nodes)[0] - reach).reshape(shape)
         enclosed = np.asarray(ndimage.binary_fill_holes(level < 0))
         level = np.where(enclosed, -np.abs(level), level)
     else:
-        some = np.random.default_rng(0).permutation(len(cloud.points))[:NUM_SAMPLES]
-        width = largest / KERNELS_ACROSS
-        occupancy = fit_occupancy(cloud.points[some], cloud.labels[some], width, regularisation=REGULARISATION)
+        some = np.random.default_rng(0).permutation(len(cloud.points))[: SETTINGS.num_samples]
+        width = largest / SETTINGS.kernels_across
+        occupancy = fit_occupancy(cloud.points[some], cloud.labels[some], width, regularisation=SETTINGS.regularisation)
         cell = _cell(upper - lower + 2 * width)
         origin, nodes, shape = _grid(lower - width, upper + width, cell)
         level = -occupancy.logit(nodes).reshape(shape)
@@ -131,7 +141,7 @@ def _solid(cloud: Cloud) -> Solid:
 
 
 def _cell(sizes: Array) -> float:
-    return float(np.cbrt(np.prod(np.maximum(sizes, 0.05 * sizes.max())) / NUM_NODES))
+    return float(np.cbrt(np.prod(np.maximum(sizes, 0.05 * sizes.max())) / SETTINGS.num_nodes))
 
 
 def _grid(lower: Array, upper: Array, cell: float) -> tuple[Array, Array, tuple[int, int, int]]:

@@ -17,9 +17,6 @@ from dt_viz.kernels.flows import RATE, carry
 
 Generator = Literal["free-space", "probability"]
 GENERATORS: tuple[Generator, ...] = ("free-space", "probability")
-PAD = 0.5
-"""Margin of the inducing points around the occupied samples, in kernel widths. A larger one lets the map vary far from
-the obstacle, where no field is wanted."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,8 @@ def fit_occupancy(
     if occupied.all() or not occupied.any():
         found = "occupied" if occupied.any() else "free"
         raise ValueError(f"all {len(labels)} samples are {found}; an occupancy map needs both occupied and free ones")
-    grid = GaussianGrid.covering(samples[occupied], kernel_width, pad=PAD)
+    # a larger margin, in kernel widths, lets the map vary far from the obstacle, where no field is wanted
+    grid = GaussianGrid.covering(samples[occupied], kernel_width, pad=0.5)
     features = np.concatenate([grid.features(samples), np.ones((len(samples), 1))], axis=1)
     penalty = np.full(features.shape[1], regularisation)
     penalty[-1] = 1e-3  # the bias follows from the data: the share of free space

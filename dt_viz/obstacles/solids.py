@@ -20,30 +20,34 @@ from trimesh.triangles import closest_point
 from dt_viz.errors import check_between
 from dt_viz.files.checks import check_triangles
 from dt_viz.flows.fields import Array, Indices
+from dt_viz.numerics import divisor, unit
+from dt_viz.obstacles.covers import cells_cover
 from dt_viz.obstacles.triangles import grid_nodes, inside_of_grid, surface_samples
 
+
+@dataclass(frozen=True)
+class GridSettings:
+    """How a solid's signed distance is computed."""
+
+    num_nodes: int = 64**3
+    """Approximate number of nodes of the grid."""
+    margin: float = 0.2
+    """Margin of the grid around the shape, relative to the largest side of its bounding box."""
+    num_samples: int = 60_000
+    """Approximate number of samples on a surface, by which nearest triangles are found; each has at least one."""
+    longest_rows: int = 8
+    """Largest number of samples in rows along the sides of all triangles, in units of `num_samples`."""
+    num_nearest: int = 6
+    """Number of nearest samples of a point whose triangles are measured exactly."""
+    num_rounds: int = 2
+    """Number of rounds of sweeps in which nodes of a grid hand on near points of the surface."""
+    walk: float = 0.6
+    """Part of the way along a surface to the place that would be nearest if it were flat, at most a cell at a time."""
+
+
+SETTINGS = GridSettings()
 SMALLEST = 1e-9
 """Smallest size of a solid, and inverse of the largest, in its own unit."""
-NUM_NODES = 64**3
-"""Approximate number of nodes of a distance grid."""
-MARGIN = 0.2
-"""Margin of the grid around the shape, relative to the largest side of its bounding box."""
-NUM_SAMPLES = 60_000
-"""Approximate number of samples on a surface; each triangle has at least one."""
-LONGEST_ROWS = 8
-"""Largest number of samples in rows along the sides of all triangles, in units of `NUM_SAMPLES`."""
-NUM_NEAREST = 6
-"""Number of nearest samples of a point whose triangles are measured exactly."""
-NUM_ROUNDS, NUM_SWEEPS = 2, 3
-"""Numbers of rounds, and of sweeps in each, in which nodes of a grid hand on near points of the surface."""
-WALK = 0.6
-"""Part of the way along a surface to the place that would be nearest if it were flat."""
-WALK_CELLS = 1.0
-"""Longest such step, in cells of the grid."""
-NUM_PROBES = 100_000
-"""Number of points at which the slope of a distance is checked."""
-BLOCK = 2048
-"""Number of points for which a grid is evaluated in one step, so that intermediate results stay in the cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +104,10 @@ class Solid:
         used[self.faces] = True
         return self.vertices[used]
 
-    def nearest(self, s: Array) -> Array:
-        """Find the points of the surface, (N, 3), nearest to the points `s` (N, 3), metres."""
-        return _surface(self).nearest(s)
-
-    def balls(self, num: int) -> tuple[Array, Array]:
-        """Cover it by at most `num` balls: centres (K, 3) and radii (K,), metres."""
-        centres, radii = _balls(self, num)
-        return centres.copy(), radii.copy()
+    @property
+    def balls(self) -> tuple[Array, Array]:
+        """A cover of it: centres (K, 3) and radii (K,), metres."""
+        return _balls(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +172,9 @@ class DistanceGrid:
 
     def _evaluate(self, s: Array, *, slopes: bool) -> tuple[Array, Array]:
         """Values (N,), and gradients (N, 3) where they are wanted."""
-        if len(s) > BLOCK:
-            blocks = [self._evaluate(s[i : i + BLOCK], slopes=slopes) for i in range(0, len(s), BLOCK)]
+        num = 2048  # points whose intermediate results stay in the cache
+        if len(s) > num:
+            blocks = [self._evaluate(s[i : i + num], slopes=slopes) for i in range(0, len(s), num)]
             values, gradients = zip(*blocks, strict=True)
             return np.concatenate(values), np.concatenate(gradients)
         shape = np.array(self.values.shape)[:, None]
@@ -234,17 +235,13 @@ class _Surface:
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
         # long and thin triangles would otherwise have rows of very many samples
         length = sum(float(np.linalg.norm(side, axis=1).sum()) for side in (b - a, c - b, a - c)) / 2
-        spacing = max(np.sqrt(area / NUM_SAMPLES), length / (LONGEST_ROWS * NUM_SAMPLES))
+        spacing = max(np.sqrt(area / SETTINGS.num_samples), length / (SETTINGS.longest_rows * SETTINGS.num_samples))
         self.samples, self._owner = surface_samples(triangles, spacing)
         self._tree = KDTree(self.samples)
 
-    def nearest(self, s: Array) -> Array:
-        """Find the points of the surface, (N, 3), nearest to the points `s` (N, 3)."""
-        return self._nearest(s)[1] if len(s) else s.copy()
-
     def _nearest(self, s: Array) -> tuple[Indices, Array]:
         """Find the triangles (N,) nearest to points `s` (N, 3), and the points (N, 3) on them."""
-        _, found = self._tree.query(s, k=min(NUM_NEAREST, self._tree.n))
+        _, found = self._tree.query(s, k=min(SETTINGS.num_nearest, self._tree.n))
         owners = self._owner[np.reshape(found, (len(s), -1))]  # (N, K)
         points = np.stack([closest_point(self._triangles[owner], s) for owner in owners.T], axis=1)
         best = np.arange(len(s)), ((points - s[:, None]) ** 2).sum(axis=2).argmin(axis=1)
@@ -265,26 +262,25 @@ class _Surface:
         owner, points = np.zeros(shape, dtype=np.intp), np.empty((*shape, 3))
         owner[beside], points[beside] = self._nearest(nodes[beside.ravel()])
         owner, points = owner[tuple(to)], points[tuple(to)]
-        for _ in range(NUM_ROUNDS):
+        for _ in range(SETTINGS.num_rounds):
             _hand_on(owner, points, nodes.reshape(*shape, 3))
             points = closest_point(self._triangles[owner.ravel()], nodes).reshape(*shape, 3)
-            self._walk(owner.reshape(-1), points.reshape(-1, 3), nodes, WALK_CELLS * cell)
+            self._walk(owner.reshape(-1), points.reshape(-1, 3), nodes, cell)
         return np.linalg.norm(points - nodes.reshape(*shape, 3), axis=-1)
 
     def _walk(self, owner: Indices, points: Array, nodes: Array, longest: float) -> None:
         """Move points of the surface, in place, along it to where they are nearer to the nodes.
 
         Where the surface has radius of curvature R and the node is at distance d, the step covers the part
-        WALK·(1 + d/R) of the way.
+        w·(1 + d/R) of the way.
         """
         offset = nodes - points
         a, b, c = self._triangles[owner].swapaxes(0, 1)
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        normal = unit(np.cross(b - a, c - a))
         aside = offset - np.einsum("ni,ni->n", offset, normal)[:, None] * normal
-        squared, step = np.einsum("ni,ni->n", offset, offset), WALK * np.linalg.norm(aside, axis=1)
+        squared, step = np.einsum("ni,ni->n", offset, offset), SETTINGS.walk * np.linalg.norm(aside, axis=1)
         far = np.flatnonzero(step**2 > 1e-4 * squared)
-        aside *= (WALK * np.minimum(1, longest / np.maximum(step, 1e-300)))[:, None]
+        aside *= (SETTINGS.walk * np.minimum(1, longest / divisor(step)))[:, None]
         new = self._owner[self._tree.query(points[far] + aside[far])[1]]
         reached = closest_point(self._triangles[new], nodes[far])
         nearer = ((reached - nodes[far]) ** 2).sum(axis=1) < squared[far]
@@ -306,7 +302,7 @@ def _flatten(signed: Array, cell: float) -> None:
 def _hand_on(owner: Indices, points: Array, nodes: Array) -> None:
     """Replace, in place, each node's point of the surface by its neighbour's where that is nearer."""
     squared = ((points - nodes) ** 2).sum(axis=-1)
-    for _, axis, back in itertools.product(range(NUM_SWEEPS), range(3), (False, True)):
+    for _, axis, back in itertools.product(range(3), range(3), (False, True)):
         ends = slice(1, None), slice(None, -1)
         here, there = ((*axis * (slice(None),), end) for end in (ends[::-1] if back else ends))
         apart = ((points[there] - nodes[here]) ** 2).sum(axis=-1)
@@ -317,16 +313,11 @@ def _hand_on(owner: Indices, points: Array, nodes: Array) -> None:
 
 
 @lru_cache(maxsize=16)
-def _surface(solid: Solid) -> _Surface:
-    return _Surface(solid.vertices[solid.faces])
-
-
-@lru_cache(maxsize=16)
 def _distances(solid: Solid) -> DistanceGrid:
     lower, upper = solid.bounds
-    margin = MARGIN * float((upper - lower).max())
+    margin = SETTINGS.margin * float((upper - lower).max())
     size = upper - lower + 2 * margin
-    cell = float(np.cbrt(size.prod() / NUM_NODES))
+    cell = float(np.cbrt(size.prod() / SETTINGS.num_nodes))
     counts = np.ceil(size / cell).astype(int) + 2  # the outermost nodes are for the spline only
     centre = (lower + upper) / 2
     origin = centre - cell * (counts - 1) / 2
@@ -334,44 +325,18 @@ def _distances(solid: Solid) -> DistanceGrid:
     nodes = grid_nodes(origin, cell, shape)
     # first, since it refuses meshes that take too long, or that are not closed
     inside = inside_of_grid(solid.vertices[solid.faces], origin, cell, shape, closed=True)
-    distance = _surface(solid).distances(nodes, origin, cell, shape)
+    distance = _Surface(solid.vertices[solid.faces]).distances(nodes, origin, cell, shape)
     radius = float(np.linalg.norm(solid.used - centre, axis=1).max())
     signed = np.where(inside, -distance, distance)
     _flatten(signed, cell)
     grid = DistanceGrid(origin, cell, signed, margin, centre, radius)
     # steeper than 1 by a percent or two beside edges
-    s = origin + cell * np.random.default_rng(0).uniform(0.5, counts - 1.5, (NUM_PROBES, 3))
+    s = origin + cell * np.random.default_rng(0).uniform(0.5, counts - 1.5, (100_000, 3))
     slope = np.sqrt((grid.with_slope(s)[1] ** 2).sum(axis=1).max())
     return replace(grid, values=grid.values / slope, margin=margin / slope) if slope > 1 else grid
 
 
 @lru_cache(maxsize=64)
-def _balls(solid: Solid, num: int) -> tuple[Array, Array]:
-    """Cluster the grid's cells that the solid reaches into; the balls are grown by half a cell's diagonal."""
-    grid = solid.distances
-    half_diagonal = grid.cell * np.sqrt(3) / 2
-    nodes = grid.nodes[grid.values.ravel() < half_diagonal]
-    some = nodes[:: max(1, len(nodes) // 4000)]
-    centres = [some[np.linalg.norm(some - some.mean(axis=0), axis=1).argmax()]]
-    apart = np.linalg.norm(some - centres[0], axis=1)
-    while len(centres) < num:  # farthest-point initialisation
-        centres.append(some[apart.argmax()])
-        apart = np.minimum(apart, np.linalg.norm(some - centres[-1], axis=1))
-    centres = np.array(centres)
-    for _ in range(15):
-        member = KDTree(centres).query(some)[1]
-        for k in range(num):
-            if len(mine := some[member == k]):
-                centres[k] = _middle(mine)
-    distance, member = KDTree(centres).query(nodes)
-    radii = np.array([distance[member == k].max(initial=-1.0) for k in range(num)])
-    return centres[radii >= 0], radii[radii >= 0] + half_diagonal
-
-
-def _middle(points: Array) -> Array:
-    """Find the centre (3,) of a small ball around points (N, 3) by steps to the farthest (Bădoiu and Clarkson)."""
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    for k in range(1, 20):
-        farthest = points[((points - centre) ** 2).sum(axis=1).argmax()]
-        centre = centre + (farthest - centre) / (k + 4)
-    return centre
+def _balls(solid: Solid) -> tuple[Array, Array]:
+    grid = solid.distances  # cells into which the solid reaches
+    return cells_cover(grid.nodes[grid.values.ravel() < grid.cell * np.sqrt(3) / 2], grid.cell)

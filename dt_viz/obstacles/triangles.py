@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from dt_viz.errors import FormatError
 from dt_viz.flows.fields import Array, Indices, Mask
+from dt_viz.numerics import divisor
 
 MAX_DISPUTED = 0.02
 """Largest number of nodes off the surface on which the directions may disagree, relative to that inside. Meshes that
@@ -15,8 +16,6 @@ REMEDY = (
     "close it in a mesh editor, or give its walls a thickness; if its hollows do not matter, load its convex hull "
     "(Blender, MeshLab and trimesh make one)"
 )
-CHUNK = 100_000
-"""Number of pairs of a triangle and a line that are tested in one step."""
 MAX_CROSSINGS = 3_000_000
 """Largest number of pairs of a triangle and a line near it; 500,000 even triangles have some 10,000."""
 
@@ -27,7 +26,7 @@ def surface_samples(triangles: Array, spacing: float) -> tuple[Array, Indices]:
     turned = (longest[:, None] + np.arange(3)) % 3  # its longest side first
     a, b, c = np.take_along_axis(triangles, turned[..., None], axis=1).swapaxes(0, 1)
     base = np.linalg.norm(b - a, axis=1)
-    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(base, 1e-300)
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / divisor(base)
     along, across = (np.maximum(1, np.ceil(size / spacing)).astype(np.intp) for size in (base, height))
     count = along * across
     owner = np.repeat(np.arange(len(triangles)), count)
@@ -96,7 +95,7 @@ def _winding(triangles: Array, origin: Array, cell: float, shape: tuple[int, ...
     start = 0
     while start < len(hit):
         done = ends[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
+        stop = max(start + 1, int(np.searchsorted(ends, done + 100_000, side="right")))
         some = hit[start:stop]
         owner = np.repeat(some, count[some])
         rank = np.arange(len(owner)) - np.repeat(np.cumsum(count[some]) - count[some], count[some])

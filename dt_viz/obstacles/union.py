@@ -7,15 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array, Sum
+from dt_viz.numerics import unit
 from dt_viz.obstacles.occupancy import Generator
-from dt_viz.obstacles.shapes import Obstacle, golden_spiral
-
-NUM_DIRECTIONS, NUM_STEPS = 500, 200
-"""Number of rays along which a way out of overlapping obstacles is searched, and largest number of steps on a ray."""
-SHORTEST = 1e-4
-"""Smallest ray-marching step, metres; bounds the overshoot."""
-ROUNDING = 1e-6
-"""Largest depth, metres, that counts as lying on a surface."""
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.surfaces import golden_spiral
 
 
 @dataclass(frozen=True)
@@ -35,25 +30,40 @@ class Union:
             nearest = np.where(distance.real < nearest.real, distance, nearest)
         return nearest
 
+    def distance_and_normal(self, s: Array) -> tuple[Array, Array]:
+        """Signed distance (N,), metres, of points `s` (N, 3), and unit vectors (N, 3) away from the nearest surface.
+
+        A vector is zero where the distance has no slope; without an obstacle the distance is infinite and all are.
+        """
+        step = 1e-20  # imaginary: signed distances are analytic
+        beside: Array = s + 1j * step * np.eye(3)[:, None]  # pyright: ignore[reportAssignmentType]
+        ahead = self.signed_distance(beside)  # (3, N)
+        return ahead[0].real, unit(ahead.imag.T / step)
+
     def nearest_free(self, s: Array) -> Array:
         """Return the points `s` (*B, 3), those inside moved about to the nearest free place, (*B, 3), metres."""
         free = np.array(s, dtype=float).reshape(-1, 3)
-        for row in np.flatnonzero(self.signed_distance(free) < 0):
+        inside = np.flatnonzero(self.signed_distance(free) < 0)
+        for row in inside:
             free[row] = self._way_out(free[row])
-        return free.reshape(s.shape)
+        return free.reshape(np.shape(s))
 
     def _way_out(self, s: Array) -> Array:
         """Find the free place for one point (3,) inside."""
-        deepest = min(self.parts, key=lambda part: float(part.signed_distance(s)))
-        free = deepest.nearest_free(s)
-        if self.signed_distance(free) >= -ROUNDING:  # no free place is nearer
-            return free
-        directions, length = golden_spiral(NUM_DIRECTIONS) * [1, -1, -1], np.zeros(NUM_DIRECTIONS)
-        for _ in range(NUM_STEPS):
+        deepest = Union((min(self.parts, key=lambda part: float(part.signed_distance(s))),))
+        free, rounding = s[None], 1e-9
+        for _ in range(20):  # one step to exact surfaces, more to interpolated ones
+            distance, normal = deepest.distance_and_normal(free)
+            free = free - (distance - rounding)[:, None] * normal
+        if self.signed_distance(free)[0] >= 0:  # no free place is nearer
+            return free[0]
+        directions = golden_spiral(500) * [1, -1, -1]
+        length, shortest = np.zeros(len(directions)), 1e-4  # metres; bounds the overshoot
+        for _ in range(200):
             depth = -self.signed_distance(s + length[:, None] * directions)
             if depth[length.argmin()] <= 0:
                 break
-            length += np.where(depth > 0, np.maximum(depth, SHORTEST), 0)
+            length += np.where(depth > 0, np.maximum(depth, shortest), 0)
         nearest = length.argmin()
         return s + length[nearest] * directions[nearest]
 

@@ -13,7 +13,7 @@ from dt_viz.flows.fields import Array, Mask
 from dt_viz.flows.rollouts import Rays
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.obstacles.union import Union
-from dt_viz.pictures.slice_fields import Clearance, streamlines
+from dt_viz.pictures.slice_fields import SETTINGS, Clearance, everywhere, streamlines
 from dt_viz.scenario.slices import Slice, level_line
 
 MARGIN = 0.18
@@ -80,7 +80,7 @@ def system_panel(
         coarse: whether it is soon replaced.
     """
     outlines = np.zeros((0, 2, 3))
-    clearance: Clearance = _everywhere
+    clearance: Clearance = everywhere
     if obstacle is not None and obstacle.parts:
         clearance, lattice = obstacle.signed_distance, area.grid(OUTLINE_SPACING)
         distance = clearance(lattice.reshape(-1, 3)).reshape(lattice.shape[:2])
@@ -106,14 +106,22 @@ def generator_panel(title: str, transform: Diffeomorphism, area: Slice) -> Panel
         transform: ψ; what is in it besides flows is left out.
         area: its rectangle.
     """
-    half = np.array(area.half_size) - ARROW_SPACING / 2
-    points = replace(area, half_size=(float(half[0]), float(half[1]))).lattice(ARROW_SPACING)
-    vectors = np.zeros_like(points)
-    for flow in transform.parts if isinstance(transform, Chain) else [transform]:
-        if isinstance(flow, Flow | AdaptiveFlow):
-            vectors -= flow.duration * flow.field(points)
+    points = inset(area).lattice(ARROW_SPACING)
+    vectors = -displacements(transform.parts if isinstance(transform, Chain) else [transform], points)
     seen = long_enough(vectors)
     return PanelPicture(title, area, points=points[seen], vectors=vectors[seen])
+
+
+def displacements(transforms: Sequence[Diffeomorphism], points: Array) -> Array:
+    """Return t·V (N, d) of the flows among transforms at points (N, d), added up: roughly what they displace."""
+    flows = [transform for transform in transforms if isinstance(transform, Flow | AdaptiveFlow)]
+    return np.zeros_like(points) + sum(flow.duration * flow.field(points) for flow in flows)
+
+
+def inset(area: Slice) -> Slice:
+    """Return a rectangle whose lattice of arrows keeps clear of the border of another one."""
+    width, height = (half - ARROW_SPACING / 2 for half in area.half_size)
+    return replace(area, half_size=(width, height))
 
 
 def long_enough(vectors: Array) -> Mask:
@@ -126,6 +134,7 @@ def long_enough(vectors: Array) -> Mask:
 class Fit:
     """Base space scaled to a rectangle: z ↦ centre + scale·(z − middle)."""
 
+    rays: Rays
     area: Slice
     middle: Array
     """(3,)."""
@@ -140,7 +149,7 @@ class Fit:
         half = np.maximum(half + MARGIN * half.max(), 1e-3)
         offset = (rays.base.goal - area.centre) @ area.normal
         middle = area.at((lower + upper) / 2) + offset * area.normal
-        return cls(area, middle, min(1.0, float((area.half_size / half).min())))
+        return cls(rays, area, middle, min(1.0, float((area.half_size / half).min())))
 
     @property
     def base_area(self) -> Slice:
@@ -153,27 +162,27 @@ class Fit:
         return self.area.centre + self.scale * (z - self.middle)
 
 
-def base_panel(title: str, rays: Rays, fit: Fit, grid: Sequence[Array], *, coarse: bool) -> PanelPicture:
+def base_panel(title: str, fit: Fit, *, grid: bool) -> PanelPicture:
     """Return the picture of the base attractor, whose motions are straight.
 
     Args:
         title: what is written over it.
-        rays: its motions.
         fit: how base space is scaled.
-        grid: (2, 3) lines in base space, metres.
-        coarse: whether it is soon replaced.
+        grid: whether it has the lattice of lines whose image is the warped grid.
     """
+    rays, seen = fit.rays, fit.base_area
     system = DiffeomorphicSystem(Identity(rays.base.dim), rays.base)
+    lines, spacing = [], SETTINGS.grid_spacing
+    for axis, (half, middle) in enumerate(zip(seen.half_size, seen.across(rays.base.goal), strict=True)):
+        for k in range(-int((half + middle) / spacing), 1 + int((half - middle) / spacing)) if grid else ():
+            ends = np.array([-1.0, 1.0])[:, None] * seen.half_size
+            ends[:, axis] = middle + k * spacing
+            lines.append(fit(seen.at(ends)))
     return PanelPicture(
         title,
         fit.area,
         fit(rays.base.goal),
         tuple(fit(np.stack([z0, rays.base.goal])) for z0 in rays.z0),
-        tuple(fit(line) for line in streamlines(system, fit.base_area, _everywhere, coarse=coarse)),
-        grid=tuple(fit(line) for line in grid),
+        tuple(fit(line) for line in streamlines(system, seen, everywhere, coarse=False)),
+        grid=tuple(lines),
     )
-
-
-def _everywhere(points: Array) -> Array:
-    """Return the distance (N,) of points (N, 3) from an obstacle that is not there."""
-    return np.full(len(points), np.inf)

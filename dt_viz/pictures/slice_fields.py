@@ -1,9 +1,11 @@
-"""Fields of a system on a slice: velocity, streamlines, and det J or the Lyapunov value."""
+"""Fields of a system on a slice: velocity, streamlines, det J or the Lyapunov value, and the warped grid."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -13,24 +15,32 @@ from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.scenario.scenario import SliceColour
 from dt_viz.scenario.slices import Slice, level_line
 
-ARROW_SPACING = 0.030
-"""Spacing of the arrows, metres."""
-SEPARATION = 0.032
-"""Distance from all other streamlines at which one may begin, metres; it ends at half that distance."""
-SEED_SPACINGS = (2.0, 1.0, 0.5)
-"""Spacings of the successive lattices of streamlines' seeds, in separations."""
-NUM_TRIALS = 64
-"""Number of samples of a streamline from which its end is found."""
-MIN_LENGTH = 1.0
-"""Smallest length of a streamline, in separations."""
-MAX_OFFSET = 0.10
-"""Distance from the slice at which a streamline ends, metres."""
-FINE_LINE, COARSE_LINE = 0.006, 0.014
-"""Distances between neighbouring samples of a drawn streamline, metres."""
-FINE_COLOUR = 0.008
-"""Distance between neighbouring samples of a function, metres; a coarse picture has the arrows' spacing."""
-LEVEL_SPACING = 0.04
-"""Spacing of the base attractor's circles whose images are the level lines of the Lyapunov value, metres."""
+
+@dataclass(frozen=True)
+class SliceSettings:
+    """How densely a slice is covered; lengths in metres."""
+
+    arrow_spacing: float = 0.030
+    """Spacing of the arrows."""
+    lattice: float = 0.008
+    """Spacing of the lattice on which functions are sampled; a coarse picture has the arrows'."""
+    grid_spacing: float = 0.035
+    """Spacing in base space of the lines whose images are the warped grid."""
+    coarse_lattice: float = 0.012
+    """Spacing of the lattice on which those of a coarse picture are found."""
+    level_spacing: float = 0.04
+    """Spacing of the base attractor's circles whose images are the level lines of the Lyapunov value."""
+    separation: float = 0.032
+    """Distance from all other streamlines at which one may begin, and its least length; it ends at half of it."""
+    max_offset: float = 0.10
+    """Distance from the slice at which a streamline ends."""
+    line: float = 0.006
+    """Distance between neighbouring samples of a drawn streamline."""
+    coarse_line: float = 0.014
+    """The distance of a coarse picture."""
+
+
+SETTINGS = SliceSettings()
 
 Clearance = Callable[[Array], Array]
 """Function from points (N, 3) to their distances (N,) from the blocked region, metres, negative inside."""
@@ -65,7 +75,7 @@ class Samples:
     """A system at the free lattice points of a slice, evaluated once for several pictures."""
 
     def __init__(self, system: DiffeomorphicSystem, area: Slice, clearance: Clearance, spacing: float) -> None:
-        """Evaluate ψ and its Jacobian.
+        """Sample the slice.
 
         Args:
             system: the system of ψ.
@@ -81,17 +91,23 @@ class Samples:
         self.free = self.clearance > 0
         self.points = self.grid[self.free]
         """(N, 3) free points, metres."""
-        self.images, self.jacobians = system.transform.jacobian(self.points)
 
-    @property
-    def velocities(self) -> Array:
-        """(N, 3), m/s."""
-        return np.linalg.solve(self.jacobians, self.system.base.velocity(self.images)[..., None])[..., 0]
+    @cached_property
+    def jacobians(self) -> tuple[Array, Array]:
+        """ψ of the free points (N, 3), and its Jacobians there (N, 3, 3)."""
+        return self.system.transform.jacobian(self.points)
+
+    @cached_property
+    def images(self) -> Array:
+        """ψ of the free points, (N, 3), where nobody needs the Jacobians."""
+        return self.system.transform.forward(self.points)
 
     @property
     def field(self) -> FieldPicture:
         """The velocities at the free points."""
-        return FieldPicture(self.points, self.velocities)
+        images, jacobians = self.jacobians
+        velocities = np.linalg.solve(jacobians, self.system.base.velocity(images)[..., None])[..., 0]
+        return FieldPicture(self.points, velocities)
 
     def spread(self, values: Array) -> Array:
         """Return values (N,) on the whole lattice (n, m), NaN in the blocked region."""
@@ -99,74 +115,106 @@ class Samples:
         spread[self.free] = values
         return spread
 
+    def level_lines(self, values: Array, levels: Iterable[float], steepest: float = np.inf) -> Array:
+        """Find segments (K, 2, 3), metres, of the lines on which values (N,) have one of the levels.
+
+        Cells of the lattice over which the values change by the `steepest` step or more have none.
+        """
+        spread = self.spread(values)
+        sparse = np.where(_steps(spread) < steepest, spread, np.nan)
+        return np.concatenate([np.empty((0, 2, 3)), *(level_line(self.grid, sparse - level) for level in levels)])
+
 
 def arrows_and_colour(
-    system: DiffeomorphicSystem, area: Slice, clearance: Clearance, colour: SliceColour, *, arrows: bool, coarse: bool
+    system: DiffeomorphicSystem,
+    area: Slice,
+    clearance: Clearance,
+    colour: SliceColour,
+    *,
+    arrows: bool,
+    coarse: bool,
+    settings: SliceSettings = SETTINGS,
 ) -> tuple[FieldPicture | None, ColourPicture | None]:
     """Compute velocities on the slice, if `arrows` are wanted, and the function that the `colour` shows, if any.
 
     A `coarse` picture, which is soon replaced, uses one lattice for both.
     """
-    function, det = colour in {"det", "lyapunov"}, colour == "det"
+    draw = {"det": det_jacobian, "lyapunov": lyapunov_value}.get(colour)
     field, samples = None, None
-    if arrows or (function and coarse):
-        samples = Samples(system, area, clearance, ARROW_SPACING)
+    if arrows or (draw and coarse):
+        samples = Samples(system, area, clearance, settings.arrow_spacing)
         field = samples.field if arrows else None
-    if not function:
+    if not draw:
         return field, None
     if samples is None or not coarse:
-        samples = Samples(system, area, clearance, FINE_COLOUR)
-    return field, det_jacobian(samples) if det else lyapunov_value(samples)
+        samples = Samples(system, area, clearance, settings.lattice)
+    return field, draw(samples, settings)
 
 
-def det_jacobian(samples: Samples) -> ColourPicture:
+def grid_lines(system: DiffeomorphicSystem, area: Slice, *, coarse: bool, settings: SliceSettings = SETTINGS) -> Array:
+    """Find segments (K, 2, 3), metres, where coordinates of ψ along the slice are multiples of the grid's spacing.
+
+    They are counted from the goal, so that two lines cross there. In a drawing's plane these are the images of a
+    lattice of straight lines under ψ⁻¹.
+    """
+    samples = Samples(system, area, everywhere, settings.coarse_lattice if coarse else settings.lattice)
+    across, spacing = (samples.images - system.base.goal) @ area.axes, settings.grid_spacing
+    levels = [spacing * np.arange(np.ceil(x.min() / spacing), 1 + np.floor(x.max() / spacing)) for x in across.T]
+    return np.concatenate([samples.level_lines(x, at) for x, at in zip(across.T, levels, strict=True)])
+
+
+def everywhere(points: Array) -> Array:
+    """Return the distance (N,) of points (N, 3) from an obstacle that is not there."""
+    return np.full(len(points), np.inf)
+
+
+def det_jacobian(samples: Samples, _: SliceSettings = SETTINGS) -> ColourPicture:
     """Compute det J of ψ: the ratio of a small volume in base space to the original; ≤ 0 where ψ folds."""
-    values = samples.spread(np.linalg.det(samples.jacobians))
+    values = samples.spread(np.linalg.det(samples.jacobians[1]))
     return ColourPicture("det", samples.area, values, samples.clearance, np.empty((0, 2, 3)))
 
 
-def lyapunov_value(samples: Samples) -> ColourPicture:
+def lyapunov_value(samples: Samples, settings: SliceSettings = SETTINGS) -> ColourPicture:
     """Compute Φ(ψ(y)), which falls along every motion, and level lines: images of evenly spaced circles."""
-    base = samples.system.base
-    values = samples.spread(base.potential(samples.images))
-    radius, levels = LEVEL_SPACING, []
-    # no lines where a cell of the lattice would have more than one
-    sparse = np.where(_steps(values) < base.speed * LEVEL_SPACING, values, np.nan)
-    while (level := base.potential_at(radius)) < np.nanmax(values, initial=0.0):
-        levels.append(level_line(samples.grid, sparse - level))
-        radius += LEVEL_SPACING
-    lines = np.concatenate([np.empty((0, 2, 3)), *levels])
-    return ColourPicture("lyapunov", samples.area, values, samples.clearance, lines)
+    base, spacing = samples.system.base, settings.level_spacing
+    values = base.potential(samples.images)
+    highest, levels = values.max(initial=0.0), (base.potential_at(spacing * k) for k in itertools.count(1))
+    below = itertools.takewhile(lambda level: level < highest, levels)
+    lines = samples.level_lines(values, below, base.speed * spacing)  # at most one in a cell
+    return ColourPicture("lyapunov", samples.area, samples.spread(values), samples.clearance, lines)
 
 
-def streamlines(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool) -> tuple[Array, ...]:
+def streamlines(
+    system: DiffeomorphicSystem, area: Slice, clearance: Clearance, *, coarse: bool, settings: SliceSettings = SETTINGS
+) -> tuple[Array, ...]:
     """Compute evenly spaced motions from places on the slice, each (T_i, 3), metres, as far as they stay over it.
 
     They are exact: by conjugacy a streamline through y is ψ⁻¹ of the ray through ψ(y). Each ends where it comes too
     close to an earlier one, and the remaining gaps are filled, after Jobard and Lefer, "Creating Evenly-Spaced
     Streamlines of Arbitrary Density" (1997).
     """
-    marks, starts, trials, lengths = _Marks(area), [], [], []
-    u = np.linspace(0, 1, NUM_TRIALS)
-    for spacing in SEED_SPACINGS:
-        seeds = area.lattice(spacing * SEPARATION)
+    marks, starts, trials, lengths = _Marks(area, settings), [], [], []
+    num = 64  # samples from which the end of a streamline is found
+    u = np.linspace(0, 1, num)
+    for finer in (0.5, 1, 2):
+        seeds = area.lattice(settings.separation / finer)
         seeds = seeds[~marks.crowded(seeds) & (clearance(seeds) > 0)]
         # from the rim inwards: those are long, and their order does not change with the motion
         seeds = seeds[np.argsort(-np.abs(area.across(seeds) / area.half_size).max(axis=1).round(6), kind="stable")]
         rays = Rays(system.transform.forward(seeds), system.base)
-        index = np.repeat(np.arange(len(seeds)), NUM_TRIALS)
-        lines = system.transform.inverse(rays.at(index, np.tile(u, len(seeds)))).reshape(-1, NUM_TRIALS, 3)
+        index = np.repeat(np.arange(len(seeds)), num)
+        lines = system.transform.inverse(rays.at(index, np.tile(u, len(seeds)))).reshape(-1, num, 3)
         starts.append(rays.z0)
         trials.append(lines)
         lengths += [marks.take(line) for line in lines]
 
-    kept = np.arange(NUM_TRIALS) < np.reshape(lengths, (-1, 1))
+    kept = np.arange(num) < np.reshape(lengths, (-1, 1))
     if not kept.any():
         return ()
     index, sample = np.nonzero(kept)
     rays = Rays(np.concatenate(starts), system.base)
     bundle = Bundle(index, u[sample], np.concatenate(trials)[kept][:, None])
-    spacing, rounds = (COARSE_LINE, 1) if coarse else (FINE_LINE, 3)
+    spacing, rounds = (settings.coarse_line, 1) if coarse else (settings.line, 3)
     return refined(
         bundle, lambda i, u: system.transform.inverse(rays.at(i, u))[:, None], spacing, max_rounds=rounds
     ).paths
@@ -175,9 +223,9 @@ def streamlines(system: DiffeomorphicSystem, area: Slice, clearance: Clearance, 
 class _Marks:
     """Cells near streamlines, on a lattice of small cubes over the slice."""
 
-    def __init__(self, area: Slice) -> None:
-        self._area, self._cell, border = area, SEPARATION / 3, 4
-        self._half = np.array([*area.half_size, MAX_OFFSET])
+    def __init__(self, area: Slice, settings: SliceSettings) -> None:
+        self._area, self._shortest, self._cell, border = area, settings.separation, settings.separation / 3, 4
+        self._half = np.array([*area.half_size, settings.max_offset])
         shape = np.ceil(2 * self._half / self._cell).astype(int) + 2 * border + 1
         self._stride, self._border = np.array([shape[1] * shape[2], shape[2], 1]), border
         self._near, self._nearer = np.zeros((2, shape.prod()), bool)
@@ -209,7 +257,7 @@ class _Marks:
             return 0
         cells = cells[: _num_leading(~self._nearer[cells])]
         length = int(np.searchsorted(along, closely[len(cells) - 1], side="right")) if len(cells) else 0
-        if not length or along[length - 1] < MIN_LENGTH * SEPARATION:
+        if not length or along[length - 1] < self._shortest:
             return 0
         self._near[(cells[:, None] + self._around).ravel()] = True
         self._nearer[(cells[:, None] + self._close).ravel()] = True

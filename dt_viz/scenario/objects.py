@@ -11,19 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.obstacles.shapes import Box, Sphere, lathe
+from dt_viz.obstacles.shapes import Box, Sphere
+from dt_viz.obstacles.surfaces import lathe
 
-GRAVITY = 9.81
-"""Acceleration of gravity, m/s²."""
-FRICTION = 0.5
-"""Way that a pushed box is taken aside for each metre that it is pushed."""
 FINGERS = 0.035
 """Distance of the hand's point from what the fingers push, metres."""
-GRASP = 0.03
-"""Distance from the place where a box is grasped at which the hand takes it along, metres."""
 WALL = 0.004
 """Thickness of walls, metres."""
-NUM_SIDES = 64
 
 
 @dataclass(frozen=True)
@@ -78,7 +72,7 @@ class Pot:
         """Return vertices (V, 3), metres, above the middle of its bottom, and faces (F, 3), outward."""
         inner, outer = self.radius, self.radius + WALL
         profile = [(0.0, 0.0), (outer, 0.0), (outer, self.height), (inner, self.height), (inner, WALL), (0.0, WALL)]
-        return lathe(profile, NUM_SIDES)
+        return lathe(profile, 64)
 
     def catches(self, position: Array) -> bool:
         """Return whether an object released at `position` (3,), metres, falls into it."""
@@ -108,7 +102,7 @@ class Ball(TaskObject):
         """Return where a ball is that was dropped at a place (3,), metres, some time ago."""
         bottom = WALL if any(pot.catches(place) for pot in self.pots) else 0.0
         x, y, z = place
-        return np.array([x, y, min(z, max(bottom + self.radius, z - GRAVITY * seconds**2 / 2))])
+        return np.array([x, y, min(z, max(bottom + self.radius, z - 9.81 * seconds**2 / 2))])
 
 
 @dataclass(frozen=True)
@@ -121,6 +115,8 @@ class PushedBox(TaskObject):
     """Unit vector along which it is pushed."""
     sizes: tuple[float, float, float] = (0.07, 0.09, 0.19)
     """Length along the direction, width and height, metres."""
+    friction: float = 0.5
+    """Way that it is taken aside for each metre that it is pushed."""
 
     @classmethod
     def before(cls, hand: Array, goal: Array) -> PushedBox:
@@ -146,7 +142,7 @@ class PushedBox(TaskObject):
         behind = offset @ along < 0 and abs(offset @ across) < width / 2 and hand.place[2] < height
         if not behind or ahead <= 0 or hand.arrived > 0:
             return place
-        aside = np.clip(step @ across, -FRICTION * ahead, FRICTION * ahead)
+        aside = np.clip(step @ across, -self.friction * ahead, self.friction * ahead)
         return place + np.array([*(ahead * along + aside * across), 0.0])
 
 
@@ -160,6 +156,8 @@ class LiftedBox(TaskObject):
     """Height of the hand at which it is grasped, metres."""
     sizes: tuple[float, float, float] = (0.22, 0.20, 0.08)
     """Sides and height, metres."""
+    near: float = 0.03
+    """Distance from the place where it is grasped at which the hand takes it along, metres."""
 
     @property
     def start(self) -> Array:
@@ -177,7 +175,7 @@ class LiftedBox(TaskObject):
 
     def moved(self, place: Array, hand: Hand) -> Array:
         step, grasped = hand.place - hand.before, place[2] > 0
-        inside = np.linalg.norm(hand.place - [*place[:2], self.grasp]) < GRASP
+        inside = np.linalg.norm(hand.place - [*place[:2], self.grasp]) < self.near
         if hand.arrived > 0 or not (grasped or (inside and step[2] > 0)):
             return place
         return np.maximum(place + step, [-np.inf, -np.inf, 0.0])

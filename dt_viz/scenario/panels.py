@@ -11,8 +11,6 @@ from dt_viz.learning.state import State
 from dt_viz.obstacles.shapes import Point
 from dt_viz.scenario.slices import Slice
 
-MOST_IN_A_ROW = 4
-"""Largest number of rectangles in one row, the scene's own included; more are in two rows."""
 GAP = 0.06
 """Distance between rectangles beside each other, metres."""
 TITLE_ROOM = 0.07
@@ -53,7 +51,7 @@ def offsets(area: Slice, half_size: Array, num: int, camera: tuple[Point, Point]
     Returns:
         (num, 3) offsets from the scene's rectangle, metres.
     """
-    columns = num + 1 if num < MOST_IN_A_ROW else -(-(num + 1) // 2)
+    columns = num + 1 if num < 4 else -(-(num + 1) // 2)  # more than four are in two rows
     row, column = np.divmod(np.arange(num + 1), columns)
     # a last row that is not full ends with the scene, too
     column = np.where(row == row[-1], column + columns - 1 - column[-1], column)

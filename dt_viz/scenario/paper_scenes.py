@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,32 +14,15 @@ from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.fields import Array, Mask
 from dt_viz.obstacles.clouds import Cloud
 from dt_viz.obstacles.occupancy import sample_labels
-from dt_viz.obstacles.shapes import Box, CloudObstacle, MeshObstacle, Point, Sphere, as_point, lathe
+from dt_viz.obstacles.shapes import Box, CloudObstacle, MeshObstacle, Point, Sphere, as_point
 from dt_viz.obstacles.solids import Solid
+from dt_viz.obstacles.surfaces import lathe
 from dt_viz.scenario.objects import Pot
 from dt_viz.scenario.panels import BASE_PANEL, Panel
 from dt_viz.scenario.scenario import Layer, Scenario, View
 from dt_viz.scenario.stack import IMITATION, plane_of, with_added
 from dt_viz.scenario.tasks import Task
 
-IN_8 = 0.09
-"""Diameter of the sphere in the 8, metres."""
-BODY, NECK, RIM = (0.035, 0.180), (0.013, 0.265), (0.0155, 0.280)
-"""Radius of the bottle's body, neck and rim, and the height at which each ends, metres."""
-SHOULDER, NUM_SHOULDER = 0.05, 8
-"""Height of the shoulder between body and neck, metres, and number of rings of the mesh along it."""
-BOTTLE_PLACES = {"lift_box": 0.34, "push_box": 0.55}
-"""Place of the bottle, as a fraction of the motion's length, for each task: beside the box."""
-CUBE = 0.10
-"""Edge of the cube, metres."""
-CLOVER_RADIUS, CLOVER_THICKNESS = 0.06, 0.06
-"""Mean radius and half the thickness of the clover, metres."""
-CLOVER_LOBES = 0.4
-"""Height of the clover's three lobes, relative to the mean radius."""
-NUM_LABELS = 4000
-"""Number of labelled points of the clover."""
-J_OFFSETS = ((0.30, (0.05, 0.0)), (0.70, (0.0, -0.03)))
-"""Places of the two points beside the J: fraction of its length, and offset to the right and up, metres."""
 OTHER_LETTERS = tuple(f"draw_{letter}" for letter in "cgjwz")
 """Tasks of fig. 5 beside the S, of the letters that ship with DT-Viz."""
 OTHER_LASA_LETTERS = ("Angle", "CShape", "GShape", "JShape", "Leaf_1", "NShape", "PShape")
@@ -62,8 +45,6 @@ FIG_6 = {"compared": ("eflow-repulsive", "linear", "modulation"), "field": False
 """View of its scenes: the methods that follow a drag, one of each kind."""
 FIRST_BIAS = f"{BiasPoint.title} 1"
 """Name of the layer of the first bias point."""
-ABOVE = 0.16
-"""Height over a pot's opening at which the object is released, metres, as in the demonstrations."""
 
 
 @dataclass(frozen=True)
@@ -109,16 +90,18 @@ def _biased(task: Task, *points: BiasPoint) -> Scenario:
 @lru_cache(maxsize=1)
 def bottle() -> Solid:
     """Return a bottle that stands in the origin."""
-    (body, top), (neck, under), (rim, height) = BODY, NECK, RIM
-    part = np.linspace(0, 1, NUM_SHOULDER + 1)
-    shoulder = zip(neck + (body - neck) * (1 + np.cos(np.pi * part)) / 2, top + SHOULDER * part, strict=True)
+    # radius of body, neck and rim, and the height at which each ends, metres
+    (body, top), (neck, under), (rim, height) = (0.035, 0.180), (0.013, 0.265), (0.0155, 0.280)
+    part = np.linspace(0, 1, 9)  # along the shoulder, which is 5 cm high
+    shoulder = zip(neck + (body - neck) * (1 + np.cos(np.pi * part)) / 2, top + 0.05 * part, strict=True)
     bottom, mouth = [(0.0, 0.0), (body, 0.0)], [(neck, under), (rim, under), (rim, height), (0.0, height)]
     return Solid(*lathe([*bottom, *shoulder, *mouth], 32))
 
 
 def _bottle_in_the_way(task: Task) -> Scenario:
     """Fig. 1 and 7: a standing bottle in the path, given way to by the whole arm."""
-    x, y, _ = task.mean_path[round(100 * BOTTLE_PLACES[task.name])]
+    beside_the_box = {"lift_box": 34, "push_box": 55}  # percent of the motion's length
+    x, y, _ = task.mean_path[beside_the_box[task.name]]
     return _avoiding(task, ArmAvoidance(MeshObstacle((float(x), float(y), 0.0), bottle())))
 
 
@@ -129,7 +112,7 @@ def _sphere_in_the_letter(task: Task) -> Scenario:
 
 def _sphere_in_the_8(task: Task) -> Scenario:
     """Sec. 6: a small sphere, so that the 8 remains one."""
-    return _avoiding(task, Avoidance(Sphere(task.obstacle_position, IN_8), plane=plane_of(task)))
+    return _avoiding(task, Avoidance(Sphere(task.obstacle_position, 0.09), plane=plane_of(task)))
 
 
 def _in_style(task: Task) -> Scenario:
@@ -138,9 +121,9 @@ def _in_style(task: Task) -> Scenario:
 
 
 def _cube_before_the_attractor(task: Task) -> Scenario:
-    """Fig. 3 (a): motions that are straight but for the cube."""
+    """Fig. 3 (a): motions that are straight but for a cube of 10 cm."""
     middle = (task.starts.mean(axis=0) + task.mean_path[-1]) / 2
-    cube = Box(as_point(middle), (CUBE, CUBE, CUBE))
+    cube = Box(as_point(middle), (0.10, 0.10, 0.10))
     return replace(_avoiding(task, Avoidance(cube, plane=plane_of(task))), imitation=False)
 
 
@@ -161,36 +144,50 @@ def _gallery(name: str, title: str, task: str, others: tuple[str, ...]) -> Paper
     )
 
 
-def in_clover(s: Array) -> Mask:
-    """Return whether points `s` (N, 3), metres, lie in a clover of three leaves around the y axis, which is smooth."""
-    turn = np.arctan2(s[:, 2], s[:, 0])
-    radius = CLOVER_RADIUS * (1 + CLOVER_LOBES * np.cos(3 * turn))
-    return (s[:, 0] ** 2 + s[:, 2] ** 2) / radius**2 + (s[:, 1] / CLOVER_THICKNESS) ** 2 < 1
+@dataclass(frozen=True)
+class Clover:
+    """A smooth clover of three leaves around the y axis, metres."""
+
+    radius: float = 0.06
+    """Mean radius."""
+    thickness: float = 0.06
+    """Half the thickness."""
+    lobes: float = 0.4
+    """Height of the lobes, relative to the mean radius."""
+
+    def holds(self, s: Array) -> Mask:
+        """Return whether points `s` (N, 3), metres, lie in it."""
+        turn = np.arctan2(s[:, 2], s[:, 0])
+        radius = self.radius * (1 + self.lobes * np.cos(3 * turn))
+        return (s[:, 0] ** 2 + s[:, 2] ** 2) / radius**2 + (s[:, 1] / self.thickness) ** 2 < 1
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """Points labelled by whether they lie in it."""
+        half = np.array([1 + self.lobes, 0, 1 + self.lobes]) * self.radius + [0, self.thickness, 0]
+        return Cloud(*sample_labels(self.holds, -half, half, 4000, np.random.default_rng(0)))
 
 
-@lru_cache(maxsize=1)
-def clover() -> Cloud:
-    """Return points labelled by whether they lie in the clover."""
-    half = np.array([1 + CLOVER_LOBES, 0, 1 + CLOVER_LOBES]) * CLOVER_RADIUS + [0, CLOVER_THICKNESS, 0]
-    return Cloud(*sample_labels(in_clover, -half, half, NUM_LABELS, np.random.default_rng(0)))
+CLOVER = Clover()
 
 
 def _cloud_in_the_letter(task: Task) -> Scenario:
     """Sec. 4.4."""
-    return _avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, clover())))
+    return _avoiding(task, Avoidance(CloudObstacle(task.obstacle_position, CLOVER.cloud)))
 
 
 def _two_points(task: Task) -> Scenario:
     """Fig. 4."""
     mean, plane = task.mean_path, plane_of(task)
-    places = [mean[round(100 * u)] + task.slice.axes @ offset for u, offset in J_OFFSETS]
+    offsets = {30: (0.05, 0.0), 70: (0.0, -0.03)}  # to the right and up, metres, by the percent of its length
+    places = [mean[at] + task.slice.axes @ offset for at, offset in offsets.items()]
     return _biased(task, *(BiasPoint(as_point(place), plane=plane) for place in places))
 
 
 def release(pot: Pot) -> Point:
-    """Return the place where an object is released to fall into this pot, metres."""
+    """Return the place where an object is released to fall into this pot, metres, as in the demonstrations."""
     x, y, z = pot.opening
-    return x, y, z + ABOVE
+    return x, y, z + 0.16
 
 
 def _beside_others(task: Task) -> Scenario:

@@ -2,44 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dt_viz.avoidance.bias import BiasPoint
 from dt_viz.flows.fields import Array
 from dt_viz.metrics import resample_by_arc_length
+from dt_viz.numerics import divisor, unit
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import Stack, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
 
-SWINGS, TURNS = 5, 3
-"""Number of swings through the motion and back on one round, and of turns of their direction."""
-ALONG = 0.3
-"""Largest distance of the swings' middle from that of the motion, in lengths of the motion."""
-BESIDE = 0.22
-"""Distance from the motion at which an obstacle turns round, beside its own size, metres."""
-SOFT = 0.03
-"""Width in which the way bends where it comes near to table or pedestal, metres."""
-TABLE_ROOM = 0.01
-"""Height of the obstacle above the table, metres."""
-PEDESTAL_ROOM = 0.20
-"""Distance of the obstacle's surface from the axis of the arm's base, metres."""
-NUM_TRIED = 12
-"""Number of random ways of which the smoothest is taken."""
-NUM_SAMPLES = 1200
-"""Number of samples of a round."""
-JOINING = 0.8
-"""Time constant with which an obstacle joins its round, seconds."""
-GOAL_SWAY = 0.07
-"""Amplitude of a goal that moves, metres."""
-GOAL_PERIODS = (7.0, 11.0)
-"""Periods of a goal that moves, along two axes, seconds."""
+
+@dataclass(frozen=True)
+class RoamingSettings:
+    """The round of an obstacle, and the sway of a goal; lengths in metres, times in seconds."""
+
+    swings: int = 5
+    """Number of swings through the motion and back on one round."""
+    turns: int = 3
+    """Number of turns of their direction."""
+    along: float = 0.3
+    """Largest distance of the swings' middle from that of the motion, in lengths of the motion."""
+    beside: float = 0.22
+    """Distance from the motion at which an obstacle turns round, beside its own size."""
+    soft: float = 0.03
+    """Width in which the round bends where it comes near to table or pedestal."""
+    table_room: float = 0.01
+    """Height of the obstacle above the table."""
+    pedestal_room: float = 0.20
+    """Distance of the obstacle's surface from the axis of the arm's base."""
+    joining: float = 0.8
+    """Time constant with which an obstacle joins its round."""
+    goal_sway: float = 0.07
+    """Amplitude of a goal that moves."""
+    goal_periods: tuple[float, float] = (7.0, 11.0)
+    """Periods of a goal that moves, along two axes."""
+
+
+SETTINGS = RoamingSettings()
 
 
 def crossings(task: Task, size: float, rng: np.random.Generator) -> Array:
-    """A closed way (`NUM_SAMPLES`, 3), metres, evenly sampled, that crosses the mean motion again and again.
+    """A closed path (1200, 3), metres, evenly sampled, that crosses the mean motion again and again.
 
     It is a rose curve, whose petals all pass its middle, and the middle goes to and fro along the motion.
 
@@ -49,13 +56,12 @@ def crossings(task: Task, size: float, rng: np.random.Generator) -> Array:
         rng: for directions and places.
     """
     mean = resample_by_arc_length(task.mean_path, 201)
-    return max((_rose(mean, size, rng) for _ in range(NUM_TRIED)), key=_smoothness)
+    return max((_rose(mean, size, rng) for _ in range(12)), key=_smoothness)  # the smoothest of some
 
 
 def _smoothness(way: Array) -> float:
     """Cosine of the sharpest angle between neighbouring pieces of a way."""
-    pieces = np.diff(np.concatenate([way, way[1:2]]), axis=0)
-    pieces /= np.linalg.norm(pieces, axis=1, keepdims=True)
+    pieces = unit(np.diff(np.concatenate([way, way[1:2]]), axis=0))
     return float((pieces[1:] * pieces[:-1]).sum(axis=1).min())
 
 
@@ -63,21 +69,21 @@ def _rose(mean: Array, size: float, rng: np.random.Generator) -> Array:
     """A way around a mean motion (201, 3), which may have corners where it is bent away from table and pedestal."""
     u, v = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
     at, angle = rng.uniform(0, 2 * np.pi, size=2)
-    round_ = np.linspace(0, 2 * np.pi, 4 * NUM_SAMPLES)
-    along = 200 * (0.5 + ALONG * np.sin(round_ + at))
+    round_ = np.linspace(0, 2 * np.pi, 4800)
+    along = 200 * (0.5 + SETTINGS.along * np.sin(round_ + at))
     middle = np.stack([np.interp(along, np.arange(201), axis) for axis in mean.T], axis=1)
-    turned = TURNS * round_ + angle
+    turned = SETTINGS.turns * round_ + angle
     direction = np.cos(turned)[:, None] * u + np.sin(turned)[:, None] * v
-    way = middle + (BESIDE + size) * np.sin(SWINGS * round_)[:, None] * direction
-    way[:, 2] = _at_least(way[:, 2], size + TABLE_ROOM)
+    way = middle + (SETTINGS.beside + size) * np.sin(SETTINGS.swings * round_)[:, None] * direction
+    way[:, 2] = _at_least(way[:, 2], size + SETTINGS.table_room)
     away = np.linalg.norm(way[:, :2], axis=1)
-    way[:, :2] *= (_at_least(away, size + PEDESTAL_ROOM) / np.maximum(away, 1e-6))[:, None]
-    return resample_by_arc_length(way, NUM_SAMPLES)
+    way[:, :2] *= (_at_least(away, size + SETTINGS.pedestal_room) / divisor(away))[:, None]
+    return resample_by_arc_length(way, 1200)
 
 
 def _at_least(values: Array, least: float) -> Array:
     """Values, smoothly kept above the least."""
-    return (values + least + np.sqrt((values - least) ** 2 + SOFT**2)) / 2
+    return (values + least + np.sqrt((values - least) ** 2 + SETTINGS.soft**2)) / 2
 
 
 class Chase:
@@ -104,7 +110,7 @@ class Chase:
 
     def place(self, seconds: float) -> Array:
         """Where the obstacle is (3,), metres."""
-        joins = np.exp(-seconds / JOINING) * (np.asarray(self._begins.position) - self._at(0.0))
+        joins = np.exp(-seconds / SETTINGS.joining) * (np.asarray(self._begins.position) - self._at(0.0))
         return self._at(self._speed * seconds) + joins
 
     def __call__(self, scenario: Scenario, seconds: float) -> dict[str, Stack]:
@@ -133,7 +139,7 @@ class MovingGoal:
         if not self._name:
             stack, self._name = with_added(scenario, self._point)
             scenario = replace(scenario, stack=stack)
-        sway = GOAL_SWAY * np.sin(2 * np.pi * seconds / np.array(GOAL_PERIODS))
+        sway = SETTINGS.goal_sway * np.sin(2 * np.pi * seconds / np.array(SETTINGS.goal_periods))
         place = self._goal + self._axes @ sway
-        place[2] = max(place[2], self._goal[2] - GOAL_SWAY / 2, TABLE_ROOM)
+        place[2] = max(place[2], self._goal[2] - SETTINGS.goal_sway / 2, SETTINGS.table_room)
         return {"stack": with_transform(scenario, self._name, replace(self._point, position=as_point(place)))}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,10 +51,17 @@ class Slice:
             return self
         return replace(self, centre=np.array(pose.position), axes=rotation(pose.wxyz)[:, :2])
 
-    def lies_like(self, other: Slice) -> bool:
-        """Return whether both are the same rectangle."""
-        same_place = np.array_equal(self.centre, other.centre) and np.array_equal(self.axes, other.axes)
-        return same_place and self.half_size == other.half_size
+    @property
+    def key(self) -> tuple[bytes, bytes, tuple[float, float]]:
+        """A hashable value; equal rectangles have equal ones."""
+        return self.centre.tobytes(), np.ascontiguousarray(self.axes).tobytes(), self.half_size
+
+    def holding(self, paths: Sequence[Array]) -> Slice:
+        """Return the smallest rectangle of this plane that holds this one and the feet of paths (T_i, 3), metres."""
+        across = np.concatenate([self.across(self.border), *(self.across(path) for path in paths)])
+        lower, upper = across.min(axis=0), across.max(axis=0)
+        width, height = (upper - lower) / 2
+        return replace(self, centre=self.at((lower + upper) / 2), half_size=(float(width), float(height)))
 
     def grid(self, spacing: float) -> Array:
         """Points (n, m, 3) at about this spacing along the first and the second axis, from corner to corner, metres."""

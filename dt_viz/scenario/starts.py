@@ -12,14 +12,10 @@ from dt_viz.obstacles.shapes import as_point
 from dt_viz.scenario.scenario import MAX_STARTS, Scenario, Start
 from dt_viz.scenario.slices import Slice
 
-GRID = (4, 4)
-"""Number of starts of a grid along the slice's first and second axis."""
 INNER = 0.8
 """Part of the slice that a grid covers."""
 APART = 0.02
 """Smallest distance between starts, metres."""
-MIN_HEIGHT = 0.02
-"""Smallest height of a start above the table, metres."""
 SHOULDER = (0.0, 0.0, 0.28)
 """Place of the arm's shoulder, metres."""
 REACH = 0.95
@@ -35,7 +31,7 @@ class Grid:
     num_blocked: int = 0
     """Number of places at or inside an obstacle, or where the arm that avoids it would touch it."""
     num_far: int = 0
-    """Number of places that the hand cannot reach."""
+    """Number of places that the hand cannot reach, or less than 2 cm above the table."""
 
 
 def struck(area: Slice, origin: Array, direction: Array) -> Array | None:
@@ -77,7 +73,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
         arm_room: distance (N,) of the arm from the obstacles with its hand at places (N, 3), metres; asked where the
             whole arm avoids them.
     """
-    u, v = (np.linspace(-INNER * half, INNER * half, num) for half, num in zip(area.half_size, GRID, strict=True))
+    u, v = (np.linspace(-INNER * half, INNER * half, num) for half, num in zip(area.half_size, (4, 4), strict=True))
     starts, blocked, far = scenario.starts, 0, 0
     places = area.at(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2))
     rooms = scenario.obstacle.signed_distance(places)
@@ -86,7 +82,7 @@ def with_grid(scenario: Scenario, area: Slice, arm_room: Callable[[Array], Array
     for place, room in zip(places, rooms, strict=True):
         if room < scenario.avoidance.margin:
             blocked += 1
-        elif place[2] < MIN_HEIGHT or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
+        elif place[2] < 0.02 or np.linalg.norm(place - np.array(SHOULDER)) > REACH:
             far += 1
         elif len(starts) < MAX_STARTS and not _is_taken(starts, place):
             starts = (*starts, _new(scenario, place))

@@ -24,7 +24,7 @@ from dt_viz.obstacles.union import Union
 from dt_viz.pictures.occupancy import occupancy_picture
 from dt_viz.pictures.panels import PanelPicture, generator_panel, system_panel
 from dt_viz.pictures.sketchbook import BASE_TITLE, Pictures, Sketchbook, in_frame
-from dt_viz.pictures.slice_fields import ARROW_SPACING, arrows_and_colour, streamlines
+from dt_viz.pictures.slice_fields import SETTINGS, arrows_and_colour, streamlines
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.scenario.panels import BASE_PANEL, Panel, offsets
@@ -203,7 +203,7 @@ def rest(scenario: Scenario, solved: Solved) -> Array:
 
 def lattice(scenario: Scenario, solved: Solved) -> Array:
     """Places (M, 3) of the arrows on the view's slice, metres."""
-    return solved.below.task.slice.posed(scenario.view.slice).grid(ARROW_SPACING).reshape(-1, 3)
+    return solved.below.task.slice.posed(scenario.view.slice).lattice(SETTINGS.arrow_spacing)
 
 
 def learned_system(scenario: Scenario, solved: Solved) -> DiffeomorphicSystem:

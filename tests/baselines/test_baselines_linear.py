@@ -5,7 +5,7 @@ import pytest
 from plans import joints_of
 
 from dt_viz.baselines.linear import Linear
-from dt_viz.baselines.postures import NUM_SAMPLES, PlanningScene, Query, planned
+from dt_viz.baselines.postures import PlanningScene, Query, planned
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.collision import load_collision_model
@@ -18,9 +18,9 @@ def test_joints_go_straight_from_the_demonstrated_start_to_the_demonstrated_goal
     plan = Linear().fit(problem).plan(Union(), problem.task.starts)
     for i, (q, t) in enumerate(zip(joints_of(plan), plan.times, strict=True)):
         start, goal = problem.postures[i][[0, -1]]
-        np.testing.assert_allclose(q, start + np.linspace(0, 1, NUM_SAMPLES)[:, None] * (goal - start), atol=1e-9)
+        np.testing.assert_allclose(q, start + np.linspace(0, 1, len(q))[:, None] * (goal - start), atol=1e-9)
         duration = np.ptp(problem.task.demonstrations[i].times)
-        np.testing.assert_allclose(t, np.linspace(0, duration, NUM_SAMPLES), atol=1e-9)
+        np.testing.assert_allclose(t, np.linspace(0, duration, len(q)), atol=1e-9)
         np.testing.assert_allclose(plan.paths[i], problem.robot.end_effector(q), atol=1e-12)
 
 

@@ -13,38 +13,28 @@ from plans import joints_of
 from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.linear import Linear
 from dt_viz.baselines.mpnet import (
-    DROPOUT,
-    ENCODER,
-    LAYERS,
-    MAX_STEPS,
-    NUM_POINTS,
+    ARCHITECTURE,
     MPNet,
     MPNetModel,
-    Network,
     Search,
-    cloud,
 )
 from dt_viz.baselines.mpnet_rrt import MPNetRRT
+from dt_viz.baselines.mpnet_training import SETTINGS, initial, loss_and_gradient, steps, train
 from dt_viz.baselines.postures import PlanningScene
 from dt_viz.errors import UnwantedError
-from dt_viz.obstacles.shapes import Box, Sphere, as_point
+from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.collision import load_collision_model
+from dt_viz.scenario.tasks import TASKS
+from dt_viz.shipped import ASSETS
 
-needs_torch = pytest.mark.skipif(find_spec("torch") is None, reason="torch is an extra")
 needs_ompl = pytest.mark.skipif(find_spec("ompl") is None, reason="ompl is an extra")
 
 
 def weights(seed=0):
     """Some weights, as training leaves them."""
     rng = np.random.default_rng(seed)
-    arrays = {"centre": rng.normal(size=6), "scale": rng.uniform(0.1, 1, size=6)}
-    for name, widths in (("encoder", ENCODER), ("planning", LAYERS)):
-        for k, (num_in, num_out) in enumerate(pairwise(widths)):
-            arrays[f"{name}_W_{k}"] = rng.normal(size=(num_out, num_in)) / np.sqrt(num_in)
-            arrays[f"{name}_c_{k}"] = rng.normal(size=num_out) * 0.1
-        arrays[f"{name}_slopes"] = rng.uniform(0.1, 0.3, size=len(widths) - 2)
-    return arrays
+    return {**initial(ARCHITECTURE.widths, rng), "centre": rng.normal(size=6), "scale": rng.uniform(0.1, 1, size=6)}
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +49,7 @@ def search(free):
 
     line = SimpleNamespace(robot=SimpleNamespace(clip=np.asarray), is_free=lambda start, end: free(start[0], end[0]))
     model = MPNetModel.of(weights())
-    return Search(model, np.zeros(ENCODER[-1]), cast(PlanningScene, line), np.random.default_rng(0))
+    return Search(model, cast(PlanningScene, line), np.random.default_rng(0))
 
 
 def at(*values):
@@ -67,41 +57,21 @@ def at(*values):
 
 
 class TestModel:
-    @needs_torch
-    def test_equals_the_network_of_torch(self):
-        import torch  # pyright: ignore[reportMissingImports] - an extra
-
-        from dt_viz.baselines import mpnet_training
-
-        torch.manual_seed(1)
-        widths = {"encoder": ENCODER, "planning": LAYERS}
-        networks = {name: mpnet_training._network(its).eval() for name, its in widths.items()}
-        trained = [mpnet_training.arrays_of(name, network) for name, network in networks.items()]
-        model, rng = MPNetModel.of(weights() | trained[0] | trained[1]), np.random.default_rng(2)
-        for name, network in networks.items():
-            x = rng.normal(size=network[0].in_features)
-            with torch.no_grad():
-                expected = network(torch.tensor(x, dtype=torch.float32)).numpy()
-            np.testing.assert_allclose(getattr(model, name)(x), expected, atol=1e-5)
-
     def test_dropout_leaves_out_the_asked_share_and_is_seeded(self):
-        model, encoded, captured = MPNetModel.of(weights()), np.zeros(ENCODER[-1]), []
+        model = MPNetModel.of(weights())
+        (first, again), other = (
+            (model.next(np.zeros(6), np.ones(6), np.random.default_rng(0)) for _ in range(2)),
+            (model.next(np.zeros(6), np.ones(6), np.random.default_rng(1))),
+        )
+        np.testing.assert_array_equal(first, again)
+        assert np.abs(first - other).max() > 1e-3
+        masks = model.planning.masks(np.random.default_rng(0), 50)
+        for mask, width in zip(masks, ARCHITECTURE.hidden[:-1], strict=True):
+            assert mask.shape == (50, width)
+            assert set(np.unique(mask)) == {0, 1 / (1 - ARCHITECTURE.dropout)}
+            assert np.mean(mask == 0) == pytest.approx(ARCHITECTURE.dropout, abs=0.06)
 
-        def following(model, seed):
-            return model.next(encoded, np.zeros(6), np.ones(6), np.random.default_rng(seed))
-
-        np.testing.assert_array_equal(following(model, 0), following(model, 0))
-        assert np.abs(following(model, 0) - following(model, 1)).max() > 1e-3
-        spied = replace(model, planning=cast("Network", lambda x, masks: captured.append(masks) or np.zeros(6)))
-        for seed in range(20):
-            following(spied, seed)
-        for layer, width in zip(zip(*captured, strict=True), LAYERS[1:5], strict=True):
-            masks = np.stack(layer)
-            assert masks.shape == (20, width)
-            assert set(np.unique(masks)) == {0, 1 / (1 - DROPOUT)}
-            assert np.mean(masks == 0) == pytest.approx(DROPOUT, abs=0.06)
-
-    @pytest.mark.parametrize("name", ["planning_W_2", "encoder_c_0", "scale", "planning_slopes"])
+    @pytest.mark.parametrize("name", ["W_2", "scale", "slopes"])
     def test_weights_that_lack_something_are_refused_by_name(self, name):
         arrays = weights()
         with pytest.raises(NotFittedError, match=f"{name}.*nothing"):
@@ -109,30 +79,18 @@ class TestModel:
         with pytest.raises(NotFittedError, match=f"{name}.*found"):
             MPNetModel.of({**arrays, name: arrays[name][:-1]})
 
-    def test_the_shipped_encoder_does_not_tell_where_an_obstacle_is(self, problem):
-        model = MPNet().model(problem)
-        encoded = [model.encoded(Union((Sphere(place, 0.15),))) for place in ((0.1, -0.5, 0.2), (-0.3, 0.4, 0.6))]
-        np.testing.assert_allclose(encoded, [model.encoded(Union())] * 2, atol=1e-6)
-        other = MPNetModel.of(weights())
-        assert np.abs(other.encoded(Union()) - other.encoded(Union((Sphere((0.1, -0.5, 0.2), 0.15),)))).max() > 1e-3
-
-    def test_a_cloud_lies_on_the_surfaces(self):
-        both = Union((Sphere((0.1, -0.5, 0.2), 0.15), Box((0.4, 0.1, 0.3), (0.1, 0.2, 0.1), (0.6, 0.8, 0.0, 0.0))))
-        points = cloud(both)
-        assert points.shape == (NUM_POINTS, 3)
-        np.testing.assert_allclose(both.signed_distance(points), 0, atol=1e-9)
-        for part in both.parts:
-            assert (np.abs(part.signed_distance(points)) < 1e-9).any()
-        assert not cloud(Union()).any()
+    def test_all_weights_that_ship_take_a_megabyte(self):
+        files = list((ASSETS / "baselines").glob("*.npz"))
+        assert len(files) == 2 * len(TASKS) and sum(file.stat().st_size for file in files) < 1e6
 
 
 class TestSearch:
-    @pytest.mark.parametrize("num", [1, 2, 7, MAX_STEPS + 1])
+    @pytest.mark.parametrize("num", [1, 2, 7, ARCHITECTURE.max_steps + 1])
     def test_ends_when_the_two_ends_can_be_joined_or_after_its_steps(self, num):
         asked = []
         start, goal = at(0.0, 1.0)
         way = search(lambda a, b: asked.append((a, b)) or len(asked) == num).bidirectional(start, goal)
-        assert len(way) == min(num, MAX_STEPS) + 2
+        assert len(way) == min(num, ARCHITECTURE.max_steps) + 2
         assert way[0] is start and way[-1] is goal
         # from both ends in turn: what was joined last lies next to each other
         assert all(after[1] == before[0] for before, after in pairwise(asked))
@@ -215,33 +173,36 @@ class TestRRT:
         assert MPNet().missing == ()
 
 
-@needs_torch
 class TestTraining:
-    def test_a_single_demonstration_is_learned_from_in_both_directions(self, problem):
-        from dt_viz.baselines.mpnet_training import NUM_WAYPOINTS, steps
+    def test_the_gradient_is_that_of_finite_differences(self):
+        arrays, rng = weights(), np.random.default_rng(1)
+        x, y, h = rng.normal(size=(5, 12)), rng.normal(size=(5, 6)), 1e-6
+        slopes = loss_and_gradient(arrays, x, y, np.random.default_rng(2))[1]
+        for name, slope in slopes.items():
+            along = rng.normal(size=slope.shape)
+            beside = ({**arrays, name: arrays[name] + side * h * along} for side in (1, -1))
+            ahead, behind = (loss_and_gradient(moved, x, y, np.random.default_rng(2))[0] for moved in beside)
+            assert (slope * along).sum() == pytest.approx((ahead - behind) / (2 * h), rel=1e-4, abs=1e-9)
 
+    def test_a_single_demonstration_is_learned_from_in_both_directions(self, problem):
         x, y, centre, scale = steps(replace(problem, postures=problem.postures[:1]))
-        assert len(x) == 2 * (NUM_WAYPOINTS - 1)
+        assert len(x) == 2 * (SETTINGS.num_waypoints - 1)
         there, back = np.split(x, 2)
         np.testing.assert_allclose(centre + scale * there[0, :6], problem.postures[0][0], atol=1e-9)
         np.testing.assert_allclose(centre + scale * there[0, 6:], problem.postures[0][-1], atol=1e-9)
         np.testing.assert_allclose(back[0, 6:], there[0, :6])
-        np.testing.assert_allclose(y[:-1][: NUM_WAYPOINTS - 2], there[1:, :6])
+        np.testing.assert_allclose(y[:-1][: SETTINGS.num_waypoints - 2], there[1:, :6])
 
     def test_a_demonstration_that_does_not_move_the_arm_is_refused(self, problem):
-        from dt_viz.baselines.mpnet_training import steps
-
         still = np.repeat(problem.postures[0][:1], 5, axis=0)
         with pytest.raises(NotFittedError, match="does not move"):
             steps(replace(problem, postures=(problem.postures[0], still)))
 
     def test_what_training_returns_can_be_planned_with(self, problem):
-        from dt_viz.baselines.mpnet_training import train
-
         lines = []
         model = MPNetModel.of(train(problem, 100, lines.append))
-        assert len(lines) == 2
+        assert len(lines) == 1
         q, goal = problem.postures[0][[0, -1]]
-        rng, encoded = np.random.default_rng(0), model.encoded(Union())
-        ahead = np.mean([model.next(encoded, q, goal, rng) for _ in range(200)], axis=0)
+        rng = np.random.default_rng(0)
+        ahead = np.mean([model.next(q, goal, rng) for _ in range(200)], axis=0)
         assert np.linalg.norm(ahead - q) < np.linalg.norm(goal - q) / 2  # a step, not the goal

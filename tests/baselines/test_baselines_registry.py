@@ -19,7 +19,7 @@ def test_methods_are_known_by_their_name_and_promise_stability_unless_they_plan_
     assert [method.name for method in METHODS.values()] == list(METHODS)
     assert all(method.promise.startswith("Stable") == method.stable for method in METHODS.values())
     stable = {name for name, method in METHODS.items() if method.stable}
-    assert stable == {"ours", "ours-no-avoidance", "eflow", "signed-distance"}
+    assert stable == {"ours", "ours-no-avoidance", "eflow"}
 
 
 def test_the_arm_follows_each_demonstration(problem, robot):
@@ -50,7 +50,7 @@ def test_where_nothing_can_move_the_arm_stays_at_its_starts(problem, robot):
     assert np.linalg.norm(np.concatenate(plan.paths) - problem.task.starts[:2], axis=1).max() < 1e-4
 
 
-@pytest.mark.parametrize("name", ["eflow-repulsive-fine", "mpnet"])
+@pytest.mark.parametrize("name", ["eflow-repulsive", "mpnet"])
 def test_a_plan_that_is_cancelled_ends(problem, in_the_way, name):
     planner, calls = METHODS[name].fit(problem), []
 

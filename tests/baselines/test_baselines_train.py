@@ -117,8 +117,8 @@ def test_what_is_learned_from_never_turns_back_where_a_motion_stands_at_first_an
     along = np.clip((times - 0.15) / 3.7, 0, 1)
     motion = Demonstration(times, np.outer(along, [0.3, -0.2]), "straight")
     turned_back = []
-    for learned in (eflow_training.LEARNED, slice(0, eflow_training.NUM_POINTS - 1)):
-        monkeypatch.setattr(eflow_training, "LEARNED", learned)
+    for learned in (eflow_training.SETTINGS.learned, slice(None)):
+        monkeypatch.setattr(eflow_training, "SETTINGS", eflow_training.TrainingSettings(learned=learned))
         _, velocities, normalisation, _ = eflow_training.samples((motion,))
         turned_back.append(np.mean((velocities / normalisation[0]) @ [0.3, -0.2] < 0))
     assert turned_back[0] == 0 and turned_back[1] > 0.01

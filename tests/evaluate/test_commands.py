@@ -97,7 +97,7 @@ def test_a_command_with_another_name_says_so_and_runs(capsys, name):
 def test_printed_tables_are_written_with_all_digits_and_null_for_nan(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(options, "PRINTED", [])
     options.report([{"name": "a", "mm": 1.23456}, {"name": "b", "mm": float("nan")}, {"name": "c"}])
-    options.print_table(("name", "mm"), [("d", "2")])
+    options.report([{"name": "d", "mm": "2"}])
     options.write_tables(tmp_path / "tables.json")
     written = json.loads((tmp_path / "tables.json").read_text())["tables"]
     rows = [{"name": "a", "mm": 1.23456}, {"name": "b", "mm": None}, {"name": "c", "mm": None}]

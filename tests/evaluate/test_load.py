@@ -23,7 +23,7 @@ PATIENCE = 240.0
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     monkeypatch.setattr(load, "FIRST_PICTURE", PATIENCE)
-    monkeypatch.setattr(load, "PATIENCE", PATIENCE)
+    monkeypatch.setattr(load, "SETTINGS", load.LoadSettings(patience=PATIENCE))
     monkeypatch.setattr(load, "SETTLED", 0.0)
 
 
@@ -54,7 +54,7 @@ def test_places_are_on_a_circle_in_the_slice_around_the_obstacle_and_none_comes_
     task = TASKS["draw_s"]()
     places = load.places_of(task, 3, 500)
     offset = np.array(places) - task.obstacle_position
-    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), load.RADIUS, rtol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), load.SETTINGS.radius, rtol=1e-3)
     np.testing.assert_allclose(offset @ np.cross(*task.slice.axes.T), 0, atol=1e-12)
     assert len(set(places) | set(load.places_of(task, 4, 500))) == 1000
 
@@ -107,7 +107,7 @@ def test_all_visitors_who_come_and_drag_at_once_are_shown_their_last_edit(tmp_pa
         assert 0 < visits["ping_ms"]["median"] <= visits["ping_ms"]["p95"] <= visits["ping_ms"]["worst"]
         for visitor in visits["visitors"]:
             assert visitor["last_shown"] and not visitor["lost"]
-            assert 0 <= visitor["pictures_per_s"] <= load.EDITS_PER_SECOND
+            assert 0 <= visitor["pictures_per_s"] <= load.SETTINGS.edits_per_second
             assert 0 < visitor["latency_ms"]["median"] <= visitor["latency_ms"]["p95"]
     assert figures["unit_ms"] > 0
     assert f"{NUM_VISITORS} of {NUM_VISITORS}" in capsys.readouterr().out

@@ -13,7 +13,7 @@ from dt_viz.robot.collision import load_collision_model
 
 
 def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured, robot):
-    arrays, (rows,) = measured("reactive", "--speed 0.4 --runs 1 --beside")
+    arrays, (rows,) = measured("reactive", "--speed 0.4 --runs 1")
     row = rows[0]
     q, t, places = arrays["q_0"], arrays["t_0"], arrays["obstacle_0"]
     assert q.shape == (len(t), 6) and places.shape == (len(t), 3)
@@ -22,8 +22,6 @@ def test_reactive_writes_what_its_figures_are_computed_from_and_repeats(measured
     assert np.abs(np.diff(velocity, axis=0)).max() < ControllerSettings().acceleration * 0.01 + 1e-9
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     np.testing.assert_allclose(steps[np.isfinite(steps)], 0.004, rtol=0.02)
-    for kind in ("potential_", "stepped_"):
-        assert len(arrays[f"{kind}q_0"]) == len(arrays[f"{kind}t_0"]) > 100
     there = np.isfinite(places[:, 0])
     closest = nearest(q[there], places[there], float(arrays["diameter"]))
     assert float(row["clearance mm"]) == pytest.approx(1e3 * closest, abs=2)  # it looks between ticks, too
@@ -69,8 +67,8 @@ def test_spheres_cross_the_motion_when_the_hand_is_there(bench, speed, num):
             assert np.isnan(passage.at(passage.gone)).all() and np.isnan(passage.at(passage.comes - 1e-9)).all()
             there = joints[max(0, int((passage.comes - crossing.begins) / reactive.TICK))]
             gap = bench.follower.whole_arm.clearance(there[None], bench.shape(passage.path[0]))[0]
-            assert gap >= reactive.START_ROOM - 0.01
-            assert passage.path[:, 2].min() >= 0.075 + reactive.TABLE_ROOM
+            assert gap >= reactive.SETTINGS.start_room - 0.01
+            assert passage.path[:, 2].min() >= 0.075 + reactive.SETTINGS.table_room
 
 
 def test_a_second_obstacle_and_a_turned_box_count(engine):
@@ -128,20 +126,6 @@ def test_figures_of_a_run_are_relative_to_the_limits(bench):
     assert found.lost == pytest.approx(0.015) and found.distance > 2
     assert found.missed == pytest.approx(np.linalg.norm(bench.robot.end_effector(q[-1]) - bench.goal))
     touched = replace(found, distance=-0.002, missed=1e-4, lost=0.215)
-    assert reactive.summary([found, touched, touched])[:3] == ("1 of 3", "-2.0", "2 of 3")
-    assert reactive.summary([found, touched, touched])[5:] == ("0.2 (0.2)", "2.00 (3.0, 3)")
-
-
-def test_the_potential_field_pushes_what_is_near_away_from_the_sphere(bench):
-    arm, q = reactive.Potential(bench), bench.starts[0]
-    hand = bench.robot.end_effector(q)
-    far, beside = (bench.shape(hand + np.array([0.0, -away, 0.0])) for away in (1.0, 0.14))
-    assert not arm._away(q, None).any() and not arm._away(q, far).any()
-    step = 1e-4
-    pushed = bench.robot.end_effector(q + step * arm._away(q, beside)) - hand
-    assert pushed[1] > 0.5 * np.linalg.norm(pushed) > 1e-7
-    nearer = bench.robot.end_effector(q + step * arm._away(q, bench.shape(hand - [0.0, 0.12, 0.0]))) - hand
-    assert nearer[1] > pushed[1]
-    np.testing.assert_allclose(arm._at(q, beside), arm._at(q, None) + arm._away(q, beside), atol=1e-12)
-    free = bench.robot.end_effector(q + step * arm._at(q, None)) - hand
-    np.testing.assert_allclose(free / step, arm._hand.velocity(hand), atol=0.02)
+    row = reactive.summary([found, touched, touched])
+    assert [row[name] for name in ("without contact", "clearance mm", "goal reached")] == ["1 of 3", "-2.0", "2 of 3"]
+    assert [row[name] for name in ("time lost s", "tick ms")] == ["0.2 (0.2)", "2.00 (3.0, 3)"]

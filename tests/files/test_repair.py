@@ -47,9 +47,7 @@ def volume(mesh: trimesh.Trimesh) -> float:
 @pytest.fixture(scope="module", autouse=True)
 def _coarsely():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solids, "NUM_NODES", 32**3)
-        patch.setattr(solids, "NUM_SAMPLES", 6000)
-        patch.setattr(solids, "NUM_PROBES", 6000)
+        patch.setattr(solids, "SETTINGS", solids.GridSettings(num_nodes=32**3, num_samples=6000))
         yield
 
 

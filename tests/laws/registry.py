@@ -17,7 +17,6 @@ from dt_viz.avoidance.hand import Avoidance
 from dt_viz.avoidance.sideways import Sideways
 from dt_viz.avoidance.transform import Transform
 from dt_viz.baselines.eflow import Coupling, Normalisation
-from dt_viz.baselines.signed_distance import SignedDistanceField
 from dt_viz.flows.augmented_systems import OnPlaces, PhaseCurve, PhasedAttractor, Shear, Translation
 from dt_viz.flows.diffeomorphisms import (
     AdaptiveFlow,
@@ -34,8 +33,10 @@ from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.systems import Attractor
 from dt_viz.learning.timing import TimedAttractor
 from dt_viz.obstacles.clouds import Cloud
+from dt_viz.obstacles.learned_maps import unit_map
 from dt_viz.obstacles.occupancy import AvoidanceField
 from dt_viz.obstacles.shapes import (
+    ORIGIN,
     Box,
     CloudObstacle,
     Cylinder,
@@ -44,10 +45,8 @@ from dt_viz.obstacles.shapes import (
     Quaternion,
     Sphere,
     as_point,
-    unit_sphere_map,
 )
 from dt_viz.obstacles.solids import Solid
-from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import load_body_points
 from dt_viz.robot.robot import HOME, NUM_JOINTS, load_jaco
 from dt_viz.scenario.tasks import DRAWING_AXES
@@ -271,16 +270,17 @@ def sideways() -> Sideways:
 
 
 PLACES = tuple(PlacedField(bent(3), o, c * tilted_axes()) for o, c in ((np.zeros(3), 0.5), (np.full(3, 0.4), 2.0)))
-BALL_FIELD = AvoidanceField(unit_sphere_map(), "free-space", 3.0)
+BALL_MAP = unit_map(Sphere(ORIGIN, 2.0))
+BALL_FIELD = AvoidanceField(BALL_MAP, "free-space", 3.0)
 FIELDS: dict[str, Generator] = {
     "grid in the plane": Generator(bent(2), uniform(2)),
     "grid in space": Generator(bent(3), uniform(3)),
     "placed": Generator(PlacedField(bent(3), np.array([0.2, 0.1, -0.1]), 0.5 * tilted_axes()), uniform(3)),
     "in a plane": Generator(Projected(bent(3), tilted_axes()[:, :2] @ tilted_axes()[:, :2].T), uniform(3)),
     "sum": Generator(Sum((bent(3), PLACES[1])), uniform(3)),
-    "free space": Generator(AvoidanceField(unit_sphere_map(), "free-space", 1.0), uniform(3, 2.0), 1e-4, 1e-6),
-    "free space, hot": Generator(AvoidanceField(unit_sphere_map(), "free-space", 12.0), uniform(3, 2.0), 1e-4, 1e-6),
-    "probability": Generator(AvoidanceField(unit_sphere_map(), "probability"), uniform(3, 2.0), 1e-4, 1e-6),
+    "free space": Generator(AvoidanceField(BALL_MAP, "free-space", 1.0), uniform(3, 2.0), 1e-4, 1e-6),
+    "free space, hot": Generator(AvoidanceField(BALL_MAP, "free-space", 12.0), uniform(3, 2.0), 1e-4, 1e-6),
+    "probability": Generator(AvoidanceField(BALL_MAP, "probability"), uniform(3, 2.0), 1e-4, 1e-6),
     "stretched": Generator(
         PlacedField(BALL_FIELD, np.zeros(3), tilted_axes() * [1.0, 0.4, 2.0]), uniform(3), 1e-4, 1e-6
     ),
@@ -293,7 +293,6 @@ FIELDS: dict[str, Generator] = {
     ),
     "shift": Generator(Shift(np.array([0.6, 0.0, 0.8]), 3), uniform(3, 0.7), 1e-4, 1e-6),
     "sideways": Generator(sideways(), uniform(3, 0.5)),
-    "signed distance": Generator(SignedDistanceField(Union((HAND,))), around_hand, 1e-5, 1e-4),
     "escape of the hand": Generator(WholeArmField(ROBOT, BODY, (HAND,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5),
     "escape of the elbow": Generator(
         WholeArmField(ROBOT, BODY, (ELBOW,), UP[None], PINS, REACH), near_ready, 1e-5, 1e-5

@@ -10,7 +10,8 @@ from oracles import central_differences
 
 from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.flows.integrators import integrate_adaptive
-from dt_viz.obstacles.shapes import MAX_BALLS, SHAPES, UPRIGHT, Box, CloudObstacle, MeshObstacle, Obstacle, rotation
+from dt_viz.obstacles.covers import MAX_BALLS
+from dt_viz.obstacles.shapes import SHAPES, UPRIGHT, Box, CloudObstacle, MeshObstacle, Obstacle, rotation
 from dt_viz.obstacles.union import Union
 
 
@@ -105,7 +106,7 @@ def test_a_distance_does_not_depend_on_how_many_are_asked_for(obstacle):
 
 def test_the_nearest_free_place_is_free_and_near(obstacle):
     inside = within(obstacle, 200)
-    moved = obstacle.nearest_free(inside)
+    moved = Union((obstacle,)).nearest_free(inside)
     depth = -obstacle.signed_distance(inside)
     assert np.abs(obstacle.signed_distance(moved)).max() < 1e-6
     travel = np.linalg.norm(moved - inside, axis=1)
@@ -113,8 +114,8 @@ def test_the_nearest_free_place_is_free_and_near(obstacle):
     assert (travel <= depth + 3e-3).mean() > 0.95
     outside = around(obstacle, 200, 2.0)
     outside = outside[obstacle.signed_distance(outside) >= 0]
-    np.testing.assert_array_equal(obstacle.nearest_free(outside), outside)
-    one = obstacle.nearest_free(np.asarray(obstacle.position))
+    np.testing.assert_array_equal(Union((obstacle,)).nearest_free(outside), outside)
+    one = Union((obstacle,)).nearest_free(np.asarray(obstacle.position))
     assert one.shape == (3,)
     assert obstacle.signed_distance(one) > -1e-6
 

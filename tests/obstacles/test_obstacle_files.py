@@ -182,10 +182,8 @@ class TestMeshes:
 @pytest.fixture
 def coarse(monkeypatch):
     """What is read is looked at, not how finely it is mapped."""
-    monkeypatch.setattr(clouds, "NUM_NODES", 16**3)
-    monkeypatch.setattr(solids, "NUM_NODES", 24**3)
-    monkeypatch.setattr(solids, "NUM_SAMPLES", 6000)
-    monkeypatch.setattr(solids, "NUM_PROBES", 6000)
+    monkeypatch.setattr(clouds, "SETTINGS", clouds.CloudSettings(num_nodes=16**3))
+    monkeypatch.setattr(solids, "SETTINGS", solids.GridSettings(num_nodes=24**3, num_samples=6000))
 
 
 @pytest.mark.usefixtures("coarse")

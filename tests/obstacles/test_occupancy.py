@@ -8,11 +8,12 @@ from oracles import central_differences
 from scipy.special import expit
 
 from dt_viz.flows.integrators import integrate_adaptive
+from dt_viz.obstacles.learned_maps import unit_map
 from dt_viz.obstacles.occupancy import GENERATORS, AvoidanceField, fit_occupancy, sample_labels
-from dt_viz.obstacles.shapes import Sphere, unit_sphere_map
+from dt_viz.obstacles.shapes import ORIGIN, Sphere
 
 seeds = st.integers(0, 2**32 - 1)
-BALL = unit_sphere_map()
+BALL = unit_map(Sphere(ORIGIN, 2.0))
 
 
 def directions(num, dim=3, seed=0):

@@ -97,7 +97,7 @@ def test_each_level_has_its_own_rollouts_and_streamlines(engine, initial):
     titles = [panel.title for panel in frame.pictures.panels]
     assert titles == ["base attractor", "imitation", "+ bias 1", "+ avoidance", "+ avoidance"]
     for panel, paths in ((imitation, frame.ghost), (bias, frame.levels[1]), (avoidance, frame.levels[2])):
-        assert panel.area.lies_like(own.area) and np.linalg.norm(panel.offset) > own.area.half_size[0]
+        assert panel.area.key == own.area.key and np.linalg.norm(panel.offset) > own.area.half_size[0]
         for path, wanted in zip(panel.rollouts, paths, strict=True):
             np.testing.assert_allclose(path, wanted, atol=1e-9)
     assert not len(imitation.outlines) and len(avoidance.outlines)

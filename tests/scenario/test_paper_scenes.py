@@ -11,7 +11,7 @@ from scenes import changed, frame_at
 from dt_viz.learning.store import FitStore
 from dt_viz.metrics import maximum_collision_distance, resample_by_arc_length
 from dt_viz.obstacles.shapes import CloudObstacle, MeshObstacle, Sphere
-from dt_viz.scenario.paper_scenes import SCENES, clover, in_clover, offered
+from dt_viz.scenario.paper_scenes import CLOVER, SCENES, Clover, offered
 from dt_viz.scenario.scenario import View
 from dt_viz.scenario.stack import anchored
 from dt_viz.scenario.tasks import POTS, TASKS, known_tasks
@@ -113,14 +113,13 @@ def assert_only_the_stroke_gives_way(frame, obstacle, until):
 def test_the_clover_is_known_by_labelled_points_only_and_every_stroke_leaves_it(live):
     frame = live("cloud")
     (cloud,) = frame.scenario.obstacles
-    assert isinstance(cloud, CloudObstacle) and cloud.cloud == clover()
-    clover.cache_clear()
-    assert clover() == cloud.cloud  # the same every time
+    assert isinstance(cloud, CloudObstacle) and cloud.cloud == CLOVER.cloud
+    assert Clover().cloud == cloud.cloud  # the same every time
     points, occupied = cloud.labelled()
     assert 0.05 < occupied.mean() < 0.5
     own = points - cloud.position
-    np.testing.assert_array_equal(in_clover(own), occupied)
-    assert not in_clover((own[occupied][:-1] + own[occupied][1:]) / 2).all()  # it is not convex
+    np.testing.assert_array_equal(CLOVER.holds(own), occupied)
+    assert not CLOVER.holds((own[occupied][:-1] + own[occupied][1:]) / 2).all()  # it is not convex
     distance = cloud.signed_distance(points)  # from what is learned, which is rounder than the tips of the leaves
     assert (distance[occupied] < 0).mean() > 0.95 and distance[occupied].max() < 0.012
     assert (distance[~occupied] > 0).mean() > 0.95 and distance[~occupied].min() > -0.012

@@ -10,9 +10,7 @@ from scenes import changed
 
 from dt_viz.obstacles.shapes import Box, Sphere
 from dt_viz.scenario.roaming import (
-    GOAL_SWAY,
-    PEDESTAL_ROOM,
-    TABLE_ROOM,
+    SETTINGS,
     Chase,
     MovingGoal,
     crossings,
@@ -36,8 +34,8 @@ def test_it_crosses_the_motion_smoothly_beside_table_and_pedestal(engine, name):
         assert np.linalg.norm(way[0] - way[-1]) < 2 * lengths.max()
         turns = (steps[1:] * steps[:-1]).sum(axis=1) / lengths[1:] / lengths[:-1]
         assert turns.min() > 0.8
-        assert way[:, 2].min() >= 0.075 + TABLE_ROOM - 1e-3
-        assert np.linalg.norm(way[:, :2], axis=1).min() >= 0.075 + PEDESTAL_ROOM - 5e-3
+        assert way[:, 2].min() >= 0.075 + SETTINGS.table_room - 1e-3
+        assert np.linalg.norm(way[:, :2], axis=1).min() >= 0.075 + SETTINGS.pedestal_room - 5e-3
         near = np.linalg.norm(way[:, None] - task.mean_path, axis=2).min(axis=1) < 0.06
         assert np.count_nonzero(np.diff(near.astype(int)) == 1) >= 3
 
@@ -78,9 +76,9 @@ def test_the_goal_moves_around_its_place_and_motions_end_there(engine, initial):
         assert len(stack) == len(scenario.stack) + 1
         frame = next(engine.frames(changed(scenario, stack=stack)))
         ends.append(frame.reached)
-        assert np.linalg.norm(frame.reached - goal) <= 1.5 * GOAL_SWAY
+        assert np.linalg.norm(frame.reached - goal) <= 1.5 * SETTINGS.goal_sway
     np.testing.assert_allclose(ends[0], goal, atol=2e-3)
-    assert np.linalg.norm(ends[1] - goal) > 0.5 * GOAL_SWAY and np.linalg.norm(ends[2] - ends[1]) > 0.02
+    assert np.linalg.norm(ends[1] - goal) > 0.5 * SETTINGS.goal_sway and np.linalg.norm(ends[2] - ends[1]) > 0.02
 
 
 class Editable:

@@ -12,9 +12,10 @@ from dt_viz.baselines.base import NotFittedError
 from dt_viz.baselines.eflow import EFlow
 from dt_viz.baselines.mpnet import MPNet
 from dt_viz.baselines.registry import METHODS, problem_of
+from dt_viz.baselines.repulsive import EFlowRepulsive
 from dt_viz.errors import UnwantedError
+from dt_viz.evaluate.held_out import frechet
 from dt_viz.evaluate.table1 import drawn
-from dt_viz.metrics import frechet
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.collision import load_collision_model
@@ -75,7 +76,8 @@ def test_quick_methods_follow_a_drag_and_slow_ones_come_one_after_the_other(besi
 
 @pytest.mark.usefixtures("quick")
 def test_while_slow_methods_are_planned_the_frames_say_which_and_how_many_are_left(new_engine, initial, monkeypatch):
-    engine, first, second = new_engine(), "eflow-repulsive-fine", SLOW
+    engine, first, second = new_engine(), "eflow-repulsive", SLOW
+    monkeypatch.setattr(EFlowRepulsive, "live", False)
     planned = type(engine.comparison)._planned
     begun = []
 
@@ -116,7 +118,7 @@ def test_scores_are_those_of_the_motions(beside):
     last, task, goal = by_name(frames[-1]), frames[-1].task, frames[-1].goal
     (sphere,) = scenario.obstacles
     for compared in last.values():
-        found = np.mean([frechet(path, d, 1e-5) for path, d in zip(compared.paths, task.paths, strict=True)])
+        found = frechet(compared.paths, task.paths).mean()
         assert compared.scores.frechet == pytest.approx(found, abs=3e-3)
         inside = max(float(-sphere.signed_distance(path).min()) for path in compared.paths)
         assert compared.scores.hand_depth == pytest.approx(max(0.0, inside), abs=1e-3)

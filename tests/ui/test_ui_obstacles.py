@@ -44,7 +44,7 @@ def shown(server):
 @pytest.fixture(autouse=True)
 def _coarse_distances(monkeypatch):
     """What is looked at here are places and sizes, not distances to within a millimetre."""
-    monkeypatch.setattr(solids, "NUM_NODES", 20_000)
+    monkeypatch.setattr(solids, "SETTINGS", solids.GridSettings(num_nodes=20_000))
 
 
 def scenario(*obstacles, selected=0, **changes):

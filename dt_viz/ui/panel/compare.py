@@ -27,8 +27,6 @@ NONE = "–"
 SHORT = {
     "ours-no-avoidance": "No avoidance",
     "eflow-repulsive": "EFlow, field",
-    "eflow-repulsive-fine": "… at 200 Hz",
-    "signed-distance": "Distance",
 }
 """Names of methods that fit beside a box, where the title does not."""
 HEIGHT = 130

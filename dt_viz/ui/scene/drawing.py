@@ -6,7 +6,7 @@ import numpy as np
 import viser
 
 from dt_viz.flows.fields import Array
-from dt_viz.obstacles.shapes import lathe
+from dt_viz.obstacles.surfaces import lathe
 from dt_viz.scenario.slices import Slice
 from dt_viz.scenario.tasks import Task
 from dt_viz.ui.scene import palette

@@ -48,7 +48,7 @@ class WarpedGrid(Picture):
     def draw(self, frame: Frame) -> None:
         if frame.pictures.grid is not None:
             beside = frame.level is not None
-            self.lines.show(frame.pictures.grid.lines)
+            self.lines.show_segments(frame.pictures.grid)
             self.lines.colour = palette.shade(palette.GRID_BESIDE if beside else palette.GRID, self._dark)
             self.lines.node.thickness = THIN if beside else THICK
 

@@ -66,12 +66,10 @@ COMPARED = (
     (120, 94, 200),
     (51, 34, 136),
     (17, 119, 51),
-    (110, 170, 60),
     (136, 34, 85),
     (204, 102, 119),
     (140, 130, 40),
     (0, 140, 150),
-    (60, 110, 190),
 )
 """Motions of methods beside ours, in the order of the tables: after the muted set of Tol."""
 BRAND = (0, 114, 178)
@@ -90,8 +88,8 @@ ON_DARK = {
     COMPARED[0]: (168, 148, 236),
     COMPARED[1]: (136, 128, 230),
     COMPARED[2]: (72, 186, 112),
-    COMPARED[4]: (214, 96, 152),
-    COMPARED[6]: (200, 190, 92),
+    COMPARED[3]: (214, 96, 152),
+    COMPARED[5]: (200, 190, 92),
     TABLE: (38, 40, 46),
     ZENITH: (16, 19, 26),
     HORIZON: (58, 61, 71),

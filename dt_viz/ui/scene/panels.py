@@ -65,7 +65,7 @@ class PanelNodes:
         self._goal.visible = panel.goal is not None
         if panel.goal is not None:
             self._goal.position = panel.goal
-        if before is None or not before.area.lies_like(panel.area):
+        if before is None or before.area.key != panel.area.key:
             self._border.show([panel.area.border])
         _, up = directions(panel.area, camera)
         self._title.text = panel.title
