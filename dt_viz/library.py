@@ -200,7 +200,7 @@ class Motion:
             float(scenario.obstacle.signed_distance(path).min()), found=motion_warnings(solved, missed)
         )
         times = solution.rays.times(bundle.index, bundle.fraction)
-        return certified(known, solution, solved.ends, DrawnSamples(bundle.index, bundle.fraction, times, path))
+        return certified(known, solution, DrawnSamples(bundle.index, bundle.fraction, times, path))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.

@@ -23,7 +23,7 @@ NUM_ALTERNATIVES = 3
 """Number of other stances that are tried where the arm finds no way around the obstacle."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solved:
     """A scenario's motion: the end effector's stack, and how the whole arm avoids on top of it."""
 

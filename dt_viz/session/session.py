@@ -63,7 +63,7 @@ def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
 
 def _is_step(after: Scenario, before: Scenario) -> bool:
     """Whether the change from one to the other is a step for undo: what moves is, and where the slice lies."""
-    return not after.moves_like(before) or after.view.slice != before.view.slice
+    return after.choices != before.choices or after.view.slice != before.view.slice
 
 
 class Display(Protocol):
@@ -140,7 +140,7 @@ class Session:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
             if edited == self.scenario and not self._failed:
                 return
-            if not edited.passes_like(self.scenario):
+            if edited.full != self.scenario.full:
                 edited = replace(edited, passing=ANEW if anew else None)
             if _is_step(edited, self.scenario):
                 name, when = self._gesture
@@ -248,7 +248,7 @@ class Session:
         """Stop learning a task and go back to what was shown before. Nothing is done while nothing is learned."""
         with self._lock:
             abandoned = self.scenario
-            if not self._learning or (self._shown is not None and abandoned.learns_like(self._shown)):
+            if not self._learning or (self._shown is not None and abandoned.fit == self._shown.fit):
                 return
             self._stopped = not self._retreat(abandoned)
         self._adopt()
@@ -290,13 +290,13 @@ class Session:
         Called with the lock held. False if there is none, or if `abandoned` is not what is wanted any more.
         """
         shown = self._shown
-        if shown is None or shown.learns_like(abandoned) or not self.scenario.learns_like(abandoned):
+        if shown is None or shown.fit == abandoned.fit or self.scenario.fit != abandoned.fit:
             return False
-        while self._past and self._past[-1].learns_like(abandoned):
+        while self._past and self._past[-1].fit == abandoned.fit:
             self._past.pop()  # edits of what was never seen
         before = shown
         for history in (self._past, self._future):
-            if history and history[-1].learns_like(shown):
+            if history and history[-1].fit == shown.fit:
                 before = history.pop()
                 break
         self.scenario = self._as_seen(before)
@@ -330,7 +330,7 @@ class Session:
     def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
         with self._lock:
-            if self._stopped or self._closed or not self.scenario.learns_like(scenario):
+            if self._stopped or self._closed or self.scenario.fit != scenario.fit:
                 raise UnwantedError
             self._learning = True
         self._display.learning(fraction, message)
@@ -342,7 +342,7 @@ class Session:
         alike = self._shown is not None and scenario.learned == self._shown.learned
         passing = self._passing if alike else ANEW
         with self._lock:
-            if self.scenario.passing is None and self.scenario.passes_like(scenario):
+            if self.scenario.passing is None and self.scenario.full == scenario.full:
                 self.scenario = replace(self.scenario, passing=passing)
         return replace(scenario, passing=passing)
 
@@ -353,7 +353,7 @@ class Session:
             now = time.perf_counter()
             if self._learning:
                 edited = now - frame.seconds  # learning is no rebuild
-            drawn = self._shown is not None and scenario.moves_like(self._shown)
+            drawn = self._shown is not None and scenario.choices == self._shown.choices
             self._learning, self._shown, self._passing = False, scenario, frame.passing
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes
