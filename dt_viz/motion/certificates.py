@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
@@ -21,7 +20,7 @@ from dt_viz.motion.stack import Solution
 from dt_viz.robot.collision import CollisionReport
 from dt_viz.warning import Kind, MotionWarning, in_millimetres, told
 
-NUM_CHECKED, NUM_CHECKED_POSTURES = 400, 100
+NUM_CHECKED, NUM_POSTURES = 400, 100
 """Samples on which det J and what is lost there and back are computed, of the hand's stack and of the whole arm's
 transform; all else is of every sample."""
 MAX_OFF = 1e-6
@@ -103,57 +102,66 @@ def certified(known: Certificates, stack: Solution, shown: DrawnSamples, *, tole
         shown: the motions.
         tolerance: distance of ψ of a sample from its base motion, metres, before it is said.
     """
-    transform, base = stack.transform, stack.rays.base
+    base = stack.rays.base
     base_motion = base.flow(stack.rays.z0[shown.index], shown.times[:, None])[:, 0]
     goal = stack.rays.at(shown.index, shown.fraction)
     arrived = (shown.fraction == 1) & (np.linalg.norm(base_motion - goal, axis=1) <= ARRIVED + MAX_OFF)
     base_motion[arrived] = goal[arrived]
     y = np.concatenate([shown.positions, base_motion[:, 3:]], axis=1)
     by_hand = any(applied.made.integration.by_hand for applied in stack.built)
-    keep = _evenly(np.arange(len(y)), NUM_CHECKED)
-    z = transform.forward(y)
-    # coarse steps there and back are no inverses: then ψ⁻¹, which is what is drawn, is compared and looked at for folds
-    off = transform.inverse(base_motion) - y if by_hand else z - base_motion
-    det = _determinant(transform, y[keep], base_motion[keep] if by_hand else None)
-    known = _with_map(known, det, _longest(transform.inverse(z[keep]) - y[keep]))
+    known, z = certified_map(known, stack.transform, y, base_motion, NUM_CHECKED, tolerance, by_hand=by_hand)
     falls = _falls(base.distance(z), shown)
     rises = () if falls else (MotionWarning(Kind.NOT_FALLING, "the Lyapunov value does not fall all the way"),)
-    return replace(known, lyapunov_falls=falls).warning(*rises, *_beside(_longest(off), tolerance))
+    return replace(known, lyapunov_falls=falls).warning(*rises)
 
 
-def certified_arm(
-    known: Certificates, transform: Diffeomorphism, p: Array, undisturbed: Array, *, by_hand: bool
+def certified_map(
+    known: Certificates,
+    transform: Diffeomorphism,
+    y: Array,
+    x: Array,
+    num: int,
+    tolerance: float,
+    unit: Array | float = 1.0,
+    *,
+    by_hand: bool,
 ) -> tuple[Certificates, Array]:
-    """Add the certificates of the whole arm's transform along the postures that are shown.
+    """The worse of the certificates known and of those of a map, with a warning for each failure, and its images.
 
     Args:
         known: what is known already.
-        transform: ψ_q.
-        p: (N, 6) the postures, rad.
-        undisturbed: (N, 6) the postures inside the joint limits that ψ_q⁻¹ is said to lead to them, rad.
-        by_hand: whether the integration of ψ_q was chosen by hand.
-
-    Returns:
-        The health, and the postures (N, 6) without avoidance that those shown are the images of, rad.
+        transform: ψ.
+        y: (N, d) samples that are drawn.
+        x: (N, d) what ψ⁻¹ is said to lead to them.
+        num: number of samples at which det J and the round trip are computed, of those that it moves.
+        tolerance: distance of an image from `x`, metres, before it is said.
+        unit: metres for one unit of each coordinate.
+        by_hand: whether an integration was chosen by hand.
     """
-    moved = np.flatnonzero((p != undisturbed).any(axis=1))
-    keep = _evenly(moved if len(moved) else np.arange(len(p)), NUM_CHECKED_POSTURES)
-    det = _determinant(transform, p[keep], undisturbed[keep] if by_hand else None)
-    back = transform.inverse(transform.forward(p[keep]))
-    known = _with_map(known, det, _longest((back - p[keep]) * LEVERS))
+    moved = np.flatnonzero((y != x).any(axis=1))
+    keep = _evenly(moved if len(moved) else np.arange(len(y)), num)
+    images, det = _quicker(transform).forward(y), np.linalg.det(transform.jacobian(y[keep])[1])
+    off = images - x
     if by_hand:
-        q, off = undisturbed, transform.inverse(undisturbed) - p
-    else:
-        q = _quicker(transform).forward(p)
-        off = q - undisturbed
-    return known.warning(*_beside(_longest(off * LEVERS), MAX_OFF_POSTURE)), q
-
-
-def _beside(off: float, tolerance: float) -> tuple[MotionWarning, ...]:
-    if off <= tolerance:
-        return ()
-    text = f"what is shown is up to {in_millimetres(off)} beside the motion of the base system"
-    return (MotionWarning(Kind.OFF_MOTION, text),)
+        # coarse steps there and back are no inverses: then ψ⁻¹, which is what is drawn, is compared and looked at for
+        # folds
+        off, inverse = transform.inverse(x) - y, np.linalg.det(transform.inverse_jacobian(x[keep])[1])
+        det = np.append(det, inverse[~(inverse > 0)])
+    least, beside = float(det.min()), _longest(off * unit)
+    missed = _longest((transform.inverse(transform.forward(y[keep])) - y[keep]) * unit)
+    warnings = []
+    if not least > 0:
+        text = f"det J falls to {least:.2g}: the map folds space, the stack is no diffeomorphism there"
+        warnings.append(MotionWarning(Kind.NO_DIFFEOMORPHISM, text))
+    if not missed <= MAX_ROUND_TRIP:
+        text = f"a round trip through the stack misses by {1e3 * missed:.3g} mm: steps too coarse"
+        warnings.append(MotionWarning(Kind.ROUND_TRIP, text))
+    if not beside <= tolerance:
+        text = f"what is shown is up to {in_millimetres(beside)} beside the motion of the base system"
+        warnings.append(MotionWarning(Kind.OFF_MOTION, text))
+    worst = min(least, np.inf if known.min_det_jacobian is None else known.min_det_jacobian)
+    known = replace(known, min_det_jacobian=worst, round_trip_error=max(missed, known.round_trip_error or 0.0))
+    return known.warning(*warnings), images
 
 
 def _falls(distance: Array, shown: DrawnSamples) -> bool:
@@ -170,31 +178,6 @@ def _quicker(transform: Diffeomorphism) -> Diffeomorphism:
     if isinstance(transform, Conjugated) and isinstance(transform.inner, AdaptiveFlow):
         return replace(transform, inner=replace(transform.inner, tolerance=POSTURE_TOLERANCE))
     return transform
-
-
-def _determinant(transform: Diffeomorphism, y: Array, drawn_from: Array | None) -> float:
-    """Smallest det J at `y`, or of ψ⁻¹'s derivative where that is not positive at what it is `drawn_from`."""
-    det = np.linalg.det(transform.jacobian(y)[1])
-    if drawn_from is not None:
-        inverse = np.linalg.det(transform.inverse_jacobian(drawn_from)[1])
-        det = np.append(det, inverse[~(inverse > 0)])
-    return float(det.min())
-
-
-def _with_map(known: Certificates, det: float, round_trip: float) -> Certificates:
-    """The worse of the certificates known and of those of another map, and a warning for each failure."""
-    warnings = []
-    if not det > 0:
-        text = f"det J falls to {det:.2g}: the map folds space, the stack is no diffeomorphism there"
-        warnings.append(MotionWarning(Kind.NO_DIFFEOMORPHISM, text))
-    if not round_trip <= MAX_ROUND_TRIP:
-        text = f"a round trip through the stack misses by {1e3 * round_trip:.3g} mm: steps too coarse"
-        warnings.append(MotionWarning(Kind.ROUND_TRIP, text))
-    return replace(
-        known,
-        min_det_jacobian=min(det, np.inf if known.min_det_jacobian is None else known.min_det_jacobian),
-        round_trip_error=max(round_trip, known.round_trip_error or 0.0),
-    ).warning(*warnings)
 
 
 def _evenly(rows: Indices, num: int) -> Indices:

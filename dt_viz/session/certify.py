@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
+from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.metrics import maximum_collision_distance
-from dt_viz.motion.certificates import MAX_OFF_TRACKED, Certificates, DrawnSamples, certified, certified_arm
+from dt_viz.motion.certificates import (
+    MAX_OFF_POSTURE,
+    MAX_OFF_TRACKED,
+    NUM_POSTURES,
+    Certificates,
+    DrawnSamples,
+    certified,
+    certified_map,
+)
 from dt_viz.motion.diagnostics import (
     anchor_warnings,
     fold_warnings,
@@ -26,13 +33,9 @@ from dt_viz.warning import Kind
 
 def uncertified(motion: Solved, drawn: DrawnSamples, follower: Follower) -> Certificates:
     """What is known of a motion at once: its clearance, and what it does not get that it wants."""
-    scenario, arm = motion.scenario, motion.arm
-    missed = float(np.linalg.norm(drawn.positions[-1] - motion.nominal.goal))
-    warnings = (*motion_warnings(motion, missed), *anchor_warnings(motion.stack))
-    if scenario.avoids and scenario.warp == 1:
-        warnings += target_warnings(motion, follower.robot)
-    kept = clearance(motion, drawn, scenario.obstacle, follower) if arm is None else arm.clearance
-    return Certificates(kept, found=warnings)
+    kept = motion.arm.clearance if motion.arm else clearance(motion, drawn, motion.scenario.obstacle, follower)
+    found = (*motion_warnings(motion, drawn), *anchor_warnings(motion.stack), *target_warnings(motion, drawn))
+    return Certificates(kept, found=found)
 
 
 def clearance(motion: Solved, drawn: DrawnSamples, obstacle: Union, follower: Follower) -> float:
@@ -54,8 +57,10 @@ def certify(frame: Frame, follower: Follower) -> Certificates:
     if frame.arm is not None:
         p[arm.index == frame.chosen] = frame.arm.q
     known = known.warning(*fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed))
-    known, q = certified_arm(known, arm.transform, p, undisturbed, by_hand=integration.by_hand)
-    below = replace(drawn, positions=follower.robot.end_effector(q))
+    known, q = certified_map(
+        known, arm.transform, p, undisturbed, NUM_POSTURES, MAX_OFF_POSTURE, LEVERS, by_hand=integration.by_hand
+    )
+    below = replace(drawn, positions=follower.robot.end_effector(undisturbed if integration.by_hand else q))
     return certified(known, motion.stack, below, tolerance=MAX_OFF_TRACKED)
 
 

@@ -209,7 +209,7 @@ class Comparison:
         try:
             if method is OURS:
                 rollouts = range(len(frame.rollouts))
-                joints = [arm_along(frame.motion, frame.drawn, k, self._follower)[0].q for k in rollouts]
+                joints = [arm_along(frame, k, self._follower)[0].q for k in rollouts]
             else:
                 joints = [self._joints(motions, learned, k) for k in range(len(motions.paths))]
         except UnreachableError:

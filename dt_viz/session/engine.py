@@ -29,7 +29,7 @@ from dt_viz.scenario.tasks import STYLES, Task, TaskEntry
 from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
 from dt_viz.session.cores import Cores
-from dt_viz.session.drawing import Drawing, Subject, arm_along, rollouts_of
+from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.warning import MotionWarning
@@ -153,15 +153,11 @@ class Engine:
     @kept(NEWEST, by=lambda scenario: scenario.learned)
     def _styled(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the augmented state, in its style."""
-        own, usual, other = (self._augmented(name) for name in (scenario.task, *STYLES[scenario.style]))
+        tasks = scenario.task, *STYLES[scenario.style]
+        learned = (self._learned(Scenario(task, state="augmented"), None).imitation for task in tasks)
+        own, usual, other = (imitation for imitation in learned if isinstance(imitation, AugmentedImitation))
         imitation = Style.between(usual, other).on(own, scenario.style_amount)
         return Learned.of(self.task(scenario.task), imitation, imitates=True)
-
-    @kept()
-    def _augmented(self, task: str) -> AugmentedImitation:
-        imitation = self._fits.learned(self.task(task).demonstrations, state="augmented")
-        assert isinstance(imitation, AugmentedImitation)
-        return imitation
 
     def _admission(self, scenario: Scenario, precision: Precision) -> Admission:
         """Whether the scenario has a motion, and from which starts.
@@ -209,7 +205,7 @@ class Engine:
         """
         frame = replace(self._rollouts(scenario, FINE), stage=Stage.FINE)
         rollouts = () if frame.blocked else range(len(frame.rollouts))
-        found = [arm_along(frame.motion, frame.drawn, rollout, self.follower) for rollout in rollouts]
+        found = [arm_along(frame, rollout, self.follower) for rollout in rollouts]
         warnings = [warning for _, warnings in found for warning in warnings]
         return replace(frame, certificates=frame.certificates.warning(*warnings)), tuple(arm for arm, _ in found)
 
@@ -245,7 +241,7 @@ class Engine:
         """The frame with pictures and the arm, at LIVE with the arm's motion only if that is drawn."""
         view, live = frame.scenario.view, stage is Stage.LIVE
         arm, warnings = self._arm(frame, not live or view.shows_arm_motion)
-        pictures = self._drawing.pictures(Subject(frame.motion, view, frame.chosen), others, live)
+        pictures = self._drawing.pictures(frame, others, live)
         known = frame.certificates if frame.blocked else frame.certificates.warning(*warnings)
         frame = replace(frame, stage=stage, arm=arm, certificates=known, pictures=pictures)
         if view.health_plots and not live and frame.chosen is not None:
@@ -260,7 +256,7 @@ class Engine:
             far = self.follower.out_of_reach(nominal)
             arm, warnings = None, ()
             if moves and rollout is not None and not far[rollout]:
-                arm, warnings = arm_along(frame.motion, frame.drawn, rollout, self.follower)
+                arm, warnings = arm_along(frame, rollout, self.follower)
         except UnreachableError as error:
             return None, (unreachable(error),)
         return arm, (*warnings, *far_starts(np.array(nominal.numbers)[far], nominal.num_demonstrated))
