@@ -25,7 +25,8 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session import session as session_module
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Stage
-from dt_viz.session.session import GESTURE_PAUSE, MAX_UNDO, Session
+from dt_viz.session.history import GESTURE_PAUSE, MAX_UNDO
+from dt_viz.session.session import Session
 
 PATIENCE = 30.0
 
