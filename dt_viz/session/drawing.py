@@ -124,9 +124,9 @@ class Drawing:
 
     def __init__(self, follower: Follower, memo: Memo) -> None:
         """Draw motions of this arm."""
-        self._follower, self._memo = follower, memo
+        self._follower, self.memo = follower, memo
 
-    @kept(2, by=lambda frame, _, coarse: _seen(frame, coarse), of="_memo")
+    @kept(2, by=lambda frame, _, coarse: _seen(frame, coarse))
     def pictures(self, frame: Frame, others: Mapping[Panel, Learned], coarse: bool) -> Pictures:
         """The pictures that the view of a frame shows, on its slice and of its level.
 
@@ -165,24 +165,24 @@ class Drawing:
         postures = self._postures(frame, self._follower.reference(motion.nominal))
         return postures.carried(self._velocities(frame), motion.arm.transform, robot, motion.scenario.obstacle)
 
-    @kept(NUM_BOOKS, by=lambda learned, at: (learned, at.tobytes()), of="_memo")
+    @kept(NUM_BOOKS, by=lambda learned, at: (learned, at.tobytes()))
     def _book(self, learned: Learned, at: Array) -> Sketchbook:
         """The maker of pictures of ψ, at one phase and for one condition."""
         shown, system = learned.demonstrated, frozen(learned.system, at)
         rays = Rays(system.transform.forward(shown.starts), system.base)
         return Sketchbook(learned.task, in_frame(learned.system.transform), system, rays, shown.paths)
 
-    @kept(2, by=lambda frame, near: (frame.motion.scenario.task, frame.scenario.view.slice, near.tobytes()), of="_memo")
+    @kept(2, by=lambda frame, near: (frame.motion.scenario.task, frame.scenario.view.slice, near.tobytes()))
     def _postures(self, frame: Frame, near: Array) -> Lattice:
         """The postures that hold the hand at the lattice, `near` one (6,), rad."""
         return Lattice.of(lattice(frame), self._follower.robot, near)
 
-    @kept(2, by=_stacked, of="_memo")
+    @kept(2, by=_stacked)
     def _velocities(self, frame: Frame) -> Array:
         """See `velocities`."""
         return velocities(frame, self._learned_velocities(frame))
 
-    @kept(2, by=_learned, of="_memo")
+    @kept(2, by=_learned)
     def _learned_velocities(self, frame: Frame) -> Array:
         """Velocities (M, 3) of the learned motion at the lattice, m/s."""
         return system_of(frame, 0).velocity(lattice(frame))

@@ -60,16 +60,20 @@ class Compared:
     """A method's motions around the obstacles of a scenario, from the starts of the demonstrations."""
 
     method: Method
-    paths: tuple[Array, ...]
+    paths: tuple[Array, ...] = ()
     """(N_i, 3) of the end effector, metres; none where there are no motions."""
-    scores: Scores | None
-    curves: Array | None
-    """(`dt_viz.motion.profiles.NUM_SAMPLES`, 2) of one motion, at even distances along it, metres: distance to the
-    demonstration, and depth in the obstacle."""
-    rollout: int
-    """Number of that motion: the one that the arm follows where that begins at a demonstrated start."""
+    times: tuple[Array, ...] = ()
+    """(N_i,) of their samples, seconds."""
+    joints: tuple[Array, ...] | None = None
+    """(N_i, 6) of the arm, rad, where the method plans them."""
+    scores: Scores | None = None
     note: str = ""
     """What the motions fail at, or why there are none."""
+    rollout: int = 0
+    """Number of one motion: the one that the arm follows where that begins at a demonstrated start."""
+    curves: Array | None = None
+    """(`dt_viz.motion.profiles.NUM_SAMPLES`, 2) of that one, at even distances along it, metres: distance to the
+    demonstration, and depth in the obstacle."""
     arm: ArmMotion | None = None
     """The arm along that motion, where the view shows it."""
 
