@@ -217,16 +217,13 @@ class Engine:
         Where there is no last one it is the motion without obstacles.
         """
         admission = self._admission(scenario, precision)
-        blocked, motion = admission.blocked, None
-        if not blocked:
-            motion = self._solved(scenario, admission.nominal, precision)
-            blocked = motion.blocked
-        if motion is not None and not blocked:
-            self._last[scenario.task] = motion
-            return Frame(scenario, Stage.ROLLOUTS, motion, *self._drawn(motion))
-        motion = self._last.get(scenario.task)
-        if motion is None:
-            motion = self.solved(replace(scenario, stack=_without_obstacles(scenario.stack)), precision)
+        found = None if admission.blocked else self._solved(scenario, admission.nominal, precision)
+        if found is not None and not found.blocked:
+            self._last[scenario.task] = found
+            return Frame(scenario, Stage.ROLLOUTS, found, *self._drawn(found))
+        blocked = admission.blocked if found is None else found.blocked
+        free = replace(scenario, stack=_without_obstacles(scenario.stack))
+        motion = self._last.get(scenario.task) or self.solved(free, precision)
         drawn, _ = self._drawn(motion)
         known = Certificates(clearance(motion, drawn, scenario.obstacle, self.follower))
         return Frame(scenario, Stage.ROLLOUTS, motion, drawn, known, blocked)

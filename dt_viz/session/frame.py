@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 
@@ -153,7 +154,7 @@ class Frame:
         """Number of rollouts, the last ones, from added starts."""
         return self.motion.nominal.num_added
 
-    @property
+    @cached_property
     def chosen(self) -> int | None:
         """Index of the rollout that the arm follows.
 
