@@ -195,12 +195,10 @@ class Motion:
         scenario = self._scenario
         solved = Solved(scenario, nominal, nominal, solution, None, None)
         bundle, path = solution.bundle, solution.bundle.positions
-        missed = float(np.linalg.norm(path[-1] - nominal.goal))
-        known = Certificates(
-            float(scenario.obstacle.signed_distance(path).min()), found=motion_warnings(solved, missed)
-        )
         times = solution.rays.times(bundle.index, bundle.fraction)
-        return certified(known, solution, solved.ends, DrawnSamples(bundle.index, bundle.fraction, times, path))
+        drawn = DrawnSamples(bundle.index, bundle.fraction, times, path)
+        clearance = float(scenario.obstacle.signed_distance(path).min())
+        return certified(Certificates(clearance, found=motion_warnings(solved, drawn)), solution, drawn)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the motion to a file (npz, whatever its suffix): what was learned, the demonstrations and the stack.

@@ -5,9 +5,11 @@ from __future__ import annotations
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Hashable
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 _Result = TypeVar("_Result")
+_Method = TypeVar("_Method", bound=Callable[..., Any])
 
 
 class Memo:
@@ -44,3 +46,24 @@ class Memo:
     def count(self, kind: str) -> int:
         """Number of results of a kind that are kept."""
         return len(self._results[kind])
+
+
+def kept(
+    newest: int | None = None, by: Callable[..., Hashable] = lambda *given: given, of: str = "memo"
+) -> Callable[[_Method], _Method]:
+    """Decorate a method whose newest results its object keeps.
+
+    Args:
+        newest: number of results that are kept; None keeps all.
+        by: what a result depends on, of the method's arguments.
+        of: name of the object's attribute that is the `Memo`.
+    """
+
+    def decorate(method: _Method) -> _Method:
+        @wraps(method)
+        def asked(self: Any, *given: Any) -> Any:  # noqa: ANN401 - whatever the method takes and returns
+            return getattr(self, of)(method.__qualname__, by(*given), lambda: method(self, *given), newest=newest)
+
+        return cast(_Method, asked)
+
+    return decorate

@@ -69,16 +69,6 @@ class Kind(Enum):
     """Certificate: the Lyapunov value does not fall."""
     OFF_MOTION = auto()
     """Certificate: the shown motion is no image of the base motion."""
-    OTHER_ENDS = auto()
-    """Certificate: motions do not begin at their starts or do not end at their goal."""
-    OTHER_TIMES = auto()
-    """Certificate: times are not those of the motion."""
-    OTHER_CLEARANCE = auto()
-    """Certificate: the clearance differs from the reported one."""
-    HAND_BESIDE = auto()
-    """Certificate: the hand of the arm is not on its rollout."""
-    OTHER_DELAY = auto()
-    """Certificate: the arm does not keep its times and velocity limits."""
 
 
 CONSEQUENCES: Mapping[Kind, frozenset[Kind]] = {
@@ -86,7 +76,6 @@ CONSEQUENCES: Mapping[Kind, frozenset[Kind]] = {
     Kind.STAYS_INSIDE: frozenset({Kind.ENTERS}),
     Kind.FOLDS: frozenset({Kind.NO_DIFFEOMORPHISM, Kind.NOT_FALLING}),
     Kind.INEXACT_INVERSE: frozenset({Kind.ROUND_TRIP}),
-    Kind.PATH_MISSED: frozenset({Kind.HAND_BESIDE}),
     Kind.ROLLOUT_ENTERS: frozenset({Kind.ARM_ENTERS}),
 }
 """Kinds of warnings that are hidden by a warning of their cause."""

@@ -111,13 +111,13 @@ def engine(new_engine) -> Engine:
 @pytest.fixture(scope="module", autouse=True)
 def _nothing_shown_before_a_module():
     for engine in _shared:
-        engine._shown.clear()
+        engine._last.clear()
 
 
 @pytest.fixture(autouse=True)
 def _nothing_shown_before_a_test(_nothing_shown_before_a_module):
     for engine in _shared:
-        engine._shown.clear()
+        engine._last.clear()
 
 
 @pytest.fixture(scope="session")
@@ -127,9 +127,9 @@ def at_rest(engine):
 
     def frame(scenario, stage):
         if (scenario, stage) not in known:
-            engine._shown.clear()
+            engine._last.clear()
             known[scenario, stage] = frame_at(engine, scenario, stage)
-            engine._shown.clear()
+            engine._last.clear()
         return known[scenario, stage]
 
     return frame

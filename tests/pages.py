@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import time
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -63,22 +63,34 @@ def painted_at(image: Any, half_size: Any, seen: Any) -> np.ndarray:
     return image.position + rotation((w, x, y, z)) @ [*np.multiply(half_size, across), 0.0]
 
 
+@dataclass(frozen=True, eq=False)
+class FrameWithoutMotion(Frame):
+    """A frame that is given what others take from their motion."""
+
+    task: Any = None
+    ghost: Any = ()
+    rollouts: Any = ()
+    times: Any = ()
+    levels: Any = ()
+    level: Any = None
+    goal: Any = None
+    reached: Any = None
+    num_added: Any = 0
+    chosen: Any = 0
+    remembers: Any = False
+    reason: Any = ""
+    labels: Any = ()
+    learned_steps: Any = ()
+    durations: Any = ()
+    chosen_values: Any = ()
+    arm_duration: Any = None
+
+
 def frame_of(scenario: Scenario, **changes: Any) -> Frame:
     """The last frame of a scenario, with nothing in it but what is given."""
     nothing: Any = None
-    given: dict[str, Any] = {
-        "task": nothing,
-        "stage": Stage.CERTIFIED,
-        "ghost": (),
-        "rollouts": (),
-        "times": (),
-        "levels": (),
-        "goal": nothing,
-        "reached": nothing,
-        "blocked": (),
-        "certificates": Certificates(0.01),
-    }
-    return Frame(scenario=scenario, **(given | changes))
+    given = {"stage": Stage.CERTIFIED, "certificates": Certificates(0.01)} | changes
+    return FrameWithoutMotion(scenario, motion=nothing, drawn=nothing, **given)
 
 
 class CameraClient:

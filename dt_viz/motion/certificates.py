@@ -2,27 +2,25 @@
 
 A motion y(t) of the stack is the image of a motion of the base system: ψ(y(t)) = z(t). Certified is that ψ is a
 diffeomorphism along it, that ψ⁻¹ undoes ψ there, that Φ(ψ(y)) falls, and the conjugacy itself: each sample lies where
-the base motion from its start is at its time, up to the goal. The conjugacy check catches drawn samples of another
-motion, and those that are permuted, shifted or mistimed.
+the base motion from its start is at its time, and the last one at the goal. The conjugacy check catches drawn samples
+of another motion, and those that are permuted, shifted or mistimed.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.flows.rollouts import ARRIVED
 from dt_viz.motion.stack import Solution
 from dt_viz.robot.collision import CollisionReport
-from dt_viz.robot.retiming import within_velocity_limits
-from dt_viz.robot.robot import Robot
-from dt_viz.warning import ARM, Kind, MotionWarning, in_millimetres, told
+from dt_viz.warning import Kind, MotionWarning, in_millimetres, told
 
-NUM_CHECKED, NUM_CHECKED_POSTURES = 400, 100
+NUM_CHECKED, NUM_POSTURES = 400, 100
 """Samples on which det J and what is lost there and back are computed, of the hand's stack and of the whole arm's
 transform; all else is of every sample."""
 MAX_OFF = 1e-6
@@ -38,12 +36,6 @@ MAX_OFF_TRACKED = 1e-3
 at their limits leave more."""
 RESOLVED = 1e-5
 """Distance between samples in base space, metres, up to which whether Φ falls is rounding."""
-MAX_HAND_MISS = 1e-3
-"""Distance of the hand of the arm that is shown from its rollout, metres, before it is said."""
-MAX_DELAY_ERROR = 1e-9
-"""Time, seconds, by which the times of the arm may differ from those that its velocity limits ask for."""
-MAX_CLEARANCE_ERROR = 1e-6
-"""Difference of a clearance from the one that is said that is allowed, metres."""
 MAX_ROUND_TRIP = 1e-6
 """Largest ‖ψ⁻¹(ψ(y)) − y‖, metres, that is not said; the workspace is about one metre wide."""
 
@@ -91,137 +83,85 @@ class DrawnSamples:
     positions: Array
     """(N, 3), metres."""
 
+    def split(self, values: Array) -> tuple[Array, ...]:
+        """Cut an array (N, …) that belongs to the samples into one array for each motion."""
+        return tuple(np.split(values, np.flatnonzero(np.diff(self.index)) + 1))
 
-def certified(
-    known: Certificates, stack: Solution, ends: Array, shown: DrawnSamples, *, tolerance: float = MAX_OFF
-) -> Certificates:
+    @cached_property
+    def paths(self) -> tuple[Array, ...]:
+        """Positions of each motion, (T_i, 3), metres."""
+        return self.split(self.positions)
+
+
+def certified(known: Certificates, stack: Solution, shown: DrawnSamples, *, tolerance: float = MAX_OFF) -> Certificates:
     """Add the certificates of a stack along the motions that are shown of it, and a warning for each that fails.
 
     Args:
         known: what is known already.
         stack: ψ and the rays of the base system.
-        ends: (R + 1, 3) where the motions are to begin, and where all are to end, metres.
         shown: the motions.
         tolerance: distance of ψ of a sample from its base motion, metres, before it is said.
     """
-    transform, base_motion = stack.transform, stack.rays.at(shown.index, shown.fraction)
+    base = stack.rays.base
+    base_motion = base.flow(stack.rays.z0[shown.index], shown.times[:, None])[:, 0]
+    goal = stack.rays.at(shown.index, shown.fraction)
+    arrived = (shown.fraction == 1) & (np.linalg.norm(base_motion - goal, axis=1) <= ARRIVED + MAX_OFF)
+    base_motion[arrived] = goal[arrived]
     y = np.concatenate([shown.positions, base_motion[:, 3:]], axis=1)
     by_hand = any(applied.made.integration.by_hand for applied in stack.built)
-    keep = _evenly(np.arange(len(y)), NUM_CHECKED)
-    z = transform.forward(y)
-    # coarse steps there and back are no inverses: then ψ⁻¹, which is what is drawn, is compared and looked at for folds
-    off = transform.inverse(base_motion) - y if by_hand else z - base_motion
-    det = _determinant(transform, y[keep], base_motion[keep] if by_hand else None)
-    known = _with_map(known, det, _longest(transform.inverse(z[keep]) - y[keep]))
-    falls = _falls(stack.rays.base.distance(z), shown)
-    base_ends = np.concatenate([stack.rays.z0, stack.rays.base.goal[None]])
+    known, z = certified_map(known, stack.transform, y, base_motion, NUM_CHECKED, tolerance, by_hand=by_hand)
+    falls = _falls(base.distance(z), shown)
     rises = () if falls else (MotionWarning(Kind.NOT_FALLING, "the Lyapunov value does not fall all the way"),)
-    return replace(known, lyapunov_falls=falls).warning(
-        *rises,
-        *_beside(_longest(off), tolerance),
-        *_of_ends(base_ends - transform.forward(np.concatenate([ends, base_ends[:, 3:]], axis=1)), shown),
-        *_of_times(stack, shown, base_motion),
-    )
+    return replace(known, lyapunov_falls=falls).warning(*rises)
 
 
-def certified_arm(
-    known: Certificates, transform: Diffeomorphism, p: Array, undisturbed: Array, *, by_hand: bool
+def certified_map(
+    known: Certificates,
+    transform: Diffeomorphism,
+    y: Array,
+    x: Array,
+    num: int,
+    tolerance: float,
+    unit: Array | float = 1.0,
+    *,
+    by_hand: bool,
 ) -> tuple[Certificates, Array]:
-    """Add the certificates of the whole arm's transform along the postures that are shown.
+    """The worse of the certificates known and of those of a map, with a warning for each failure, and its images.
 
     Args:
         known: what is known already.
-        transform: ψ_q.
-        p: (N, 6) the postures, rad.
-        undisturbed: (N, 6) the postures inside the joint limits that ψ_q⁻¹ is said to lead to them, rad.
-        by_hand: whether the integration of ψ_q was chosen by hand.
-
-    Returns:
-        The health, and the postures (N, 6) without avoidance that those shown are the images of, rad.
+        transform: ψ.
+        y: (N, d) samples that are drawn.
+        x: (N, d) what ψ⁻¹ is said to lead to them.
+        num: number of samples at which det J and the round trip are computed, of those that it moves.
+        tolerance: distance of an image from `x`, metres, before it is said.
+        unit: metres for one unit of each coordinate.
+        by_hand: whether an integration was chosen by hand.
     """
-    moved = np.flatnonzero((p != undisturbed).any(axis=1))
-    keep = _evenly(moved if len(moved) else np.arange(len(p)), NUM_CHECKED_POSTURES)
-    det = _determinant(transform, p[keep], undisturbed[keep] if by_hand else None)
-    back = transform.inverse(transform.forward(p[keep]))
-    known = _with_map(known, det, _longest((back - p[keep]) * LEVERS))
+    moved = np.flatnonzero((y != x).any(axis=1))
+    keep = _evenly(moved if len(moved) else np.arange(len(y)), num)
+    images, det = _quicker(transform).forward(y), np.linalg.det(transform.jacobian(y[keep])[1])
+    off = images - x
     if by_hand:
-        q, off = undisturbed, transform.inverse(undisturbed) - p
-    else:
-        q = _quicker(transform).forward(p)
-        off = q - undisturbed
-    return known.warning(*_beside(_longest(off * LEVERS), MAX_OFF_POSTURE)), q
-
-
-def hand_warnings(
-    robot: Robot, q: Array, path: Array, *, source: str = "", tolerance: float = MAX_HAND_MISS
-) -> tuple[MotionWarning, ...]:
-    """Whether the hand of the arm is where its rollouts are.
-
-    Args:
-        robot: whose hand it is.
-        q: (N, 6) postures, rad.
-        path: (N, 3) the samples that belong to them, metres.
-        source: of the warnings.
-        tolerance: distance before it is said, metres.
-    """
-    missed = _longest(robot.end_effector(q) - path)
-    if missed <= tolerance:
-        return ()
-    text = f"the hand of the arm is up to {in_millimetres(missed)} beside its rollout"
-    return (MotionWarning(Kind.HAND_BESIDE, text, source),)
-
-
-def delay_warnings(robot: Robot, q: Array, times: Array, due: Array) -> tuple[MotionWarning, ...]:
-    """Whether the arm is as late as its velocity limits ask for.
-
-    Args:
-        robot: whose limits they are.
-        q: (T, 6) postures, rad.
-        times: (T,) when the arm takes them, seconds.
-        due: (T,) times of the rollout, seconds.
-    """
-    if np.abs(times - within_velocity_limits(due, q, robot.velocity_limits)).max() <= MAX_DELAY_ERROR:
-        return ()
-    text = "the arm does not keep the times of its rollout and its velocity limits"
-    return (MotionWarning(Kind.OTHER_DELAY, text, ARM),)
-
-
-def clearance_warnings(said: float, kept: float) -> tuple[MotionWarning, ...]:
-    """Whether the motions that are shown keep the clearance that is said of them, both in metres."""
-    if said == kept or abs(said - kept) <= MAX_CLEARANCE_ERROR:
-        return ()
-    text = f"the motions shown keep {1e3 * kept:.1f} mm from the obstacle, not {1e3 * said:.1f} mm"
-    return (MotionWarning(Kind.OTHER_CLEARANCE, text),)
-
-
-def _beside(off: float, tolerance: float) -> tuple[MotionWarning, ...]:
-    if off <= tolerance:
-        return ()
-    text = f"what is shown is up to {in_millimetres(off)} beside the motion of the base system"
-    return (MotionWarning(Kind.OFF_MOTION, text),)
-
-
-def _of_ends(missed: Array, shown: DrawnSamples) -> tuple[MotionWarning, ...]:
-    """Warnings about starts and goal: of base motions that miss theirs by (R + 1, d), and of samples."""
-    texts = []
-    first = np.r_[True, np.diff(shown.index) > 0]
-    last = np.append(first[1:], True)
-    if not _longest(missed) <= MAX_OFF or (shown.index[first] != np.arange(len(missed) - 1)).any():
-        texts.append(f"the motions begin or end up to {in_millimetres(_longest(missed))} beside where they are to")
-    if (shown.fraction[first] != 0).any() or (shown.fraction[last] != 1).any():
-        texts.append("a motion is not shown from its start to its goal")
-    return tuple(MotionWarning(Kind.OTHER_ENDS, text) for text in texts)
-
-
-def _of_times(stack: Solution, shown: DrawnSamples, base_motion: Array) -> tuple[MotionWarning, ...]:
-    """Whether the base motion is elsewhere (N, d) at the times that are said."""
-    then = stack.rays.base.flow(stack.rays.z0[shown.index], shown.times[:, None])[:, 0]
-    off = np.linalg.norm(then - base_motion, axis=1) - np.where(shown.fraction == 1, ARRIVED, 0.0)
-    if off.max() <= MAX_OFF:
-        return ()
-    elsewhere = in_millimetres(float(off.max()))
-    text = f"the times are not those of the motion: at them it is up to {elsewhere} elsewhere"
-    return (MotionWarning(Kind.OTHER_TIMES, text),)
+        # coarse steps there and back are no inverses: then ψ⁻¹, which is what is drawn, is compared and looked at for
+        # folds
+        off, inverse = transform.inverse(x) - y, np.linalg.det(transform.inverse_jacobian(x[keep])[1])
+        det = np.append(det, inverse[~(inverse > 0)])
+    least, beside = float(det.min()), _longest(off * unit)
+    missed = _longest((transform.inverse(transform.forward(y[keep])) - y[keep]) * unit)
+    warnings = []
+    if not least > 0:
+        text = f"det J falls to {least:.2g}: the map folds space, the stack is no diffeomorphism there"
+        warnings.append(MotionWarning(Kind.NO_DIFFEOMORPHISM, text))
+    if not missed <= MAX_ROUND_TRIP:
+        text = f"a round trip through the stack misses by {1e3 * missed:.3g} mm: steps too coarse"
+        warnings.append(MotionWarning(Kind.ROUND_TRIP, text))
+    if not beside <= tolerance:
+        text = f"what is shown is up to {in_millimetres(beside)} beside the motion of the base system"
+        warnings.append(MotionWarning(Kind.OFF_MOTION, text))
+    worst = min(least, np.inf if known.min_det_jacobian is None else known.min_det_jacobian)
+    known = replace(known, min_det_jacobian=worst, round_trip_error=max(missed, known.round_trip_error or 0.0))
+    return known.warning(*warnings), images
 
 
 def _falls(distance: Array, shown: DrawnSamples) -> bool:
@@ -238,31 +178,6 @@ def _quicker(transform: Diffeomorphism) -> Diffeomorphism:
     if isinstance(transform, Conjugated) and isinstance(transform.inner, AdaptiveFlow):
         return replace(transform, inner=replace(transform.inner, tolerance=POSTURE_TOLERANCE))
     return transform
-
-
-def _determinant(transform: Diffeomorphism, y: Array, drawn_from: Array | None) -> float:
-    """Smallest det J at `y`, or of ψ⁻¹'s derivative where that is not positive at what it is `drawn_from`."""
-    det = np.linalg.det(transform.jacobian(y)[1])
-    if drawn_from is not None:
-        inverse = np.linalg.det(transform.inverse_jacobian(drawn_from)[1])
-        det = np.append(det, inverse[~(inverse > 0)])
-    return float(det.min())
-
-
-def _with_map(known: Certificates, det: float, round_trip: float) -> Certificates:
-    """The worse of the certificates known and of those of another map, and a warning for each failure."""
-    warnings = []
-    if not det > 0:
-        text = f"det J falls to {det:.2g}: the map folds space, the stack is no diffeomorphism there"
-        warnings.append(MotionWarning(Kind.NO_DIFFEOMORPHISM, text))
-    if not round_trip <= MAX_ROUND_TRIP:
-        text = f"a round trip through the stack misses by {1e3 * round_trip:.3g} mm: steps too coarse"
-        warnings.append(MotionWarning(Kind.ROUND_TRIP, text))
-    return replace(
-        known,
-        min_det_jacobian=min(det, np.inf if known.min_det_jacobian is None else known.min_det_jacobian),
-        round_trip_error=max(round_trip, known.round_trip_error or 0.0),
-    ).warning(*warnings)
 
 
 def _evenly(rows: Indices, num: int) -> Indices:

@@ -10,14 +10,13 @@ import numpy as np
 from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.avoidance.transform import MotionBelow, start_warnings
 from dt_viz.flows.diffeomorphisms import Chain, Conjugated, Diffeomorphism, Flow, Integration
-from dt_viz.flows.fields import Array, Indices
-from dt_viz.flows.rollouts import MAX_SAMPLES
-from dt_viz.motion.certificates import MAX_ROUND_TRIP
+from dt_viz.flows.fields import Array
+from dt_viz.flows.rollouts import MAX_SAMPLES, Bundle
+from dt_viz.motion.certificates import MAX_ROUND_TRIP, DrawnSamples
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.solve import Solved
 from dt_viz.motion.stack import Applied, Solution
 from dt_viz.robot.collision import Nearest
-from dt_viz.robot.robot import Robot
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.scenario.starts import REACH, SHOULDER
@@ -31,14 +30,10 @@ NUM_CHECKED_LIVE = 300
 """Number of samples on which it is computed what an integrator costs that was chosen by hand."""
 
 
-def motion_warnings(solved: Solved, missed: float) -> tuple[MotionWarning, ...]:
-    """Why the motion is not to be trusted.
-
-    Args:
-        solved: the motion.
-        missed: metres by which it ends beside the goal.
-    """
+def motion_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning, ...]:
+    """Why the motion that is drawn is not to be trusted."""
     nominal, scenario, stack, arm = solved.nominal, solved.scenario, solved.stack, solved.arm
+    missed = float(np.linalg.norm(drawn.positions[-1] - nominal.goal))
     warnings = [MotionWarning(Kind.IMITATION, text) for text in nominal.imitation.warnings]
     warnings += stack.warnings
     if max(len(stack.bundle.index), len(arm.index) if arm else 0) >= MAX_SAMPLES:
@@ -50,7 +45,7 @@ def motion_warnings(solved: Solved, missed: float) -> tuple[MotionWarning, ...]:
     if arm is not None:
         warnings += _of_arm(solved)
     for applied in stack.built:
-        top = _top(solved, applied, stack.bundle.index, stack.bundle.positions)
+        top = _top(solved, applied, stack.bundle)
         warnings += applied.transform.shortfall(top, applied.made, satisfied=applied.satisfied)
     warnings += integration
     if missed > MAX_GOAL_MISS and not _moves_goal(nominal, stack):
@@ -83,46 +78,33 @@ def _of_arm(solved: Solved) -> list[MotionWarning]:
 
 def anchor_warnings(stack: Solution) -> tuple[MotionWarning, ...]:
     """Warnings about transforms that lead motions to where the arm's hand cannot be."""
-    warnings = []
-    for applied in stack.built:
-        anchor = applied.transform.anchor
-        if anchor is None:
-            continue
-        away = float(np.linalg.norm(np.subtract(anchor, SHOULDER)))
-        if anchor[2] < 0:
-            warnings.append(
-                MotionWarning(Kind.MISPLACED, f"{applied.name}: the point is below the table", applied.name)
-            )
+    said = []
+    for name, anchor in ((applied.name, applied.transform.anchor) for applied in stack.built):
+        if anchor is not None and anchor[2] < 0:
+            said.append((name, "the point is below the table"))
+        away = 0.0 if anchor is None else float(np.linalg.norm(np.subtract(anchor, SHOULDER)))
         if away > REACH:
-            text = f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m"
-            warnings.append(MotionWarning(Kind.MISPLACED, f"{applied.name}: {text}", applied.name))
-    return tuple(warnings)
+            said.append((name, f"the point is {away:.2f} m from the arm's shoulder, which reaches {REACH:.2f} m"))
+    return tuple(MotionWarning(Kind.MISPLACED, f"{name}: {text}", name) for name, text in said)
 
 
-def _top(solved: Solved, applied: Applied, index: Indices, positions: Array) -> MotionBelow:
+def _top(solved: Solved, applied: Applied, drawn: DrawnSamples | Bundle) -> MotionBelow:
     """Samples of the whole stack's motions, as a transform of the stack is asked about them."""
-    nominal = solved.nominal
-    return MotionBelow(
-        nominal.starts,
-        nominal.goal,
-        index,
-        positions,
-        name=applied.name,
-        num_demonstrated=nominal.num_shaping,
-    )
+    nominal, samples = solved.nominal, (drawn.index, drawn.positions)
+    told = {"name": applied.name, "num_demonstrated": nominal.num_shaping}
+    return MotionBelow(nominal.starts, nominal.goal, *samples, **told)
 
 
-def target_warnings(solved: Solved, robot: Robot) -> tuple[MotionWarning, ...]:
+def target_warnings(solved: Solved, drawn: DrawnSamples) -> tuple[MotionWarning, ...]:
     """Warnings about transforms that the stack satisfies, but the avoidance of obstacles does not."""
-    stack, arm = solved.stack, solved.arm
-    bundle = stack.bundle if arm is None else arm
-    positions = stack.bundle.positions if arm is None else robot.end_effector(arm.p)
-    who = "a motion" if arm is None else "the arm"
+    if not solved.scenario.avoids or solved.scenario.warp < 1:
+        return ()
+    who = "a motion" if solved.arm is None else "the arm"
     return tuple(
         warning
-        for applied in stack.built
+        for applied in solved.stack.built
         if applied.satisfied
-        for warning in applied.transform.deflected(_top(solved, applied, bundle.index, positions), applied.made, who)
+        for warning in applied.transform.deflected(_top(solved, applied, drawn), applied.made, who)
     )
 
 

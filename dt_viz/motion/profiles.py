@@ -14,7 +14,9 @@ from dt_viz.metrics import (
     maximum_collision_distance,
     resample_by_arc_length,
 )
-from dt_viz.obstacles.union import Union
+from dt_viz.motion.certificates import DrawnSamples
+from dt_viz.motion.following import Follower
+from dt_viz.motion.solve import Solved
 
 NUM_SAMPLES = 120
 """Number of samples at even distances along a path, start and goal included."""
@@ -53,32 +55,48 @@ class Profiles:
         return np.linspace(0, 1, len(self.shown.lyapunov))
 
 
-def hand_profile(path: Array, demonstration: Array, potential: Array, obstacle: Union) -> Profile:
-    """Profile of a motion of the end effector.
+def profiles(motion: Solved, drawn: DrawnSamples, rollout: int, follower: Follower) -> Profiles:
+    """Profiles of a rollout, with and without behaviours.
 
     Args:
-        path: (T, 3) its samples, metres.
-        demonstration: (M, 3), metres.
-        potential: (T,) Lyapunov value at the samples.
-        obstacle: that it is to keep clear of.
+        motion: what it is a rollout of.
+        drawn: its rollouts.
+        rollout: index of this one.
+        follower: the arm.
     """
-    depth = maximum_collision_distance(path, obstacle.signed_distance)
-    return _profile(path, demonstration, potential, obstacle.signed_distance(path), depth)
+    nominal, arm, task, rows = motion.nominal, motion.arm, motion.nominal.task, drawn.index == rollout
+    number, obstacle = nominal.numbers[rollout], motion.scenario.obstacle
+    of_mean = number >= nominal.num_demonstrated
+    demonstration = task.mean_path if of_mean else task.paths[number]
+    paths, below = (drawn.positions[rows], nominal.paths[rollout]), drawn.positions[rows]
+    if arm is None:
+        clearances = [obstacle.signed_distance(path) for path in paths]
+        depths = [maximum_collision_distance(path, obstacle.signed_distance) for path in paths]
+    else:
+        fraction = nominal.trajectories[rollout].fraction
+        q = follower.undisturbed_along(nominal, rollout).at(np.zeros(len(fraction), int), fraction)
+        below = follower.robot.end_effector(arm.transform.forward(arm.p[rows]))
+        clearances = [follower.whole_arm.clearance(postures, obstacle) for postures in (arm.p[rows], q)]
+        depths = [-float(clearance.min()) for clearance in clearances]
+    states = motion.stack.states(drawn.index[rows], drawn.fraction[rows], below)
+    values = motion.stack.system.lyapunov(states), nominal.system.lyapunov(nominal.states_of(rollout))
+    shown, undisturbed = (
+        profile(path, demonstration, potential, clearance, depth)
+        for path, potential, clearance, depth in zip(paths, values, clearances, depths, strict=True)
+    )
+    return Profiles(shown, undisturbed, of_body=arm is not None, of_mean=of_mean)
 
 
-def body_profile(path: Array, demonstration: Array, potential: Array, clearance: Array) -> Profile:
-    """Profile of a motion of the whole arm.
+def profile(path: Array, demonstration: Array, potential: Array, clearance: Array, depth: float) -> Profile:
+    """Profile of one motion.
 
     Args:
         path: (T, 3) end effector at its samples, metres.
         demonstration: (M, 3), metres.
         potential: (T,) Lyapunov value at the samples.
-        clearance: (T,) of the spheres that cover the arm at the samples, metres.
+        clearance: (T,) of what avoids the obstacles at the samples, metres.
+        depth: how deep that enters them, metres, negative where it is clear.
     """
-    return _profile(path, demonstration, potential, clearance, -float(clearance.min()))
-
-
-def _profile(path: Array, demonstration: Array, potential: Array, clearance: Array, depth: float) -> Profile:
     length = arc_length(path)
     moves = np.r_[True, np.diff(length) > 0]
     places = np.linspace(0, length[-1], NUM_SAMPLES)

@@ -11,7 +11,7 @@ import numpy as np
 from dt_viz.avoidance.arm import ArmSolution, Lift
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.transform import start_warnings
-from dt_viz.flows.fields import Array, Indices
+from dt_viz.flows.fields import Indices
 from dt_viz.motion.following import Follower
 from dt_viz.motion.nominal import Nominal
 from dt_viz.motion.stack import LIVE, Precision, Solution, build_stack
@@ -23,7 +23,7 @@ NUM_ALTERNATIVES = 3
 """Number of other stances that are tried where the arm finds no way around the obstacle."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solved:
     """A scenario's motion: the end effector's stack, and how the whole arm avoids on top of it."""
 
@@ -48,13 +48,6 @@ class Solved:
     def cleared(self) -> bool:
         """Whether the whole arm, where it avoids, finds a way."""
         return self.arm is None or self.arm.cleared
-
-    @property
-    def ends(self) -> Array:
-        """(R + 1, 3) where the end effector's motions are to begin, and where all are to end, metres."""
-        goal, built = self.nominal.goal, self.stack.built
-        moved = built[-1].made.goal - goal if built else np.zeros_like(goal)
-        return np.concatenate([self.nominal.starts, [goal + self.scenario.warp * moved]])
 
 
 def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: Follower) -> Solved:

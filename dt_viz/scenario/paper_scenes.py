@@ -73,7 +73,7 @@ class PaperScene:
     def is_changed(self, scenario: Scenario, task: Task) -> bool:
         """Return whether the stack differs from the scene's own."""
         own, followed = _own(self.name, task), {"starts": scenario.starts, "arm_rollout": scenario.arm_rollout}
-        return not scenario.moves_like(replace(own, warp=scenario.warp, **followed))
+        return scenario.choices != replace(own, warp=scenario.warp, **followed).choices
 
 
 def _avoiding(task: Task, avoidance: Avoidance) -> Scenario:

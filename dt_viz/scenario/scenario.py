@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -30,13 +31,10 @@ MAX_STARTS = 36
 MAX_MARGIN = 0.05
 """Largest margin, metres."""
 
-COMPUTED_VIEWS = ("field", "streamlines", "generator", "grid", "health_plots")
-"""Fields of `View` whose pictures are computed only while they are shown."""
-
 
 @dataclass(frozen=True)
 class View:
-    """View of a result; changing it moves nothing. Pictures of `COMPUTED_VIEWS` are computed only while shown."""
+    """View of a result; changing it moves nothing."""
 
     demonstrations: bool = True
     rollouts: bool = True
@@ -106,6 +104,22 @@ class View:
     def shows_arm_motion(self) -> bool:
         """Whether something is drawn from the arm's motion along its rollout, as replay is."""
         return self.replay or self.onion or self.joint_plots
+
+    @property
+    def computed(self) -> Mapping[str, object]:
+        """What is computed only while it is shown, and the choices that it depends on beside the motion."""
+        wanted = {
+            "place": (self.slice, self.level, self.phase),
+            "field": self.field,
+            "streamlines": self.streamlines,
+            "generator": self.generator and (self.generator_layer,),
+            "grid": self.grid,
+            "colour": self.colour != "none" and self.colour,
+            "panels": self.panels,
+            "health plots": self.health_plots,
+            "compared": self.compared and (self.compared, self.their_arm),
+        }
+        return {name: choices for name, choices in wanted.items() if choices}
 
 
 @dataclass(frozen=True)
@@ -211,39 +225,29 @@ class Scenario:
         return min(self.view.selected, len(self.obstacles) - 1) if self.obstacles else None
 
     @cached_property
-    def plain(self) -> Scenario:
-        """The same with the view that a scenario begins with: all that moves, and nothing of how it is looked at."""
+    def choices(self) -> Scenario:
+        """All that is chosen but how it is looked at: the same scenario with the view that it begins with."""
         return replace(self, view=View())
 
     @cached_property
     def motion(self) -> Scenario:
-        """What the motions depend on: the same also without the choice of the one that the arm follows."""
+        """What the motions depend on: the choices without that of the rollout that the arm follows."""
         return replace(self, view=View(), arm_rollout=0, scene="")
 
-    def moves_like(self, other: Scenario) -> bool:
-        """Return whether both give the same motion, however it is viewed."""
-        return replace(self, view=other.view) == other
+    @cached_property
+    def full(self) -> Scenario:
+        """What the motions depend on when every flow has run for its full duration."""
+        return replace(self.motion, warp=1.0)
 
-    def passes_like(self, other: Scenario) -> bool:
-        """Return whether both give the same motion when every flow has run for its full duration."""
-        return replace(self.motion, warp=1.0) == replace(other.motion, warp=1.0)
-
-    def learns_like(self, other: Scenario) -> bool:
-        """Return whether both need the same fit."""
-        return (self.task, self.objective, self.state) == (other.task, other.objective, other.state)
+    @property
+    def fit(self) -> tuple[str, Objective, State]:
+        """What is to be learned before there are motions."""
+        return self.task, self.objective, self.state
 
     def begins_like(self, other: Scenario) -> bool:
         """Return whether both have the same task, fit and scene, so that one is a small edit of the other."""
-        return self.learns_like(other) and self.scene == other.scene
+        return (self.fit, self.scene) == (other.fit, other.scene)
 
     def computes_like(self, other: Scenario) -> bool:
         """Return whether a frame of `other` holds all that this scenario needs."""
-        before, after = other.view, self.view
-        shows_no_more = all(getattr(before, name) or not getattr(after, name) for name in COMPUTED_VIEWS)
-        same_layer = not after.generator or after.generator_layer == before.generator_layer
-        same_colour = after.colour in {"none", before.colour}
-        same_place = (after.slice, after.level, after.phase) == (before.slice, before.level, before.phase)
-        same_panels = after.panels in ((), before.panels)
-        same_methods = after.compared == () or (after.compared, after.their_arm) == (before.compared, before.their_arm)
-        same_pictures = shows_no_more and same_layer and same_colour and same_place and same_panels and same_methods
-        return self.moves_like(other) and same_pictures
+        return self.choices == other.choices and self.view.computed.items() <= other.view.computed.items()

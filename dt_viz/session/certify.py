@@ -1,86 +1,81 @@
-"""Certificates of a frame: of the motions that it shows, with the transforms that they were solved with."""
+"""Checks of a frame: of the motions that it shows, with the transforms that they were solved with."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from dt_viz.avoidance.arm import ArmSolution
+from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.metrics import maximum_collision_distance
 from dt_viz.motion.certificates import (
-    MAX_OFF,
+    MAX_OFF_POSTURE,
     MAX_OFF_TRACKED,
+    NUM_POSTURES,
     Certificates,
     DrawnSamples,
     certified,
-    certified_arm,
-    clearance_warnings,
-    delay_warnings,
-    hand_warnings,
+    certified_map,
 )
-from dt_viz.motion.diagnostics import fold_warnings, margin_warnings
-from dt_viz.motion.following import Follower, arm_samples
+from dt_viz.motion.diagnostics import (
+    anchor_warnings,
+    fold_warnings,
+    margin_warnings,
+    motion_warnings,
+    target_warnings,
+)
+from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
+from dt_viz.obstacles.union import Union
 from dt_viz.robot.collision import load_collision_model
 from dt_viz.scenario.stack import WHOLE_ARM
 from dt_viz.session.frame import Frame
-from dt_viz.warning import ARM, Kind
+from dt_viz.warning import Kind
 
 
-def certify(frame: Frame, fine: Solved, follower: Follower) -> Certificates:
-    """Certificates of the motions that the frame shows, with the transforms that they were solved with."""
-    known = _certified_hand(frame, fine) if fine.arm is None else _certified_arm(frame, fine, fine.arm, follower)
-    if frame.arm is None or frame.chosen is None:
-        return known
-    path, due = frame.rollouts[frame.chosen], frame.times[frame.chosen]
-    if fine.arm is None:
-        keep = arm_samples(len(path))
-        known = known.warning(*hand_warnings(follower.robot, frame.arm.q, path[keep], source=ARM))
-        due = due[keep]
-    return known.warning(*delay_warnings(follower.robot, frame.arm.q, frame.arm.times, due))
+def uncertified(motion: Solved, drawn: DrawnSamples, follower: Follower) -> Certificates:
+    """What is known of a motion at once: its clearance, and what it does not get that it wants."""
+    kept = motion.arm.clearance if motion.arm else clearance(motion, drawn, motion.scenario.obstacle, follower)
+    found = (*motion_warnings(motion, drawn), *anchor_warnings(motion.stack), *target_warnings(motion, drawn))
+    return Certificates(kept, found=found)
 
 
-def _certified_hand(frame: Frame, fine: Solved) -> Certificates:
-    stack, obstacle, path = fine.stack, frame.scenario.obstacle, np.concatenate(frame.rollouts)
-    shown = DrawnSamples(stack.bundle.index, stack.bundle.fraction, np.concatenate(frame.times), path)
-    known = certified(frame.certificates, stack, fine.ends, shown)
-    known = known.warning(*clearance_warnings(known.clearance, float(obstacle.signed_distance(path).min())))
-    depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
-    return replace(known, clearance=-depth if depth > 0 else known.clearance)
+def clearance(motion: Solved, drawn: DrawnSamples, obstacle: Union, follower: Follower) -> float:
+    """Smallest distance of what moves, the end effector or the spheres that cover the arm, from an obstacle, metres."""
+    if motion.arm is None:
+        return float(obstacle.signed_distance(drawn.positions).min())
+    return float(follower.whole_arm.clearance(motion.arm.p, obstacle).min())
 
 
-def _certified_arm(frame: Frame, fine: Solved, arm: ArmSolution, follower: Follower) -> Certificates:
-    scenario, robot, whole_arm = frame.scenario, follower.robot, follower.whole_arm
-    p, undisturbed, known = arm.p.copy(), whole_arm.limits.inside(arm.q), frame.certificates
+def certify(frame: Frame, follower: Follower) -> Certificates:
+    """Certificates of the motions that a frame shows."""
+    motion, known, drawn = frame.motion, frame.certificates, frame.drawn
+    arm, avoidance, obstacle = motion.arm, motion.scenario.arm_avoidance, motion.scenario.obstacle
+    if arm is None or avoidance is None:
+        depth = max(maximum_collision_distance(path, obstacle.signed_distance) for path in frame.rollouts)
+        known = replace(known, clearance=-depth if depth > 0 else known.clearance)
+        return certified(known, motion.stack, drawn)
+    p, undisturbed, integration = arm.p.copy(), follower.whole_arm.limits.inside(arm.q), avoidance.integration
     if frame.arm is not None:
         p[arm.index == frame.chosen] = frame.arm.q
-    path, times = np.concatenate(frame.rollouts), np.concatenate(frame.times)
-    avoidance = scenario.arm_avoidance
-    assert avoidance is not None
-    integration = avoidance.integration
-    known = known.warning(
-        *hand_warnings(robot, p, path, tolerance=MAX_OFF),
-        *fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed),
+    known = known.warning(*fold_warnings(WHOLE_ARM, arm.transform, integration, p, undisturbed))
+    known, q = certified_map(
+        known, arm.transform, p, undisturbed, NUM_POSTURES, MAX_OFF_POSTURE, LEVERS, by_hand=integration.by_hand
     )
-    known, q = certified_arm(known, arm.transform, p, undisturbed, by_hand=integration.by_hand)
-    shown = DrawnSamples(arm.index, arm.fraction, times, robot.end_effector(q))
-    known = certified(known, fine.stack, fine.ends, shown, tolerance=MAX_OFF_TRACKED)
-    shaping = arm.index < len(frame.rollouts) - fine.nominal.num_added
-    kept = float(whole_arm.clearance(p[shaping], avoidance.avoided).min())
-    return known.warning(*clearance_warnings(known.clearance, kept))
+    below = replace(drawn, positions=follower.robot.end_effector(undisturbed if integration.by_hand else q))
+    return certified(known, motion.stack, below, tolerance=MAX_OFF_TRACKED)
 
 
-def with_meshes(known: Certificates, frame: Frame, fine: Solved) -> Certificates:
+def with_meshes(frame: Frame) -> Certificates:
     """Certificates with distances of the arm's meshes: on the motion that it shows, and on all that it avoids along."""
-    assert frame.arm is not None
-    model, scenario, avoidance = load_collision_model(), frame.scenario, frame.scenario.arm_avoidance
+    known, motion = frame.certificates, frame.motion
+    if frame.arm is None:
+        return known
+    model, scenario, avoidance = load_collision_model(), motion.scenario, motion.scenario.arm_avoidance
     report = model.report(frame.arm.q, scenario.obstacle)
     # what gives way only in part may still be in the obstacle
     apart = {Kind.ARM_ENTERS} if scenario.warp < 1 else set()
     known = replace(known, collision=report).warning(*(w for w in report.warnings if w.kind not in apart))
-    if fine.arm is None or avoidance is None:
+    if motion.arm is None or avoidance is None:
         return known
-    shaping = range(len(frame.rollouts) - fine.nominal.num_added)
-    nearest = [model.nearest_to_obstacle(fine.arm.p[fine.arm.index == k], avoidance.avoided) for k in shaping]
-    return known.warning(*margin_warnings(scenario, nearest, fine.nominal.numbers))
+    shaping = range(len(frame.rollouts) - frame.num_added)
+    nearest = [model.nearest_to_obstacle(motion.arm.p[motion.arm.index == k], avoidance.avoided) for k in shaping]
+    return known.warning(*margin_warnings(scenario, nearest, motion.nominal.numbers))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,19 +11,17 @@ from dt_viz.baselines.base import INSTALL, Method, NotFittedError, Planner, Prob
 from dt_viz.baselines.registry import METHODS, problem_of
 from dt_viz.errors import Cancelled, end_if, never
 from dt_viz.flows.fields import Array, Indices
-from dt_viz.memo import Memo
+from dt_viz.memo import Memo, kept
 from dt_viz.metrics import discrete_frechet, distance_from_path, maximum_collision_distance, resample_by_arc_length
 from dt_viz.motion.following import ArmMotion, Follower, arm_samples
 from dt_viz.motion.nominal import Learned
 from dt_viz.motion.profiles import NUM_SAMPLES
-from dt_viz.motion.solve import Solved
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import UnreachableError, track
 from dt_viz.robot.retiming import within_velocity_limits
-from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.tasks import Task
-from dt_viz.session.compose import arm_along
+from dt_viz.session.drawing import arm_along
 from dt_viz.session.frame import Compared, Frame, Scores
 
 OURS = METHODS["ours"]
@@ -36,28 +34,12 @@ TOLERANCE = 1e-4
 WAITS, NEXT, NO_WAY = "waits for the obstacle to rest", "waits for its turn", "finds no way"
 
 
-@dataclass(frozen=True, eq=False)
-class _Motions:
-    """Motions of a method, from the starts of the demonstrations."""
-
-    paths: tuple[Array, ...] = ()
-    """(N_i, 3), metres; none where there are no motions."""
-    times: tuple[Array, ...] = ()
-    """(N_i,), s."""
-    joints: tuple[Array, ...] | None = None
-    """(N_i, 6), rad, where the method plans them."""
-    scores: Scores | None = None
-    note: str = ""
-
-
 @dataclass(eq=False)
 class _Record:
     """What is known of a method around an obstacle; it grows while the obstacle rests."""
 
-    motions: _Motions | None = None
-    """None until they are planned."""
-    arm_depth: float | None = None
-    """Maximum collision distance of the arm's meshes, metres; None until it is known, or where there is no motion."""
+    known: Compared | None = None
+    """Without curves and arm; None until its motions are planned."""
     is_complete: bool = False
     """Whether nothing is left to work out."""
     curves: dict[int, Array] = field(default_factory=dict)
@@ -66,12 +48,19 @@ class _Record:
     """Motions of the arm, by the rollout that they follow."""
 
 
+def _around(method: Method, learned: Learned, frame: Frame) -> tuple[Hashable, ...]:
+    """What a method's motions depend on."""
+    if method is OURS:
+        return method.name, learned, frame.drawn, bool(frame.blocked)
+    return method.name, learned, frame.scenario.obstacle
+
+
 class Comparison:
     """Motions of other methods, for one engine and on its thread; what an edit leaves unchanged is kept."""
 
     def __init__(self, follower: Follower, memo: Memo) -> None:
         """Compare methods for this arm."""
-        self._follower, self._memo = follower, memo
+        self._follower, self.memo = follower, memo
 
     def of(self, frame: Frame, learned: Learned, notes: Mapping[str, str] | None = None) -> tuple[Compared, ...]:
         """The methods that the view of a frame shows, ours first; those that do not follow a drag as far as known.
@@ -81,25 +70,19 @@ class Comparison:
             learned: its task, learned.
             notes: what is said of methods, by their names, while they are not planned.
         """
-        chosen = _chosen(frame.scenario)
-        rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
-        for method in chosen:
+        for method in _chosen(frame):
             if method.live:
                 self._plan(method, frame, learned)
         return tuple(
-            self._compared(method, frame, learned, rollout, (notes or {}).get(method.name, WAITS))
-            for method in ((OURS, *chosen) if chosen else ())
+            self._compared(method, frame, learned, (notes or {}).get(method.name, WAITS)) for method in _chosen(frame)
         )
 
-    def complete(
-        self, frame: Frame, learned: Learned, solved: Solved | None, cancelled: Cancelled
-    ) -> Iterator[Mapping[str, str]]:
+    def complete(self, frame: Frame, learned: Learned, cancelled: Cancelled) -> Iterator[Mapping[str, str]]:
         """Work out what is left for a scenario that rests; stops whenever `of` would tell more.
 
         Args:
             frame: ours.
             learned: its task, learned.
-            solved: our motion; None where there is none.
             cancelled: asked between parts of the work.
 
         Yields:
@@ -108,79 +91,68 @@ class Comparison:
         Raises:
             UnwantedError: it is cancelled.
         """
-        chosen = _chosen(frame.scenario)
-        slow = [method for method in chosen if self._record(method, frame, learned).motions is None]
+        slow = [method for method in _chosen(frame) if self._record(method, learned, frame).known is None]
         for k, method in enumerate(slow):
             left = {later.name: NEXT for later in slow[k + 1 :]}
             yield {method.name: f"planning … ({k + 1} of {len(slow)})", **left}
             self._plan(method, frame, learned, cancelled)
         if slow:
             yield {}
-        if not frame.scenario.obstacle.parts:
-            return
-        for method in (OURS, *chosen) if chosen else ():
-            record = self._record(method, frame, learned)
+        for method in _chosen(frame) if frame.scenario.obstacle.parts else ():
+            record = self._record(method, learned, frame)
             if not record.is_complete:
-                record.arm_depth = self._arm_depth(method, record, frame, learned, solved, cancelled)
+                known = record.known
+                if known is not None and known.scores is not None:
+                    depth = self._arm_depth(known, frame, learned, cancelled)
+                    record.known = replace(known, scores=replace(known.scores, arm_depth=depth))
                 record.is_complete = True
                 yield {}
 
-    def _record(self, method: Method, frame: Frame, learned: Learned) -> _Record:
+    @kept(NEWEST, by=_around)
+    def _record(self, method: Method, learned: Learned, frame: Frame) -> _Record:
         """What is known of a method around the obstacle of a frame: one place for all that is kept."""
-        obstacle = frame.scenario.obstacle
-        if method is not OURS:
-            return self._memo("compared", (method.name, learned, obstacle), _Record, newest=NEWEST)
-        shown = tuple(path.tobytes() for path in frame.rollouts), bool(frame.blocked)
-        return self._memo("ours", (learned, frame.scenario.motion, shown), lambda: _Record(_ours(frame)), newest=NEWEST)
+        return _Record(_ours(frame) if method is OURS else None)
 
-    def _compared(self, method: Method, frame: Frame, learned: Learned, rollout: int, waiting: str) -> Compared:
+    def _compared(self, method: Method, frame: Frame, learned: Learned, waiting: str) -> Compared:
         """What is known of a method; `waiting` is its note while its motions are not."""
-        record, obstacle = self._record(method, frame, learned), frame.scenario.obstacle
-        motions = record.motions or _Motions(note=waiting)
-        if motions.paths and rollout not in record.curves:
-            record.curves[rollout] = curves(motions.paths[rollout], learned.task.paths[rollout], obstacle)
+        record = self._record(method, learned, frame)
+        known = record.known or Compared(method, note=waiting)
+        rollout = frame.chosen if frame.chosen is not None and frame.chosen < len(learned.task.starts) else 0
+        if known.paths and rollout not in record.curves:
+            path, demonstration = known.paths[rollout], learned.task.paths[rollout]
+            record.curves[rollout] = curves(path, demonstration, frame.scenario.obstacle)
         shows_arm = frame.scenario.view.their_arm == method.name
-        if shows_arm and rollout not in record.arms and motions.times and len(motions.times[rollout]) > 1:
-            record.arms[rollout] = self._arm(motions, learned, rollout)
-        return Compared(
-            method,
-            motions.paths,
-            motions.scores and replace(motions.scores, arm_depth=record.arm_depth),
-            record.curves.get(rollout),
-            rollout,
-            motions.note,
-            record.arms.get(rollout) if shows_arm else None,
-        )
+        if shows_arm and rollout not in record.arms and known.times and len(known.times[rollout]) > 1:
+            record.arms[rollout] = self._arm(known, learned, rollout)
+        arm = record.arms.get(rollout) if shows_arm else None
+        return replace(known, rollout=rollout, curves=record.curves.get(rollout), arm=arm)
 
     def _plan(self, method: Method, frame: Frame, learned: Learned, cancelled: Cancelled = never) -> None:
         """Plan a method's motions unless they are known; those that do not avoid are the same around all obstacles."""
-        record, obstacle = self._record(method, frame, learned), frame.scenario.obstacle
-        if record.motions is not None:
-            return
-        if method.avoids:
-            record.motions = self._planned(method, learned, obstacle, cancelled)
-            return
-        motions = self._memo(
-            "motions", (method.name, learned), lambda: self._planned(method, learned, Union(), cancelled)
-        )
-        scores = motions.scores and replace(motions.scores, hand_depth=hand_depth(motions.paths, obstacle))
-        record.motions = replace(motions, scores=scores)
+        record, obstacle = self._record(method, learned, frame), frame.scenario.obstacle
+        if record.known is None:
+            known = self._planned(method, learned, obstacle if method.avoids else Union(), cancelled)
+            if known.scores is not None and not method.avoids:
+                known = replace(known, scores=replace(known.scores, hand_depth=hand_depth(known.paths, obstacle)))
+            record.known = known
 
-    def _planned(self, method: Method, learned: Learned, obstacle: Union, cancelled: Cancelled) -> _Motions:
-        planner = self._memo("planner", (method.name, learned), lambda: self._fitted(method, learned), newest=NEWEST)
+    @kept(NEWEST, by=lambda method, learned, obstacle, _: (method.name, learned, obstacle))
+    def _planned(self, method: Method, learned: Learned, obstacle: Union, cancelled: Cancelled) -> Compared:
+        planner = self._planner(method, learned)
         if isinstance(planner, str):
-            return _Motions(note=planner)
+            return Compared(method, note=planner)
         try:
             plan = planner.plan(obstacle, learned.task.starts, cancelled)
         except UnreachableError as error:
-            return _Motions(note=str(error))
+            return Compared(method, note=str(error))
         stays = sum(len(path) < 2 for path in plan.paths)
         notes = (*plan.warnings, *([f"{NO_WAY} from {stays} of {len(plan.paths)} starts"] if stays else []))
         paths = tuple(path if len(path) > 1 else np.repeat(path, 2, axis=0) for path in plan.paths)
         scores = scored(paths, learned.task, learned.goal, obstacle)
-        return _Motions(paths, plan.times, plan.joints, scores, "; ".join(notes))
+        return Compared(method, paths, plan.times, plan.joints, scores, "; ".join(notes))
 
-    def _fitted(self, method: Method, learned: Learned) -> Planner | str:
+    @kept(NEWEST, by=lambda method, learned: (method.name, learned))
+    def _planner(self, method: Method, learned: Learned) -> Planner | str:
         """The planner of a method for a task, or why there is none."""
         if method.missing:
             return f"needs {', '.join(method.missing)}: {INSTALL}"
@@ -189,46 +161,36 @@ class Comparison:
         except (NotFittedError, UnreachableError) as error:
             return str(error)
 
+    @kept(NEWEST)
     def _problem(self, learned: Learned) -> Problem:
-        return self._memo("problem", learned, lambda: problem_of(learned, self._follower), newest=NEWEST)
+        return problem_of(learned, self._follower)
 
-    def _arm(self, motions: _Motions, learned: Learned, rollout: int) -> ArmMotion:
+    def _arm(self, known: Compared, learned: Learned, rollout: int) -> ArmMotion:
         """The arm's motion along a rollout of a method."""
-        q, times = self._joints(motions, learned, rollout), motions.times[rollout]
-        if motions.joints is None:
+        q, times = self._joints(known, learned, rollout), known.times[rollout]
+        if known.joints is None:
             times = times[_tracked(len(times))]
         return ArmMotion(within_velocity_limits(times, q, self._follower.robot.velocity_limits), q, q)
 
-    def _joints(self, motions: _Motions, learned: Learned, rollout: int) -> Array:
+    def _joints(self, known: Compared, learned: Learned, rollout: int) -> Array:
         """Postures (N, 6), rad, along a rollout: planned, or tracking it from the demonstration's first posture."""
-        if motions.joints is not None:
-            return motions.joints[rollout]
-        path = motions.paths[rollout]
+        if known.joints is not None:
+            return known.joints[rollout]
+        path = known.paths[rollout]
         start = self._problem(learned).postures[rollout][0]
         return track(self._follower.robot, path[_tracked(len(path))], start).q
 
-    def _arm_depth(
-        self,
-        method: Method,
-        record: _Record,
-        frame: Frame,
-        learned: Learned,
-        solved: Solved | None,
-        cancelled: Cancelled,
-    ) -> float | None:
-        """How deep the arm's meshes enter the obstacle along a method's motions, metres; None where there are none."""
-        motions, obstacle = record.motions, frame.scenario.obstacle
-        if motions is None or not motions.paths:
-            return None
-        if method is not OURS:
-            return _deepest([self._joints(motions, learned, k) for k in range(len(motions.paths))], obstacle, cancelled)
-        if solved is None:
-            return None
+    def _arm_depth(self, known: Compared, frame: Frame, learned: Learned, cancelled: Cancelled) -> float | None:
+        """How deep the arm's meshes enter the obstacle along motions, metres; None where it cannot follow."""
         try:
-            arms = [arm_along(frame, solved, k, self._follower)[0] for k in range(len(frame.rollouts))]
+            if known.method is OURS:
+                rollouts = range(len(frame.rollouts))
+                joints = [arm_along(frame, k, self._follower)[0].q for k in rollouts]
+            else:
+                joints = [self._joints(known, learned, k) for k in range(len(known.paths))]
         except UnreachableError:
             return None
-        return _deepest([arm.q for arm in arms], obstacle, cancelled)
+        return _deepest(joints, frame.scenario.obstacle, cancelled)
 
 
 def _deepest(joints: list[Array], obstacle: Union, cancelled: Cancelled) -> float:
@@ -280,17 +242,18 @@ def _tracked(num: int) -> Indices:
     return np.unique(arm_samples(num))
 
 
-def _chosen(scenario: Scenario) -> list[Method]:
-    return [method for method in OTHERS if method.name in scenario.view.compared]
+def _chosen(frame: Frame) -> list[Method]:
+    """The methods that the view of a frame shows, ours first; none where it shows no others."""
+    others = [method for method in OTHERS if method.name in frame.scenario.view.compared]
+    return [OURS, *others] if others else []
 
 
-def _ours(frame: Frame) -> _Motions:
+def _ours(frame: Frame) -> Compared:
     """Our motions, those from the starts of the demonstrations that have one."""
     if frame.blocked:
-        return _Motions(note="; ".join(warning.text for warning in frame.blocked[:1]))
+        return Compared(OURS, note=frame.blocked[0].text)
     paths = frame.rollouts[: len(frame.rollouts) - frame.num_added]
     if len(paths) < len(frame.task.starts):
-        return _Motions(note=f"{NO_WAY} from some starts")
-    return _Motions(
-        paths, frame.times[: len(paths)], None, scored(paths, frame.task, frame.goal, frame.scenario.obstacle)
-    )
+        return Compared(OURS, note=f"{NO_WAY} from some starts")
+    scores = scored(paths, frame.task, frame.goal, frame.scenario.obstacle)
+    return Compared(OURS, paths, frame.times[: len(paths)], scores=scores)

@@ -1,4 +1,4 @@
-"""Scenario → motion → frames. Knows no browser; keeps what an edit leaves unchanged."""
+"""Scenario → motion → pictures and checks of it, as frames. Knows no browser; keeps what an edit leaves unchanged."""
 
 from __future__ import annotations
 
@@ -6,42 +6,37 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from dt_viz.avoidance.avoidance import Avoidance
 from dt_viz.avoidance.transform import Transform
 from dt_viz.errors import Cancelled, never
-from dt_viz.flows.augmented_systems import frozen
-from dt_viz.flows.fields import Array
-from dt_viz.flows.rollouts import Rays
 from dt_viz.learning.augmented import AugmentedImitation
 from dt_viz.learning.imitation import ImitationSettings, Progress
 from dt_viz.learning.store import FitStore
 from dt_viz.learning.style import Style
-from dt_viz.memo import Memo
-from dt_viz.motion.certificates import Certificates
-from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower
-from dt_viz.motion.nominal import Learned, Nominal
+from dt_viz.memo import Memo, kept
+from dt_viz.motion.certificates import Certificates, DrawnSamples
+from dt_viz.motion.following import NEWEST, Admission, ArmMotion, Follower, far_starts, unreachable
+from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
+from dt_viz.motion.profiles import profiles
 from dt_viz.motion.solve import Solved, solve, warped
 from dt_viz.motion.stack import FINE, LIVE, Precision
-from dt_viz.pictures.arm_field import Lattice
-from dt_viz.pictures.sketchbook import Pictures, Sketchbook, in_frame
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.robot import Robot
 from dt_viz.scenario.panels import Panel
-from dt_viz.scenario.scenario import Layer, Scenario
+from dt_viz.scenario.scenario import Layer, Scenario, Start
 from dt_viz.scenario.tasks import STYLES, Task, TaskEntry
-from dt_viz.session import compose
-from dt_viz.session.certify import certify, with_meshes
+from dt_viz.session.certify import certify, clearance, uncertified, with_meshes
 from dt_viz.session.comparison import Comparison
 from dt_viz.session.cores import Cores
+from dt_viz.session.drawing import Drawing, arm_along, rollouts_of
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.robot_loop import LiveArm
 from dt_viz.warning import MotionWarning
 
 _cores = Cores()
 """Slots of all engines."""
-
-NUM_BOOKS = 8
-"""Number of learned motions whose pictures are kept."""
 
 
 class Engine:
@@ -71,12 +66,11 @@ class Engine:
         """The arm in the loop."""
         self.comparison = Comparison(self.follower, self.memo)
         """Other methods beside ours."""
-        self._shown: dict[str, tuple[Frame, Solved]] = {}
-        """The frame of each task that was computed last, and its motion."""
+        self._drawing = Drawing(self.follower, self.memo)
+        self._last: dict[str, Solved] = {}
+        """The last motion of each task: what is shown where a scenario has none."""
         self._seconds = 0.0
         """Time that the frames of a scenario have taken so far, seconds."""
-        self._yielded: Solved | None = None
-        """The motion of the frame that was yielded last; where that is blocked, the one before."""
 
     def task(self, name: str) -> Task:
         """The task of that name, which all engines share; any thread may ask for it.
@@ -102,113 +96,69 @@ class Engine:
             UnwantedError: it is cancelled.
         """
         self.nominal(scenario, progress)
-        for panel in scenario.view.panels:
-            if panel.task:
-                self._imitated(panel, progress)
+        others = {panel.shown: Scenario(panel.task, state=panel.state) for panel in scenario.view.panels if panel.shown}
+        learned = {panel: self.nominal(other, progress).learned for panel, other in others.items()}
         self._seconds, began = 0.0, time.perf_counter()
-        for frame in self._stages(scenario, cancelled):
+        for frame in self._stages(scenario, learned, cancelled):
             self._seconds += time.perf_counter() - began
             yield replace(frame, seconds=self._seconds)
             began = time.perf_counter()
 
+    def _stages(self, scenario: Scenario, others: Mapping[Panel, Learned], cancelled: Cancelled) -> Iterator[Frame]:
+        with _cores.slot():
+            frame = self._rollouts(scenario, LIVE)
+        yield frame
+        with _cores.slot():
+            frame = self._seen(frame, Stage.LIVE, others)
+        yield frame
+        with _cores.slot(cancelled):
+            frame = self._rollouts(scenario, FINE)
+        with _cores.slot(cancelled):
+            frame = self._seen(frame, Stage.FINE, others)
+        yield frame
+        frame = replace(frame, stage=Stage.CERTIFIED)
+        if not frame.blocked:
+            with _cores.slot(cancelled):
+                frame = replace(frame, certificates=self._certified(frame))
+            with _cores.slot(cancelled):
+                frame = replace(frame, certificates=self._with_meshes(frame))
+        yield frame
+        if frame.motion.arm is not None and not frame.blocked:
+            with _cores.slot(cancelled):
+                self.follower.stances(frame.motion.nominal.learned)  # a drag may need them at once
+        yield from self._compared_at_rest(frame, cancelled)
+
+    # --- motion ---
+
     def nominal(self, scenario: Scenario, progress: Progress | None = None) -> Nominal:
         """The undisturbed motion of a scenario, from all of its starts; see `frames`."""
-        if scenario.style and scenario.imitation:
-            learned = self.memo("styled", scenario.learned, lambda: self._styled(scenario), newest=NEWEST)
-        else:
-            learned = self._shared("learned", scenario.learned, lambda: self._learned(scenario, progress))
-        make = learned.trajectory  # a start that is dragged leaves nothing behind
-        added = [self.memo("added start", (learned, s), lambda s=s: make(s), newest=NEWEST) for s in scenario.starts]
-        return self.memo("nominal", (learned, scenario.starts), lambda: learned.nominal(added), newest=4)
+        styled = scenario.style and scenario.imitation
+        learned = self._styled(scenario) if styled else self._learned(scenario, progress)
+        return self._nominal(learned, scenario.starts)
 
-    def _imitated(self, panel: Panel, progress: Progress | None = None) -> Nominal:
-        """The undisturbed motion that a panel shows."""
-        return self.nominal(Scenario(panel.task, state=panel.state), progress)
+    @kept(4)
+    def _nominal(self, learned: Learned, starts: tuple[Start, ...]) -> Nominal:
+        return learned.nominal([self._added(learned, start) for start in starts])
 
-    def solved(self, scenario: Scenario, precision: Precision) -> Solved:
-        """The motion of a scenario that is not blocked, at a precision; what it raises see `frames`.
+    @kept(NEWEST)
+    def _added(self, learned: Learned, start: Start) -> NominalTrajectory:
+        return learned.trajectory(start)  # one that is dragged leaves nothing behind
 
-        Raises:
-            UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
-        """
-        return self._solved(scenario, self._admission(scenario, precision).nominal, precision)
-
-    def _solved(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
-        """The motion of a scenario from the starts that the arm can begin at."""
-        motion, follower = scenario.motion, self.follower
-        full = self.memo(
-            "full",
-            (replace(motion, warp=1.0), motion.passing, precision),
-            lambda: solve(motion, nominal, precision, follower),
-            newest=2,
-        )
-        if motion.warp == 1:
-            return full
-        below = self.memo("below", (full.nominal, motion.warp), lambda: full.nominal.warped(motion.warp), newest=1)
-        return self.memo(
-            "warped",
-            (motion, motion.passing, precision),
-            lambda: warped(full, below, motion.warp, precision, follower),
-            newest=2,
-        )
-
-    def arm_motions(self, scenario: Scenario) -> tuple[Frame, tuple[ArmMotion, ...]]:
-        """The frame of stage FINE, without pictures, and the arm's motion along each rollout; none if it is blocked.
-
-        Raises:
-            DemonstrationError, ImitationError: as `frames`.
-            UnreachableError: the arm cannot get to where the motions start.
-        """
-        fine, blocked = self._motion(scenario, FINE)
-        if fine is None:
-            *_, frame = self._stages_without_motion(scenario, blocked)
-            return frame, ()
-        frame = self._rollouts(scenario, fine, FINE)
-        arms, certificates = [], frame.certificates
-        for rollout in range(len(frame.rollouts)):
-            arm, warnings = compose.arm_along(frame, fine, rollout, self.follower)
-            arms.append(arm)
-            certificates = certificates.warning(*warnings)
-        return replace(frame, stage=Stage.FINE, certificates=certificates), tuple(arms)
-
-    def see(self, scenario: Scenario) -> None:
-        """Let the arm know where the obstacles of a scenario are, long before its frames; any thread may."""
-        self.arm.see(scenario.arm_avoidance)
-
-    def drive(self, frame: Frame) -> None:
-        """Have the arm go on with the motion of the frame that was yielded last.
-
-        Where that is blocked it stays with the motion that is shown, and gives way to what is in its way now.
-        """
-        began, solved = time.perf_counter(), self._yielded
-        if frame.blocked:
-            solved = replace(self._shown[frame.scenario.task][1], scenario=frame.scenario.motion)
-        assert solved is not None
-        try:
-            self.arm.follow(solved, frame.chosen)
-        except UnreachableError:
-            self.arm.stop()
-        self._seconds += time.perf_counter() - began
-
+    @kept(by=lambda scenario, _: scenario.learned, of="_shared")
     def _learned(self, scenario: Scenario, progress: Progress | None) -> Learned:
         task = self.task(scenario.task)
         state = scenario.state if scenario.imitation else "plain"  # without it there is nothing to remember
         imitation = self._fits.learned(task.demonstrations, ImitationSettings(scenario.objective), state, progress)
         return Learned.of(task, imitation, imitates=scenario.imitation)
 
+    @kept(NEWEST, by=lambda scenario: scenario.learned)
     def _styled(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the augmented state, in its style."""
-        own, usual, other = (
-            self.memo("augmented", name, lambda name=name: self._augmented(name))
-            for name in (scenario.task, *STYLES[scenario.style])
-        )
+        tasks = scenario.task, *STYLES[scenario.style]
+        learned = (self._learned(Scenario(task, state="augmented"), None).imitation for task in tasks)
+        own, usual, other = (imitation for imitation in learned if isinstance(imitation, AugmentedImitation))
         imitation = Style.between(usual, other).on(own, scenario.style_amount)
         return Learned.of(self.task(scenario.task), imitation, imitates=True)
-
-    def _augmented(self, task: str) -> AugmentedImitation:
-        imitation = self._fits.learned(self.task(task).demonstrations, state="augmented")
-        assert isinstance(imitation, AugmentedImitation)
-        return imitation
 
     def _admission(self, scenario: Scenario, precision: Precision) -> Admission:
         """Whether the scenario has a motion, and from which starts.
@@ -223,68 +173,115 @@ class Engine:
             return self.follower.admission(nominal, avoidance)
         return self.follower.admission(nominal, avoidance, passing.stance, keeps=precision is LIVE)
 
-    def _motion(self, scenario: Scenario, precision: Precision) -> tuple[Solved | None, tuple[MotionWarning, ...]]:
-        """The motion of a scenario, and why it has none, at the ends or between them."""
-        admission = self._admission(scenario, precision)
-        if admission.blocked:
-            return None, admission.blocked
-        solved = self._solved(scenario, admission.nominal, precision)
-        return (None, solved.blocked) if solved.blocked else (solved, ())
+    def solved(self, scenario: Scenario, precision: Precision) -> Solved:
+        """The motion of a scenario whose goal and some start are free, at a precision; what it raises see `frames`.
 
-    def _stages(self, scenario: Scenario, cancelled: Cancelled) -> Iterator[Frame]:
-        with _cores.slot():
-            live, blocked = self._motion(scenario, LIVE)
-            first = None if live is None else self._rollouts(scenario, live, LIVE)
-        if live is None or first is None:
-            yield from self._stages_without_motion(scenario, blocked, cancelled)
-            return
-        self._yielded = live
-        yield first
-        with _cores.slot():
-            frame = self._with_arm(first, live, LIVE)
-            frame = replace(frame, stage=Stage.LIVE, pictures=self._pictures(scenario, live, coarse=True))
-            frame = self._compared(frame)
-            self._shown[scenario.task] = frame, live
-        yield frame
-        with _cores.slot(cancelled):
-            fine = self.solved(scenario, FINE)
-        with _cores.slot(cancelled):
-            frame = self._with_arm(self._rollouts(scenario, fine, FINE), fine, FINE)
-            frame = replace(frame, stage=Stage.FINE, pictures=self._pictures(scenario, fine, coarse=False))
-            frame = self._compared(replace(frame, blocked=fine.blocked))
-            if scenario.view.health_plots and frame.chosen is not None:
-                frame = replace(frame, profiles=compose.profiles(frame, fine, frame.chosen, self.follower))
-            self._shown[scenario.task] = frame, fine
-        self._yielded = fine
-        yield frame
-        with _cores.slot(cancelled):
-            key = scenario.plain, scenario.passing
-            certificates = self.memo("certificates", key, lambda: certify(frame, fine, self.follower), newest=1)
-        if frame.arm is not None:
-            with _cores.slot(cancelled):
-                certificates = self.memo("meshes", key, lambda: with_meshes(certificates, frame, fine), newest=1)
-        frame = replace(frame, stage=Stage.CERTIFIED, certificates=certificates)
-        yield frame
-        if fine.arm is not None:
-            with _cores.slot(cancelled):
-                self.follower.stances(fine.nominal.learned)  # a drag may need them at once
-        yield from self._compared_at_rest(frame, fine, cancelled)
+        Raises:
+            UnreachableError: the whole arm is to avoid, and cannot get to where the motions start.
+        """
+        return self._solved(scenario, self._admission(scenario, precision).nominal, precision)
+
+    def _solved(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
+        full = self._full(scenario, nominal, precision)
+        return full if scenario.warp == 1 else self._warped(full, scenario.warp, precision)
+
+    @kept(2, by=lambda scenario, _, precision: (scenario.full, scenario.passing, precision))
+    def _full(self, scenario: Scenario, nominal: Nominal, precision: Precision) -> Solved:
+        return solve(scenario.motion, nominal, precision, self.follower)
+
+    @kept(2)
+    def _warped(self, full: Solved, fraction: float, precision: Precision) -> Solved:
+        return warped(full, self._below(full.nominal, fraction), fraction, precision, self.follower)
+
+    @kept(1)
+    def _below(self, nominal: Nominal, fraction: float) -> Nominal:
+        return nominal.warped(fraction)
+
+    def arm_motions(self, scenario: Scenario) -> tuple[Frame, tuple[ArmMotion, ...]]:
+        """The frame of stage FINE, without pictures, and the arm's motion along each rollout; none if it is blocked.
+
+        Raises:
+            DemonstrationError, ImitationError: as `frames`.
+            UnreachableError: the arm cannot get to where the motions start.
+        """
+        frame = replace(self._rollouts(scenario, FINE), stage=Stage.FINE)
+        rollouts = () if frame.blocked else range(len(frame.rollouts))
+        found = [arm_along(frame, rollout, self.follower) for rollout in rollouts]
+        warnings = [warning for _, warnings in found for warning in warnings]
+        return replace(frame, certificates=frame.certificates.warning(*warnings)), tuple(arm for arm, _ in found)
+
+    # --- frames of it ---
+
+    def _rollouts(self, scenario: Scenario, precision: Precision) -> Frame:
+        """The frame of stage ROLLOUTS, of the last motion of its task where the scenario has none.
+
+        Where there is no last one it is the motion without obstacles.
+        """
+        admission = self._admission(scenario, precision)
+        found = None if admission.blocked else self._solved(scenario, admission.nominal, precision)
+        if found is not None and not found.blocked:
+            self._last[scenario.task] = found
+            return Frame(scenario, Stage.ROLLOUTS, found, *self._drawn(found))
+        blocked = admission.blocked if found is None else found.blocked
+        free = replace(scenario, stack=_without_obstacles(scenario.stack))
+        motion = self._last.get(scenario.task) or self.solved(free, precision)
+        drawn, _ = self._drawn(motion)
+        known = Certificates(clearance(motion, drawn, scenario.obstacle, self.follower))
+        return Frame(scenario, Stage.ROLLOUTS, motion, drawn, known, blocked)
+
+    @kept(2)
+    def _drawn(self, motion: Solved) -> tuple[DrawnSamples, Certificates]:
+        """The rollouts of a motion, and what is known of them before they are certified."""
+        drawn = rollouts_of(motion, self.follower.robot)
+        return drawn, uncertified(motion, drawn, self.follower)
+
+    def _seen(self, frame: Frame, stage: Stage, others: Mapping[Panel, Learned]) -> Frame:
+        """The frame with pictures and the arm, at LIVE with the arm's motion only if that is drawn."""
+        view, live = frame.scenario.view, stage is Stage.LIVE
+        arm, warnings = self._arm(frame, not live or view.shows_arm_motion)
+        pictures = self._drawing.pictures(frame, others, live)
+        known = frame.certificates if frame.blocked else frame.certificates.warning(*warnings)
+        frame = replace(frame, stage=stage, arm=arm, certificates=known, pictures=pictures)
+        if view.health_plots and not live and frame.chosen is not None:
+            frame = replace(frame, profiles=profiles(frame.motion, frame.drawn, frame.chosen, self.follower))
+        return self._compared(frame)
+
+    @kept(2, by=lambda frame, moves: (frame.motion, frame.chosen, moves))
+    def _arm(self, frame: Frame, moves: bool) -> tuple[ArmMotion | None, tuple[MotionWarning, ...]]:
+        """The arm's motion along the rollout that it follows, if that is wanted, and what is wrong with it."""
+        nominal, rollout = frame.motion.nominal, frame.chosen
+        try:
+            far = self.follower.out_of_reach(nominal)
+            arm, warnings = None, ()
+            if moves and rollout is not None and not far[rollout]:
+                arm, warnings = arm_along(frame, rollout, self.follower)
+        except UnreachableError as error:
+            return None, (unreachable(error),)
+        return arm, (*warnings, *far_starts(np.array(nominal.numbers)[far], nominal.num_demonstrated))
+
+    @kept(1, by=lambda frame: (frame.motion, frame.chosen))
+    def _certified(self, frame: Frame) -> Certificates:
+        return certify(frame, self.follower)
+
+    @kept(1, by=lambda frame: (frame.motion, frame.chosen))
+    def _with_meshes(self, frame: Frame) -> Certificates:
+        return with_meshes(frame)
 
     def _compared(self, frame: Frame, notes: Mapping[str, str] | None = None) -> Frame:
         """The frame with other methods beside ours, as far as they are known; `notes` see `Comparison.of`."""
         if not frame.scenario.view.compared:
-            return replace(frame, comparison=())
+            return frame
         return replace(frame, comparison=self.comparison.of(frame, self._plain(frame.scenario), notes))
 
     def _plain(self, scenario: Scenario) -> Learned:
         """What is learned for a scenario in the plain state, which other methods are compared with."""
         return self.nominal(replace(scenario, state="plain", style="")).learned
 
-    def _compared_at_rest(self, frame: Frame, solved: Solved | None, cancelled: Cancelled) -> Iterator[Frame]:
+    def _compared_at_rest(self, frame: Frame, cancelled: Cancelled) -> Iterator[Frame]:
         """The last frame again and again, each with more of what is known of other methods."""
         if not frame.scenario.view.compared:
             return
-        left = self.comparison.complete(frame, self._plain(frame.scenario), solved, cancelled)
+        left = self.comparison.complete(frame, self._plain(frame.scenario), cancelled)
         while True:
             with _cores.slot(cancelled):
                 notes = next(left, None)
@@ -293,89 +290,25 @@ class Engine:
                 frame = self._compared(frame, notes)
             yield frame
 
-    def _rollouts(self, scenario: Scenario, solved: Solved, precision: Precision) -> Frame:
-        """The frame of stage ROLLOUTS."""
-        frame = self.memo(
-            "rollouts",
-            (scenario.plain, scenario.passing, precision),
-            lambda: compose.rollouts_frame(scenario, solved, self.follower),
-            newest=2,
-        )
-        return replace(frame, scenario=scenario, level=compose.level_of(scenario, solved.stack))
+    # --- the robot ---
 
-    def _with_arm(self, frame: Frame, solved: Solved, precision: Precision) -> Frame:
-        """The frame of stage ROLLOUTS, with the arm; at LIVE with its motion only if that is drawn."""
-        scenario = frame.scenario
-        moves = precision is not LIVE or scenario.view.shows_arm_motion
-        with_arm = self.memo(
-            "arm",
-            (scenario.plain, scenario.passing, precision, moves),
-            lambda: compose.with_arm(frame, solved, self.follower, moves=moves),
-            newest=2,
-        )
-        return replace(with_arm, scenario=scenario, level=frame.level)
+    def see(self, scenario: Scenario) -> None:
+        """Let the arm know where the obstacles of a scenario are, long before its frames; any thread may."""
+        self.arm.see(scenario.arm_avoidance)
 
-    def _pictures(self, scenario: Scenario, solved: Solved, *, coarse: bool) -> Pictures:
-        others = {panel.shown: self._imitated(panel).learned for panel in scenario.view.panels if panel.shown}
-        books = {panel: self._book(learned, learned.demonstrated.rest(0)) for panel, learned in others.items()}
-        books[Panel(task=scenario.task)] = self._book(solved.below.learned, compose.rest(scenario, solved))
-        arm, view = solved.arm, scenario.view
-        carried = view.field and arm is not None and not view.level
-        pictures = compose.pictures(scenario, solved, books, arrows=view.field and not carried, coarse=coarse)
-        if arm is None or not carried:
-            return pictures
-        robot, reference = self.follower.robot, self.follower.reference(solved.nominal)
-        rest, layers = compose.rest(scenario, solved), tuple(layer for _, layer in scenario.active)
-        made_for = solved.below if solved.stack.built or scenario.warp < 1 else solved.below.learned
-        places = compose.lattice(scenario, solved)
-        lattice = self.memo(
-            "lattice",
-            (scenario.task, view.slice, reference.tobytes()),
-            lambda: Lattice.of(places, robot, reference),
-            newest=2,
-        )
-        of = view.slice, rest.tobytes()
-        learned = self.memo(
-            "learned velocities",
-            (solved.below.learned, solved.stack.rays.base.goal.tobytes(), *of),
-            lambda: compose.learned_system(scenario, solved).velocity(places),
-            newest=2,
-        )
-        velocities = self.memo(
-            "velocities",
-            (made_for, layers, *solved.passing.hand.values(), *of),
-            lambda: compose.velocities(scenario, solved, learned),
-            newest=2,
-        )
-        return replace(pictures, field=lattice.carried(velocities, arm.transform, robot, scenario.obstacle))
+    def drive(self, frame: Frame) -> None:
+        """Have the arm go on with the motion of a frame.
 
-    def _book(self, learned: Learned, rest: Array) -> Sketchbook:
-        """The maker of pictures of ψ, at one phase and for one condition."""
-        key = (learned, rest.tobytes())
-        return self.memo("sketchbook", key, lambda: _sketchbook(learned, rest), newest=NUM_BOOKS)
-
-    def _stages_without_motion(
-        self, scenario: Scenario, blocked: tuple[MotionWarning, ...], cancelled: Cancelled = never
-    ) -> Iterator[Frame]:
-        """The last motion that was shown at every stage, or the undisturbed one, refined, if there is none."""
-        if scenario.task not in self._shown:
-            undisturbed = self._stages(replace(scenario, stack=_without_obstacles(scenario.stack)), cancelled)
-            next(frame for frame in undisturbed if frame.stage is Stage.FINE)
-        good, solved = self._shown[scenario.task]
-        if good.arm is None and good.stage is Stage.LIVE:
-            good = compose.with_arm(good, solved, self.follower)
-            self._shown[scenario.task] = good, solved
-        seen = replace(good.scenario, view=scenario.view)
-        changed = not seen.computes_like(good.scenario)
-        good = replace(good, level=compose.level_of(seen, solved.stack))
-        q = self.follower.robot.home[None] if good.arm is None else good.arm.q
-        certificates = Certificates(float(self.follower.whole_arm.clearance(q, scenario.obstacle).min()))
-        for stage in Stage:
-            if changed and stage in (Stage.LIVE, Stage.FINE):
-                good = replace(good, pictures=self._pictures(seen, solved, coarse=stage is Stage.LIVE))
-            good = replace(good, scenario=scenario, stage=stage, blocked=blocked, certificates=certificates)
-            yield self._compared(good) if stage >= Stage.LIVE else replace(good, comparison=())
-        yield from self._compared_at_rest(good, None, cancelled)
+        Where that is blocked it stays with the motion that is shown, and gives way to what is in its way now.
+        """
+        began, motion = time.perf_counter(), frame.motion
+        if frame.blocked:
+            motion = replace(motion, scenario=frame.scenario.motion)
+        try:
+            self.arm.follow(motion, frame.chosen)
+        except UnreachableError:
+            self.arm.stop()
+        self._seconds += time.perf_counter() - began
 
 
 def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
@@ -385,9 +318,3 @@ def _without_obstacles(stack: tuple[Layer, ...]) -> tuple[Layer, ...]:
 
 def _avoids(transform: Transform) -> bool:
     return isinstance(transform, Avoidance) or bool(transform.avoided.parts)
-
-
-def _sketchbook(learned: Learned, rest: Array) -> Sketchbook:
-    shown, system = learned.demonstrated, frozen(learned.system, rest)
-    rays = Rays(system.transform.forward(shown.starts), system.base)
-    return Sketchbook(learned.task, in_frame(learned.system.transform), system, rays, shown.paths)

@@ -1,20 +1,29 @@
-"""What an engine computes for a scenario, stage by stage."""
+"""What an engine computes for a scenario, stage by stage: its motion, pictures of it, and checks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 
-from dt_viz.avoidance.passing import ANEW, Passing
+import numpy as np
+
+from dt_viz.avoidance.passing import Passing
 from dt_viz.baselines.base import Method
+from dt_viz.flows.diffeomorphisms import Flow
 from dt_viz.flows.fields import Array
-from dt_viz.motion.certificates import Certificates
+from dt_viz.learning.augmented import AugmentedImitation
+from dt_viz.motion.certificates import Certificates, DrawnSamples
 from dt_viz.motion.following import ArmMotion
 from dt_viz.motion.profiles import Profiles
-from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures
+from dt_viz.motion.solve import Solved
+from dt_viz.motion.stack import Applied
+from dt_viz.pictures.sketchbook import NO_PICTURES, Pictures, in_frame
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.slices import Slice
+from dt_viz.scenario.stack import level_of
+from dt_viz.scenario.starts import followed
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import MotionWarning
 
@@ -52,65 +61,37 @@ class Compared:
     """A method's motions around the obstacles of a scenario, from the starts of the demonstrations."""
 
     method: Method
-    paths: tuple[Array, ...]
+    paths: tuple[Array, ...] = ()
     """(N_i, 3) of the end effector, metres; none where there are no motions."""
-    scores: Scores | None
-    curves: Array | None
-    """(`dt_viz.motion.profiles.NUM_SAMPLES`, 2) of one motion, at even distances along it, metres: distance to the
-    demonstration, and depth in the obstacle."""
-    rollout: int
-    """Number of that motion: the one that the arm follows where that begins at a demonstrated start."""
+    times: tuple[Array, ...] = ()
+    """(N_i,) of their samples, seconds."""
+    joints: tuple[Array, ...] | None = None
+    """(N_i, 6) of the arm, rad, where the method plans them."""
+    scores: Scores | None = None
     note: str = ""
     """What the motions fail at, or why there are none."""
+    rollout: int = 0
+    """Number of one motion: the one that the arm follows where that begins at a demonstrated start."""
+    curves: Array | None = None
+    """(`dt_viz.motion.profiles.NUM_SAMPLES`, 2) of that one, at even distances along it, metres: distance to the
+    demonstration, and depth in the obstacle."""
     arm: ArmMotion | None = None
     """The arm along that motion, where the view shows it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
-    """All that the page draws for a scenario. Read only."""
+    """A motion, what is drawn of it, and its checks: all that the page shows for a scenario. Read only."""
 
     scenario: Scenario
-    task: Task
     stage: Stage
-    ghost: tuple[Array, ...]
-    """Undeformed rollouts, (T_i, 3)."""
-    rollouts: tuple[Array, ...]
-    """(T_i, 3), metres: first those from the task's starts, then those from added ones."""
-    times: tuple[Array, ...]
-    """(T_i,) seconds of the samples of each rollout."""
-    levels: tuple[tuple[Array, ...], ...]
-    """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3)."""
-    goal: Array
-    """(3,) where the demonstrations end."""
-    reached: Array
-    """(3,) where the motions end: elsewhere where the obstacle covers the goal or leaves no way to it."""
-    blocked: tuple[MotionWarning, ...]
-    """Why there is no motion for this scenario; what is shown then is the last one that there was."""
+    motion: Solved
+    """The scenario's motion, or where it has none the last one that its task had."""
+    drawn: DrawnSamples
+    """Its rollouts: first those from the task's starts, then those from added ones."""
     certificates: Certificates
-    num_added: int = 0
-    """Number of rollouts, the last ones, from added starts."""
-    chosen: int | None = 0
-    """Index of the rollout that the arm follows: the first one where it cannot begin the one that is asked for;
-    None where that begins at an added start."""
-    remembers: bool = False
-    """Whether the imitation is augmented: it remembers its phase and where it began."""
-    reason: str = ""
-    """Why it is augmented, if nobody asked for that."""
-    labels: tuple[float, ...] = ()
-    """Label of each demonstration; an added start may have one of them. None where no labels are needed."""
-    learned_steps: tuple[int, ...] = ()
-    """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
-    durations: tuple[float | None, ...] = ()
-    """t of the flow of each layer of `Scenario.stack`, under a warp that of the full one; None where it is off."""
-    chosen_values: tuple[Mapping[str, float], ...] = ()
-    """Values that each layer of `Scenario.stack` chose automatically, by its fields; none where it is off."""
-    arm_duration: float | None = None
-    """t of the flow by which the whole arm avoids, under a warp that of the full one; None where it does not."""
-    passing: Passing = ANEW
-    """How its motions pass the obstacles, for a scenario that goes on from it."""
-    level: int | None = None
-    """Index in `levels` of the manifold that the view and the pictures show; None is the top of the stack."""
+    blocked: tuple[MotionWarning, ...] = ()
+    """Why there is no motion for this scenario."""
     arm: ArmMotion | None = None
     """None before stage FINE, at LIVE only unless the view shows it, and where the arm cannot reach the start."""
     pictures: Pictures = NO_PICTURES
@@ -123,6 +104,110 @@ class Frame:
     """Time that it took to compute, with the frames before it and what the robot was given, without waits, seconds."""
 
     @property
+    def task(self) -> Task:
+        """The task of the motion."""
+        return self.motion.nominal.task
+
+    @property
     def slice(self) -> Slice:
         """Where the pictures lie."""
         return self.task.slice.posed(self.scenario.view.slice)
+
+    @property
+    def ghost(self) -> tuple[Array, ...]:
+        """Undeformed rollouts, (T_i, 3), metres."""
+        return self.motion.nominal.paths
+
+    @property
+    def rollouts(self) -> tuple[Array, ...]:
+        """Rollouts of the end effector, (T_i, 3), metres."""
+        return self.drawn.paths
+
+    @property
+    def times(self) -> tuple[Array, ...]:
+        """(T_i,) seconds of the samples of each rollout."""
+        return self.drawn.split(self.drawn.times)
+
+    @property
+    def levels(self) -> tuple[tuple[Array, ...], ...]:
+        """Rollouts of the end effector on each manifold of its stack, from the imitation up, each (T_i, 3)."""
+        bundle = self.motion.stack.bundle
+        return tuple(bundle.split(level) for level in np.moveaxis(bundle.levels, 1, 0))
+
+    @property
+    def level(self) -> int | None:
+        """Index in `levels` of the manifold that the view and the pictures show; None is the top of the stack."""
+        return level_of(self.motion.scenario, self.scenario.view)
+
+    @property
+    def goal(self) -> Array:
+        """(3,) where the demonstrations end, metres."""
+        return self.motion.nominal.goal
+
+    @property
+    def reached(self) -> Array:
+        """(3,) where the motions end: elsewhere where the obstacle covers the goal or leaves no way to it."""
+        return self.drawn.positions[-1]
+
+    @property
+    def num_added(self) -> int:
+        """Number of rollouts, the last ones, from added starts."""
+        return self.motion.nominal.num_added
+
+    @cached_property
+    def chosen(self) -> int | None:
+        """Index of the rollout that the arm follows.
+
+        The first one where it cannot begin the one that is asked for; None where that begins at an added start.
+        """
+        nominal, scenario = self.motion.nominal, self.motion.scenario
+        number = followed(replace(scenario, arm_rollout=self.scenario.arm_rollout), nominal.num_demonstrated)
+        rollout = nominal.rollout(number)
+        return 0 if rollout is None and number < nominal.num_demonstrated else rollout
+
+    @property
+    def passing(self) -> Passing:
+        """How the motions pass the obstacles, for a scenario that goes on from them."""
+        return self.motion.passing
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the imitation is augmented: it remembers its phase and where it began."""
+        return isinstance(self.motion.nominal.imitation, AugmentedImitation)
+
+    @property
+    def reason(self) -> str:
+        """Why it is augmented, if nobody asked for that."""
+        imitation = self.motion.nominal.imitation
+        return imitation.reason if isinstance(imitation, AugmentedImitation) else ""
+
+    @property
+    def labels(self) -> tuple[float, ...]:
+        """Label of each demonstration; an added start may have one of them. None where no labels are needed."""
+        return self.motion.nominal.learned.demonstrated_labels
+
+    @property
+    def learned_steps(self) -> tuple[int, ...]:
+        """Euler steps of each of the flows that the imitation is composed of; none where it is off."""
+        flows = in_frame(self.motion.nominal.system.transform)
+        return () if flows is None else tuple(flow.steps for flow in flows.parts if isinstance(flow, Flow))
+
+    @property
+    def durations(self) -> tuple[float | None, ...]:
+        """Flow time t of each layer of the stack, under a warp that of the full one; None where it is off."""
+        return tuple(applied.made.duration if applied else None for applied in self._layers)
+
+    @property
+    def chosen_values(self) -> tuple[Mapping[str, float], ...]:
+        """Values that each layer of the stack chose automatically, by its fields; none where it is off."""
+        return tuple(applied.made.chosen if applied else {} for applied in self._layers)
+
+    @property
+    def arm_duration(self) -> float | None:
+        """Flow time t by which the whole arm avoids, under a warp that of the full one; None where it does not."""
+        return self.motion.arm.duration if self.motion.arm else None
+
+    @property
+    def _layers(self) -> list[Applied | None]:
+        """The layers of the stack as they were made; None where they are off."""
+        return [self.motion.stack.at(place) for place in range(len(self.motion.scenario.stack))]

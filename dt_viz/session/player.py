@@ -64,7 +64,7 @@ class Player:
         self._changed(True)
         session.begin_gesture()
         before, mine, began = session.scenario, None, time.monotonic()
-        while mine is None or session.scenario.moves_like(mine):  # else the user edits something
+        while mine is None or session.scenario.choices == mine.choices:  # else the user edits something
             changes = play(session.scenario, time.monotonic() - began)
             if changes is not None:
                 session.edit(gesture, **changes)

@@ -21,13 +21,11 @@ from dt_viz.scenario.stack import IMITATION, as_fresh
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
+from dt_viz.session.history import History
 from dt_viz.session.worker import LatestWorker
 
 logger = logging.getLogger(__name__)
 
-GESTURE_PAUSE = 1.0
-"""Time without an edit, seconds, after which the next edit of the same control is a step of its own for undo."""
-MAX_UNDO = 200
 LIVE_PAUSE, LIVE_LATENCIES = 0.05, 2.0
 """Shortest time between two drawings of the field while edits come faster, in seconds and in latencies of the rollouts:
 these are drawn more often, the more so the longer they take."""
@@ -59,11 +57,6 @@ def _with_a_level_of_its_own(scenario: Scenario) -> Scenario:
     if not level or level in (IMITATION, *(layer.name for layer in scenario.stack)):
         return scenario
     return replace(scenario, view=replace(scenario.view, level=""))
-
-
-def _is_step(after: Scenario, before: Scenario) -> bool:
-    """Whether the change from one to the other is a step for undo: what moves is, and where the slice lies."""
-    return not after.moves_like(before) or after.view.slice != before.view.slice
 
 
 class Display(Protocol):
@@ -103,10 +96,7 @@ class Session:
         self._lock = threading.Lock()
         self._adopting = threading.RLock()
         self.scenario = initial(task)
-        self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
-        self._future: list[Scenario] = []
-        self._gesture: tuple[str, float] = ("", 0.0)
-        self._held = False
+        self._history = History()
         self._unadopted = False
         """Whether the scenario was edited by a drag and is not shown on the controls yet."""
         self._learning = self._stopped = self._closed = False
@@ -135,34 +125,26 @@ class Session:
             anew: whether sides and stance are chosen anew, not kept from the motion that is shown.
             **changes: fields of `Scenario`, without `passing`.
         """
-        now = time.monotonic()
         with self._lock:
             edited = _with_a_level_of_its_own(replace(self.scenario, **changes))
             if edited == self.scenario and not self._failed:
                 return
-            if not edited.passes_like(self.scenario):
+            if edited.full != self.scenario.full:
                 edited = replace(edited, passing=ANEW if anew else None)
-            if _is_step(edited, self.scenario):
-                name, when = self._gesture
-                # another control is moved, so whatever was held has been let go, even if nobody said so
-                self._held = self._held and name in {"", gesture}
-                if name != gesture or (now - when > GESTURE_PAUSE and not self._held):
-                    self._past.append(self.scenario)
-                self._gesture = (gesture, now)
-                self._future.clear()
+            self._history.edited(gesture, self.scenario, edited)
             needs_frames = self._failed or not edited.computes_like(self.scenario)
             self.scenario = edited
             if needs_frames:
                 self._submit()
             # a drag sends edits faster than the controls can show them: they are shown with the next frame
-            self._unadopted = self._held and needs_frames
+            self._unadopted = self._history.held and needs_frames
         if not self._unadopted:
             self._adopt()
 
     def begin_gesture(self) -> None:
         """The user took hold of something: edits until `end_gesture` are undone together, however slow."""
         with self._lock:
-            self._gesture, self._held = ("", 0.0), True
+            self._history.begin_gesture()
 
     def take_phase(self) -> None:
         """Show augmented motions on the slice at the phase at which the arm is."""
@@ -172,9 +154,7 @@ class Session:
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
         with self._lock:
-            if self._held and self._gesture[0] and self._past and not _is_step(self.scenario, self._past[-1]):
-                self._past.pop()
-            self._gesture, self._held = ("", 0.0), False
+            self._history.end_gesture(self.scenario)
         self._catch_up()
 
     def choose_task(self, name: str) -> None:
@@ -238,17 +218,17 @@ class Session:
 
     def undo(self) -> None:
         """Take the last gesture back."""
-        self._travel(self._past, self._future)
+        self._travel(self._history.undone)
 
     def redo(self) -> None:
         """Do again what was undone last."""
-        self._travel(self._future, self._past)
+        self._travel(self._history.redone)
 
     def cancel(self) -> None:
         """Stop learning a task and go back to what was shown before. Nothing is done while nothing is learned."""
         with self._lock:
             abandoned = self.scenario
-            if not self._learning or (self._shown is not None and abandoned.learns_like(self._shown)):
+            if not self._learning or (self._shown is not None and abandoned.fit == self._shown.fit):
                 return
             self._stopped = not self._retreat(abandoned)
         self._adopt()
@@ -263,13 +243,12 @@ class Session:
         self._closed = True
         self._worker.close()
 
-    def _travel(self, source: Any, target: Any) -> None:  # noqa: ANN401 - both kinds of history
+    def _travel(self, moved: Callable[[Scenario], Scenario | None]) -> None:
         with self._lock:
-            if not source:
+            there = moved(self.scenario)
+            if there is None:
                 return
-            target.append(self.scenario)
-            self.scenario = self._as_seen(source.pop())
-            self._gesture = ("", 0.0)
+            self.scenario = self._as_seen(there)
             self._submit()
         self._adopt()
 
@@ -290,17 +269,9 @@ class Session:
         Called with the lock held. False if there is none, or if `abandoned` is not what is wanted any more.
         """
         shown = self._shown
-        if shown is None or shown.learns_like(abandoned) or not self.scenario.learns_like(abandoned):
+        if shown is None or shown.fit == abandoned.fit or self.scenario.fit != abandoned.fit:
             return False
-        while self._past and self._past[-1].learns_like(abandoned):
-            self._past.pop()  # edits of what was never seen
-        before = shown
-        for history in (self._past, self._future):
-            if history and history[-1].learns_like(shown):
-                before = history.pop()
-                break
-        self.scenario = self._as_seen(before)
-        self._gesture = ("", 0.0)
+        self.scenario = self._as_seen(self._history.without(abandoned, shown))
         self._submit()
         return True
 
@@ -330,7 +301,7 @@ class Session:
     def _learn(self, scenario: Scenario, fraction: float, message: str) -> None:
         """Show how far learning is; end it when something else is to be learned, not when the obstacle moves."""
         with self._lock:
-            if self._stopped or self._closed or not self.scenario.learns_like(scenario):
+            if self._stopped or self._closed or self.scenario.fit != scenario.fit:
                 raise UnwantedError
             self._learning = True
         self._display.learning(fraction, message)
@@ -342,7 +313,7 @@ class Session:
         alike = self._shown is not None and scenario.learned == self._shown.learned
         passing = self._passing if alike else ANEW
         with self._lock:
-            if self.scenario.passing is None and self.scenario.passes_like(scenario):
+            if self.scenario.passing is None and self.scenario.full == scenario.full:
                 self.scenario = replace(self.scenario, passing=passing)
         return replace(scenario, passing=passing)
 
@@ -353,7 +324,7 @@ class Session:
             now = time.perf_counter()
             if self._learning:
                 edited = now - frame.seconds  # learning is no rebuild
-            drawn = self._shown is not None and scenario.moves_like(self._shown)
+            drawn = self._shown is not None and scenario.choices == self._shown.choices
             self._learning, self._shown, self._passing = False, scenario, frame.passing
             if frame.stage is Stage.ROLLOUTS and drawn:
                 continue  # it is only looked at in another way: the next stage is what changes

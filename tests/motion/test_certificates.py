@@ -15,19 +15,9 @@ from dt_viz.flows.fields import Array, GaussianGrid, GridRBF
 from dt_viz.flows.integrators import euler, implicit_euler
 from dt_viz.flows.rollouts import ARRIVED, Bundle, Rays, evenly_sampled
 from dt_viz.flows.systems import Attractor
-from dt_viz.motion.certificates import (
-    MAX_OFF,
-    MAX_OFF_POSTURE,
-    Certificates,
-    DrawnSamples,
-    certified,
-    clearance_warnings,
-    delay_warnings,
-    hand_warnings,
-)
-from dt_viz.motion.solve import Solved
-from dt_viz.motion.stack import FINE, Solution
-from dt_viz.obstacles.shapes import Sphere
+from dt_viz.motion.certificates import MAX_OFF, MAX_OFF_POSTURE, Certificates, DrawnSamples, certified
+from dt_viz.motion.following import arm_samples
+from dt_viz.motion.stack import Solution
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.scenario.scenario import View
 from dt_viz.session.certify import certify
@@ -37,7 +27,6 @@ from dt_viz.warning import Kind, MotionWarning
 
 BASE = Attractor(np.array([0.5, 0.2, 0.0]), 0.2, 0.05)
 RAYS = Rays(np.array([[-0.8, -0.3, 0.1], [-0.6, 0.7, -0.2]]), BASE)
-ENDS = np.concatenate([RAYS.z0, BASE.goal[None]])
 IDENTITY = Identity(3)
 AWAY = np.eye(3)[2]
 BEFORE = MotionWarning(Kind.IMITATION, "said before")
@@ -67,14 +56,11 @@ def as_shown(bundle):
 SHOWN = as_shown(bundle_of(IDENTITY))
 
 
-def certificates_of(
-    shown: DrawnSamples | Bundle = SHOWN, ends=None, transform: Diffeomorphism = IDENTITY, known=KNOWN, **options
-):
+def certificates_of(shown: DrawnSamples | Bundle = SHOWN, transform: Diffeomorphism = IDENTITY, known=KNOWN, **options):
     """Certificates of what is shown, said to be motions of the transform."""
     if isinstance(shown, Bundle):
         shown = as_shown(shown)
-    ends = transform.inverse(ENDS) if ends is None else ends
-    return certified(known, Solution(transform, RAYS, bundle_of(transform), ()), ends, shown, **options)
+    return certified(known, Solution(transform, RAYS, bundle_of(transform), ()), shown, **options)
 
 
 # --- the map ---
@@ -152,7 +138,7 @@ def test_no_number_is_no_certificate():
     with np.errstate(invalid="ignore"):
         known = certificates_of(straight(np.linspace(0, 1, 5)), transform=Broken())
     assert known.lyapunov_falls is False
-    failed = {Kind.NO_DIFFEOMORPHISM, Kind.ROUND_TRIP, Kind.NOT_FALLING, Kind.OFF_MOTION, Kind.OTHER_ENDS}
+    failed = {Kind.NO_DIFFEOMORPHISM, Kind.ROUND_TRIP, Kind.NOT_FALLING, Kind.OFF_MOTION}
     assert kinds(known.warnings) == {BEFORE.kind, *failed}
 
 
@@ -174,7 +160,7 @@ def test_a_sample_beside_the_motion_of_the_base_system(row, tolerance, part, sai
 def test_a_sample_at_another_time(sign, part, said):
     row, times = 40, SHOWN.times.copy()
     times[row] += sign * part * 1e-6 / np.linalg.norm(BASE.velocity(SHOWN.positions[row]))
-    assert (Kind.OTHER_TIMES in kinds(certificates_of(replace(SHOWN, times=times)).warnings)) == said
+    assert (Kind.OFF_MOTION in kinds(certificates_of(replace(SHOWN, times=times)).warnings)) == said
 
 
 @around_the_limit
@@ -182,20 +168,13 @@ def test_a_motion_that_is_said_to_be_at_its_goal_too_early(part, said):
     """It counts as there a tenth of a millimetre before."""
     last, times = np.flatnonzero(SHOWN.index == 0)[-1], SHOWN.times.copy()
     times[last] = BASE.arrival_time(RAYS.z0[:1], ARRIVED + part * 1e-6)[0]
-    assert (Kind.OTHER_TIMES in kinds(certificates_of(replace(SHOWN, times=times)).warnings)) == said
-
-
-@around_the_limit
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_a_start_or_goal_beside_those_of_the_base_system(which, part, said):
-    known = certificates_of(ends=ENDS + part * 1e-6 * np.outer(np.eye(3)[which], AWAY))
-    assert (Kind.OTHER_ENDS in kinds(known.warnings)) == said
+    assert (Kind.OFF_MOTION in kinds(certificates_of(replace(SHOWN, times=times)).warnings)) == said
 
 
 def test_motions_in_another_order_are_recognised():
-    assert Kind.OTHER_ENDS in kinds(certificates_of(ends=ENDS[[1, 0, 2]]).warnings)
+    assert Kind.OFF_MOTION in kinds(certificates_of(replace(SHOWN, index=SHOWN.index[::-1])).warnings)
     only_one = replace(SHOWN, index=np.zeros_like(SHOWN.index))
-    assert Kind.OTHER_ENDS in kinds(certificates_of(only_one).warnings)
+    assert Kind.OFF_MOTION in kinds(certificates_of(only_one).warnings)
 
 
 @pytest.mark.parametrize(
@@ -219,41 +198,6 @@ def test_samples_nearer_than_rounding_need_not_fall(rise, falls):
     assert certificates_of(Bundle(index, fraction, levels)).lyapunov_falls is falls
 
 
-@pytest.mark.parametrize(("first", "last"), [(0.0, 0.9), (0.1, 1.0)])
-def test_a_motion_that_is_not_shown_as_a_whole_is_recognised(first, last):
-    warnings = certificates_of(straight(np.linspace(first, last, 50))).warnings[1:]
-    assert warnings == (MotionWarning(Kind.OTHER_ENDS, "a motion is not shown from its start to its goal"),)
-
-
-@around_the_limit
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_clearance_other_than_the_one_that_is_said(sign, part, said):
-    warnings = clearance_warnings(0.0532, 0.0532 + sign * part * 1e-6)
-    assert kinds(warnings) == ({Kind.OTHER_CLEARANCE} if said else set())
-    assert clearance_warnings(np.inf, np.inf) == ()
-    (warning,) = clearance_warnings(0.0532, -0.004)
-    assert warning.text == "the motions shown keep -4.0 mm from the obstacle, not 53.2 mm"
-
-
-@around_the_limit
-@pytest.mark.parametrize("options", [{}, {"tolerance": 1e-6}])
-def test_a_hand_beside_its_rollout(robot, options, part, said):
-    path = robot.end_effector(robot.home)[None].repeat(5, axis=0)
-    path[3] += part * options.get("tolerance", 1e-3) * AWAY
-    warnings = hand_warnings(robot, robot.home[None].repeat(5, axis=0), path, source="it", **options)
-    assert [(warning.kind, warning.source) for warning in warnings] == [(Kind.HAND_BESIDE, "it")] * said
-
-
-@around_the_limit
-@pytest.mark.parametrize("sign", [1, -1])
-def test_an_arm_at_other_times_than_its_limits_ask_for(robot, sign, part, said):
-    q, due = robot.home + np.linspace(0, 1, 20)[:, None] * np.eye(6)[0], np.linspace(0.0, 1.0, 20)
-    times = within_velocity_limits(due, q, robot.velocity_limits)
-    assert times[-1] > 1.5  # they have something to ask for
-    times[7] += sign * part * 1e-9
-    assert kinds(delay_warnings(robot, q, times, due)) == ({Kind.OTHER_DELAY} if said else set())
-
-
 # --- what is told ---
 
 
@@ -275,43 +219,37 @@ class Certified:
 
     engine: Engine
     frame: Frame
-    solved: Solved
 
-    def failed(self, frame: Frame | None = None, solved: Solved | None = None) -> set[Kind]:
+    def failed(self, frame: Frame | None = None) -> set[Kind]:
         """The kinds of warnings that the certificates add to those of a frame."""
         frame = frame or self.frame
-        warnings = certify(frame, solved or self.solved, self.engine.follower).warnings
+        warnings = certify(frame, self.engine.follower).warnings
         return kinds(warning for warning in warnings if warning not in frame.certificates.warnings)
 
-    def with_hand(self, change) -> tuple[Frame, Solved]:
+    def with_hand(self, change) -> Frame:
         """The same with other rollouts, everywhere: `change` takes each (T, 3) and what it is without avoidance."""
-        stack, frame = self.solved.stack, self.frame
+        stack, drawn = self.frame.motion.stack, self.frame.drawn
         below = stack.bundle.split(stack.bundle.levels[:, 0])
-        paths = tuple(change(path, without) for path, without in zip(frame.rollouts, below, strict=True))
-        levels = stack.bundle.levels.copy()
-        levels[:, -1] = np.concatenate(paths)
-        stack = replace(stack, bundle=replace(stack.bundle, levels=levels))
-        return replace(frame, rollouts=paths, reached=paths[-1][-1], arm=None), replace(self.solved, stack=stack)
+        paths = [change(path, without) for path, without in zip(drawn.paths, below, strict=True)]
+        return replace(self.frame, drawn=replace(drawn, positions=np.concatenate(paths)), arm=None)
 
-    def with_postures(self, change) -> tuple[Frame, Solved]:
+    def with_postures(self, change) -> Frame:
         """The same with other postures, everywhere: `change` takes each (T, 6) and what it is without avoidance."""
-        arm, frame, robot = self.solved.arm, self.frame, self.engine.follower.robot
-        assert arm is not None and frame.arm is not None and frame.chosen is not None
-        rows = [arm.index == rollout for rollout in range(len(frame.rollouts))]
-        p = arm.p.copy()
-        for row in rows:
-            p[row] = change(arm.p[row], arm.q[row])
-        paths = tuple(robot.end_effector(p[row]) for row in rows)
-        q = p[rows[frame.chosen]]
+        motion, frame, robot = self.frame.motion, self.frame, self.engine.follower.robot
+        assert motion.arm is not None and frame.arm is not None and frame.chosen is not None
+        p = motion.arm.p.copy()
+        for rollout in range(len(frame.rollouts)):
+            rows = motion.arm.index == rollout
+            p[rows] = change(p[rows], motion.arm.q[rows])
+        q = p[motion.arm.index == frame.chosen]
         shown = replace(frame.arm, q=q, times=within_velocity_limits(frame.times[0], q, robot.velocity_limits))
-        frame = replace(frame, rollouts=paths, reached=paths[-1][-1], arm=shown)
-        return frame, replace(self.solved, arm=replace(arm, p=p))
+        drawn = replace(frame.drawn, positions=robot.end_effector(p))
+        return replace(frame, motion=replace(motion, arm=replace(motion.arm, p=p)), drawn=drawn, arm=shown)
 
 
 def computed(engine, scenario):
     """A motion of the scenario, refined."""
-    scenario = replace(scenario, view=View(field=False))
-    return Certified(engine, frame_at(engine, scenario, Stage.FINE), engine.solved(scenario, FINE))
+    return Certified(engine, frame_at(engine, replace(scenario, view=View(field=False)), Stage.FINE))
 
 
 @pytest.fixture(scope="module", name="hand")
@@ -362,17 +300,16 @@ def test_the_computed_motions_pass(hand, arm):
 
 @pytest.mark.parametrize("corruption", HAND)
 def test_rollouts_of_another_motion_are_recognised(hand, corruption):
-    assert Kind.OFF_MOTION in hand.failed(*hand.with_hand(HAND[corruption]))
+    assert Kind.OFF_MOTION in hand.failed(hand.with_hand(HAND[corruption]))
 
 
 @pytest.mark.parametrize("corruption", ARM)
 def test_postures_of_another_motion_are_recognised(arm, robot, corruption):
-    frame, solved = arm.with_postures(lambda p, q: ARM[corruption](p, q, robot))
-    assert Kind.OFF_MOTION in arm.failed(frame, solved)
+    assert Kind.OFF_MOTION in arm.failed(arm.with_postures(lambda p, q: ARM[corruption](p, q, robot)))
 
 
 def test_tolerances_are_far_from_what_the_computation_leaves_and_from_5_mm_where_space_is_squeezed_most(hand, arm):
-    of_hand, of_arm = hand.solved.stack, arm.solved.arm
+    of_hand, of_arm = hand.frame.motion.stack, arm.frame.motion.arm
     hand_base = of_hand.rays.at(of_hand.bundle.index, of_hand.bundle.fraction)
     for transform, y, base, units, tolerance in (
         (of_hand.transform, of_hand.bundle.positions, hand_base, np.ones(3), MAX_OFF),
@@ -386,40 +323,53 @@ def test_tolerances_are_far_from_what_the_computation_leaves_and_from_5_mm_where
 @pytest.mark.parametrize(("whose", "factor"), [("hand", 1.02), ("arm", 0.98)])
 def test_scaled_times_are_recognised(request, whose, factor):
     motion = request.getfixturevalue(whose)
-    frame = motion.frame
-    late = replace(frame, times=tuple(factor * times for times in frame.times))
-    assert Kind.OTHER_TIMES in motion.failed(late)
-    slow = replace(frame, arm=replace(frame.arm, times=factor * frame.arm.times))
-    assert Kind.OTHER_DELAY in motion.failed(slow)
+    drawn = replace(motion.frame.drawn, times=factor * motion.frame.drawn.times)
+    assert Kind.OFF_MOTION in motion.failed(replace(motion.frame, drawn=drawn))
 
 
 @pytest.mark.parametrize("whose", ["hand", "arm"])
 def test_a_goal_other_than_the_one_of_the_base_system_is_recognised(request, whose):
     motion = request.getfixturevalue(whose)
-    rays = motion.solved.stack.rays
+    solved, rays = motion.frame.motion, motion.frame.motion.stack.rays
     base = replace(rays.base, goal=rays.base.goal + 0.005 * np.eye(3)[0])
-    shifted = replace(motion.solved, stack=replace(motion.solved.stack, rays=replace(rays, base=base)))
-    warnings = certify(motion.frame, shifted, motion.engine.follower).warnings
-    assert any(w.kind is Kind.OTHER_ENDS and "begin or end up to 5" in w.text for w in warnings)
+    shifted = replace(solved, stack=replace(solved.stack, rays=replace(rays, base=base)))
+    assert Kind.OFF_MOTION in motion.failed(replace(motion.frame, motion=shifted))
+
+
+# --- what is drawn, and said of it before it is certified ---
 
 
 @pytest.mark.parametrize("whose", ["hand", "arm"])
-def test_a_motion_around_another_obstacle_is_recognised(request, engine, whose):
-    motion = request.getfixturevalue(whose)
-    (obstacle,) = motion.frame.scenario.obstacles
-    x, y, z = obstacle.position
-    scenario = changed(motion.frame.scenario, obstacles=Sphere((x, y, z + 0.03), obstacle.diameter))
-    other = computed(engine, scenario)
-    assert other.failed() == set()
-    posed = replace(other.frame, scenario=motion.frame.scenario)
-    solved = replace(other.solved, scenario=motion.frame.scenario)
-    assert Kind.OTHER_CLEARANCE in other.failed(posed, solved)
+def test_motions_are_drawn_from_their_starts_to_their_goal_at_their_times(request, whose):
+    frame = request.getfixturevalue(whose).frame
+    rays, drawn = frame.motion.stack.rays, frame.drawn
+    first = np.r_[True, np.diff(drawn.index) > 0]
+    last = np.append(first[1:], True)
+    np.testing.assert_array_equal(drawn.index[first], range(len(frame.task.starts)))
+    assert (drawn.fraction[first] == 0).all() and (drawn.fraction[last] == 1).all()
+    np.testing.assert_allclose(drawn.positions[first], frame.task.starts, rtol=0, atol=1e-6)
+    moved = 1e-5 if whose == "arm" else 1e-6  # by the way away from joint limits
+    np.testing.assert_allclose(drawn.positions[last], [frame.goal] * last.sum(), rtol=0, atol=moved)
+    off = rays.base.flow(rays.z0[drawn.index], drawn.times[:, None])[:, 0] - rays.at(drawn.index, drawn.fraction)
+    assert (np.linalg.norm(off, axis=1) < np.where(last, ARRIVED, 0) + 1e-9).all()
 
 
 @pytest.mark.parametrize("whose", ["hand", "arm"])
-def test_an_arm_beside_its_rollout_is_recognised(request, whose, robot):
+def test_the_clearance_that_is_said_is_that_of_what_is_drawn(request, whose):
     motion = request.getfixturevalue(whose)
-    q = displaced(motion.frame.arm.q, 50, sideways(motion.frame.arm.q, robot))
-    times = motion.frame.arm.times
-    frame = replace(motion.frame, arm=replace(motion.frame.arm, q=q, times=times))
-    assert Kind.HAND_BESIDE in motion.failed(frame)
+    frame, follower = motion.frame, motion.engine.follower
+    kept = frame.scenario.obstacle.signed_distance(frame.drawn.positions)
+    if whose == "arm":
+        kept = follower.whole_arm.clearance(frame.motion.arm.p, frame.scenario.obstacle)
+    for known in (frame.certificates, certify(frame, follower)):
+        assert known.clearance == pytest.approx(kept.min(), abs=1e-6)
+
+
+@pytest.mark.parametrize("whose", ["hand", "arm"])
+def test_the_arm_is_on_its_rollout_as_late_as_its_velocity_limits_ask_for(request, whose, robot):
+    frame = request.getfixturevalue(whose).frame
+    rows = slice(None) if whose == "arm" else arm_samples(len(frame.rollouts[frame.chosen]))
+    path, due = frame.rollouts[frame.chosen][rows], frame.times[frame.chosen][rows]
+    np.testing.assert_allclose(robot.end_effector(frame.arm.q), path, rtol=0, atol=1e-3)
+    expected = within_velocity_limits(due, frame.arm.q, robot.velocity_limits)
+    np.testing.assert_allclose(frame.arm.times, expected, rtol=0, atol=1e-9)

@@ -14,7 +14,8 @@ from dt_viz.metrics import (
     maximum_collision_distance,
     resample_by_arc_length,
 )
-from dt_viz.motion.profiles import NUM_SAMPLES, body_profile
+from dt_viz.motion import profiles as profiles_module
+from dt_viz.motion.profiles import NUM_SAMPLES
 from dt_viz.robot.body_points import load_body_points
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Stage
@@ -112,10 +113,10 @@ def test_profiles_are_computed_only_while_shown_and_not_while_dragging(engine, i
 
 def test_a_motion_that_rests_on_its_way_has_a_profile():
     path = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
-    profile = body_profile(path, path, np.array([4.0, 2, 1.5, 0]), np.array([0.3, 0.1, -0.02, 0.3]))
-    assert profile.depth == 0.02 and profile.frechet == 0
-    np.testing.assert_allclose(profile.distance, 0, atol=1e-12)
-    assert np.isfinite(profile.lyapunov).all() and (np.diff(profile.lyapunov) < 0).all()
+    found = profiles_module.profile(path, path, np.array([4.0, 2, 1.5, 0]), np.array([0.3, 0.1, -0.02, 0.3]), 0.02)
+    assert found.depth == 0.02 and found.frechet == 0
+    np.testing.assert_allclose(found.distance, 0, atol=1e-12)
+    assert np.isfinite(found.lyapunov).all() and (np.diff(found.lyapunov) < 0).all()
 
 
 # --- In the panel ---

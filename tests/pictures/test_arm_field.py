@@ -13,7 +13,7 @@ from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.obstacles.union import Union
 from dt_viz.pictures.arm_field import Lattice
 from dt_viz.scenario.scenario import Layer
-from dt_viz.session import compose
+from dt_viz.session.drawing import lattice, rest, system_of, velocities
 from dt_viz.session.frame import Stage
 
 
@@ -78,11 +78,11 @@ def test_velocities_are_those_of_the_whole_stack_whether_it_moves_a_place_or_not
     path = engine.task(task).mean_path
     ball, beside = Avoidance((Sphere(as_point(path[30]), 0.1),)), path[-1] + np.array([0.03, 0.0, 0.04])
     layers = (Layer(ball, name="Hand"), *biases(BiasPoint(as_point(beside), moves_goal=moves_goal)))
-    solved = engine.solved(avoiding(task, layers=layers), FINE)
-    rest, places = compose.rest(solved.scenario, solved), compose.lattice(solved.scenario, solved)
-    alone = compose.learned_system(solved.scenario, solved).velocity(places)
-    found = compose.velocities(solved.scenario, solved, alone)
+    frame = frame_at(engine, avoiding(task, layers=layers), Stage.FINE)
+    places = lattice(frame)
+    alone = system_of(frame, 0).velocity(places)
+    found = velocities(frame, alone)
     free, expected = np.isfinite(found[:, 0]), np.full_like(found, np.nan)
-    expected[free] = solved.stack.at_phase(rest).velocity(places[free])
+    expected[free] = frame.motion.stack.at_phase(rest(frame)).velocity(places[free])
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
     assert 0.02 < (np.abs(found - alone)[free].max(axis=1) > 1e-4).mean() < 0.98

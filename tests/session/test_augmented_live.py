@@ -356,9 +356,9 @@ def test_certificates_recognise_motions_of_other_conditions(engine):
     shown = DrawnSamples(
         bundle.index, bundle.fraction, stack.rays.times(bundle.index, bundle.fraction), bundle.positions
     )
-    assert not certified(Certificates(0.01), stack, solved.ends, shown).warnings
+    assert not certified(Certificates(0.01), stack, shown).warnings
     another = replace(stack, rays=replace(stack.rays, z0=np.roll(stack.rays.z0, 1, axis=0)))
-    assert Kind.OFF_MOTION in kinds(certified(Certificates(0.01), another, solved.ends, shown).warnings)
+    assert Kind.OFF_MOTION in kinds(certified(Certificates(0.01), another, shown).warnings)
 
 
 def test_an_added_start_draws_the_8_from_there(engine):

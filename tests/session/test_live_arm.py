@@ -84,7 +84,7 @@ def begin(known):
     """Begins a loop with an arm that has not moved yet."""
 
     def loop(scenario):
-        known._shown.clear()
+        known._last.clear()
         known.arm = LiveArm(known.follower)
         return Loop(known, scenario)
 

@@ -352,7 +352,8 @@ async def test_a_visitor_who_does_not_listen_costs_no_memory(url, server):
         await asyncio.gather(client._receiving, return_exceptions=True)
         client._socket.transport.pause_reading()
         visitor.client.add_notification("", os.urandom(2**23).hex())  # fills all buffers on the way
-        frames = visitor.shown, replace(visitor.shown, rollouts=tuple(path + 0.01 for path in visitor.shown.rollouts))
+        drawn = visitor.shown.drawn
+        frames = visitor.shown, replace(visitor.shown, drawn=replace(drawn, positions=drawn.positions + 0.01))
         held = []
         for frame in 10 * frames:
             visitor.draw(frame, Pace(0.02, 10.0, 0))

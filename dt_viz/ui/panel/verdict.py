@@ -62,11 +62,6 @@ CONCERNS = (
                 Kind.ROUND_TRIP,
                 Kind.NOT_FALLING,
                 Kind.OFF_MOTION,
-                Kind.OTHER_ENDS,
-                Kind.OTHER_TIMES,
-                Kind.OTHER_CLEARANCE,
-                Kind.HAND_BESIDE,
-                Kind.OTHER_DELAY,
                 Kind.UNSAMPLED,
             }
         ),

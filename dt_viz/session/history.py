@@ -1,0 +1,79 @@
+"""Scenarios to go back to: undo and redo, gesture by gesture."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+from dt_viz.scenario.scenario import Scenario
+
+GESTURE_PAUSE = 1.0
+"""Time without an edit, seconds, after which the next edit of the same control is a step of its own for undo."""
+MAX_UNDO = 200
+
+
+class History:
+    """The scenarios before and after the present one. Whoever has it asks one thing at a time."""
+
+    def __init__(self) -> None:
+        """Begin without a past."""
+        self._past: deque[Scenario] = deque(maxlen=MAX_UNDO)
+        self._future: list[Scenario] = []
+        self._gesture: tuple[str, float] = ("", 0.0)
+        """Name of the gesture that is under way, and when it edited last."""
+        self.held = False
+        """Whether something is held, so that the gesture goes on however slow it is."""
+
+    def begin_gesture(self) -> None:
+        """The user took hold of something."""
+        self._gesture, self.held = ("", 0.0), True
+
+    def end_gesture(self, present: Scenario) -> None:
+        """The user let go. What ends as it began is no step."""
+        if self.held and self._gesture[0] and self._past and not _is_step(present, self._past[-1]):
+            self._past.pop()
+        self._gesture, self.held = ("", 0.0), False
+
+    def edited(self, gesture: str, before: Scenario, after: Scenario) -> None:
+        """Take note of an edit by a gesture."""
+        if not _is_step(after, before):
+            return
+        now, (name, when) = time.monotonic(), self._gesture
+        # another control is moved, so whatever was held has been let go, even if nobody said so
+        self.held = self.held and name in {"", gesture}
+        if name != gesture or (now - when > GESTURE_PAUSE and not self.held):
+            self._past.append(before)
+        self._gesture = (gesture, now)
+        self._future.clear()
+
+    def undone(self, present: Scenario) -> Scenario | None:
+        """The scenario before the last gesture, to which one goes back; None if there is none."""
+        return self._moved(present, self._past, self._future)
+
+    def redone(self, present: Scenario) -> Scenario | None:
+        """The scenario after the gesture that was undone last, to which one goes; None if there is none."""
+        return self._moved(present, self._future, self._past)
+
+    def without(self, abandoned: Scenario, shown: Scenario) -> Scenario:
+        """The newest scenario with the fit of the one that is shown, after forgetting those with the abandoned fit."""
+        self._gesture = ("", 0.0)
+        while self._past and self._past[-1].fit == abandoned.fit:
+            self._past.pop()
+        for steps in (self._past, self._future):
+            if steps and steps[-1].fit == shown.fit:
+                return steps.pop()
+        return shown
+
+    def _moved(
+        self, present: Scenario, source: deque[Scenario] | list[Scenario], target: deque[Scenario] | list[Scenario]
+    ) -> Scenario | None:
+        if not source:
+            return None
+        target.append(present)
+        self._gesture = ("", 0.0)
+        return source.pop()
+
+
+def _is_step(after: Scenario, before: Scenario) -> bool:
+    """Whether the change from one to the other is a step for undo: what moves is, and where the slice lies."""
+    return after.choices != before.choices or after.view.slice != before.view.slice
