@@ -9,7 +9,7 @@ import pytest
 import dt_viz as dt
 from dt_viz.examples import arm_controller, controller, plot
 from dt_viz.examples.viser_scene import Scene
-from dt_viz.library import Motion
+from dt_viz.library.motion import Motion
 from dt_viz.robot.collision import load_collision_model
 from dt_viz.shipped import ASSETS
 from dt_viz.warning import Kind
@@ -114,7 +114,7 @@ def test_a_drawing_stays_in_its_plane_around_an_obstacle(letter):
         flat = np.pad(path.positions, ((0, 0), (0, 1)))
         assert ball.signed_distance(flat).min() > 0.0085
         np.testing.assert_allclose(path.positions[-1], letter.goal, atol=1e-6)
-    assert around._solution.bundle.positions[:, 2] == pytest.approx(0.0, abs=1e-12)
+    assert around.solution.bundle.positions[:, 2] == pytest.approx(0.0, abs=1e-12)
     assert around.certificates().warnings == ()
 
 
