@@ -10,7 +10,7 @@ import numpy as np
 from dt_viz.avoidance.arm_field import COMPLEX_STEP
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
-from dt_viz.flows.systems import DiffeomorphicSystem, stepped
+from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.robot.inverse_kinematics import soft_limits, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 
@@ -114,22 +114,3 @@ class ArmSystem:
         """Compute p(t), (*B, T, 6), exactly, from states `p0` (*B, 6) at `times` (T,) or (*B, T), seconds."""
         x0 = self.section.robot.end_effector(self.transform.forward(p0))
         return self.postures(self.hand.rollout(x0, times))
-
-    def stepped_rollout(self, p0: Array, times: Array, substeps: int = 1) -> Array:
-        """Compute the same motion by stepping ṗ = J_ψ(p)⁻¹ q̇ with RK4, independently of `rollout`.
-
-        Args:
-            p0: (*B, 6) states, rad.
-            times: (T,) increasing, seconds; the first is that of `p0`.
-            substeps: number of RK4 steps between neighbouring times.
-
-        Returns:
-            (*B, T, 6) states.
-        """
-        return stepped(self._velocity_by_solve, p0, times, substeps)
-
-    def _velocity_by_solve(self, p: Array) -> Array:
-        q, J_arm = self.transform.jacobian(p)
-        z, J_hand = self.hand.transform.jacobian(self.section.robot.end_effector(q))
-        of_hand = np.linalg.solve(J_hand, self.hand.base.velocity(z)[..., None])[..., 0]
-        return np.linalg.solve(J_arm, self.section.velocities(q, of_hand)[..., None])[..., 0]

@@ -81,7 +81,7 @@ class ArmController:
             follower: the arm.
             solved: as in `follow`.
             settings: None are the defaults.
-            rollout: as in `begin`.
+            rollout: number of the one that is begun, from 0; None draws the pattern of the nearest demonstration.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
@@ -150,9 +150,7 @@ class ArmController:
     def begin(self, q: ArrayLike, rollout: int | None = None) -> None:
         """Begin at a posture (6,), rad, before the first tick: what lies ahead is known from then on.
 
-        Args:
-            q: the posture.
-            rollout: number of the one that is begun, from 0; None leaves the pattern that is drawn as it is.
+        A rollout takes the place of the one that was begun with.
         """
         with self._lock:
             self._q = np.array(q, float)
@@ -324,18 +322,12 @@ class ArmController:
         held = self._activity.held
         self._take(resting(self.robot, undisturbed) if held else self._onwards(undisturbed))
 
-    def _change(
-        self,
-        course: Course | None = None,
-        *,
-        held: bool = False,
-        let_go: bool = False,
-        **changes: Any,  # noqa: ANN401
-    ) -> None:
+    def _change(self, course: Course | None = None, **changes: Any) -> None:  # noqa: ANN401
         """Change what the robot does: it takes a course, by default the one to where it goes then."""
         self._remember()
-        pushed = held or self._activity.held
-        self._activity = replace(self._activity, held=held, let_go=let_go, **changes)
+        activity = replace(self._activity, **{"held": False, "let_go": False, **changes})
+        pushed = activity.held or self._activity.held
+        self._activity = activity
         if self._progress is not None:
             self._take(self._onwards(self._progress.q) if course is None else course, pushed=pushed)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.kernels.compiled import compiled
-from dt_viz.kernels.runge_kutta import Array, Field, Rate, Rows, Work, add, moving, rates
+from dt_viz.kernels.runge_kutta import Array, Field, Rate, Rows, Work, add, largest, moving, rates
 
 STAGES = np.array(
     [
@@ -90,7 +90,7 @@ def carry_adaptively(
     See `dt_viz.flows.integrators.integrate_adaptive`. Where a state has arrived, another takes its lane.
     """
     m, total, sign = states.shape[1], abs(duration), 1.0 if duration > 0 else -1.0
-    first = rates(rate, field, states, d, lanes, work)
+    first = rates(rate, field, states, d, lanes, work, np.empty_like(states))
     waiting = moving(first)
     steps = _first_steps(rate, field, states, d, duration, tolerance, lanes, work, first, waiting)
     k, start, end, defect = np.empty((7, m, lanes)), np.empty((m, lanes)), np.empty((m, lanes)), np.empty((m, lanes))
@@ -152,21 +152,23 @@ def _first_steps(
     m, total, lengths = states.shape[1], abs(duration), np.zeros(len(rows))
     ahead, there = np.zeros(len(rows)), states[rows, :d]
     for k in range(len(rows)):
-        speed = np.abs(first[rows[k], :d]).max()
+        speed = largest(first[rows[k]], 0, d)
         ahead[k] = min(total, tolerance / speed) if speed > 0 else 0.0
-        there[k] += (ahead[k] if duration > 0 else -ahead[k]) * first[rows[k], :d]
-    there = rates(rate, field, there, d, lanes, work)
+        for i in range(d):
+            there[k, i] += (ahead[k] if duration > 0 else -ahead[k]) * first[rows[k], i]
+    rates(rate, field, there, d, lanes, work, there)
     for k in range(len(rows)):
         state, own = states[rows[k]], first[rows[k]]
-        speed = np.abs(own[:d]).max()
-        turning = np.abs(there[k] - own[:d]).max() / (ahead[k] * speed) if speed > 0 else 0.0
+        speed, turning = largest(own, 0, d), 0.0
+        for i in range(d if speed > 0 else 0):
+            turning = max(turning, abs(there[k, i] - own[i]) / (ahead[k] * speed))
+        still = is_straight(speed, turning, total, tolerance)
         if m > d:
-            changing = np.abs(own[d:]).max() * total
-            still = speed * total <= tolerance and changing <= TANGENT_TOLERANCE * np.abs(state[d:]).max()
-        else:
-            still = is_straight(speed, turning, total, tolerance)
+            changing = largest(own, d, m) * total
+            still = speed * total <= tolerance and changing <= TANGENT_TOLERANCE * largest(state, d, m)
         if still:
-            state += duration * own
+            for i in range(m):
+                state[i] += duration * own[i]
         else:
             lengths[k] = first_step(speed, turning, total, tolerance)
     return lengths

@@ -249,7 +249,9 @@ def _rate(escape: Escape, states: Array, n: int, d: int, work: Blocks, into: Arr
     q, velocity = block.q, block.velocity
     for i in range(d):
         for lane in range(LANES):
-            q[i, lane] = states[i, min(lane, n - 1)]
+            q[i, lane] = states[i, lane]
+        for lane in range(n, LANES):
+            q[i, lane] = states[i, n - 1]
     _find_velocity(escape, block)
     for i in range(d):
         for lane in range(LANES):
@@ -260,7 +262,7 @@ def _rate(escape: Escape, states: Array, n: int, d: int, work: Blocks, into: Arr
 def velocities(escape: Escape, q: Array) -> Array:
     """V_q (N, n) at postures q (N, n)."""
     memory = np.empty(1, BLOCK)
-    result = rates(_rate, escape, q, q.shape[1], LANES, memory)
+    result = rates(_rate, escape, q, q.shape[1], LANES, memory, np.empty_like(q))
     keep(memory)
     return result
 

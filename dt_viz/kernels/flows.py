@@ -131,7 +131,7 @@ def _implicit_euler(
 @compiled
 def _carry_implicitly(field: Terms, states: Array, d: int, duration: float, steps: int, work: FieldWork) -> None:
     """Carry states (N, m) along in equal steps of implicit Euler, in place."""
-    m, first = states.shape[1], rates(_rate, field, states, d, LANES, work)
+    m, first = states.shape[1], rates(_rate, field, states, d, LANES, work, np.empty_like(states))
     rows, block, memory = moving(first), np.empty((m, LANES)), np.empty((9, max(m, 3), LANES))
     for begin in range(0, len(rows), LANES):
         n = min(LANES, len(rows) - begin)
@@ -159,7 +159,7 @@ def carry(field: Terms, states: Array, d: int, method: int, duration: float, ste
     """
     work = field_work(field, d)
     if method == RATE:
-        states[:] = rates(_rate, field, states, d, LANES, work)
+        rates(_rate, field, states, d, LANES, work, states)
     elif method == IMPLICIT_EULER:
         _carry_implicitly(field, states, d, duration, steps, work)
     elif method == DORMAND_PRINCE:

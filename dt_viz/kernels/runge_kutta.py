@@ -59,9 +59,18 @@ def any_moves(rates: Array, n: int) -> bool:
 
 
 @compiled
-def rates(rate: Rate, field: Field, states: Array, d: int, lanes: int, work: Work) -> Array:
-    """Rates of change (N, m) of states (N, m)."""
-    found, rows = np.empty_like(states), np.arange(len(states))
+def largest(row: Array, begin: int, end: int) -> float:
+    """Largest magnitude of some entries."""
+    found = 0.0
+    for i in range(begin, end):
+        found = max(found, abs(row[i]))
+    return found
+
+
+@compiled
+def rates(rate: Rate, field: Field, states: Array, d: int, lanes: int, work: Work, found: Array) -> Array:
+    """Write rates of change to `found` (N, m), and return that; it may be the states (N, m) themselves."""
+    rows = np.arange(len(states))
     block, into = np.empty((states.shape[1], lanes)), np.empty((states.shape[1], lanes))
     for begin in range(0, len(states), lanes):
         n = min(lanes, len(states) - begin)
@@ -88,7 +97,7 @@ def carry_in_steps(
 ) -> None:
     """Carry states (N, m) along in equal steps, in place: explicit Euler's of one stage, or the classical four."""
     m, h = states.shape[1], duration / steps
-    first = rates(rate, field, states, d, lanes, work)
+    first = rates(rate, field, states, d, lanes, work, np.empty_like(states))
     rows = moving(first)
     start, there, k, total = np.empty((m, lanes)), np.empty((m, lanes)), np.empty((m, lanes)), np.empty((m, lanes))
     for begin in range(0, len(rows), lanes):
@@ -99,11 +108,15 @@ def carry_in_steps(
             if step > 0:
                 rate(field, start, n, d, work, k)
             total[:] = 0
-            add(h if stages == 1 else h / 6, k, total, n, total)
-            for stage in range(1, stages):
-                add(h if stage == 3 else h / 2, k, start, n, there)
-                rate(field, there, n, d, work, k)
-                add(h / 6 if stage == 3 else h / 3, k, total, n, total)
+            for stage in range(stages):
+                if stage > 0:
+                    rate(field, there, n, d, work, k)
+                weight = h if stages == 1 else (h / 6 if stage in (0, 3) else h / 3)
+                ahead = h if stage == 2 else h / 2
+                for i in range(m):
+                    for p in range(n):
+                        total[i, p] += weight * k[i, p]
+                        there[i, p] = start[i, p] + ahead * k[i, p]
             add(1.0, total, start, n, start)
             if not any_moves(k, n):
                 break

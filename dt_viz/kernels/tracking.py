@@ -50,8 +50,12 @@ class TrackingArm(NamedTuple):
     """(n,) rad."""
     upper: Array
     """(n,) rad."""
-    settings: Record
-    """Of `dt_viz.robot.tracking_settings.TrackingSettings`."""
+    limit_weight: float
+    """This and what follows are fields of `dt_viz.robot.tracking_settings.TrackingSettings`."""
+    damping_floor: float
+    damping_per_error: float
+    curvature: float
+    step_limit: float
 
 
 class Postures(NamedTuple):
@@ -98,27 +102,28 @@ def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
     `gain` is a factor of the null-space part; 0 leaves the plain pseudo-inverse. Postures end inside the limits;
     `largest` is the largest joint motion, rad.
     """
-    n, settings, error, J, p, H_inv_J = len(arm.joints), arm.settings, block.error, block.J, block.p, block.H_inv_J
+    n, error, J, p, H_inv_J = len(arm.joints), block.error, block.J, block.p, block.H_inv_J
     damping, inverse, v, multipliers, caution = block.damping, block.inverse, block.v, block.multipliers, block.caution
     _linearise(arm, block)
-    _improve(n, settings.limit_weight, block)
+    _improve(n, arm.limit_weight, block)
     for lane in range(LANES):
         squared = error[0, lane] ** 2 + error[1, lane] ** 2 + error[2, lane] ** 2
         caution[lane] = np.sqrt(squared)
-    damping[:], multipliers[:] = settings.damping_floor, 0
+    damping[:], multipliers[:] = arm.damping_floor, 0
     for i in range(n):
-        for c in range(3):
-            for lane in range(LANES):
-                multipliers[c, lane] += J[i, c, lane] * p[i, lane]
+        for lane in range(LANES):
+            multipliers[0, lane] += J[i, 0, lane] * p[i, lane]
+            multipliers[1, lane] += J[i, 1, lane] * p[i, lane]
+            multipliers[2, lane] += J[i, 2, lane] * p[i, lane]
     _invert(block)
     for lane in range(LANES):
         x, y, z = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
         multipliers[0, lane], multipliers[1, lane], multipliers[2, lane] = _times(inverse, lane, x, y, z)
-        damping[lane] = settings.damping_floor + settings.damping_per_error * caution[lane]
+        damping[lane] = arm.damping_floor + arm.damping_per_error * caution[lane]
     _invert(block)
     for lane in range(LANES):
         a, b, c = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
-        care = gain / (1 + settings.curvature * np.sqrt(a * a + b * b + c * c))
+        care = gain / (1 + arm.curvature * np.sqrt(a * a + b * b + c * c))
         x, y, z = _times(inverse, lane, error[0, lane], error[1, lane], error[2, lane])
         v[0, lane], v[1, lane], v[2, lane] = x - care * a, y - care * b, z - care * c
         caution[lane] = care
@@ -178,9 +183,9 @@ def _improve(n: int, limit_weight: float, block: Record) -> None:
             excess = angle - inside
             mobility[i, lane] = 1 / (1 + limit_weight) if excess != 0 else 1.0
             p[i, lane] = mobility[i, lane] * (reference[i, lane] - angle - limit_weight * excess)
-        for c in range(3):
-            for lane in range(LANES):
-                H_inv_J[i, c, lane] = mobility[i, lane] * D[i, c, lane]
+            H_inv_J[i, 0, lane] = mobility[i, lane] * D[i, 0, lane]
+            H_inv_J[i, 1, lane] = mobility[i, lane] * D[i, 1, lane]
+            H_inv_J[i, 2, lane] = mobility[i, lane] * D[i, 2, lane]
     _product(n, D, H_inv_J, block)
     damping[:] = flexibility
     _invert(block)
@@ -195,9 +200,9 @@ def _improve(n: int, limit_weight: float, block: Record) -> None:
         for c in range(3):
             for lane in range(LANES):
                 v[c, lane] -= D[i, c, lane] * p[i, lane]
-            for k in range(3):
-                for lane in range(LANES):
-                    mixed[c, k, lane] += H_inv_J[i, c, lane] * J[i, k, lane]
+                mixed[c, 0, lane] += H_inv_J[i, c, lane] * J[i, 0, lane]
+                mixed[c, 1, lane] += H_inv_J[i, c, lane] * J[i, 1, lane]
+                mixed[c, 2, lane] += H_inv_J[i, c, lane] * J[i, 2, lane]
     for i in range(n):
         for lane in range(LANES):
             x, y, z = G[i, 0, lane], G[i, 1, lane], G[i, 2, lane]
@@ -246,7 +251,7 @@ def _invert(block: Record) -> None:
 def _move(arm: TrackingArm, block: Record) -> None:
     """Move the joints by p, at most by the step's limit and up to their own, in the lanes that move."""
     q, p, largest, moves, caution = block.q, block.p, block.largest, block.moves, block.caution
-    longest = arm.settings.step_limit
+    longest = arm.step_limit
     largest[:] = 0
     for i in range(len(arm.joints)):
         for lane in range(LANES):

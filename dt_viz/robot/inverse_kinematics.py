@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dt_viz.kernels.tracking import Postures, TrackingArm, settle, walk
+from dt_viz.kernels.tracking import Postures, settle, walk
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def inverse_kinematics(
     targets, which, q = np.tile(target, (len(starts), 1)), np.zeros(len(starts), int), robot.clip(starts)
     for iteration in range(settings.max_iterations):  # all go on until each has come to rest
         improves = iteration < settings.max_iterations - settings.final_sweeps
-        before, q = q, settle(_arm(robot), posture, q, targets, which, int(improves), int(not improves), -1.0)
+        before, q = q, settle(robot.tracking_arm, posture, q, targets, which, int(improves), int(not improves), -1.0)
         if np.abs(q - before).max() < 1e-6:
             break
 
@@ -190,13 +190,9 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
     """
     posture = _posture(robot, reference[None], robot.hand_direction(reference)[None], at_reference=True)
     begin, targets = np.array(q, order="C"), np.array(positions, order="C")
-    return settle(_arm(robot), posture, begin, targets, np.zeros(len(q), int), 0, robot.tracking.final_sweeps, -1.0)
-
-
-def _arm(robot: Robot) -> TrackingArm:
-    """The arm for compiled loops."""
-    constant = robot.end_effector_offset, robot.lower, robot.upper
-    return TrackingArm(robot.records, *(np.array(values) for values in constant), robot.tracking)
+    return settle(
+        robot.tracking_arm, posture, begin, targets, np.zeros(len(q), int), 0, robot.tracking.final_sweeps, -1.0
+    )
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -212,7 +208,7 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: 
     lines = np.concatenate([robot.end_effector(starts)[:, None], paths], axis=1)
     lengths = np.cumsum(np.linalg.norm(np.diff(lines, axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)
-    return walk(_arm(robot), posture, lines, np.insert(lengths, 0, 0.0, axis=1), np.array(starts), num_strides)
+    return walk(robot.tracking_arm, posture, lines, np.insert(lengths, 0, 0.0, axis=1), np.array(starts), num_strides)
 
 
 def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:
@@ -220,7 +216,7 @@ def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArr
     each, settings = np.repeat(which, paths.shape[1]), robot.tracking
     begin, targets = np.array(q.reshape(-1, NUM_JOINTS), order="C"), np.array(paths.reshape(-1, 3), order="C")
     limits = settings.max_sweeps, settings.final_sweeps, settings.step_tolerance
-    return settle(_arm(robot), posture, begin, targets, each, *limits).reshape(q.shape)
+    return settle(robot.tracking_arm, posture, begin, targets, each, *limits).reshape(q.shape)
 
 
 def _report(robot: Robot, q: Array, path: Array) -> TrackedPath:

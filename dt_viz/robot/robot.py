@@ -18,6 +18,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from dt_viz.kernels.arm import JOINT, chains, places
+from dt_viz.kernels.tracking import TrackingArm
 from dt_viz.robot.tracking_settings import TrackingSettings
 
 if TYPE_CHECKING:
@@ -108,6 +109,13 @@ class Robot:
         joints = np.zeros(NUM_JOINTS, JOINT)
         joints["rotation"], joints["translation"] = self.joint_rotations, self.joint_translations
         return joints
+
+    @cached_property
+    def tracking_arm(self) -> TrackingArm:
+        """The arm for the compiled loops of tracking."""
+        hand, lower, upper = (np.array(values) for values in (self.end_effector_offset, self.lower, self.upper))
+        weights = (getattr(self.tracking, name) for name in TrackingArm._fields[4:])
+        return TrackingArm(self.records, hand, lower, upper, *weights)
 
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
         """Compute the poses of the six joint frames (each turns with the link after it).

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 
-class TrackingSettings(NamedTuple):
+@dataclass(frozen=True)
+class TrackingSettings:
     """Settings of `dt_viz.robot.inverse_kinematics`, which compiled loops take, too."""
 
     direction_weight: float = 1.5

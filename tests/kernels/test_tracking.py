@@ -5,14 +5,12 @@ import plain_tracking
 import pytest
 
 from dt_viz.kernels.blocks import LANES
-from dt_viz.kernels.tracking import Postures, TrackingArm, settle, walk
+from dt_viz.kernels.tracking import Postures, settle, walk
 from dt_viz.robot.inverse_kinematics import soft_limits
 from dt_viz.robot.robot import load_jaco
 
 ROBOT = load_jaco()
-ARM = TrackingArm(
-    ROBOT.records, *(np.array(v) for v in (ROBOT.end_effector_offset, ROBOT.lower, ROBOT.upper)), ROBOT.tracking
-)
+ARM = ROBOT.tracking_arm
 
 
 def postures(num, seed=0):
