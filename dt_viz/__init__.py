@@ -19,13 +19,17 @@ if TYPE_CHECKING:
     from dt_viz.avoidance.bias import BiasPoint
     from dt_viz.avoidance.hand import Avoidance, HandAvoidance
     from dt_viz.avoidance.transform import Transform
+    from dt_viz.control.settings import ControllerSettings
     from dt_viz.errors import DataError, FormatError
     from dt_viz.flows.diffeomorphisms import Integration
     from dt_viz.learning.demonstrations import Demonstration, load_demonstrations
     from dt_viz.learning.preparation import ImitationError
-    from dt_viz.library import Arm, BlockedError, Controller, HandController, JointPath, Motion, Path, fit, load_jaco
+    from dt_viz.library.arm import Arm, BlockedError, Controller, JointPath, load_jaco
+    from dt_viz.library.hand import HandController
+    from dt_viz.library.motion import Motion, Path, fit
     from dt_viz.motion.certificates import Certificates
     from dt_viz.obstacles.shapes import Box, Cylinder, Sphere
+    from dt_viz.robot.tracking_settings import TrackingSettings
     from dt_viz.warning import MotionWarning
 
 __all__ = [
@@ -37,6 +41,7 @@ __all__ = [
     "Box",
     "Certificates",
     "Controller",
+    "ControllerSettings",
     "Cylinder",
     "DataError",
     "Demonstration",
@@ -50,6 +55,7 @@ __all__ = [
     "MotionWarning",
     "Path",
     "Sphere",
+    "TrackingSettings",
     "Transform",
     "fit",
     "load_demonstrations",
@@ -57,25 +63,19 @@ __all__ = [
 ]
 
 _MODULES = {
+    "control.settings": ("ControllerSettings",),
     "errors": ("DataError", "FormatError"),
     "flows.diffeomorphisms": ("Integration",),
     "learning.demonstrations": ("Demonstration", "load_demonstrations"),
     "learning.preparation": ("ImitationError",),
-    "library": (
-        "Arm",
-        "BlockedError",
-        "Controller",
-        "HandController",
-        "JointPath",
-        "Motion",
-        "Path",
-        "fit",
-        "load_jaco",
-    ),
+    "library.arm": ("Arm", "BlockedError", "Controller", "JointPath", "load_jaco"),
+    "library.hand": ("HandController",),
+    "library.motion": ("Motion", "Path", "fit"),
     "motion.certificates": ("Certificates",),
     "obstacles.shapes": ("Box", "Cylinder", "Sphere"),
     "avoidance.avoidance": ("ArmAvoidance",),
     "avoidance.hand": ("Avoidance", "HandAvoidance"),
+    "robot.tracking_settings": ("TrackingSettings",),
     "avoidance.transform": ("Transform",),
     "avoidance.bias": ("BiasPoint",),
     "warning": ("MotionWarning",),

@@ -4,7 +4,6 @@ import numpy as np
 
 from dt_viz.avoidance import arm_field as cspace
 from dt_viz.avoidance.arm_field import WholeArmField
-from dt_viz.robot.inverse_kinematics import DIRECTION_WEIGHT
 from dt_viz.robot.robot import NUM_JOINTS, cross
 
 
@@ -36,7 +35,7 @@ def _without_pins(field, q, obstacle, direction):
     J = (weight[:, None] * moves).sum(axis=1).transpose(2, 1, 0)  # J_c, (N, 3, 6)
     hand = chain.position_jacobian().transpose(2, 1, 0), chain.direction_jacobian().transpose(2, 1, 0)
     H = np.eye(NUM_JOINTS) + cspace.HAND_WEIGHT * hand[0].transpose(0, 2, 1) @ hand[0]
-    H = H + DIRECTION_WEIGHT * hand[1].transpose(0, 2, 1) @ hand[1]
+    H = H + field.robot.tracking.direction_weight * hand[1].transpose(0, 2, 1) @ hand[1]
     back = np.linalg.solve(H, J.transpose(0, 2, 1))  # H⁻¹J_cᵀ
     pulled = np.linalg.solve(J @ back + cspace.DAMPING**2 * np.eye(3), n[..., None])
     return -cspace.SPEED * np.sqrt(total)[:, None] * (back @ pulled)[..., 0]

@@ -2,27 +2,25 @@
 
 import numpy as np
 
-from dt_viz.kernels.tracking import CURVATURE, DAMPING_FLOOR, DAMPING_PER_ERROR, LIMIT_WEIGHT, STEP_LIMIT
-
 
 def newton(robot, q, targets, postures, gain):
     """One step of postures q (N, 6) towards targets (N, 3), each with its posture, in the notation of the kernel."""
-    chain = robot.chain(q.T)
+    chain, chosen = robot.chain(q.T), robot.tracking
     J, D = (jacobian.transpose(2, 1, 0) for jacobian in (chain.position_jacobian(), chain.direction_jacobian()))
     error = targets - chain.position.T
     excess = q - np.clip(q, postures.soft_lower, postures.soft_upper)
     H = np.einsum("n,nri,nrj->nij", postures.direction_weight, D, D)
-    H += np.eye(6) * (1 + LIMIT_WEIGHT * (excess != 0))[:, None]
-    slope = q - postures.reference + LIMIT_WEIGHT * excess
+    H += np.eye(6) * (1 + chosen.limit_weight * (excess != 0))[:, None]
+    slope = q - postures.reference + chosen.limit_weight * excess
     turn = postures.direction - chain.direction.T
     slope -= postures.direction_weight[:, None] * np.einsum("nri,nr->ni", D, turn)
     p = -np.linalg.solve(H, slope[..., None])[..., 0]
     H_inv_J = np.linalg.solve(H, J.transpose(0, 2, 1))
     S = J @ H_inv_J
-    damping = DAMPING_FLOOR + DAMPING_PER_ERROR * np.linalg.norm(error, axis=1)
+    damping = chosen.damping_floor + chosen.damping_per_error * np.linalg.norm(error, axis=1)
     towards = np.linalg.solve(S + damping[:, None, None] * np.eye(3), error[..., None])[..., 0]
-    multipliers = np.linalg.solve(S + DAMPING_FLOOR * np.eye(3), J @ p[..., None])[..., 0]
-    caution = (gain / (1 + CURVATURE * np.linalg.norm(multipliers, axis=1)))[:, None]
+    multipliers = np.linalg.solve(S + chosen.damping_floor * np.eye(3), J @ p[..., None])[..., 0]
+    caution = (gain / (1 + chosen.curvature * np.linalg.norm(multipliers, axis=1)))[:, None]
     step = caution * p + (H_inv_J @ (towards - caution * multipliers)[..., None])[..., 0]
-    step *= np.minimum(1, STEP_LIMIT / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+    step *= np.minimum(1, chosen.step_limit / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
     return np.clip(q + step, robot.lower, robot.upper)

@@ -9,7 +9,7 @@ import pytest
 import dt_viz as dt
 from dt_viz.examples import arm_controller, controller, plot
 from dt_viz.examples.viser_scene import Scene
-from dt_viz.library import Motion
+from dt_viz.library.motion import Motion
 from dt_viz.robot.collision import load_collision_model
 from dt_viz.shipped import ASSETS
 from dt_viz.warning import Kind
@@ -95,6 +95,19 @@ def test_no_motion_of_the_arm_is_returned_unless_all_are(push, monkeypatch):
         arm.rollouts(around)
 
 
+def test_settings_of_the_controller_and_of_tracking_are_obeyed(push):
+    arm, path = dt.load_jaco(), push.rollouts()[0]
+    q = arm.follow(path).q
+    for settings in (dt.ControllerSettings(acceleration=1.0), dt.ControllerSettings(acceleration=2.0)):
+        loop = dt.Controller(push, arm, settings=settings)
+        loop.begin(q[0])
+        loop.displace(q[0] + 0.3)
+        acceleration = np.diff(loop.steps(q[0], 0.01, 20), axis=0) / 0.01
+        assert np.abs(acceleration).max() == pytest.approx(settings.acceleration)
+    looser = dt.load_jaco(dt.TrackingSettings(direction_weight=0.1)).follow(path)
+    assert looser.error.max() < 1e-3 and np.abs(looser.q - q).max() > 0.05
+
+
 def test_the_arm_does_not_follow_a_drawing_that_has_no_place_in_space(letter):
     arm = dt.load_jaco()
     with pytest.raises(ValueError, match="in space"):
@@ -114,7 +127,7 @@ def test_a_drawing_stays_in_its_plane_around_an_obstacle(letter):
         flat = np.pad(path.positions, ((0, 0), (0, 1)))
         assert ball.signed_distance(flat).min() > 0.0085
         np.testing.assert_allclose(path.positions[-1], letter.goal, atol=1e-6)
-    assert around._solution.bundle.positions[:, 2] == pytest.approx(0.0, abs=1e-12)
+    assert around.solution.bundle.positions[:, 2] == pytest.approx(0.0, abs=1e-12)
     assert around.certificates().warnings == ()
 
 

@@ -20,7 +20,6 @@ from dt_viz.kernels.joint_limits import stretched
 from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.inverse_kinematics import DIRECTION_WEIGHT
 from dt_viz.robot.robot import NUM_JOINTS, Robot, cross
 
 COMPLEX_STEP = 1e-30
@@ -122,7 +121,7 @@ class WholeArmField(ArmField, CompiledField):
             reach=float(self.reach),
             speed=SPEED,
             damping=DAMPING,
-            direction_weight=DIRECTION_WEIGHT,
+            direction_weight=self.robot.tracking.direction_weight,
             hand_weight=HAND_WEIGHT,
             pins=np.array(self.pins, dtype=float),
             levers=np.array(LEVERS),

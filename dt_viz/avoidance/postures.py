@@ -108,7 +108,7 @@ def stances(robot: Robot, body: BodyPoints, usual: Array, starts: Array, path: A
     tracked = track(robot, paths, references, reference=references)
     heights = (body.positions(robot, tracked.q)[..., 2] - body.radius).min(axis=(1, 2))
     follows = (tracked.error < REACHED) & ~tracked.limits_hit & ~tracked.damped
-    sound = follows.all(axis=1) & ~loses_branch(tracked.q, paths) & (heights >= min(0.0, heights[0]))
+    sound = follows.all(axis=1) & ~loses_branch(robot, tracked.q, paths) & (heights >= min(0.0, heights[0]))
     sound[0] = True
     away = np.sqrt((((tracked.q - tracked.q[0]) * LEVERS) ** 2).sum(axis=2).mean(axis=1))
     order = np.argsort(np.where(sound, away, np.inf), kind="stable")[: sound.sum()]

@@ -13,7 +13,7 @@ from dt_viz.metrics import arc_length, interpolate
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import BodyPoints, load_body_points
 from dt_viz.robot.collision import CollisionModel, load_collision_model
-from dt_viz.robot.inverse_kinematics import IK_TOLERANCE, inverse_kinematics
+from dt_viz.robot.inverse_kinematics import inverse_kinematics
 from dt_viz.robot.retiming import within_velocity_limits
 from dt_viz.robot.robot import Robot
 
@@ -42,7 +42,7 @@ class Query:
         nearest = int(np.linalg.norm(problem.task.starts - start, axis=1).argmin())
         along, times = problem.postures[nearest], problem.task.demonstrations[nearest].times
         posture = along[0]
-        if np.linalg.norm(problem.robot.end_effector(posture) - start) > IK_TOLERANCE:
+        if np.linalg.norm(problem.robot.end_effector(posture) - start) > problem.robot.tracking.tolerance:
             posture = inverse_kinematics(problem.robot, start, posture)
         return cls(posture, along[-1], float(times[-1] - times[0]))
 

@@ -10,8 +10,8 @@ import numpy as np
 from dt_viz.avoidance.arm_field import COMPLEX_STEP
 from dt_viz.flows.diffeomorphisms import Diffeomorphism
 from dt_viz.flows.fields import Array
-from dt_viz.flows.systems import DiffeomorphicSystem, stepped
-from dt_viz.robot.inverse_kinematics import DIRECTION_WEIGHT, LIMIT_MARGIN, LIMIT_WEIGHT, track
+from dt_viz.flows.systems import DiffeomorphicSystem
+from dt_viz.robot.inverse_kinematics import soft_limits, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 NUM_POLISHING = 4
@@ -71,14 +71,12 @@ class Section:
 
     def _slopes(self, q: Any) -> tuple[Array, Array]:  # noqa: ANN401, real or complex
         """Compute ∇h (N, 6) and J (N, 3, 6) at postures q (N, 6), real or complex."""
-        chain, reference = self.robot.chain(q.T), self.reference
-        soft_lower = np.minimum(self.robot.lower + LIMIT_MARGIN, reference)
-        soft_upper = np.maximum(self.robot.upper - LIMIT_MARGIN, reference)
-        excess = q - np.clip(q.real, soft_lower, soft_upper)
+        chain, reference, settings = self.robot.chain(q.T), self.reference, self.robot.tracking
+        excess = q - np.clip(q.real, *soft_limits(self.robot, reference))
         excess = np.where(excess.real == 0, 0, excess)
         turn = chain.direction - self.robot.hand_direction(reference)[:, None]
-        slope = q - reference + LIMIT_WEIGHT * excess
-        slope = slope + DIRECTION_WEIGHT * np.einsum("irn,rn->ni", chain.direction_jacobian(), turn)
+        slope = q - reference + settings.limit_weight * excess
+        slope = slope + settings.direction_weight * np.einsum("irn,rn->ni", chain.direction_jacobian(), turn)
         return slope, chain.position_jacobian().transpose(2, 1, 0)
 
 
@@ -116,22 +114,3 @@ class ArmSystem:
         """Compute p(t), (*B, T, 6), exactly, from states `p0` (*B, 6) at `times` (T,) or (*B, T), seconds."""
         x0 = self.section.robot.end_effector(self.transform.forward(p0))
         return self.postures(self.hand.rollout(x0, times))
-
-    def stepped_rollout(self, p0: Array, times: Array, substeps: int = 1) -> Array:
-        """Compute the same motion by stepping ṗ = J_ψ(p)⁻¹ q̇ with RK4, independently of `rollout`.
-
-        Args:
-            p0: (*B, 6) states, rad.
-            times: (T,) increasing, seconds; the first is that of `p0`.
-            substeps: number of RK4 steps between neighbouring times.
-
-        Returns:
-            (*B, T, 6) states.
-        """
-        return stepped(self._velocity_by_solve, p0, times, substeps)
-
-    def _velocity_by_solve(self, p: Array) -> Array:
-        q, J_arm = self.transform.jacobian(p)
-        z, J_hand = self.hand.transform.jacobian(self.section.robot.end_effector(q))
-        of_hand = np.linalg.solve(J_hand, self.hand.base.velocity(z)[..., None])[..., 0]
-        return np.linalg.solve(J_arm, self.section.velocities(q, of_hand)[..., None])[..., 0]

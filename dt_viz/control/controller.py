@@ -2,30 +2,27 @@
 
 With q(t) the course, the undisturbed motion of the joints, and ψ_q the flow around obstacles, made for where these will
 be, the robot's target is p(t) = ψ_q⁻¹(q(t)): while nothing moves, the motion of eq. (4) lifted to the joints
-(`control.arm_system`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among those that the limits allow
-(`dt_viz.control.limits`). The clock of the course waits in proportion to the gap, so that a robot that had to give way
-takes up its motion where it left it. Home, hold and shove are other courses of the same loop.
+(`control.arm_system`). Each tick finds the velocity nearest to ṗ + g·(p − robot) among the feasible ones
+(`control.feasible`). The clock of the course waits in proportion to the gap, so that a robot that had to give way takes
+up its motion where it left it. Home, hold and shove are other courses of the same loop.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
-import daqp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dt_viz.avoidance.arm_field import LEVERS
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.arm_system import ArmSystem, Section
-from dt_viz.control.clearing import Clearing, clearing
-from dt_viz.control.courses import Course, resting, towards
-from dt_viz.control.dodging import Dodge
-from dt_viz.control.limits import AccelerationLimit, ContactLimit, ObstacleLimit, RangeLimit, VelocityLimit
-from dt_viz.control.obstacle_motion import NOTHING_SEEN
+from dt_viz.control.courses import Course, Progress, resting, shoved, straight_to, towards
+from dt_viz.control.feasible import FeasibleVelocities, Tick
+from dt_viz.control.obstacle_flow import ObstacleFlow
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED
@@ -33,30 +30,14 @@ from dt_viz.flows.systems import Attractor, DiffeomorphicSystem
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.robot.inverse_kinematics import track
-from dt_viz.robot.robot import NUM_JOINTS
-
-MOVED = 5e-3
-"""Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
-AT_REST = 1e-3
-"""Gap, rad, and velocity, rad/s, of joints that count as at rest."""
-NEARLY = 0.01
-"""Distance from the end of a joint's range, rad, that counts as being there."""
-NUM_CLEAR, NUM_CLEAR_MOVING = 40, 10
-"""Numbers of postures of the motion ahead that are to be clear of obstacles, at rest and moving."""
-TOUCHING = 5e-3
-"""Depth of a body point's sphere, less what it sticks out of the arm, that counts as touching, metres."""
-ASIDE = 5e-3
-"""Displacement, metres by `LEVERS`, from which on a robot at rest counts as having stepped aside."""
-RAMP = 0.3
-"""Shortest time in which the clock comes to its pace, seconds."""
-SOFT = 8
-"""Mark of a row of the quadratic programme that may be violated where there is no other way."""
+from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 
 class Phase(Enum):
     """What the robot is doing."""
 
     MOVING = "moving"
+    """It goes to the goal."""
     HOMING = "going home"
     RESTING = "resting"
     ASIDE = "stepped aside"
@@ -65,73 +46,63 @@ class Phase(Enum):
     """An obstacle touches it, or leaves no way out: it waits where it is or gives way."""
 
 
-class Aim(Enum):
-    """Where the robot is to go."""
+@dataclass(frozen=True, eq=False)
+class Activity:
+    """What the robot was told to do."""
 
-    GOAL = "goal"
-    HOME = "home"
-    HAND = "hand"
+    heading: Phase = Phase.MOVING
+    """Where it goes, to the goal or home, also when it is let go."""
+    held: bool = False
+    """Whether somebody has its hand, so that it stays at the end of its course."""
+    let_go: bool = False
+    """Whether the hand is let go there."""
+    rollout: int | None = None
+    """Number of the rollout whose start it goes home to, and whose pattern it draws from there; None draws that of the
+    nearest demonstration."""
+    rest: Array | None = None
+    """What the state was, besides the place, when it last went to the goal: phase and condition of an augmented one;
+    None where it begins anew."""
+
+    @property
+    def seeks_goal(self) -> bool:
+        """Whether it is on its way to the goal."""
+        return self.heading is Phase.MOVING and not self.held
 
 
 class ArmController:
     """A robot's state and what it follows; `step` is for one thread, `follow` and the rest may come from another."""
 
-    def __init__(self, follower: Follower, solved: Solved, settings: ControllerSettings | None = None) -> None:
+    def __init__(
+        self, follower: Follower, solved: Solved, settings: ControllerSettings | None = None, rollout: int | None = None
+    ) -> None:
         """Take an arm and the stack that it follows first; its state is that of the first `step`.
 
         Args:
             follower: the arm.
             solved: as in `follow`.
             settings: None are the defaults.
+            rollout: number of the one that is begun, from 0; None draws the pattern of the nearest demonstration.
 
         Raises:
             UnreachableError: the arm cannot get to where the motions start.
         """
-        self.settings = settings or ControllerSettings()
-        self.robot = robot = follower.robot
-        self._arm, self._follower = follower.whole_arm, follower
-        self._limits = (
-            RangeLimit(robot, self.settings.acceleration),
-            VelocityLimit(robot.velocity_limits),
-            AccelerationLimit(self.settings.acceleration),
-        )
-        self._barrier = ObstacleLimit(
-            self._arm, self.settings.clearance, self.settings.barrier_gain, self.settings.barrier_reach
-        )
-        self._contacts = tuple(
-            make(robot, follower.body, self.settings.clearance, self.settings.contact_gain)
-            for make in (ContactLimit.table, ContactLimit.itself)
-        )
+        self.settings = settings = settings or ControllerSettings()
+        self._follower, self._solved, self._lock = follower, solved, threading.RLock()
+        self._section = Section(follower.robot, follower.reference(solved.nominal))
+        self._flow = ObstacleFlow(follower.whole_arm, solved.scenario.arm_avoidance, settings)
+        self._feasible = FeasibleVelocities(follower.whole_arm, follower.body, settings)
+        self._activity = Activity(rollout=rollout)
+        self._progress: Progress | None = None
         self._kept: tuple[Array, ...] = ()
-        """Distances that are kept, for each of these limits."""
-        self._dodge, self._dodging = Dodge(self._arm, self.settings), None
-        self._lock = threading.RLock()
-        self._solved = solved
-        self._seen = NOTHING_SEEN.then(solved.scenario.arm_avoidance, 0.0, self.settings)
-        self._section = Section(robot, follower.reference(solved.nominal))
-        self._aim, self._then = Aim.GOAL, Aim.GOAL
-        self._home: int | None = None
-        """Number of the rollout whose start it goes home to, and whose pattern it draws from there; None draws that of
-        the nearest demonstration."""
-        self._rest: Array | None = None
-        """What else the state was, besides the place, when it last went to the goal: phase and condition of an
-        augmented one; None where it begins anew."""
-        self._course: Course | None = None
-        self._clock = self._rate = self._now = 0.0
+        """Distances that are kept; see `FeasibleVelocities.kept`."""
         self._q: Array | None = None
-        """Where the robot was sent."""
-        self._at = self._velocity = np.zeros(NUM_JOINTS)
-        """Where it was to be, rad, and its velocity, rad/s."""
-        self._made_for: tuple[Course, Clearing, float, float] | None = None
-        """Course, flow, duration and clock that it was to be there for."""
-        self._clearing, self._duration = Clearing(), 0.0
-        self._looked, self._changed = -np.inf, True
-        """Time of the last look at obstacles, and whether something has changed since."""
-        self._distance = np.inf
-        """Distance from the nearest obstacle, about, metres."""
-        self._settled = self._released = False
-        self._tick: tuple[Array, Array, Array, list[tuple[Array, Array]]] | None = None
-        """The last posture, the velocity that was wanted, the one that was allowed, and the rows of contacts."""
+        """(6,) where the robot was sent, rad."""
+        self._tick: Tick | None = None
+
+    @property
+    def robot(self) -> Robot:
+        """The arm."""
+        return self._follower.robot
 
     # --- What it follows ---
 
@@ -145,95 +116,81 @@ class ArmController:
         """
         section = Section(self.robot, self._follower.reference(solved.nominal))
         with self._lock:
-            before, stays = self._solved, np.array_equal(self._section.reference, section.reference)
-            alike = stays and _same_course(before, solved)
-            self._solved, self._section, course = solved, section, self._course
+            before, progress, activity = self._solved, self._progress, self._activity
+            stays = np.array_equal(self._section.reference, section.reference) and _same_course(before, solved)
+            self._solved, self._section = solved, section
             self.see(solved.scenario.arm_avoidance)
-            if course is None or alike or self._aim is Aim.HAND:
+            if progress is None or activity.held or stays:
                 return
             learned = before.below.system is solved.below.system
-            z = course.image(self._clock) if learned and self._aim is Aim.GOAL else None
-            self._take(self._to_aim(course.at(self._clock), z, course if stays else None))
+            self._take(self._onwards(progress.q, progress.image if learned and activity.seeks_goal else None))
 
     def see(self, avoidance: ArmAvoidance | None) -> None:
         """Take note of where the obstacles are now."""
         with self._lock:
-            self._seen, self._changed = self._seen.then(avoidance, self._now, self.settings), True
+            self._flow.see(avoidance)
 
     def watch(self) -> None:
         """Look at the obstacles while no time passes: what lies ahead leads around them also while the robot stands."""
         with self._lock:
-            if self._changed and self._course is not None:
-                self._look()
-                self._duration = self._clearing.duration
+            if self._progress is not None:
+                self._flow.settle(self._progress)
 
     @property
     def system(self) -> ArmSystem:
         """The system of eq. (4) whose motion it is."""
         with self._lock:
             stack, rest = self._solved.stack, self._solved.stack.rays.z0[0, 3:]
-            if self._course is not None and self._aim is Aim.GOAL:
-                rest = self._course.image(self._clock)[3:]
-            return ArmSystem(stack.at_phase(rest), self._section, self._clearing.transform(self._arm, self._duration))
+            if self._progress is not None and self._activity.seeks_goal:
+                rest = self._progress.image[3:]
+            return ArmSystem(stack.at_phase(rest), self._section, self._flow.transform)
 
-    # --- What happens to it ---
+    # --- What it is told to do ---
 
     def begin(self, q: ArrayLike, rollout: int | None = None) -> None:
         """Begin at a posture (6,), rad, before the first tick: what lies ahead is known from then on.
 
-        Args:
-            q: the posture.
-            rollout: number of the one that is begun, from 0; None leaves the pattern that is drawn as it is.
+        A rollout takes the place of the one that was begun with.
         """
         with self._lock:
-            self._q, self._home = np.array(q, float), self._home if rollout is None else rollout
-            self._take(self._to_aim(self._q))
-            self._look()
-            self._duration = self._clearing.duration
+            self._q = np.array(q, float)
+            if rollout is not None:
+                self._activity = replace(self._activity, rollout=rollout)
+            self._take(self._onwards(self._q))
+            self.watch()
 
     def go(self) -> None:
         """Go to the goal from here."""
-        self._set_out(Aim.GOAL)
+        with self._lock:
+            self._change(heading=Phase.MOVING)
 
     def home(self, start: int) -> None:
         """Go straight to the start of a rollout, counted from 0, around what is in the way."""
         with self._lock:
-            self._home = start
-            self._set_out(Aim.HOME)
-            self._rest = None
+            self._change(heading=Phase.HOMING, rollout=start)
+            self._activity = replace(self._activity, rest=None)
 
     def hold(self, place: ArrayLike) -> None:
         """Take the hand to a place (3,), metres, and stay there until `release`, giving way to obstacles."""
         with self._lock:
-            if self._course is None:
-                return
-            q = self._course.at(self._clock)
-            begin, end = self.robot.end_effector(q), np.asarray(place, float)
-            u = np.linspace(0, 1, 2 + int(np.linalg.norm(end - begin) / 0.02))
-            path = begin + u[:, None] * (end - begin)
-            joints = self._arm.limits.inside(track(self.robot, path, q, reference=self._section.reference).q)
-            lengths = np.linalg.norm(np.diff(self.robot.end_effector(joints), axis=0), axis=1)
-            times = np.cumsum([0.0, *np.maximum(lengths / self.settings.holding_speed, 0.01)])
-            self._hand(Course(times, joints, path))
+            if self._progress is not None:
+                end, limits = np.asarray(place, float), self._follower.whole_arm.limits
+                course = straight_to(end, self._section, self._progress.q, limits, self.settings.holding_speed)
+                self._change(course, held=True)
 
     def displace(self, q: ArrayLike) -> None:
         """Shove the robot towards a posture (6,), rad; it goes on from there."""
         with self._lock:
-            if self._course is None:
-                return
-            inside, transform = self._arm.limits.inside, self._clearing.transform(self._arm, self._duration)
-            begin, end = self._course.at(self._clock), inside(transform.forward(inside(np.asarray(q, float))))
-            u = np.linspace(0, 1, 9)
-            times = self.settings.shove_time * u
-            goes_on = np.stack([self._course.at(self._clock + self._rate * t) for t in times])
-            joints = goes_on + (u * u * (3 - 2 * u))[:, None] * (end - begin)
-            self._hand(Course(times, joints, self.robot.end_effector(joints)), released=True)
+            if self._progress is not None:
+                end = self._follower.whole_arm.limits.inside(self._undisturbed_of(np.asarray(q, float)))
+                course = shoved(self._progress, self.robot, end, self.settings.shove_time)
+                self._change(course, held=True, let_go=True)
 
     def release(self) -> None:
         """Let go of the hand: it goes on to where it was going."""
         with self._lock:
-            if self._aim is Aim.HAND:
-                self._set_out(self._then)
+            if self._activity.held:
+                self._change()
 
     # --- What it does ---
 
@@ -249,20 +206,28 @@ class ArmController:
         if not 0 < dt < np.inf:
             raise ValueError(f"dt: found {dt}; accepted: seconds, more than 0")
         with self._lock:
-            self._now += dt
+            flow, settings = self._flow, self.settings
+            flow.time += dt
             if self._q is None:
                 self.begin(q)
-            elif np.abs(q - self._q).max() > MOVED:
+            elif np.abs(q - self._q).max() > settings.displaced:
                 self._moved_to(q)
-            self._watch()
-            self._ease(dt)
-            course, now = self._begun, self._target()
-            self._advance(float(np.abs(now - q).max()), dt)
-            then = self._target()
-            self._velocity = self._feasible(q, (then - now) / dt + min(self.settings.gain, 0.5 / dt) * (now - q), dt)
-            self._q = q + dt * self._velocity
-            self._settle(course)
-            return self._velocity.copy()
+            assert self._progress is not None
+            before = self._progress
+            flow.advance(before, dt)
+            now = flow.image(before)
+            gap = float(np.abs(now - q).max())
+            rate = max(0.0, 1 - gap / settings.patience) if flow.cleared else 0.0
+            self._progress = progress = before.advanced(rate, dt, settings.ramp)
+            wanted = (flow.image(progress) - now) / dt + min(settings.gain, 0.5 / dt) * (now - q)
+            self._tick = tick = self._feasible.tick(q, wanted, dt, self._tick, flow.seen, flow.late, self._kept)
+            self._q = q + dt * tick.velocity
+            if progress.ended and not before.ended:
+                if self._activity.let_go:
+                    self.release()
+                else:
+                    flow.changed = True  # what was in the way of the motion need not be in that of its end
+            return tick.velocity.copy()
 
     def steps(self, q: ArrayLike, dt: float, num: int) -> Array:
         """Compute the joint velocities (num, 6), rad/s, of some steps in a row of a robot that does as it is told."""
@@ -275,228 +240,125 @@ class ArmController:
     @property
     def phase(self) -> Phase:
         """What it is doing."""
-        course, q = self._course, self._q
-        if course is None or q is None:
+        progress, q, tick, activity = self._progress, self._q, self._tick, self._activity
+        if progress is None or q is None:
             return Phase.RESTING
-        if not self._clearing.cleared or self.touched:
+        if not self._flow.cleared or self.touched:
             return Phase.TOUCHED
-        if self._aim is Aim.HAND:
+        if activity.held:
             return Phase.HELD
-        if self._settled and np.linalg.norm((self._at - course.q[-1]) * LEVERS) > ASIDE:
-            return Phase.ASIDE
-        if self.rests and np.abs(q - self._at).max() < AT_REST:
-            return Phase.RESTING
-        return Phase.HOMING if self._aim is Aim.HOME else Phase.MOVING
+        if tick is not None and progress.ended:
+            target = self._flow.image(progress)
+            if np.linalg.norm((target - progress.course.q[-1]) * LEVERS) > self.settings.aside:
+                return Phase.ASIDE
+            if self.rests and np.abs(q - target).max() < self.settings.at_rest:
+                return Phase.RESTING
+        return activity.heading
+
+    @property
+    def heading(self) -> Phase:
+        """Where it goes, to the goal or home, also when its hand is let go."""
+        return self._activity.heading
 
     @property
     def rests(self) -> bool:
         """Whether the course has ended and the robot stands still, at its end or where a limit holds it."""
-        return self._settled and bool(np.abs(self._velocity).max() < AT_REST)
+        progress, tick = self._progress, self._tick
+        if progress is None or tick is None or not progress.ended:
+            return False
+        return bool(np.abs(tick.velocity).max() < self.settings.at_rest)
 
     @property
     def touched(self) -> bool:
         """Whether an obstacle touches it."""
-        return self._distance < -TOUCHING
+        return self._tick is not None and self._tick.clearance < -self.settings.touching
 
     @property
     def held_back(self) -> str:
         """Which limit keeps it from where it is to go, in words; empty if none does."""
-        if self._tick is None:
-            return ""
-        q, wanted, velocity, contacts = self._tick
-        for limit, (slopes, bounds) in zip(self._contacts, contacts, strict=True):
-            if ((slopes @ wanted < bounds - AT_REST) & (slopes @ velocity < bounds + AT_REST)).any():
-                return f"kept from {limit.name}"
-        room = np.where(wanted < 0, q - self.robot.lower, self.robot.upper - q)
-        (ended,) = np.nonzero((room < NEARLY) & (np.abs(wanted) > AT_REST + np.abs(velocity)))
-        return f"joint {ended[0] + 1} is at its limit" if len(ended) else ""
+        return "" if self._tick is None else self._feasible.active(self._tick)
 
     @property
     def ahead(self) -> Array:
         """(K, 6) the postures ahead, from where its motion is now on, rad."""
         with self._lock:
-            if self._course is None:
+            if self._progress is None:
                 return np.empty((0, NUM_JOINTS))
-            transform = self._clearing.transform(self._arm, self._duration)
-            return transform.inverse(self._arm.limits.inside(self._course.after(self._clock)))
+            return self._flow.transform.inverse(self._follower.whole_arm.limits.inside(self._progress.ahead))
 
     @property
     def left(self) -> float:
         """Part of its motion to the goal that is left, from 1 at a start to 0; 1 while it goes elsewhere."""
         with self._lock:
-            base = self._solved.stack.rays.base
-            if self._course is None or self._aim is not Aim.GOAL:
+            rays = self._solved.stack.rays
+            if self._progress is None or not self._activity.seeks_goal:
                 return 1.0
-            whole = float(base.left(self._solved.stack.rays.z0).max())
-            return min(float(base.left(self._course.image(self._clock))) / max(whole, ARRIVED), 1.0)
+            whole = float(rays.base.left(rays.z0).max())
+            return min(float(rays.base.left(self._progress.image)) / max(whole, ARRIVED), 1.0)
 
     @property
     def undisturbed(self) -> Array:
         """The posture (6,) at this moment of the motion without what is stacked on the learned one, rad."""
         with self._lock:
-            course, solved = self._course, self._solved
-            if course is None:
+            progress, solved = self._progress, self._solved
+            if progress is None:
                 return self._section.reference
-            q = course.at(self._clock)
-            if self._aim is not Aim.GOAL or not solved.stack.built:
-                return q
-            x = solved.below.learned.places(course.image(self._clock)[None])
-            return track(self.robot, x, q, reference=self._section.reference).q[0]
-
-    @property
-    def _begun(self) -> Course:
-        """The course, after the first tick."""
-        assert self._course is not None
-        return self._course
-
-    # --- Within a tick ---
-
-    def _watch(self) -> None:
-        """Look at the obstacles where that is due: every few ticks where they move, else after a change."""
-        if self._seen.speed > 0 and self._now > self._seen.time + self.settings.stale:
-            self.see(self._seen.avoidance)
-        moving = self._seen.speed > 0
-        if self._now >= self._looked + self.settings.look_period and (moving or self._changed):
-            self._look()
-
-    def _look(self) -> None:
-        """Find the way around obstacles for the motion that is ahead."""
-        course, seen, settings = self._begun, self._seen, self.settings
-        turn = settings.turning * min(self._now - self._looked, 1.0)
-        if seen.speed > 0:
-            late = self._now - seen.time
-            avoidance = seen.expected(settings.lead + late, settings.room, settings.returning)
-            last = min(self._clock + settings.window, course.end)
-            times = np.unique(np.linspace(self._clock, last, NUM_CLEAR_MOVING))
-            ahead, end = np.stack([course.at(clock) for clock in times]), None
-        else:
-            avoidance, ahead = seen.avoidance, course.after(self._clock)
-            ahead, end = ahead[:: max(1, len(ahead) // NUM_CLEAR)], self._arm.limits.inside(ahead[-1])
-        self._clearing = clearing(self._arm, ahead, avoidance, seen.velocities, self._clearing, turn, end)
-        self._looked, self._changed = self._now, False
-
-    def _ease(self, dt: float) -> None:
-        """Change the duration of the flow towards that which clears the motion ahead."""
-        rise = self._clearing.duration - self._duration
-        self._duration += min(max(rise, -self.settings.easing * dt), 2 * self.settings.easing * dt)
-
-    def _target(self) -> Array:
-        """The posture (6,) where the robot is to be at this time of the course."""
-        made_for = self._begun, self._clearing, self._duration, self._clock
-        if made_for != self._made_for:
-            q, transform = self._begun.at(self._clock), self._clearing.transform(self._arm, self._duration)
-            self._at = transform.inverse(self._arm.limits.inside(q)[None])[0] if self._duration > 0 else q
-            self._made_for = made_for
-        return self._at
-
-    def _advance(self, gap: float, dt: float) -> None:
-        """Move the clock on, at a rate that falls with the gap (rad) between the robot and its target."""
-        rate = max(0.0, 1 - gap / self.settings.patience) if self._clearing.cleared else 0.0
-        self._rate += min(max(rate - self._rate, -dt / RAMP), dt / RAMP)
-        self._clock = min(self._clock + self._rate * dt, self._begun.end)
-
-    def _feasible(self, q: Array, wanted: Array, dt: float) -> Array:
-        """Find the velocity (6,) nearest to the wanted one that all limits allow, or that dodges what moves."""
-        lower, upper = np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
-        for limit in self._limits:  # the last one's bounds, of acceleration, come first
-            lowest, highest = limit.bounds(q, self._velocity, dt)
-            lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
-        contacts = [limit.rows(q, kept, dt) for limit, kept in zip(self._contacts, self._kept, strict=True)]
-        seen, late = self._seen, self._now - self._seen.time
-        there = replace(seen, avoidance=seen.expected(late, 0.0, self.settings.returning))
-        *barrier, self._distance = self._barrier.rows(q, there, dt)
-        velocity = _nearest(wanted, lower, upper, [*contacts, barrier])
-        self._tick = q, wanted, velocity, contacts
-        floor = float(self._kept[0].min())
-        self._dodging = self._dodge.chosen(q, self._velocity, velocity, self._dodging, seen, late, floor)
-        return velocity if self._dodging is None else _nearest(self._dodging, lower, upper, contacts)
-
-    def _settle(self, course: Course) -> None:
-        """Take note of the end of a course, and go on from a shove."""
-        if self._settled or self._clock < course.end:
-            return
-        if self._released:
-            self._set_out(self._then)
-        else:
-            self._settled = self._changed = True  # what was in the way of the motion need not be in that of its end
+            if not self._activity.seeks_goal or not solved.stack.built:
+                return progress.q
+            x = solved.below.learned.places(progress.image[None])
+            return track(self.robot, x, progress.q, reference=self._section.reference).q[0]
 
     # --- Courses ---
 
+    def _undisturbed_of(self, q: Array) -> Array:
+        """Find the undisturbed posture ψ_q(p) (6,) of a robot at a posture."""
+        inside = self._follower.whole_arm.limits.inside
+        return self._flow.transform.forward(inside(q))
+
     def _moved_to(self, q: Array) -> None:
         """Begin anew where somebody else has moved the robot, as the image of the undisturbed motion there."""
-        inside, transform = self._arm.limits.inside, self._clearing.transform(self._arm, self._duration)
-        shadow = transform.forward(inside(q))
-        self._q = q
+        self._q, undisturbed = q, self._undisturbed_of(q)
         self._remember()
-        at_hand = self._aim is Aim.HAND
-        self._take(resting(shadow, self.robot.end_effector(shadow)) if at_hand else self._to_aim(shadow))
+        held = self._activity.held
+        self._take(resting(self.robot, undisturbed) if held else self._onwards(undisturbed))
 
-    def _set_out(self, aim: Aim) -> None:
-        with self._lock:
-            self._remember()
-            pushed = self._aim is Aim.HAND
-            self._aim, self._released = aim, False
-            if self._course is not None:
-                self._take(self._to_aim(self._course.at(self._clock)), pushed=pushed)
-
-    def _hand(self, course: Course, *, released: bool = False) -> None:
+    def _change(self, course: Course | None = None, **changes: Any) -> None:  # noqa: ANN401
+        """Change what the robot does: it takes a course, by default the one to where it goes then."""
         self._remember()
-        if self._aim is not Aim.HAND:
-            self._then = self._aim
-        self._aim, self._released = Aim.HAND, released
-        self._take(course, pushed=True)
+        activity = replace(self._activity, **{"held": False, "let_go": False, **changes})
+        pushed = activity.held or self._activity.held
+        self._activity = activity
+        if self._progress is not None:
+            self._take(self._onwards(self._progress.q) if course is None else course, pushed=pushed)
 
     def _remember(self) -> None:
         """Take note of phase and condition before the motion to the goal is left."""
-        if self._aim is Aim.GOAL and self._course is not None:
-            self._rest = self._course.image(self._clock)[3:]
+        if self._activity.seeks_goal and self._progress is not None:
+            self._activity = replace(self._activity, rest=self._progress.image[3:])
 
     def _take(self, course: Course, *, pushed: bool = False) -> None:
         """Follow a course from its beginning; one that a push leads to comes no nearer to the table than before."""
         if not pushed or not self._kept:
-            self._kept = tuple(limit.kept(course.q) for limit in self._contacts)
-        self._course = course.slowed(self.settings.course_speed * self.robot.velocity_limits)
-        self._clock, self._settled, self._changed = 0.0, False, True
+            self._kept = self._feasible.kept(course.q)
+        rate = 0.0 if self._progress is None else self._progress.rate
+        slowed = course.slowed(self.settings.course_speed * self.robot.velocity_limits)
+        self._progress, self._flow.changed = Progress(slowed, rate=rate), True
 
-    def _to_aim(self, q: Array, z: Array | None = None, near: Course | None = None) -> Course:
+    def _onwards(self, q: Array, z: Array | None = None) -> Course:
         """Make the undisturbed motion from a posture (6,) to where it is to go; see `towards`."""
-        stack, nominal, settings = self._solved.stack, self._solved.nominal, self.settings
-        hand = self.robot.end_effector(q)
-        if self._aim is Aim.HOME:
-            start = stack.stacked.forward(nominal.starts[(self._home or 0) % len(nominal.starts)])
-            base = Attractor(start, settings.homing_speed * stack.rays.base.speed, stack.rays.base.smoothing)
-            system = DiffeomorphicSystem(stack.stacked, base)
-            return towards(system, self._section, q, hand, settings.convergence, z, near)
-        base, images = stack.rays.base, stack.rays.z0
-        state = base.states(hand) if self._home is None else base.states_like(hand, images[self._home % len(images)])
-        if self._rest is not None and len(self._rest) == len(state) - 3:
-            state = base.caught(np.concatenate([hand, self._rest]), stack.stacked.forward(hand))
-        return towards(stack.system, self._section, q, state, settings.convergence, z, near)
-
-
-def _nearest(wanted: Array, lower: Array, upper: Array, rows: Sequence[Sequence[Array]]) -> Array:
-    """Find the velocity nearest to a wanted one (6,), min ‖q̇ − q̇*‖².
-
-    Bounds (6,) are hard; rows of slopes s and bounds b, s·q̇ ≥ b, give way where there is no other way.
-    """
-    nearest = _within(wanted, lower, upper)
-    if all((slopes @ nearest >= bounds).all() for slopes, bounds in rows):
-        return nearest
-    slopes, bounds = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    solution, _, flag, _ = daqp.solve(
-        np.eye(NUM_JOINTS),
-        -wanted,
-        np.ascontiguousarray(slopes),
-        np.concatenate([upper, np.full(len(bounds), 1e30)]),
-        np.concatenate([lower, bounds]),
-        np.repeat(np.array([0, SOFT], np.int32), (NUM_JOINTS, len(bounds))),
-    )
-    return _within(solution if flag > 0 else np.zeros(NUM_JOINTS), lower, upper)
-
-
-def _within(values: Array, lower: Array, upper: Array) -> Array:
-    """Clip values (6,); for so few `np.clip` takes five times as long."""
-    return np.minimum(np.maximum(values, lower), upper)
+        stack, starts, activity = self._solved.stack, self._solved.nominal.starts, self._activity
+        hand, base, images = self.robot.end_effector(q), stack.rays.base, stack.rays.z0
+        if activity.heading is Phase.HOMING:
+            start = stack.stacked.forward(starts[(activity.rollout or 0) % len(starts)])
+            home = Attractor(start, self.settings.homing_speed * base.speed, base.smoothing)
+            return towards(DiffeomorphicSystem(stack.stacked, home), self._section, q, hand, self.settings, z)
+        if activity.rollout is None:
+            state = base.states(hand)
+        else:
+            state = base.states_like(hand, images[activity.rollout % len(images)])
+        if activity.rest is not None and len(activity.rest) == len(state) - 3:
+            state = base.caught(np.concatenate([hand, activity.rest]), stack.stacked.forward(hand))
+        return towards(stack.system, self._section, q, state, self.settings, z)
 
 
 def _same_course(before: Solved, after: Solved) -> bool:

@@ -8,19 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from dt_viz.avoidance.arm_field import JointLimits
 from dt_viz.control.arm_system import Section
+from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
 from dt_viz.flows.rollouts import ARRIVED, Rays, evenly_sampled
 from dt_viz.flows.systems import DiffeomorphicSystem
 from dt_viz.robot.inverse_kinematics import track
 from dt_viz.robot.retiming import within_velocity_limits
-
-CONVERGED = 1e-5
-"""Distance from the section, rad, that counts as none."""
-SETTLING = 0.1
-"""Spacing of the samples, seconds, in which a robot that has arrived still converges."""
-NUM_SAMPLES = 80
-"""Number of samples of a course."""
+from dt_viz.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +54,6 @@ class Course:
         """Return it within limits (6,) of the joints' velocities, rad/s."""
         return replace(self, times=within_velocity_limits(self.times, self.q, limits))
 
-    def where_left(self, distance: Array, section: Section) -> Array:
-        """Postures (N, 6) at distances (N,) from the end in base coordinates, unwound to a section's."""
-        along = np.linalg.norm(self.z - self.z[-1], axis=1)[::-1]
-        turns = np.where(np.isinf(section.robot.lower), np.round((self.q[-1] - section.reference) / (2 * np.pi)), 0.0)
-        return np.stack([np.interp(distance, along, joint) for joint in self.q[::-1].T], axis=1) - 2 * np.pi * turns
-
     @cached_property
     def _curve(self) -> tuple[Array, list[float]]:
         """Coefficients (K − 1, 4, 6) of a cubic in each segment, and where these begin."""
@@ -73,14 +63,49 @@ class Course:
         return np.stack([bend / h, (mean - begin) / h - bend, begin, self.q[:-1]], axis=1), self.times[:-1].tolist()
 
 
+@dataclass(frozen=True, eq=False)
+class Progress:
+    """How far a robot has come on its course."""
+
+    course: Course
+    clock: float = 0.0
+    """Time of the course, seconds."""
+    rate: float = 0.0
+    """That of its clock, relative to real time."""
+
+    @property
+    def q(self) -> Array:
+        """(6,) undisturbed posture now, rad."""
+        return self.course.at(self.clock)
+
+    @property
+    def image(self) -> Array:
+        """(k,) base coordinates now."""
+        return self.course.image(self.clock)
+
+    @property
+    def ahead(self) -> Array:
+        """(K, 6) undisturbed postures from now on, rad."""
+        return self.course.after(self.clock)
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is at the end of its course."""
+        return self.clock >= self.course.end
+
+    def advanced(self, rate: float, dt: float, ramp: float) -> Progress:
+        """Let `dt` seconds pass; the clock's rate approaches another one, and takes `ramp` seconds from 0 to 1."""
+        rate = self.rate + min(max(rate - self.rate, -dt / ramp), dt / ramp)
+        return replace(self, clock=min(self.clock + rate * dt, self.course.end), rate=rate)
+
+
 def towards(
     system: DiffeomorphicSystem,
     section: Section,
     q: Array,
     state: Array,
-    convergence: float,
+    settings: ControllerSettings,
     z: Array | None = None,
-    near: Course | None = None,
 ) -> Course:
     """Make the motion of a system that a robot follows on a section, onto which it converges.
 
@@ -91,34 +116,53 @@ def towards(
         section: the postures on which it is followed.
         q: (6,) where the robot is, rad.
         state: (k,) in which the hand is.
-        convergence: τ, seconds.
+        settings: τ, and how a course is sampled.
         z: (k,) base coordinates to begin from; None are those of the state.
-        near: a motion of another system on that section, whose postures are looked for first.
     """
-    robot, base = section.robot, system.base
+    robot, base, convergence = section.robot, system.base, settings.convergence
     z0 = system.transform.forward(state) if z is None else z
     rays = Rays(z0[None], base)
     if base.distance(z0) < ARRIVED:
         times, fractions = np.zeros(1), np.ones(1)
         path = system.transform.inverse(rays.at(np.zeros(1, int), fractions))[:, :3]
     else:
-        bundle = evenly_sampled(lambda i, u: system.transform.inverse(rays.at(i, u))[:, None, :3], 1, NUM_SAMPLES)
+        evaluate = lambda i, u: system.transform.inverse(rays.at(i, u))[:, None, :3]  # noqa: E731
+        bundle = evenly_sampled(evaluate, 1, settings.num_samples)
         times, fractions, path = rays.times(bundle.index, bundle.fraction), bundle.fraction, bundle.positions
     # from the end, which is near the reference, backwards: the beginning may be far from the section's branch
     along = rays.at(np.zeros(len(fractions), int), fractions)
-    left = np.linalg.norm(along - along[-1], axis=1)
-    initial = None if z is None or near is None else near.where_left(left[::-1], section)
-    joints = track(robot, path[::-1], section.reference, initial, reference=section.reference).q[::-1]
+    joints = track(robot, path[::-1], section.reference, reference=section.reference).q[::-1]
     turns = np.where(np.isinf(robot.lower), np.round((q - joints[0]) / (2 * np.pi)), 0.0)
     offset = q - joints[0] - 2 * np.pi * turns
-    converged = convergence * np.log(max(float(np.abs(offset).max()) / CONVERGED, 1.0))
-    longer = times[-1] + np.arange(SETTLING, max(converged - times[-1], SETTLING) + SETTLING / 2, SETTLING)
+    converged = convergence * np.log(max(float(np.abs(offset).max()) / settings.converged, 1.0))
+    period = settings.settling_period
+    longer = times[-1] + np.arange(period, max(converged - times[-1], period) + period / 2, period)
     times = np.concatenate([times, longer])
     joints, along = (np.concatenate([part, np.repeat(part[-1:], len(longer), 0)]) for part in (joints, along))
     joints = joints + 2 * np.pi * turns + offset * np.exp(-times / convergence)[:, None]
     return Course(times, joints, along)
 
 
-def resting(q: Array, hand: Array) -> Course:
-    """Stay at a posture (6,), with the hand at a place (3,)."""
-    return Course(np.array([0.0, 1e-2]), np.stack([q, q]), np.stack([hand, hand]))
+def resting(robot: Robot, q: Array) -> Course:
+    """Stay at a posture (6,)."""
+    joints = np.stack([q, q])
+    return Course(np.array([0.0, 1e-2]), joints, robot.end_effector(joints))
+
+
+def straight_to(place: Array, section: Section, q: Array, limits: JointLimits, speed: float) -> Course:
+    """Take the hand from a posture (6,) straight to a place (3,), metres, at a speed, m/s."""
+    robot = section.robot
+    begin = robot.end_effector(q)
+    u = np.linspace(0, 1, 2 + int(np.linalg.norm(place - begin) / 0.02))  # a sample every 2 cm
+    path = begin + u[:, None] * (place - begin)
+    joints = limits.inside(track(robot, path, q, reference=section.reference).q)
+    lengths = np.linalg.norm(np.diff(robot.end_effector(joints), axis=0), axis=1)
+    return Course(np.cumsum([0.0, *np.maximum(lengths / speed, 0.01)]), joints, path)
+
+
+def shoved(progress: Progress, robot: Robot, end: Array, seconds: float) -> Course:
+    """Go on for some seconds, and meanwhile be displaced from the posture now to another one (6,)."""
+    u = np.linspace(0, 1, 9)
+    goes_on = np.stack([progress.course.at(progress.clock + progress.rate * t) for t in seconds * u])
+    joints = goes_on + (u * u * (3 - 2 * u))[:, None] * (end - progress.q)
+    return Course(seconds * u, joints, robot.end_effector(joints))

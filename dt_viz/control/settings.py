@@ -73,3 +73,26 @@ class ControllerSettings:
     """Duration of a shove, seconds, if the joints can be as fast."""
     convergence: float = 0.5
     """Time constant with which the arm converges to the postures of its motion, seconds."""
+    num_samples: int = 80
+    """Number of samples of a course."""
+    settling_period: float = 0.1
+    """Spacing of the samples in which a robot that has arrived still converges, seconds."""
+    converged: float = 1e-5
+    """Distance from the postures of its motion that counts as none, rad."""
+    num_clear: int = 40
+    """Number of postures ahead that are to be clear of obstacles at rest."""
+    num_clear_moving: int = 10
+    """Number of postures within `window` that are to be clear of obstacles that move."""
+    ramp: float = 0.3
+    """Shortest time in which the clock comes to its pace, seconds."""
+    displaced: float = 5e-3
+    """Deviation of a joint from where it was sent, rad, from which on somebody else has moved the robot."""
+    at_rest: float = 1e-3
+    """Gap, rad, and velocity, rad/s, of joints that count as at rest."""
+    aside: float = 5e-3
+    """Displacement, metres by `avoidance.arm_field.LEVERS`, from which on a robot at rest counts as having stepped
+    aside."""
+    touching: float = 5e-3
+    """Depth of a body point in an obstacle that counts as touching, metres."""
+    range_tolerance: float = 0.01
+    """Distance from the end of a joint's range that counts as being there, rad."""

@@ -63,13 +63,12 @@ def keep(memory: Blocks) -> None:
 
 
 @compiled
-def load(block: Record, q: Array, rows: Array, first: int) -> int:
-    """Take the postures q[rows[first:]] (n,) into the lanes, the last one into those left over; returns how many."""
-    num, angles = min(len(rows) - first, LANES), block.q
+def load(block: Record, q: Array, first: int) -> int:
+    """Take the postures q[first:] (N, n) into the lanes, the last one into those left over; returns how many."""
+    num, angles = min(len(q) - first, LANES), block.q
     for lane in range(LANES):
-        row = rows[first + min(lane, num - 1)]
         for i in range(q.shape[1]):
-            angles[i, lane] = q[row, i]
+            angles[i, lane] = q[first + min(lane, num - 1), i]
     return num
 
 
@@ -137,6 +136,13 @@ def put(offset: Array, joint: int, block: Record) -> None:
 
 
 @compiled
+def turning(axes: Array, i: int, lane: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Velocity of what has the lever (x, y, z) from joint i, at its unit speed; axes (n, 3, 3, LANES)."""
+    a, b, c = axes[i, 2, 0, lane], axes[i, 2, 1, lane], axes[i, 2, 2, lane]
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@compiled
 def measure(shape: Record, values: Values, radius: float, enough: float, block: Record) -> None:
     """Find the distance of a sphere about the place from an obstacle; from `enough` on, any not larger one will do."""
     place, away, kind = block.place, block.away, shape.kind
@@ -185,8 +191,7 @@ def _measure_on_grid(shape: Record, values: Values, radius: float, enough: float
         x, y, z = own[0, lane] - X, own[1, lane] - Y, own[2, lane] - Z
         away[lane] = np.sqrt(x * x + y * y + z * z) - ball
     if _least(away) < limit:
-        for lane in range(LANES):
-            nodes[lane] = shape.begin
+        nodes[:] = shape.begin
         for k in range(3):
             step = stride if k == 1 else (counts[1] * stride if k == 0 else 1)
             first, last = shape.first[k], counts[k] - 1.5
@@ -202,8 +207,7 @@ def _measure_on_grid(shape: Record, values: Values, radius: float, enough: float
         for lane in range(LANES):
             away[lane] = max(away[lane], sums[lane] - SPREAD * cell)
     if _least(away) < limit:
-        for lane in range(LANES):
-            sums[lane] = 0
+        sums[:] = 0
         for p in range(3):
             for q in range(3):
                 at = (p * counts[1] + q) * stride
@@ -258,14 +262,13 @@ def room_asked(q: Array, pins: Array, room: Array, levers: Array, slope: float, 
 @short_kernel
 def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
     """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
-    result, rows, memory = np.full(len(q), np.inf), np.arange(len(q)), np.empty(1, BLOCK)
+    result, memory = np.full(len(q), np.inf), np.empty(1, BLOCK)
     block = memory[0]
     away, nearest = block.away, block.nearest
     for first in range(0, len(q), LANES):
-        num = load(block, q, rows, first)
+        num = load(block, q, first)
         chain(joints, block)
-        for lane in range(LANES):
-            nearest[lane] = np.inf
+        nearest[:] = np.inf
         for p in range(len(points) - 1, -1, -1):  # what is near the hand is most often nearest
             put(points[p].offset, points[p].joint, block)
             for k in range(len(shapes)):

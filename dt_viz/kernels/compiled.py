@@ -34,11 +34,6 @@ def compiled(function: F) -> F:
     return _dispatcher(function)
 
 
-def inlined(function: F) -> F:
-    """Make a function part of those that call it: what calls much else is compiled once only."""
-    return _dispatcher(function, inline="always")
-
-
 def kernel(function: F) -> F:
     """Compile a function that Python calls, and keep its code for the next process; meanwhile other threads go on."""
     return _kept(_dispatcher(function, nogil=True))

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dt_viz.kernels.arm import Array, BodyPoints, Joints
-from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, measure, put
+from dt_viz.kernels.blocks import LANES, MOST_JOINTS, Blocks, block_of, chain, keep, measure, put, turning
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record, Shapes, Values
-from dt_viz.kernels.dormand_prince import ERROR, STAGES, allowed_error, first_step, is_straight, next_step
+from dt_viz.kernels.dormand_prince import carry_adaptively
+from dt_viz.kernels.runge_kutta import carry_in_steps, rates
 
 BLOCK = block_of(
     ("velocity", (MOST_JOINTS,)),  # V_q, rad per unit of flow time
@@ -25,12 +26,8 @@ BLOCK = block_of(
     ("squared", ()),  # distance from a pin, m²
     ("freedom", ()),  # χ
     ("scale", ()),
-    ("start", (MOST_JOINTS,)),  # of a step, rad
-    ("sum", (MOST_JOINTS,)),  # of the slopes of a Runge–Kutta step
-    ("stages", (7, MOST_JOINTS)),
-    ("h", ()),  # length of a step, with its sign
 )
-"""Memory for the field and the steps of its flow."""
+"""Memory for the field."""
 
 
 class Escape(NamedTuple):
@@ -74,9 +71,7 @@ def _find_velocity(escape: Escape, block: Record) -> bool:
     """
     n, moves = len(escape.joints), False
     velocity, pull, freedom = block.velocity, block.pull, block.freedom
-    for i in range(n):
-        for lane in range(LANES):
-            velocity[i, lane] = 0
+    velocity[:] = 0
     chain(escape.joints, block)
     for k in range(len(escape.shapes)):
         if not _touch(escape, k, block):
@@ -114,8 +109,7 @@ def _touch(escape: Escape, k: int, block: Record) -> bool:
         if num_near == 0:
             continue
         if not touched:
-            _clear(n, block)
-            touched = True
+            total[:], wanted[:], weight[:], lever[:], touched = 0, 0, 0, 0, True
         depth = reach - escape.cores[k, p]
         for lane in range(LANES):
             u = (reach - away[lane]) / depth
@@ -156,42 +150,16 @@ def _touch(escape: Escape, k: int, block: Record) -> bool:
 
 
 @compiled
-def _clear(n: int, block: Record) -> None:
-    """Forget the contact before."""
-    total, wanted, weight, lever = block.total, block.wanted, block.weight, block.lever
-    for lane in range(LANES):
-        total[lane] = 0
-    for c in range(3):
-        for lane in range(LANES):
-            wanted[c, lane] = 0
-    for i in range(n):
-        for lane in range(LANES):
-            weight[i, lane] = 0
-        for c in range(3):
-            for lane in range(LANES):
-                lever[i, c, lane] = 0
-
-
-@compiled
 def _hold(escape: Escape, block: Record) -> None:
     """Find √w_x Jᵀ and √w_d Dᵀ, which are R[:, :3] and R[:, 3:6]."""
-    n, hand, place, tip, origins, scale = (
-        len(escape.joints),
-        escape.hand,
-        block.place,
-        block.tip,
-        block.origins,
-        block.scale,
-    )
+    n, hand = len(escape.joints), escape.hand
+    place, tip, origins, scale = block.place, block.tip, block.origins, block.scale
     staying = np.sqrt(escape.hand_weight)
     upright = np.sqrt(escape.direction_weight / (hand[0] ** 2 + hand[1] ** 2 + hand[2] ** 2))
     put(hand, n - 1, block)
-    for c in range(3):
-        for lane in range(LANES):
-            tip[c, lane] = place[c, lane]
+    tip[:] = place
     for column, weight in ((0, staying), (3, upright)):
-        for lane in range(LANES):
-            scale[lane] = weight
+        scale[:] = weight
         for i in range(n):
             about = i if column == 0 else n - 1  # the direction is that from the last joint
             for c in range(3):
@@ -205,11 +173,9 @@ def _turn(i: int, column: int, block: Record) -> None:
     """Find the velocity of what has the lever `place` from joint i, at its unit speed, times `scale`: R[i, column:]."""
     axes, place, scale, R = block.axes, block.place, block.scale, block.R
     for lane in range(LANES):
-        a, b, c = axes[i, 2, 0, lane], axes[i, 2, 1, lane], axes[i, 2, 2, lane]
-        x, y, z = place[0, lane], place[1, lane], place[2, lane]
-        R[i, column, lane] = scale[lane] * (b * z - c * y)
-        R[i, column + 1, lane] = scale[lane] * (c * x - a * z)
-        R[i, column + 2, lane] = scale[lane] * (a * y - b * x)
+        x, y, z = turning(axes, i, lane, place[0, lane], place[1, lane], place[2, lane])
+        R[i, column, lane], R[i, column + 1, lane] = scale[lane] * x, scale[lane] * y
+        R[i, column + 2, lane] = scale[lane] * z
 
 
 @compiled
@@ -261,11 +227,9 @@ def _free(escape: Escape, block: Record) -> None:
     """Find χ: 0 at the pinned postures, 1 away from them."""
     q, squared, freedom, pins, levers = block.q, block.squared, block.freedom, escape.pins, escape.levers
     width = 2 * escape.pin**2
-    for lane in range(LANES):
-        freedom[lane] = 1
+    freedom[:] = 1
     for row in range(len(pins)):
-        for lane in range(LANES):
-            squared[lane] = 0
+        squared[:] = 0
         for i in range(len(levers)):
             lever, pin = levers[i], pins[row, i]
             for lane in range(LANES):
@@ -279,166 +243,46 @@ def _free(escape: Escape, block: Record) -> None:
 
 
 @compiled
-def _unload(values: Array, row: int, lane: int, result: Array) -> None:
-    """Write the entries of one lane of `values` (n, LANES) to result[row] (n,)."""
-    for i in range(result.shape[1]):
-        result[row, i] = values[i, lane]
+def _rate(escape: Escape, states: Array, n: int, d: int, work: Blocks, into: Array) -> None:
+    """Write V_q at postures (d, L); see `dt_viz.kernels.runge_kutta`."""
+    block = work[0]
+    q, velocity = block.q, block.velocity
+    for i in range(d):
+        for lane in range(LANES):
+            q[i, lane] = states[i, lane]
+        for lane in range(n, LANES):
+            q[i, lane] = states[i, n - 1]
+    _find_velocity(escape, block)
+    for i in range(d):
+        for lane in range(LANES):
+            into[i, lane] = velocity[i, lane]
 
 
 @kernel
 def velocities(escape: Escape, q: Array) -> Array:
     """V_q (N, n) at postures q (N, n)."""
-    rows, result, memory = np.arange(len(q)), np.zeros_like(q), np.empty(1, BLOCK)
-    block = memory[0]
-    for first in range(0, len(q), LANES):
-        num = load(block, q, rows, first)
-        if _find_velocity(escape, block):
-            for lane in range(num):
-                _unload(block.velocity, first + lane, lane, result)
+    memory = np.empty(1, BLOCK)
+    result = rates(_rate, escape, q, q.shape[1], LANES, memory, np.empty_like(q))
     keep(memory)
     return result
-
-
-@compiled
-def _moving(v: Array) -> Array:
-    """Rows of v (N, n) that are not zero."""
-    rows, num = np.empty(len(v), np.int64), 0
-    for row in range(len(v)):
-        if v[row].any():
-            rows[num] = row
-            num += 1
-    return rows[:num]
 
 
 @kernel
 def flow(escape: Escape, q: Array, duration: float, steps: int) -> Array:
     """Postures q (N, n) carried along by classical Runge–Kutta steps of equal length, (N, n)."""
-    v = velocities(escape, q)
-    rows, q, memory = _moving(v), q.copy(), np.empty(1, BLOCK)  # elsewhere the flow rests
-    block = memory[0]
-    n, h, at, start, slopes = q.shape[1], duration / steps, block.q, block.start, block.sum
-    velocity = block.velocity
-    for first in range(0, len(rows), LANES):
-        num, moves = load(block, q, rows, first), True
-        for step in range(steps):
-            if not moves:
-                break
-            for i in range(n):
-                for lane in range(LANES):
-                    start[i, lane] = at[i, lane]
-                    slopes[i, lane] = 0
-            for stage, weight, ahead in ((0, h / 6, h / 2), (1, h / 3, h / 2), (2, h / 3, h), (3, h / 6, 0.0)):
-                if step == 0 and stage == 0:
-                    for lane in range(LANES):
-                        for i in range(n):
-                            velocity[i, lane] = v[rows[first + min(lane, num - 1)], i]
-                else:
-                    moves = _find_velocity(escape, block)
-                for i in range(n):
-                    for lane in range(LANES):
-                        slopes[i, lane] += weight * velocity[i, lane]
-                        at[i, lane] = start[i, lane] + ahead * velocity[i, lane]
-            for i in range(n):
-                for lane in range(LANES):
-                    at[i, lane] = start[i, lane] + slopes[i, lane]
-        for lane in range(num):
-            _unload(at, rows[first + lane], lane, q)
+    q, memory = q.copy(), np.empty(1, BLOCK)
+    carry_in_steps(_rate, escape, q, q.shape[1], 4, duration, steps, LANES, memory)
     keep(memory)
     return q
 
 
 @kernel
-def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, max_steps: int) -> tuple[Array, int]:  # noqa: PLR0915
+def adaptive_flow(escape: Escape, q: Array, duration: float, tolerance: float, max_steps: int) -> tuple[Array, int]:
     """Postures q (N, n) carried along by Dormand–Prince steps, and how many of them need more than `max_steps`.
 
-    The estimated error of a step is at most `tolerance`, rad; see `dt_viz.flows.integrators.integrate_adaptive`. Each
-    lane takes steps of its own length, and the next posture when it has arrived.
+    The estimated error of a step is at most `tolerance`, rad.
     """
-    v = velocities(escape, q)
-    rows, q, total, sign = _moving(v), q.copy(), abs(duration), np.sign(duration)
-    first_steps, num_failed, n = _first_steps(escape, q, v, rows, total, sign, tolerance), 0, q.shape[1]
-    memory = np.empty(1, BLOCK)
-    block = memory[0]
-    at, start, stages, h, velocity, defect = block.q, block.start, block.stages, block.h, block.velocity, block.sum
-    row_of, num_steps, left = np.full(LANES, -1), np.zeros(LANES, np.int64), np.zeros(LANES)
-    for i in range(n):
-        for lane in range(LANES):
-            start[i, lane] = q[rows[0], i] if len(rows) else 0.0
-            stages[0, i, lane] = 0
-    for lane in range(LANES):
-        h[lane] = 0
-    upcoming, num_busy = 0, 0
-    while True:
-        for lane in range(LANES):
-            if row_of[lane] < 0 and upcoming < len(rows):
-                row = rows[upcoming]
-                if first_steps[upcoming] == 0:  # one Euler step is exact enough
-                    q[row] += duration * v[row]
-                    upcoming += 1
-                    continue
-                row_of[lane], left[lane], num_steps[lane], h[lane] = row, total, 0, sign * first_steps[upcoming]
-                upcoming, num_busy = upcoming + 1, num_busy + 1
-                for i in range(n):
-                    start[i, lane], stages[0, i, lane] = q[row, i], v[row, i]
-        if num_busy == 0:
-            if upcoming < len(rows):
-                continue
-            keep(memory)
-            return q, num_failed
-        for stage in range(1, 7):
-            for i in range(n):
-                for lane in range(LANES):
-                    defect[i, lane] = 0
-                for before in range(stage):
-                    weight = STAGES[stage, before]
-                    for lane in range(LANES):
-                        defect[i, lane] += weight * stages[before, i, lane]
-                for lane in range(LANES):
-                    at[i, lane] = start[i, lane] + h[lane] * defect[i, lane]
-            _find_velocity(escape, block)
-            for i in range(n):
-                for lane in range(LANES):
-                    stages[stage, i, lane] = velocity[i, lane]
-        for i in range(n):
-            for lane in range(LANES):
-                defect[i, lane] = 0
-            for stage in range(7):
-                weight = ERROR[stage]
-                for lane in range(LANES):
-                    defect[i, lane] += weight * stages[stage, i, lane]
-        for lane in range(LANES):
-            if row_of[lane] < 0:
-                continue
-            motion = error = 0.0
-            for i in range(n):
-                motion = max(motion, abs(at[i, lane] - start[i, lane]))
-                error = max(error, abs(h[lane] * defect[i, lane]))
-            error, length = error / allowed_error(motion, tolerance), abs(h[lane])
-            num_steps[lane] += 1
-            if error <= 1:
-                left[lane] -= length
-                for i in range(n):
-                    start[i, lane], stages[0, i, lane] = at[i, lane], stages[6, i, lane]
-            arrived = left[lane] <= 1e-12 * total
-            if arrived or num_steps[lane] == max_steps:
-                _unload(start, row_of[lane], lane, q)
-                num_failed += not arrived
-                row_of[lane], h[lane], num_busy = -1, 0.0, num_busy - 1
-            else:
-                h[lane] = sign * min(next_step(length, error), left[lane])
-
-
-@compiled
-def _first_steps(escape: Escape, q: Array, v: Array, rows: Array, total: float, sign: float, tolerance: float) -> Array:
-    """Lengths of the first steps from postures q[rows] with velocities v[rows]; 0 where one Euler step does."""
-    there, speeds, ahead = np.empty((len(rows), q.shape[1])), np.empty(len(rows)), np.empty(len(rows))
-    for k in range(len(rows)):
-        speeds[k] = np.abs(v[rows[k]]).max()
-        ahead[k] = min(total, tolerance / speeds[k])
-        there[k] = q[rows[k]] + sign * ahead[k] * v[rows[k]]
-    there = velocities(escape, there)
-    for k in range(len(rows)):
-        turning = np.abs(there[k] - v[rows[k]]).max() / (ahead[k] * speeds[k])
-        straight = is_straight(speeds[k], turning, total, tolerance)
-        ahead[k] = 0.0 if straight else first_step(speeds[k], turning, total, tolerance)
-    return ahead
+    q, memory = q.copy(), np.empty(1, BLOCK)
+    num_failed = carry_adaptively(_rate, escape, q, q.shape[1], duration, tolerance, max_steps, LANES, memory)
+    keep(memory)
+    return q, num_failed

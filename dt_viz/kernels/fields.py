@@ -135,22 +135,6 @@ def _grid(term: Record, sums: Array, n: int, v: Array, Dv: Array) -> None:
 
 
 @compiled
-def at_rest(field: Terms, s: Array, d: int) -> bool:
-    """Return whether the field vanishes around a point, of which the first d coordinates are taken."""
-    for t in range(len(field.terms)):
-        term = field.terms[t]
-        squared = 0.0
-        for i in range(3):
-            u = 0.0
-            for j in range(d):
-                u += term.inward[i, j] * (s[j] - term.origin[j])
-            squared += u * u
-        if term.kind not in (REGION, SHIFT) or squared <= 1:
-            return False
-    return True
-
-
-@compiled
 def _first(n: int, v: Array, Dv: Array) -> None:
     """Write the first unit vector."""
     for k in range(3):

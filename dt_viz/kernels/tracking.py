@@ -8,20 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dt_viz.kernels.arm import Array, Joints
-from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, put
+from dt_viz.kernels.blocks import LANES, MOST_JOINTS, block_of, chain, keep, load, put, turning
 from dt_viz.kernels.compiled import compiled, kernel
 from dt_viz.kernels.distances import Record
-
-LIMIT_WEIGHT = 50.0
-"""Weight of the springs before the joint limits, against 1 for staying near the reference."""
-DAMPING_FLOOR = 1e-6
-"""Least damping λ₀² of the pseudo-inverse, m²: bounds the step at a singularity, is negligible elsewhere."""
-DAMPING_PER_ERROR = 0.2
-"""Growth of λ² with the remaining error, m: about half the curvature of the forward kinematics."""
-CURVATURE = 0.1
-"""Curvature of the forward kinematics along the null space, m per rad²; see `_newton`."""
-STEP_LIMIT = 0.4
-"""Largest joint motion in one step, rad; beyond it the linear model is invalid."""
 
 BLOCK = block_of(
     ("target", (3,)),  # metres
@@ -61,6 +50,12 @@ class TrackingArm(NamedTuple):
     """(n,) rad."""
     upper: Array
     """(n,) rad."""
+    limit_weight: float
+    """This and what follows are fields of `dt_viz.robot.tracking_settings.TrackingSettings`."""
+    damping_floor: float
+    damping_per_error: float
+    curvature: float
+    step_limit: float
 
 
 class Postures(NamedTuple):
@@ -110,12 +105,11 @@ def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
     n, error, J, p, H_inv_J = len(arm.joints), block.error, block.J, block.p, block.H_inv_J
     damping, inverse, v, multipliers, caution = block.damping, block.inverse, block.v, block.multipliers, block.caution
     _linearise(arm, block)
-    _improve(n, block)
+    _improve(n, arm.limit_weight, block)
     for lane in range(LANES):
         squared = error[0, lane] ** 2 + error[1, lane] ** 2 + error[2, lane] ** 2
-        damping[lane] = DAMPING_FLOOR
         caution[lane] = np.sqrt(squared)
-        multipliers[0, lane] = multipliers[1, lane] = multipliers[2, lane] = 0
+    damping[:], multipliers[:] = arm.damping_floor, 0
     for i in range(n):
         for lane in range(LANES):
             multipliers[0, lane] += J[i, 0, lane] * p[i, lane]
@@ -124,18 +118,14 @@ def _newton(arm: TrackingArm, gain: float, block: Record) -> None:
     _invert(block)
     for lane in range(LANES):
         x, y, z = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
-        multipliers[0, lane] = inverse[0, lane] * x + inverse[5, lane] * y + inverse[4, lane] * z
-        multipliers[1, lane] = inverse[5, lane] * x + inverse[1, lane] * y + inverse[3, lane] * z
-        multipliers[2, lane] = inverse[4, lane] * x + inverse[3, lane] * y + inverse[2, lane] * z
-        damping[lane] = DAMPING_FLOOR + DAMPING_PER_ERROR * caution[lane]
+        multipliers[0, lane], multipliers[1, lane], multipliers[2, lane] = _times(inverse, lane, x, y, z)
+        damping[lane] = arm.damping_floor + arm.damping_per_error * caution[lane]
     _invert(block)
     for lane in range(LANES):
         a, b, c = multipliers[0, lane], multipliers[1, lane], multipliers[2, lane]
-        care = gain / (1 + CURVATURE * np.sqrt(a * a + b * b + c * c))
-        x, y, z = error[0, lane], error[1, lane], error[2, lane]
-        v[0, lane] = inverse[0, lane] * x + inverse[5, lane] * y + inverse[4, lane] * z - care * a
-        v[1, lane] = inverse[5, lane] * x + inverse[1, lane] * y + inverse[3, lane] * z - care * b
-        v[2, lane] = inverse[4, lane] * x + inverse[3, lane] * y + inverse[2, lane] * z - care * c
+        care = gain / (1 + arm.curvature * np.sqrt(a * a + b * b + c * c))
+        x, y, z = _times(inverse, lane, error[0, lane], error[1, lane], error[2, lane])
+        v[0, lane], v[1, lane], v[2, lane] = x - care * a, y - care * b, z - care * c
         caution[lane] = care
     for i in range(n):
         for lane in range(LANES):
@@ -160,16 +150,23 @@ def _linearise(arm: TrackingArm, block: Record) -> None:
             direction[c, lane] = (place[c, lane] - origins[n - 1, c, lane]) / length
     for i in range(n):
         for lane in range(LANES):
-            a, b, c = axes[i, 2, 0, lane], axes[i, 2, 1, lane], axes[i, 2, 2, lane]
             x, y = place[0, lane] - origins[i, 0, lane], place[1, lane] - origins[i, 1, lane]
             z = place[2, lane] - origins[i, 2, lane]
-            J[i, 0, lane], J[i, 1, lane], J[i, 2, lane] = b * z - c * y, c * x - a * z, a * y - b * x
+            J[i, 0, lane], J[i, 1, lane], J[i, 2, lane] = turning(axes, i, lane, x, y, z)
             x, y, z = direction[0, lane], direction[1, lane], direction[2, lane]
-            D[i, 0, lane], D[i, 1, lane], D[i, 2, lane] = b * z - c * y, c * x - a * z, a * y - b * x
+            D[i, 0, lane], D[i, 1, lane], D[i, 2, lane] = turning(axes, i, lane, x, y, z)
 
 
 @compiled
-def _improve(n: int, block: Record) -> None:
+def _times(matrix: Array, lane: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Multiply the symmetric matrix of a lane by a vector."""
+    a, b, c = matrix[0, lane], matrix[1, lane], matrix[2, lane]
+    f, g, h = matrix[3, lane], matrix[4, lane], matrix[5, lane]
+    return a * x + h * y + g * z, h * x + b * y + f * z, g * x + f * y + c * z
+
+
+@compiled
+def _improve(n: int, limit_weight: float, block: Record) -> None:
     """Find p = −H⁻¹∇h, H⁻¹Jᵀ and J H⁻¹ Jᵀ, which is `matrix`.
 
     H = diag(1/mobility) + w_d DᵀD is inverted by Woodbury's formula: only 3 × 3 systems are solved.
@@ -184,25 +181,22 @@ def _improve(n: int, block: Record) -> None:
             inside = soft_lower[i, lane] if angle < soft_lower[i, lane] else angle
             inside = soft_upper[i, lane] if inside > soft_upper[i, lane] else inside
             excess = angle - inside
-            mobility[i, lane] = 1 / (1 + LIMIT_WEIGHT) if excess != 0 else 1.0
-            p[i, lane] = mobility[i, lane] * (reference[i, lane] - angle - LIMIT_WEIGHT * excess)
+            mobility[i, lane] = 1 / (1 + limit_weight) if excess != 0 else 1.0
+            p[i, lane] = mobility[i, lane] * (reference[i, lane] - angle - limit_weight * excess)
             H_inv_J[i, 0, lane] = mobility[i, lane] * D[i, 0, lane]
             H_inv_J[i, 1, lane] = mobility[i, lane] * D[i, 1, lane]
             H_inv_J[i, 2, lane] = mobility[i, lane] * D[i, 2, lane]
     _product(n, D, H_inv_J, block)
-    for lane in range(LANES):
-        damping[lane] = flexibility[lane]
+    damping[:] = flexibility
     _invert(block)
+    mixed[:] = 0
     for c in range(3):
         for lane in range(LANES):
             v[c, lane] = wanted[c, lane] - direction[c, lane]
-            mixed[c, 0, lane] = mixed[c, 1, lane] = mixed[c, 2, lane] = 0
     for i in range(n):
         for lane in range(LANES):
             x, y, z = H_inv_J[i, 0, lane], H_inv_J[i, 1, lane], H_inv_J[i, 2, lane]
-            G[i, 0, lane] = inverse[0, lane] * x + inverse[5, lane] * y + inverse[4, lane] * z
-            G[i, 1, lane] = inverse[5, lane] * x + inverse[1, lane] * y + inverse[3, lane] * z
-            G[i, 2, lane] = inverse[4, lane] * x + inverse[3, lane] * y + inverse[2, lane] * z
+            G[i, 0, lane], G[i, 1, lane], G[i, 2, lane] = _times(inverse, lane, x, y, z)
         for c in range(3):
             for lane in range(LANES):
                 v[c, lane] -= D[i, c, lane] * p[i, lane]
@@ -225,9 +219,7 @@ def _improve(n: int, block: Record) -> None:
 def _product(n: int, A: Array, B: Array, block: Record) -> None:
     """Find the symmetric matrix AᵀB of arrays (n, 3, LANES)."""
     matrix = block.matrix
-    for entry in range(6):
-        for lane in range(LANES):
-            matrix[entry, lane] = 0
+    matrix[:] = 0
     for i in range(n):
         for lane in range(LANES):
             matrix[0, lane] += A[i, 0, lane] * B[i, 0, lane]
@@ -257,16 +249,16 @@ def _invert(block: Record) -> None:
 
 @compiled
 def _move(arm: TrackingArm, block: Record) -> None:
-    """Move the joints by p, at most `STEP_LIMIT` and up to their limits, in the lanes that move."""
+    """Move the joints by p, at most by the step's limit and up to their own, in the lanes that move."""
     q, p, largest, moves, caution = block.q, block.p, block.largest, block.moves, block.caution
-    for lane in range(LANES):
-        largest[lane] = 0
+    longest = arm.step_limit
+    largest[:] = 0
     for i in range(len(arm.joints)):
         for lane in range(LANES):
             size = abs(p[i, lane])
             largest[lane] = size if size > largest[lane] else largest[lane]
     for lane in range(LANES):
-        caution[lane] = STEP_LIMIT / largest[lane] if largest[lane] > STEP_LIMIT else 1.0
+        caution[lane] = longest / largest[lane] if largest[lane] > longest else 1.0
         largest[lane] = 0
     for i in range(len(arm.joints)):
         lower, upper = arm.lower[i], arm.upper[i]
@@ -305,11 +297,11 @@ def settle(
     Returns:
         The postures (N, n), rad, inside the limits.
     """
-    q, rows, memory = q.copy(), np.arange(len(q)), np.empty(1, BLOCK)
+    q, memory = q.copy(), np.empty(1, BLOCK)
     block = memory[0]
     at, target, moves, largest = block.q, block.target, block.moves, block.largest
     for first in range(0, len(q), LANES):
-        num = load(block, q, rows, first)
+        num = load(block, q, first)
         for lane in range(LANES):
             row = first + min(lane, num - 1)
             _aim(postures, which[row], lane, block)
@@ -347,12 +339,12 @@ def walk(arm: TrackingArm, postures: Postures, lines: Array, lengths: Array, sta
         Rough postures (B, T, n), rad, at the places after the start: linear in the distance between strides.
     """
     num, n, last = len(lines), starts.shape[1], lines.shape[1] - 1
-    result, rows, memory = np.empty((num, last, n)), np.arange(num), np.empty(1, BLOCK)
+    result, memory = np.empty((num, last, n)), np.empty(1, BLOCK)
     block = memory[0]
     q = np.empty((LANES, num_strides + 1, n))
     at, target, moves, passed = block.q, block.target, block.moves, np.zeros(LANES, np.int64)
     for first in range(0, num, LANES):
-        here = load(block, starts, rows, first)
+        here = load(block, starts, first)
         for lane in range(LANES):
             _aim(postures, first + min(lane, here - 1), lane, block)
             moves[lane], passed[lane] = 1, 0
@@ -366,9 +358,8 @@ def walk(arm: TrackingArm, postures: Postures, lines: Array, lengths: Array, sta
                     passed[lane], begins = piece, lengths[row, piece]
                     part = (travelled - begins) / max(lengths[row, piece + 1] - begins, 1e-300)
                     for c in range(3):
-                        target[c, lane] = lines[row, piece, c] + part * (
-                            lines[row, piece + 1, c] - lines[row, piece, c]
-                        )
+                        begin, end = lines[row, piece, c], lines[row, piece + 1, c]
+                        target[c, lane] = begin + part * (end - begin)
                 _newton(arm, 1.0, block)
             for lane in range(LANES):
                 for i in range(n):
@@ -379,8 +370,7 @@ def walk(arm: TrackingArm, postures: Postures, lines: Array, lengths: Array, sta
                 place = lengths[row, waypoint + 1] / max(lengths[row, last], 1e-12) * num_strides
                 left = min(int(place), num_strides - 1)
                 for i in range(n):
-                    result[row, waypoint, i] = q[lane, left, i] + (place - left) * (
-                        q[lane, left + 1, i] - q[lane, left, i]
-                    )
+                    begin, end = q[lane, left, i], q[lane, left + 1, i]
+                    result[row, waypoint, i] = begin + (place - left) * (end - begin)
     keep(memory)
     return result

@@ -1,7 +1,8 @@
 """Inverse kinematics, and tracking of end-effector paths with the joints.
 
 Both find the configuration of best posture among those with the end effector in the right place, for whole batches.
-Lengths are metres, angles radians, positions and directions in the robot's base frame.
+`Robot.tracking` holds what may be chosen about it. Lengths are metres, angles radians, positions and directions in the
+robot's base frame.
 """
 
 from __future__ import annotations
@@ -11,46 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dt_viz.kernels.tracking import LIMIT_WEIGHT, Postures, TrackingArm, settle, walk
-from dt_viz.robot.robot import NUM_JOINTS, KinematicChain, Robot
+from dt_viz.kernels.tracking import Postures, settle, walk
+from dt_viz.robot.robot import NUM_JOINTS, Robot
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from dt_viz.flows.fields import Array
-
-
-HAND_PITCH = np.deg2rad(40.0)
-"""Default angle of the hand below horizontal, rad."""
-
-DIRECTION_WEIGHT = 1.5
-"""Weight w_d of the hand's direction (unit vectors) against joint angles (rad). Much above 2, the best posture stops
-being unique and tracked joints jump between wrist postures."""
-ASKED_DIRECTION_WEIGHT = 40.0
-"""Weight w_d where inverse kinematics is given a direction: it chooses one posture and need not be continuous."""
-LIMIT_MARGIN = 0.15
-"""Distance from the limit at which those springs start, rad."""
-
-STRIDE = 0.08
-"""Distance along the path that a cold start covers in one step, metres."""
-MAX_SWEEPS, FINAL_SWEEPS = 8, 3
-"""Largest number of sweeps, and of those after them that keep the posture and only correct the positions."""
-STEP_TOLERANCE = 1e-3
-"""Step, rad, below which a waypoint is done: the remaining error is about its square times the reach."""
-JUMP_PER_ROOT_METRE = 4.0
-"""Joint motion over the root of the hand's, rad/√m, above which a warm start has lost its branch. The stretched arm
-follows the root: 0.4 rad bend it by 2 cm."""
-SINGULAR_MANIPULABILITY = 3e-3
-"""Manipulability, m³, below which the damping takes about 1 % or more of a step; the workspace has 0.05 to 0.2."""
-
-NUM_RESTARTS = 24
-IK_ITERATIONS = 60
-IK_TOLERANCE = 1e-5
-"""Distance from the target, metres, below which it counts as reached."""
-NUM_CORRECTIONS = 3
-"""Number of Newton steps from an error of millimetres to rounding; their convergence is quadratic."""
-FLOOR_WEIGHT = 100.0
-"""Cost per metre of a joint below the table, where inverse kinematics chooses among its solutions."""
 
 
 class UnreachableError(ValueError):
@@ -66,8 +34,8 @@ class TrackedPath:
         error: (*B, T) distance of the end effector from the path, metres.
         limits_hit: (*B, T) whether a joint was held at its limit.
         manipulability: (*B, T) sqrt det(J Jᵀ), m³.
-        damped: (*B, T) whether the manipulability is below `SINGULAR_MANIPULABILITY`: the pseudo-inverse is no longer
-            the exact Moore-Penrose one there, which would move the joints fast for little motion of the hand.
+        damped: (*B, T) whether the manipulability is that of a singularity: the pseudo-inverse is no longer the exact
+            Moore-Penrose one there, which would move the joints fast for little motion of the hand.
     """
 
     q: Array
@@ -92,7 +60,7 @@ def inverse_kinematics(
         target: (3,) metres, base frame.
         seed: (6,) rad, posture to stay near; by default the ready pose turned towards the target.
         hand_direction: (3,) desired direction of the hand, base frame, any length; weighed against the rest of the
-            posture. By default the seed's direction, or without a seed outwards and `HAND_PITCH` below horizontal.
+            posture. By default the seed's direction, or without a seed outwards and `hand_pitch` below horizontal.
 
     Returns:
         (6,) joint angles, rad; continuous joints within π of the seed.
@@ -100,36 +68,36 @@ def inverse_kinematics(
     Raises:
         UnreachableError: No start arrived. The message says by how much the best one missed.
     """
-    target = np.asarray(target, dtype=float)
+    settings, target = robot.tracking, np.asarray(target, dtype=float)
     azimuth = np.arctan2(target[0], -target[1])  # 0 ahead of the base
     ready = robot.home.copy()
     ready[0] -= azimuth
     if seed is None:
         reference = ready
-        direction = np.array([np.sin(azimuth), -np.cos(azimuth), -np.tan(HAND_PITCH)])
+        direction = np.array([np.sin(azimuth), -np.cos(azimuth), -np.tan(settings.hand_pitch)])
     else:
         reference = np.asarray(seed, dtype=float)
         direction = robot.hand_direction(reference)
-    weight = DIRECTION_WEIGHT
+    weight = settings.direction_weight
     if hand_direction is not None:
-        direction, weight = np.asarray(hand_direction, dtype=float), ASKED_DIRECTION_WEIGHT
+        direction, weight = np.asarray(hand_direction, dtype=float), settings.asked_direction_weight
     direction = direction / np.linalg.norm(direction)
 
-    scatter = np.random.default_rng(0).normal(scale=0.8, size=(NUM_RESTARTS, NUM_JOINTS))
+    scatter = np.random.default_rng(0).normal(scale=0.8, size=(settings.num_restarts, NUM_JOINTS))
     scatter[:2] = 0.0
-    starts = np.where(np.arange(NUM_RESTARTS)[:, None] % 2 == 0, reference, ready) + scatter
+    starts = np.where(np.arange(len(scatter))[:, None] % 2 == 0, reference, ready) + scatter
     posture = _posture(robot, reference[None], direction[None], weight)
     targets, which, q = np.tile(target, (len(starts), 1)), np.zeros(len(starts), int), robot.clip(starts)
-    for iteration in range(IK_ITERATIONS):  # all go on until each has come to rest
-        improves = iteration < IK_ITERATIONS - FINAL_SWEEPS
-        before, q = q, settle(_arm(robot), posture, q, targets, which, int(improves), int(not improves), -1.0)
+    for iteration in range(settings.max_iterations):  # all go on until each has come to rest
+        improves = iteration < settings.max_iterations - settings.final_sweeps
+        before, q = q, settle(robot.tracking_arm, posture, q, targets, which, int(improves), int(not improves), -1.0)
         if np.abs(q - before).max() < 1e-6:
             break
 
     q -= 2 * np.pi * np.where(np.isinf(robot.upper), np.round((q - reference) / (2 * np.pi)), 0.0)
     chain = robot.chain(q.T)
     miss = np.linalg.norm(chain.position - target[:, None], axis=0)
-    if miss.min() > IK_TOLERANCE:
+    if miss.min() > settings.tolerance:
         shoulder = robot.joint_translations[0] + robot.joint_rotations[0] @ robot.joint_translations[1]
         shoulder = np.round(shoulder, 2) + 0.0  # the sum turns -0 into 0
         raise UnreachableError(
@@ -137,8 +105,11 @@ def inverse_kinematics(
             f"The arm reaches at most {robot.reach:.2f} m from its shoulder at {shoulder.tolist()} m; "
             f"the target is {np.linalg.norm(target - shoulder):.2f} m from it."
         )
-    cost = _posture_cost(q, chain, posture) + FLOOR_WEIGHT * np.maximum(0.0, -chain.origins[:, 2]).sum(axis=0)
-    return q[np.argmin(np.where(miss <= IK_TOLERANCE, cost, np.inf))]
+    excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
+    cost = ((q - reference) ** 2 + settings.limit_weight * excess**2).sum(axis=1) / 2  # h(q) of `track`
+    cost += weight / 2 * ((chain.direction - direction[:, None]) ** 2).sum(axis=0)
+    cost += settings.floor_weight * np.maximum(0.0, -chain.origins[:, 2]).sum(axis=0)
+    return q[np.argmin(np.where(miss <= settings.tolerance, cost, np.inf))]
 
 
 def track(
@@ -162,8 +133,8 @@ def track(
     Since h is measured from one reference, q depends on the position of the end effector, not on its history: paths
     that return give joints that return, a dragged path changes its joints continuously, and all paths with the same
     reference are lifted by one section x → q(x), as long as their starts lie on its branch. As waypoints do not depend
-    on each other, all of them step at once. A cold start first walks along the path in strides of `STRIDE`, one step
-    each, to stay on one branch; this also bridges jumps between samples.
+    on each other, all of them step at once. A cold start first walks along the path in strides, one step each, to stay
+    on one branch; this also bridges jumps between samples.
 
     Waypoints out of reach get the nearest reachable position inside the limits; see `error`.
 
@@ -188,7 +159,7 @@ def track(
     paths, starts = path.reshape(-1, *path.shape[-2:]), robot.clip(start.reshape(-1, NUM_JOINTS))
     references = starts if reference is None else _references(robot, reference, start.shape)
     posture = _posture(robot, references, robot.hand_direction(references), at_reference=True)
-    strides, each = [STRIDE, STRIDE / 4], np.arange(len(paths))
+    strides, each = [robot.tracking.stride, robot.tracking.stride / 4], np.arange(len(paths))
     if initial is None:
         guess = _walk(robot, paths, starts, posture, strides.pop(0))
     else:
@@ -197,7 +168,7 @@ def track(
             raise ValueError(f"initial must be {shape} like the path, got {guess.shape}")
     q = _swept(robot, guess.reshape(*paths.shape[:2], NUM_JOINTS), paths, posture, each)
     for stride in strides:
-        lost = np.flatnonzero(loses_branch(q, paths))
+        lost = np.flatnonzero(loses_branch(robot, q, paths))
         if not len(lost):
             break
         part = Postures(*(field[lost] for field in posture))
@@ -219,12 +190,9 @@ def drawn_onto(robot: Robot, q: Array, positions: Array, reference: Array) -> Ar
     """
     posture = _posture(robot, reference[None], robot.hand_direction(reference)[None], at_reference=True)
     begin, targets = np.array(q, order="C"), np.array(positions, order="C")
-    return settle(_arm(robot), posture, begin, targets, np.zeros(len(q), int), 0, NUM_CORRECTIONS, -1.0)
-
-
-def _arm(robot: Robot) -> TrackingArm:
-    """The arm for compiled loops."""
-    return TrackingArm(robot.records, np.array(robot.end_effector_offset), np.array(robot.lower), np.array(robot.upper))
+    return settle(
+        robot.tracking_arm, posture, begin, targets, np.zeros(len(q), int), 0, robot.tracking.final_sweeps, -1.0
+    )
 
 
 def _references(robot: Robot, reference: ArrayLike, shape: tuple[int, ...]) -> Array:
@@ -240,15 +208,15 @@ def _walk(robot: Robot, paths: Array, starts: Array, posture: Postures, stride: 
     lines = np.concatenate([robot.end_effector(starts)[:, None], paths], axis=1)
     lengths = np.cumsum(np.linalg.norm(np.diff(lines, axis=1), axis=-1), axis=1)
     num_strides = 1 + int(lengths.max() / stride)
-    return walk(_arm(robot), posture, lines, np.insert(lengths, 0, 0.0, axis=1), np.array(starts), num_strides)
+    return walk(robot.tracking_arm, posture, lines, np.insert(lengths, 0, 0.0, axis=1), np.array(starts), num_strides)
 
 
 def _swept(robot: Robot, q: Array, paths: Array, posture: Postures, which: NDArray[np.intp]) -> Array:
     """Step all waypoints until none moves; q (B, T, 6), paths (B, T, 3), `which` (B,) of the postures they have."""
-    each = np.repeat(which, paths.shape[1])
+    each, settings = np.repeat(which, paths.shape[1]), robot.tracking
     begin, targets = np.array(q.reshape(-1, NUM_JOINTS), order="C"), np.array(paths.reshape(-1, 3), order="C")
-    swept = settle(_arm(robot), posture, begin, targets, each, MAX_SWEEPS, FINAL_SWEEPS, STEP_TOLERANCE)
-    return swept.reshape(q.shape)
+    limits = settings.max_sweeps, settings.final_sweeps, settings.step_tolerance
+    return settle(robot.tracking_arm, posture, begin, targets, each, *limits).reshape(q.shape)
 
 
 def _report(robot: Robot, q: Array, path: Array) -> TrackedPath:
@@ -259,32 +227,29 @@ def _report(robot: Robot, q: Array, path: Array) -> TrackedPath:
         error=np.linalg.norm(chain.position.T.reshape(path.shape) - path, axis=-1),
         limits_hit=np.any((q <= robot.lower) | (q >= robot.upper), axis=-1),
         manipulability=manipulability,
-        damped=manipulability < SINGULAR_MANIPULABILITY,
+        damped=manipulability < robot.tracking.singular_manipulability,
     )
 
 
+def soft_limits(robot: Robot, reference: Array, *, at_reference: bool = True) -> tuple[Array, Array]:
+    """Find where the springs of references (*B, 6) start: `at_reference` not before these, which are optima then."""
+    margin = robot.tracking.limit_margin
+    lower, upper = np.broadcast_arrays(robot.lower + margin, robot.upper - margin, reference)[:2]
+    return (np.minimum(lower, reference), np.maximum(upper, reference)) if at_reference else (lower, upper)
+
+
 def _posture(
-    robot: Robot, reference: Array, direction: Array, weight: float = DIRECTION_WEIGHT, *, at_reference: bool = False
+    robot: Robot, reference: Array, direction: Array, weight: float | None = None, *, at_reference: bool = False
 ) -> Postures:
-    """Make the posture of references (B, 6); `at_reference` slackens the springs there, so that it is an optimum."""
-    soft_lower = np.broadcast_to(robot.lower + LIMIT_MARGIN, reference.shape)
-    soft_upper = np.broadcast_to(robot.upper - LIMIT_MARGIN, reference.shape)
-    if at_reference:
-        soft_lower, soft_upper = np.minimum(soft_lower, reference), np.maximum(soft_upper, reference)
+    """Make the posture of references (B, 6); see `soft_limits`. None is the usual weight of the direction."""
+    weight = robot.tracking.direction_weight if weight is None else weight
+    soft_lower, soft_upper = soft_limits(robot, reference, at_reference=at_reference)
     arrays = reference, direction, soft_lower, soft_upper, np.full(len(reference), weight)
     return Postures(*(np.array(values, order="C") for values in arrays))
 
 
-def loses_branch(q: Array, paths: Array) -> NDArray[np.bool_]:
+def loses_branch(robot: Robot, q: Array, paths: Array) -> NDArray[np.bool_]:
     """Find which (B,) joints (B, T, 6) jump by more than a continuous solution along paths (B, T, 3) can."""
     moved = np.linalg.norm(np.diff(paths, axis=1), axis=-1)
-    allowed = 0.05 + JUMP_PER_ROOT_METRE * np.sqrt(moved)  # the constant is for repeated samples
+    allowed = 0.05 + robot.tracking.jump_per_root_metre * np.sqrt(moved)  # the constant is for repeated samples
     return np.any(np.abs(np.diff(q, axis=1)) > allowed[..., None], axis=(1, 2))
-
-
-def _posture_cost(q: Array, chain: KinematicChain, posture: Postures) -> Array:
-    """Compute the posture cost h(q) of `track`, (N,), of one posture."""
-    excess = q - np.clip(q, posture.soft_lower, posture.soft_upper)
-    away = ((q - posture.reference) ** 2).sum(axis=1)
-    turned = ((chain.direction - posture.direction.T) ** 2).sum(axis=0)
-    return 0.5 * (away + posture.direction_weight * turned + LIMIT_WEIGHT * (excess**2).sum(axis=1))

@@ -7,7 +7,7 @@ angles, also for the continuous joints, which pinocchio keeps as (cos, sin).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -18,6 +18,8 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from dt_viz.kernels.arm import JOINT, chains, places
+from dt_viz.kernels.tracking import TrackingArm
+from dt_viz.robot.tracking_settings import TrackingSettings
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -75,6 +77,7 @@ class Robot:
             from `joint_rotations` where fixed joints lie in between.
         end_effector_offset: (3,) position of the end effector in the last joint, metres.
         home: (6,) ready pose, rad.
+        tracking: settings of inverse kinematics and tracking.
     """
 
     joint_names: tuple[str, ...]
@@ -86,6 +89,7 @@ class Robot:
     link_rotations: Array
     end_effector_offset: Array
     home: Array
+    tracking: TrackingSettings = field(default=TrackingSettings())
 
     @property
     def reach(self) -> float:
@@ -105,6 +109,13 @@ class Robot:
         joints = np.zeros(NUM_JOINTS, JOINT)
         joints["rotation"], joints["translation"] = self.joint_rotations, self.joint_translations
         return joints
+
+    @cached_property
+    def tracking_arm(self) -> TrackingArm:
+        """The arm for the compiled loops of tracking."""
+        hand, lower, upper = (np.array(values) for values in (self.end_effector_offset, self.lower, self.upper))
+        weights = (getattr(self.tracking, name) for name in TrackingArm._fields[4:])
+        return TrackingArm(self.records, hand, lower, upper, *weights)
 
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
         """Compute the poses of the six joint frames (each turns with the link after it).

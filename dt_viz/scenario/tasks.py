@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -32,27 +32,28 @@ POTS = (Pot(-0.16, -0.52), Pot(0.0, -0.52), Pot(0.16, -0.52))
 """Pots of `drop_pots`: left, centre and right as seen facing the robot."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Task:
     """Demonstrations of one motion, placed in the world.
 
-    A point u (k,) of the demonstrations is the world point origin + scale·axes·u; a drawing has k = 2.
+    A point u (k,) of the demonstrations is the world point origin + scale·axes·u; a drawing has k = 2. What has a
+    default is for the page.
     """
 
-    name: str
-    title: str
-    hint: str
-    """Line that says what to try."""
     demonstrations: tuple[Demonstration, ...]
-    origin: Array
+    name: str = ""
+    title: str = ""
+    hint: str = ""
+    """Line that says what to try."""
+    origin: Array = field(default_factory=lambda: np.zeros(3))
     """(3,), metres."""
-    axes: Array
+    axes: Array = field(default_factory=lambda: np.eye(3))
     """(3, 3) orthonormal columns."""
-    scale: float
-    slice: Slice
-    camera: tuple[tuple[float, float, float], tuple[float, float, float]]
+    scale: float = 1.0
+    slice: Slice = field(default_factory=lambda: Slice(np.zeros(3), np.eye(3)[:, :2], (1.0, 1.0)))
+    camera: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """Position and look-at, metres."""
-    obstacle_position: tuple[float, float, float]
+    obstacle_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """First position of the obstacle, metres."""
     pots: tuple[Pot, ...] = ()
     """Pots on the table, from left to right."""
@@ -129,9 +130,6 @@ def lift_box() -> Task:
         title="Lift box",
         hint="Put the sphere in the way into the box, or on the way up.",
         demonstrations=demonstrations,
-        origin=np.zeros(3),
-        axes=np.eye(3),
-        scale=1.0,
         slice=Slice(middle + np.array([0.0, 0.0, 0.02]), np.stack([along, [0.0, 0.0, 1.0]], axis=1), (0.32, 0.26)),
         camera=((0.98, -1.60, 0.92), (0.24, -0.33, 0.28)),
         obstacle_position=_on_mean_path(demonstrations, lambda u: u, 0.42),
@@ -152,9 +150,6 @@ def push_box() -> Task:
         title="Push box",
         hint="Put the sphere where the box is pushed along the table.",
         demonstrations=demonstrations,
-        origin=np.zeros(3),
-        axes=np.eye(3),
-        scale=1.0,
         slice=Slice(np.array([middle[0], middle[1], height]), np.eye(3)[:, :2], (0.42, 0.20)),
         camera=((0.70, -1.58, 0.95), (0.13, -0.32, 0.22)),
         obstacle_position=(x, y, z - 0.02),  # a little low: the way over it is free, under it is the table
@@ -174,9 +169,6 @@ def drop_pots() -> Task:
         title="Drop in pots",
         hint="Bias the motion to the left or the right pot, its goal along with it.",
         demonstrations=demonstrations,
-        origin=np.zeros(3),
-        axes=np.eye(3),
-        scale=1.0,
         slice=Slice(paths.mean(axis=(0, 1)), np.stack([[1.0, 0.0, 0.0], down], axis=1), (0.30, 0.24)),
         camera=((0.62, -1.58, 0.90), (0.06, -0.38, 0.24)),
         obstacle_position=(0.0, -0.58, 0.36),  # beyond the pots: on the other side it would meet the arm

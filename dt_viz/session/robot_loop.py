@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,24 +15,37 @@ from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import Solved
 from dt_viz.robot.inverse_kinematics import track
 
-TICK = 0.01
-"""Time between two ticks of the controller, seconds: 100 Hz."""
-LONGEST = 0.25
-"""Longest time that the robot moves at once, seconds: a thread that was held up does not make it rush."""
-REST, REST_ASIDE = 0.8, 3.0
-"""Times that the robot stays at the goal before it goes home, seconds; the second where it has stepped aside."""
-REST_AT_START = 0.3
-"""Time that the robot stays at a start, seconds."""
-DISTANCES = (0.06, 0.03, 0.015)
-"""Distances by which the hand is pushed, metres: less where there is no room for more."""
-NUM_DIRECTIONS = 4
-"""Number of directions that are tried at each distance."""
-TABLE_ROOM = 0.025
-"""Height above the table that a push leaves to the hand, metres, where it has as much."""
-BESIDE = 0.01
-"""Distance of the hand from where it is held that is worth a word, metres."""
 
-_Wish = Callable[[ArmController], None]
+@dataclass(frozen=True)
+class RoundSettings:
+    """Settings of `LiveArm`."""
+
+    tick: float = 0.01
+    """Time between two ticks of the controller, seconds: 100 Hz."""
+    longest: float = 0.25
+    """Longest time that the robot moves at once, seconds: a thread that was held up does not make it rush."""
+    rest: float = 0.8
+    """Time that the robot stays at the goal before it goes home, seconds."""
+    rest_aside: float = 3.0
+    """The same where it has stepped aside, seconds."""
+    rest_at_start: float = 0.3
+    """Time that the robot stays at a start, seconds."""
+    push_distance: float = 0.06
+    """Distance by which the hand is pushed, metres."""
+    place_tolerance: float = 0.01
+    """Distance of the hand from where it is held that is reported, metres."""
+
+
+@dataclass(frozen=True)
+class _Round:
+    """Where in its round a robot is."""
+
+    number: int = 0
+    """Number of the start of this round, or of the next one while it goes there."""
+    rested: float = 0.0
+    """Time since it came to rest, seconds."""
+    arrived: float = 0.0
+    """See `LiveArm.arrived`."""
 
 
 class LiveArm:
@@ -40,29 +54,25 @@ class LiveArm:
     `follow` is for the thread that computes, `advance` for the one that moves the robot; the rest may come from any.
     """
 
-    def __init__(self, follower: Follower) -> None:
+    def __init__(self, follower: Follower, settings: RoundSettings | None = None) -> None:
         """Take an arm; it begins to move once it has something to follow.
 
         Args:
             follower: the arm.
+            settings: None are the defaults.
         """
-        self._follower = follower
+        self._follower, self._settings = follower, settings or RoundSettings()
         self._changing = threading.Lock()
-        self._wishes: list[_Wish] = []
+        self._commands: dict[str, Callable[[ArmController], None]] = {}
+        """Commands for the thread that moves the robot, by what they are about; the newest of a kind counts."""
         self._controller: ArmController | None = None
         self._solved: Solved | None = None
         self._chosen: int | None = None
-        self._starts: tuple[int, ...] = ()
-        """Numbers of the starts that it can go to."""
-        self._number = 0
-        """Number of the start of this round, or of the next one while it goes there."""
+        """Number of the start that was chosen."""
         self._q: Array | None = None
         self._held: Array | None = None
-        """Where the hand is to be held, (3,), metres."""
-        self._homing = self._let_go = False
-        self._due = self._rested = self._arrived = 0.0
-        self._seen: tuple[ArmAvoidance | None] | None = None
-        """What was seen since the last tick."""
+        """(3,) where the hand is to be held, metres."""
+        self._round, self._due = _Round(), 0.0
         self._rng = np.random.default_rng(0)
 
     # --- What it is doing ---
@@ -99,7 +109,7 @@ class LiveArm:
     @property
     def arrived(self) -> float:
         """Time since it came to the goal, seconds; 0 from when it sets out from a start until then."""
-        return self._arrived
+        return self._round.arrived
 
     @property
     def note(self) -> str:
@@ -111,21 +121,19 @@ class LiveArm:
             return "touched" if controller.touched else "no way around the obstacle"
         if phase is Phase.ASIDE:
             return "stepped aside"
-        return self._beside or controller.held_back
+        return (self._beside(controller) if phase is Phase.HELD else "") or controller.held_back
 
-    @property
-    def _beside(self) -> str:
-        """Why the hand is not where it is held, in words; empty if it is."""
-        place, q, solved, below = self._held, self._q, self._solved, self.undisturbed
-        if self.phase is not Phase.HELD or place is None or q is None or solved is None or below is None:
+    def _beside(self, controller: ArmController) -> str:
+        """Say why the hand is not where it is held; empty if it is."""
+        place, q, solved, tolerance = self._held, self._q, self._solved, self._settings.place_tolerance
+        if place is None or q is None or solved is None or len(controller.ahead) > 1:
             return ""
-        robot = self._follower.robot
-        if len(self.ahead) > 1 or np.linalg.norm(robot.end_effector(q) - place) < BESIDE:
+        now, below = controller.robot.end_effector(np.stack([q, controller.undisturbed]))
+        if np.linalg.norm(now - place) < tolerance:
             return ""
         if solved.scenario.obstacle.signed_distance(place) < 0:
             return "inside the obstacle"
-        far = np.linalg.norm(robot.end_effector(below) - place) > BESIDE
-        return "out of the arm's reach" if far else "gives way to the obstacle"
+        return "out of the arm's reach" if np.linalg.norm(below - place) > tolerance else "gives way to the obstacle"
 
     # --- What happens to it ---
 
@@ -141,30 +149,28 @@ class LiveArm:
         """
         before, nominal = self._solved, solved.nominal
         number = None if chosen is None else nominal.numbers[chosen]
+        another = before is not None and (before.nominal.task is not nominal.task or number != self._chosen)
         same = before is not None and solved.stack is before.stack and solved.scenario == before.scenario
-        if same and number == self._chosen:
+        if same and not another:
             return
-        reached = ~self._follower.out_of_reach(nominal)
-        starts = tuple(np.array(nominal.numbers)[reached].tolist())
         if self._controller is None:
-            first = chosen or 0
-            controller, q = ArmController(self._follower, solved), self._q
+            first, q = chosen or 0, self._q
+            controller = ArmController(self._follower, solved)
             if q is None:
                 q = _posture(self._follower, solved, first)
             controller.begin(q, first)
             with self._changing:
-                self._q, self._number, self._controller = q, nominal.numbers[first], controller
-                self._homing = False
+                self._q, self._controller = q, controller
+                self._round = replace(self._round, number=nominal.numbers[first])
         else:
             self._controller.follow(solved)
-        another = before is not None and (before.nominal.task is not nominal.task or number != self._chosen)
-        self._solved, self._starts, self._chosen = solved, starts, number
+        self._solved, self._chosen = solved, number
         if another and number is not None:
-            self._wish(lambda controller: self._go_home(controller, number))
+            self._command("home", lambda controller: self._go_home(controller, number))
 
     def see(self, avoidance: ArmAvoidance | None) -> None:
         """Update the obstacles that the controller keeps away from, before the motion around them is computed."""
-        self._seen = (avoidance,)
+        self._command("see", lambda controller: controller.see(avoidance))
 
     def stop(self) -> None:
         """Stay in this posture: there is nothing to follow."""
@@ -178,17 +184,17 @@ class LiveArm:
     def hold(self, place: Array) -> None:
         """Take the hand to a place (3,), metres, and keep it there until `release`; the newest place counts."""
         with self._changing:
-            self._held, self._let_go = place, False
-            if self._hold not in self._wishes:
-                self._wishes.append(self._hold)
+            self._held = place
+            self._commands.pop("release", None)
+            self._commands["hold"] = lambda controller: controller.hold(place)
 
     def release(self) -> None:
         """Let go of the hand: it goes on to where it was going; in a pause, once it is where it was to be held."""
-        self._let_go = True
+        self._command("release", self._release)
 
     def push(self) -> None:
         """Push the hand a few centimetres aside, in a random direction across its way; it goes on from there."""
-        self._wish(self._push)
+        self._command("push", self._push)
 
     def advance(self, seconds: float, *, moves: bool) -> None:
         """Let some time pass.
@@ -197,98 +203,85 @@ class LiveArm:
             seconds: of the robot's time.
             moves: whether the robot moves by itself; else it does so only while its hand is held.
         """
-        controller = self._controller
+        controller, settings = self._controller, self._settings
         if controller is None:
             return
         with self._changing:
-            wishes, self._wishes = self._wishes, []
-        for wish in wishes:
-            wish(controller)
-        if self._let_go and (moves or controller.rests):
-            self._held, self._let_go = None, False
-            controller.release()
-        seen, self._seen = self._seen, None
-        if seen is not None:
-            controller.see(*seen)
+            commands, self._commands = self._commands, {}
+        for kind, command in commands.items():
+            if kind == "release" and not (moves or controller.rests):
+                with self._changing:
+                    if "hold" not in self._commands:
+                        self._commands.setdefault(kind, command)
+            else:
+                command(controller)
         if not moves and controller.phase is not Phase.HELD:
             controller.watch()
             return
-        self._due = min(self._due + seconds, LONGEST)
-        ticks = int(self._due / TICK)
-        self._due -= ticks * TICK
+        self._due = min(self._due + seconds, settings.longest)
+        ticks = int(self._due / settings.tick)
+        self._due -= ticks * settings.tick
         if ticks:
             q = self._q
             assert q is not None
-            velocities = controller.steps(q, TICK, ticks)
+            velocities = controller.steps(q, settings.tick, ticks)
             with self._changing:
                 if self._q is q:  # or it was put elsewhere meanwhile
-                    self._q = q + TICK * velocities.sum(axis=0)
-        self._go_round(controller, ticks * TICK)
+                    self._q = q + settings.tick * velocities.sum(axis=0)
+        self._go_round(controller, ticks * settings.tick)
 
     # --- On the thread that moves it ---
 
-    def _wish(self, wish: _Wish) -> None:
+    def _command(self, kind: str, command: Callable[[ArmController], None]) -> None:
         with self._changing:
-            self._wishes.append(wish)
+            self._commands[kind] = command
 
-    def _hold(self, controller: ArmController) -> None:
-        place = self._held
-        if place is not None:
-            controller.hold(place)
+    def _release(self, controller: ArmController) -> None:
+        self._held = None
+        controller.release()
 
     def _push(self, controller: ArmController) -> None:
-        robot, q = self._follower.robot, self._q
-        if q is None or self._solved is None or not len(controller.ahead):
+        """Push the hand as far as the controller's limits allow; they keep it off the table and the obstacles."""
+        robot, q, ahead = controller.robot, self._q, controller.ahead[:2]
+        if q is None or not len(ahead):
             return
-        best, most = q, -np.inf
-        for place in self._places_aside(controller, q):
-            tracked = track(robot, np.linspace(robot.end_effector(q), place, 4), q)
-            room = self._room(tracked.q[-1]) - float(tracked.error.max())
-            if room > most:
-                best, most = tracked.q[-1], room
-            if room > 0:
-                break
-        controller.displace(best)
-
-    def _places_aside(self, controller: ArmController, q: Array) -> Iterator[Array]:
-        """Places (3,), metres, to push the hand to, the farthest first."""
-        robot, ahead = self._follower.robot, controller.ahead[:2]
         hand, along = robot.end_effector(q), np.ptp(robot.end_effector(ahead), axis=0)
-        along /= max(float(np.linalg.norm(along)), 1e-9)
-        directions = self._rng.normal(size=(NUM_DIRECTIONS, 3))
-        directions -= np.outer(directions @ along, along)
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        for distance in DISTANCES:
-            yield from hand + distance * directions
-
-    def _room(self, q: Array) -> float:
-        """Room of the hand above the table and beside the obstacle, metres; below 0 there is too little."""
-        assert self._solved is not None and self._q is not None
-        robot, scenario = self._follower.robot, self._solved.scenario
-        hand, now = robot.end_effector(q), robot.end_effector(self._q)
-        table = float(hand[2] - min(TABLE_ROOM, now[2]))
-        return min(table, float(scenario.obstacle.signed_distance(hand))) if scenario.avoids else table
+        aside = self._rng.normal(size=3)
+        aside -= along * (aside @ along) / max(float(along @ along), 1e-18)
+        place = hand + self._settings.push_distance * aside / np.linalg.norm(aside)
+        controller.displace(track(robot, np.linspace(hand, place, 4), q).q[-1])
 
     def _go_home(self, controller: ArmController, number: int) -> None:
-        solved = self._solved
-        rollout = None if solved is None else solved.nominal.rollout(number)
+        rollout = None if self._solved is None else self._solved.nominal.rollout(number)
         if rollout is not None:
-            self._number, self._homing, self._rested = number, True, 0.0
+            self._round = replace(self._round, number=number, rested=0.0)
             controller.home(rollout)
 
     def _go_round(self, controller: ArmController, seconds: float) -> None:
         """Set out for the next start, or from there for the goal, when the robot has rested."""
-        phase = controller.phase
+        phase, homing, before, settings = (
+            controller.phase,
+            controller.heading is Phase.HOMING,
+            self._round,
+            self._settings,
+        )
         rests = phase in (Phase.RESTING, Phase.ASIDE)
-        self._rested = self._rested + seconds if rests else 0.0
-        if self._arrived > 0 or (rests and not self._homing):
-            self._arrived += seconds
-        if self._homing and self._rested > REST_AT_START:
-            self._homing, self._arrived, self._rested = False, 0.0, 0.0
+        rested = before.rested + seconds if rests else 0.0
+        arrives = before.arrived > 0 or (rests and not homing)
+        self._round = replace(before, rested=rested, arrived=before.arrived + seconds * arrives)
+        if homing and rested > settings.rest_at_start:
+            self._round = _Round(before.number)
             controller.go()
-        elif not self._homing and self._rested > (REST if phase is Phase.RESTING else REST_ASIDE) and self._starts:
-            later = [number for number in self._starts if number > self._number]
-            self._go_home(controller, later[0] if later else self._starts[0])
+        elif not homing and rested > (settings.rest if phase is Phase.RESTING else settings.rest_aside):
+            self._go_home(controller, self._next_start())
+
+    def _next_start(self) -> int:
+        """Number of the start after this round's that the arm can get to; the first one after the last."""
+        if self._solved is None:
+            return self._round.number
+        nominal = self._solved.nominal
+        reached = np.array(nominal.numbers)[~self._follower.out_of_reach(nominal)].tolist()
+        return min(reached, key=lambda number: (number <= self._round.number, number), default=self._round.number)
 
 
 def _posture(follower: Follower, solved: Solved, rollout: int) -> Array:

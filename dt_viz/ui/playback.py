@@ -11,7 +11,7 @@ import numpy as np
 
 from dt_viz.flows.fields import Array
 from dt_viz.session.engine import ArmMotion
-from dt_viz.session.robot_loop import REST, LiveArm
+from dt_viz.session.robot_loop import LiveArm, RoundSettings
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class Replay:
     @property
     def _moment(self) -> float:
         """Time in the loop, seconds."""
-        return 0.0 if self.motion is None else self._clock % (self.motion.times[-1] + REST)
+        return 0.0 if self.motion is None else self._clock % (self.motion.times[-1] + RoundSettings().rest)
 
 
 class Playback:

@@ -241,7 +241,7 @@ class TestDisturbances:
         turned = scene.start + 2 * np.pi * turns * np.isinf(scene.robot.lower)
         robot = Robot(scene.controller(), turned).run(1.5)
         robot.controller.follow(engine.solved(scenario, LIVE))
-        course, section = robot.controller._course, robot.controller.system.section
+        course, section = robot.controller._progress.course, robot.controller.system.section
         ahead = course.q[course.times > 2]  # by then it has nearly converged to the section
         exact = section.postures(scene.robot.end_effector(ahead)[::-1])[::-1]
         assert len(ahead) > 10 and np.abs(np.sin((ahead - exact) / 2)).max() < 5e-3

@@ -5,12 +5,12 @@ import plain_tracking
 import pytest
 
 from dt_viz.kernels.blocks import LANES
-from dt_viz.kernels.tracking import Postures, TrackingArm, settle, walk
-from dt_viz.robot.inverse_kinematics import LIMIT_MARGIN
+from dt_viz.kernels.tracking import Postures, settle, walk
+from dt_viz.robot.inverse_kinematics import soft_limits
 from dt_viz.robot.robot import load_jaco
 
 ROBOT = load_jaco()
-ARM = TrackingArm(ROBOT.records, np.array(ROBOT.end_effector_offset), np.array(ROBOT.lower), np.array(ROBOT.upper))
+ARM = ROBOT.tracking_arm
 
 
 def postures(num, seed=0):
@@ -20,8 +20,7 @@ def postures(num, seed=0):
     reference = ROBOT.clip(ROBOT.home + rng.normal(0, 0.4, (num, 6)))
     direction = rng.normal(size=(num, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    soft = np.broadcast_to(ROBOT.lower + LIMIT_MARGIN, q.shape), np.broadcast_to(ROBOT.upper - LIMIT_MARGIN, q.shape)
-    lower, upper = (np.array(bound) for bound in soft)
+    lower, upper = (np.array(bound) for bound in soft_limits(ROBOT, reference, at_reference=False))
     objectives = Postures(reference, direction, lower, upper, rng.uniform(1, 40, num))
     return objectives, q, ROBOT.end_effector(q) + rng.normal(0, 0.2, (num, 3))
 

@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from dt_viz.robot.inverse_kinematics import STEP_TOLERANCE, TrackedPath, UnreachableError, inverse_kinematics, track
+from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, inverse_kinematics, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot, load_jaco
 
 BOX = np.array([[-0.4, -0.65, 0.05], [0.4, -0.3, 0.75]])  # where the tasks live, metres
-STEPS = 5 * STEP_TOLERANCE  # rad, that a posture may be away from the best one
+STEPS = 5 * load_jaco().tracking.step_tolerance  # rad, that a posture may be away from the best one
 seeds = st.integers(0, 2**32 - 1)
 
 

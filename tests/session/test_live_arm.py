@@ -12,9 +12,10 @@ from dt_viz.metrics import distance_from_path
 from dt_viz.obstacles.shapes import Sphere, as_point
 from dt_viz.robot.collision import load_collision_model
 from dt_viz.session.frame import Stage
-from dt_viz.session.robot_loop import DISTANCES, REST, LiveArm
+from dt_viz.session.robot_loop import LiveArm, RoundSettings
 
 PICTURE = 0.04
+SETTINGS = RoundSettings()
 
 
 class Loop:
@@ -107,10 +108,10 @@ def test_it_goes_from_start_to_goal_and_home_to_the_next_start(begin, initial, t
     np.testing.assert_allclose(loop.hand, loop.frame.rollouts[0][0], atol=5e-3)
     loop.assert_arrives_without_a_jump()
     loop.run(3, lambda: arm.phase is Phase.HOMING)
-    assert REST <= arm.arrived < REST + 0.1
+    assert SETTINGS.rest <= arm.arrived < SETTINGS.rest + 0.1
     loop.run(30, lambda: arm.phase is Phase.RESTING)
     assert np.linalg.norm(loop.hand - starts[1]) < 5e-3
-    assert arm.arrived > REST  # what it carried stays where it fell
+    assert arm.arrived > SETTINGS.rest  # what it carried stays where it fell
     loop.run(1, lambda: arm.phase is Phase.MOVING)
     assert arm.arrived == 0
     loop.assert_arrives_without_a_jump()
@@ -154,7 +155,7 @@ def test_pushed_aside_again_and_again_it_still_reaches_the_goal(whole):
         whole.arm.push()
         whole.run(0.6)
         aside.append(distance_from_path(whole.hand[None], free)[0])
-    assert DISTANCES[-1] < max(aside) < 3 * DISTANCES[0]
+    assert SETTINGS.push_distance / 4 < max(aside) < 3 * SETTINGS.push_distance
     whole.assert_arrives_without_a_jump()
     assert Phase.HELD in whole.phases
     whole.assert_free()

@@ -9,11 +9,11 @@ import pytest
 from pages import PATIENCE
 
 from dt_viz.session.engine import ArmMotion
-from dt_viz.session.robot_loop import REST
+from dt_viz.session.robot_loop import RoundSettings
 from dt_viz.ui import playback as playback_module
 from dt_viz.ui.playback import Playback, at_moment
 
-PICTURE = 0.02
+PICTURE, REST = 0.02, RoundSettings().rest
 
 
 class Arm:

@@ -1,0 +1,170 @@
+"""The feasible velocities of a tick, and the one of them that a robot takes: a quadratic programme (daqp)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import daqp
+import numpy as np
+
+from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
+from dt_viz.control.limits import AccelerationLimit, ContactLimit, ObstacleLimit, RangeLimit, VelocityLimit
+from dt_viz.control.obstacle_motion import Sighting
+from dt_viz.control.settings import ControllerSettings
+from dt_viz.flows.fields import Array
+from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
+from dt_viz.obstacles.arrays import records
+from dt_viz.robot.body_points import BodyPoints
+from dt_viz.robot.robot import NUM_JOINTS
+
+SOFT = 8
+"""daqp's mark of a constraint that may be violated where there is no other way."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """What came of a tick."""
+
+    q: Array
+    """(6,) where the robot was, rad."""
+    wanted: Array
+    """(6,) velocity that was asked for, rad/s."""
+    velocity: Array
+    """(6,) that was found, rad/s."""
+    evasive: Array | None
+    """(6,) velocity that evades obstacles which move, rad/s; None where the wanted one leads past them."""
+    contacts: list[tuple[Array, Array]]
+    """Rows of the table's and the arm's own limits; see `ContactLimit.rows`."""
+    clearance: float
+    """Distance of the arm from the nearest obstacle, about, metres."""
+
+
+class FeasibleVelocities:
+    """Finds the velocity nearest to a wanted one that all limits allow (`dt_viz.control.limits`)."""
+
+    def __init__(self, arm: WholeArm, body: BodyPoints, settings: ControllerSettings) -> None:
+        """Make the limits of an arm, whose base and links have these body points."""
+        robot = self._robot = arm.robot
+        self._settings = settings
+        self._limits = (
+            RangeLimit(robot, settings.acceleration),
+            VelocityLimit(robot.velocity_limits),
+            AccelerationLimit(settings.acceleration),
+        )
+        self._barrier = ObstacleLimit(arm, settings.clearance, settings.barrier_gain, settings.barrier_reach)
+        self._contacts = tuple(
+            make(robot, body, settings.clearance, settings.contact_gain)
+            for make in (ContactLimit.table, ContactLimit.itself)
+        )
+        bounds = robot.lower, robot.upper, robot.velocity_limits
+        self._limited = LimitedArm(robot.records, arm.links.records, *bounds, settings.acceleration)
+
+    def kept(self, q: Array) -> tuple[Array, ...]:
+        """Distances from the table, and of the arm's parts, that are kept in a motion along postures q (N, 6)."""
+        return tuple(limit.kept(q) for limit in self._contacts)
+
+    def tick(
+        self,
+        q: Array,
+        wanted: Array,
+        dt: float,
+        before: Tick | None,
+        seen: Sighting,
+        late: float,
+        kept: Sequence[Array],
+    ) -> Tick:
+        """Find the velocity for a tick.
+
+        Args:
+            q: (6,) rad.
+            wanted: (6,) rad/s.
+            dt: duration of the tick, seconds.
+            before: the last tick; None before the first one, when the robot stands still.
+            seen: the obstacles.
+            late: time since they were seen, seconds.
+            kept: see `kept`.
+        """
+        velocity = np.zeros(NUM_JOINTS) if before is None else before.velocity
+        lower, upper = np.full(NUM_JOINTS, -np.inf), np.full(NUM_JOINTS, np.inf)
+        for limit in self._limits:  # the last one's bounds, of acceleration, come first
+            lowest, highest = limit.bounds(q, velocity, dt)
+            lower, upper = _within(lower, lowest, highest), _within(upper, lowest, highest)
+        contacts = [limit.rows(q, least, dt) for limit, least in zip(self._contacts, kept, strict=True)]
+        there = replace(seen, avoidance=seen.expected(late, 0.0, self._settings.returning))
+        *barrier, clearance = self._barrier.rows(q, there, dt)
+        nearest = _nearest(wanted, lower, upper, [*contacts, barrier])
+        previous = None if before is None else before.evasive
+        evasive = self._evasive(q, velocity, nearest, previous, seen, late, float(kept[0].min()))
+        if evasive is not None:
+            nearest = _nearest(evasive, lower, upper, contacts)
+        return Tick(q, wanted, nearest, evasive, contacts, clearance)
+
+    def _evasive(
+        self, q: Array, velocity: Array, wanted: Array, before: Array | None, seen: Sighting, late: float, floor: float
+    ) -> Array | None:
+        """Find the velocity (6,) that leads past obstacles which move; None where the wanted one does.
+
+        Each of some velocities is foreseen for a short time: the joints turn to it as fast as they may and keep it, the
+        obstacles go on as `ObstacleMotion` says. How near they come, in deviations of the obstacles from there, is its
+        worth. Choosing anew in each tick, that is model predictive control with one move, by enumeration.
+
+        Args:
+            q: (6,) rad.
+            velocity: (6,) now, rad/s.
+            wanted: (6,) rad/s.
+            before: (6,) the one of the last tick, rad/s; None is none.
+            seen: the obstacles.
+            late: time since they were seen, seconds.
+            floor: distance from the table that is to be kept, metres.
+        """
+        settings, speeds = self._settings, np.linalg.norm(seen.velocities, axis=1)
+        moving = np.flatnonzero(speeds > settings.slow)
+        if seen.avoidance is None or not len(moving):
+            return None
+        times = np.linspace(0, settings.horizon, settings.num_ahead + 1)[1:]
+        moved = np.stack([seen.motions[k].ahead(times + late, settings.returning) for k in moving], axis=1)
+        deviation = np.outer(settings.unsure + settings.doubt * times, speeds[moving])
+        kept = settings.clearance - OVERSHOOT, floor - OVERSHOOT, settings.floor_depth
+        forecast = Forecast(
+            *records(tuple(seen.avoidance.avoided.parts[k] for k in moving)), times, moved, deviation, *kept
+        )
+        before = wanted if before is None else before
+        clear, found = dodge(self._limited, forecast, q, velocity, wanted, before, settings.staying)
+        return None if clear else found
+
+    def active(self, tick: Tick) -> str:
+        """Say which limit kept a robot from the velocity that it wanted, in words; empty if none did."""
+        still = self._settings.at_rest
+        for limit, (slopes, bounds) in zip(self._contacts, tick.contacts, strict=True):
+            if ((slopes @ tick.wanted < bounds - still) & (slopes @ tick.velocity < bounds + still)).any():
+                return f"kept from {limit.name}"
+        room = np.where(tick.wanted < 0, tick.q - self._robot.lower, self._robot.upper - tick.q)
+        at_end = room < self._settings.range_tolerance
+        (ended,) = np.nonzero(at_end & (np.abs(tick.wanted) > still + np.abs(tick.velocity)))
+        return f"joint {ended[0] + 1} is at its limit" if len(ended) else ""
+
+
+def _nearest(wanted: Array, lower: Array, upper: Array, rows: Sequence[Sequence[Array]]) -> Array:
+    """Find the velocity nearest to a wanted one (6,), min ‖q̇ − q̇*‖².
+
+    Bounds (6,) are hard; rows of slopes s and bounds b, s·q̇ ≥ b, give way where there is no other way.
+    """
+    nearest = _within(wanted, lower, upper)
+    if all((slopes @ nearest >= bounds).all() for slopes, bounds in rows):
+        return nearest
+    slopes, bounds = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    solution, _, flag, _ = daqp.solve(
+        np.eye(NUM_JOINTS),
+        -wanted,
+        np.ascontiguousarray(slopes),
+        np.concatenate([upper, np.full(len(bounds), 1e30)]),
+        np.concatenate([lower, bounds]),
+        np.repeat(np.array([0, SOFT], np.int32), (NUM_JOINTS, len(bounds))),
+    )
+    return _within(solution if flag > 0 else np.zeros(NUM_JOINTS), lower, upper)
+
+
+def _within(values: Array, lower: Array, upper: Array) -> Array:
+    """Clip values (6,); for so few `np.clip` takes five times as long."""
+    return np.minimum(np.maximum(values, lower), upper)

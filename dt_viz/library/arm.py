@@ -1,0 +1,162 @@
+"""The arm: its motions along and around what was learned, and in the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dt_viz.control.controller import ArmController
+from dt_viz.control.settings import ControllerSettings
+from dt_viz.flows.fields import Array
+from dt_viz.library.motion import NUM_COORDINATES, Motion, Path
+from dt_viz.motion.following import Follower
+from dt_viz.motion.solve import Solved, solve
+from dt_viz.motion.stack import FINE, LIVE, build_stack
+from dt_viz.robot.inverse_kinematics import inverse_kinematics, track
+from dt_viz.robot.retiming import within_velocity_limits
+from dt_viz.robot.robot import Robot
+from dt_viz.robot.robot import load_jaco as load_robot
+from dt_viz.robot.tracking_settings import TrackingSettings
+
+
+@dataclass(frozen=True, eq=False)
+class JointPath:
+    """A motion of the arm's joints."""
+
+    q: Array
+    """(T, 6) joint angles, rad; continuous joints unwrapped."""
+    times: Array
+    """(T,) seconds, later than the path's where the joints' velocity limits ask for it."""
+    error: Array
+    """(T,) distances of the hand from the path, metres: what it misses, or gives way by."""
+
+
+class BlockedError(Exception):
+    """The whole arm finds no motion around an obstacle."""
+
+
+class Arm:
+    """The JACO arm."""
+
+    def __init__(self, robot: Robot) -> None:
+        """Wrap a robot; see `load_jaco`."""
+        self.robot = robot
+        self._follower = Follower(robot)
+
+    def follow(self, path: Path) -> JointPath:
+        """The joints along a path of the hand.
+
+        Args:
+            path: in space, in the frame of the arm's base.
+
+        Raises:
+            UnreachableError: the arm cannot get to where the path starts.
+            ValueError: the path lies in a plane that has no place in space.
+        """
+        if path.positions.shape[1] != NUM_COORDINATES:
+            raise ValueError(f"the arm follows paths in space, with 3 coordinates, not {path.positions.shape[1]}")
+        start = inverse_kinematics(self.robot, path.positions[0])
+        tracked = track(self.robot, path.positions, start)
+        times = within_velocity_limits(path.times, tracked.q, self.robot.velocity_limits)
+        return JointPath(tracked.q, times, tracked.error)
+
+    def rollouts(self, motion: Motion, *, spacing: float = 0.005) -> tuple[JointPath, ...]:
+        """Motions of the whole arm from the demonstrations' starts, around what the motion tells it to avoid.
+
+        Args:
+            motion: in space, in the frame of the arm's base.
+            spacing: largest distance between neighbouring samples of the hand, metres.
+
+        Raises:
+            BlockedError: an obstacle leaves no room at a start or at the goal, or no way between them.
+            UnreachableError: the arm cannot get to where the motions start.
+            ValueError: the motion is one in a plane that has no place in space.
+        """
+        if motion.dimension != NUM_COORDINATES:
+            raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {motion.dimension}")
+        scenario, nominal = motion.scenario, motion.nominal
+        avoidance = scenario.arm_avoidance
+        if avoidance is None:
+            return tuple(self.follow(path) for path in motion.rollouts(spacing=spacing))
+        admission = self._follower.admission(nominal, avoidance)
+        in_the_way = admission.blocked or admission.nominal.warnings
+        if in_the_way:
+            raise BlockedError("; ".join(warning.text for warning in in_the_way))
+        solved = solve(scenario, admission.nominal, replace(FINE, spacing=spacing), self._follower)
+        arm = solved.arm
+        assert arm is not None
+        if solved.nominal.left_out or not arm.cleared:
+            raise BlockedError("the arm finds no way around the obstacle")
+        due = solved.stack.rays.times(arm.index, arm.fraction)
+        away = self.robot.end_effector(arm.p) - solved.stack.positions_at(arm.index, arm.fraction)
+        rows = [arm.index == rollout for rollout in range(len(nominal.starts))]
+        limits = self.robot.velocity_limits
+        return tuple(
+            JointPath(
+                arm.p[row], within_velocity_limits(due[row], arm.p[row], limits), np.linalg.norm(away[row], axis=1)
+            )
+            for row in rows
+        )
+
+
+class Controller(ArmController):
+    """The joint velocities of an arm in the loop, wherever it is: see `dt_viz.control.controller`.
+
+        controller = dt.Controller(motion, arm)
+        q_velocity = controller.step(q, dt)
+
+    The arm goes to the goal around what the motion avoids by hand, and by the whole arm (`Avoidance(space="cspace")`).
+    """
+
+    def __init__(
+        self, motion: Motion, arm: Arm, label: float | None = None, settings: ControllerSettings | None = None
+    ) -> None:
+        """Take a motion and the arm.
+
+        Args:
+            motion: in space, in the frame of the arm's base.
+            arm: the arm that follows it.
+            label: of the pattern that is drawn; None takes that of the demonstration that begins nearest to the hand.
+            settings: what may be chosen; None are the defaults.
+
+        Raises:
+            FormatError: no demonstration has such a label.
+            UnreachableError: the arm cannot get to where the motion starts.
+            ValueError: the motion is one in a plane that has no place in space.
+        """
+        rollout = None if label is None else int(motion.labelled(label)[0])
+        super().__init__(arm._follower, _live(motion), settings, rollout)
+        self._motion = motion
+
+    @property
+    def motion(self) -> Motion:
+        """What it follows; another one, such as one with its obstacle elsewhere, takes over at the next `step`.
+
+        Raises:
+            UnreachableError, ValueError: as `Controller`.
+        """
+        return self._motion
+
+    @motion.setter
+    def motion(self, motion: Motion) -> None:
+        self.follow(_live(motion))
+        self._motion = motion
+
+
+def _live(motion: Motion) -> Solved:
+    """The stack of a motion in space, as exactly as a controller needs it."""
+    if motion.dimension != NUM_COORDINATES:
+        raise ValueError(f"the arm follows motions in space, with 3 coordinates, not {motion.dimension}")
+    scenario, nominal = motion.scenario, motion.nominal
+    return Solved(scenario, nominal, nominal, build_stack(nominal, scenario.active, LIVE))
+
+
+def load_jaco(tracking: TrackingSettings | None = None) -> Arm:
+    """The JACO arm, from its URDF.
+
+    Args:
+        tracking: settings of its inverse kinematics; None are the defaults.
+    """
+    robot = load_robot()
+    return Arm(robot if tracking is None else replace(robot, tracking=tracking))

@@ -1,0 +1,52 @@
+"""What may be chosen about inverse kinematics and tracking."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """Settings of `dt_viz.robot.inverse_kinematics`, which compiled loops take, too."""
+
+    direction_weight: float = 1.5
+    """Weight w_d of the hand's direction (unit vectors) against joint angles (rad). Much above 2, the best posture
+    stops being unique and tracked joints jump between wrist postures."""
+    asked_direction_weight: float = 40.0
+    """Weight w_d where inverse kinematics is given a direction: it chooses one posture and need not be continuous."""
+    limit_weight: float = 50.0
+    """Weight of the springs before the joint limits, against 1 for staying near the reference."""
+    limit_margin: float = 0.15
+    """Distance from the limit at which those springs start, rad."""
+    damping_floor: float = 1e-6
+    """Least damping λ₀² of the pseudo-inverse, m²: bounds the step at a singularity, is negligible elsewhere."""
+    damping_per_error: float = 0.2
+    """Growth of λ² with the remaining error, m: about half the curvature of the forward kinematics."""
+    curvature: float = 0.1
+    """Curvature of the forward kinematics along the null space, m per rad²; see `dt_viz.kernels.tracking`."""
+    step_limit: float = 0.4
+    """Largest joint motion in one step, rad; beyond it the linear model is invalid."""
+    stride: float = 0.08
+    """Distance along the path that a cold start covers in one step, metres."""
+    max_sweeps: int = 8
+    """Largest number of sweeps that improve the posture, too."""
+    final_sweeps: int = 3
+    """Largest number of sweeps after them, which keep the posture and only correct the positions."""
+    step_tolerance: float = 1e-3
+    """Step, rad, below which a waypoint is done: the remaining error is about its square times the reach."""
+    jump_per_root_metre: float = 4.0
+    """Joint motion over the root of the hand's, rad/√m, above which a warm start has lost its branch. The stretched arm
+    follows the root: 0.4 rad bend it by 2 cm."""
+    singular_manipulability: float = 3e-3
+    """Manipulability, m³, below which the damping takes about 1 % or more of a step; the workspace has 0.05 to 0.2."""
+    hand_pitch: float = math.radians(40.0)
+    """Angle of the hand below horizontal, rad, where inverse kinematics is asked for no other."""
+    num_restarts: int = 24
+    """Number of postures that inverse kinematics begins from."""
+    max_iterations: int = 60
+    """Largest number of its steps."""
+    tolerance: float = 1e-5
+    """Distance from its target, metres, below which that counts as reached."""
+    floor_weight: float = 100.0
+    """Cost per metre of a joint below the table, where it chooses among its solutions."""
