@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -39,9 +40,11 @@ from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import TrackedPath, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 NUM_CONFIGURATIONS = 100
 """Samples of each rollout before refinement."""
@@ -58,20 +61,10 @@ MAX_ROUNDS = 4
 """Rounds of refinement and of a longer flow where the samples that it adds are not clear."""
 SLOPE = 0.1
 """Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
-OVERSHOOT = 7e-3
-"""Distance by which the covering spheres stick out of the arm, about, metres: so much less margin is asked of them."""
 MOVED = 5e-3
 """Smallest shift of an added start by the avoidance that is reported, metres."""
 ROUNDING = 1e-3
 """Tolerance of a clearance, metres."""
-MESH_ROUNDING = 0.5e-3
-"""Tolerance of the meshes' clearance, metres: between two samples they may come a little nearer."""
-EXTENSION_STEP = 0.03
-"""Flow time between two looks at the meshes' clearance."""
-MAX_EXTENSION = 0.15
-"""Longest flow time that is added for the meshes: they are at most three centimetres nearer than asked for."""
-NUM_EXTENDED_FOR = 40
-"""Number of samples, those that lack most, that this time is chosen for."""
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
 COARSE_SPACING = 0.025
@@ -183,7 +176,7 @@ class ArmSolution:
     duration: float
     """t of the avoidance flow."""
     clearance: float
-    """Smallest distance of the covering spheres from the obstacle along the rollouts that shape the flow, metres."""
+    """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres."""
     stuck: Indices
     """Hosts that do not keep the clearance that is asked for."""
     too_near: Indices
@@ -211,7 +204,7 @@ class WholeArm:
         self.robot = robot
         self.links = body.on_moving_links
         """Points of the links."""
-        self.body = self.links.with_end_effector(robot, OVERSHOOT)
+        self.body = self.links.with_end_effector(robot)
         """The same, and what the hand holds."""
         self.limits = JointLimits(robot.lower, robot.upper)
 
@@ -221,7 +214,7 @@ class WholeArm:
         field = WholeArmField(self.robot, self.body, (obstacle,), np.eye(3)[:1], np.empty((0, NUM_JOINTS)))
         points = self.body.of_chain(self.robot.chain(q.T))
         shapes, values = records((obstacle,))
-        joints, links, still = self.robot.records, self.links.records, np.zeros(NUM_JOINTS)
+        joints, links, still = self.robot.records, self.links.spheres, np.zeros(NUM_JOINTS)
         dodging, ones = LimitedArm(joints, links, still, still, still, 1.0), np.ones((1, 1))
         forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
@@ -231,8 +224,8 @@ class WholeArm:
             lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, NUM_JOINTS))),
             lambda: room_asked(q, q, np.zeros(1), LEVERS, SLOPE, 0.0),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
-            lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy()),
-            lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy()),
+            lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy(), 1.0),
+            lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy(), 1.0),
             lambda: dodge(dodging, forecast, still, still, still, still, 0.0),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
@@ -367,25 +360,9 @@ class WholeArm:
         solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
         return replace(solver.through(full.transform.scaled(fraction), full.duration), ways=full.ways)
 
-    def touches(self, solution: ArmSolution, num_shaping: int, obstacle: Union) -> bool:
-        """Whether the arm's meshes touch the obstacle on the first `num_shaping` motions."""
-        p = solution.p[solution.index < num_shaping]
-        return bool((self.mesh_clearance(p, obstacle, np.full(len(p), ROUNDING)) < ROUNDING).any())
-
-    def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
-        """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
-        return self.body.clearance(self.robot, q, obstacle)
-
-    def mesh_clearance(self, q: Array, obstacle: Union | Obstacle, enough: Array) -> Array:
-        """Distance (N,), metres, of the arm's meshes at configurations q (N, 6) from the obstacle.
-
-        Beyond `enough` (N,) it is any value from there on that is not too large.
-        """
-        clearance = self.clearance(q, obstacle)  # of the spheres, which is smaller
-        near = np.flatnonzero(clearance < enough)
-        if len(near):
-            clearance[near] = load_collision_model().gaps(q[near], obstacle, enough[near])
-        return clearance
+    def clearance(self, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
+        """Distance (N,), metres, of arm and end effector from the obstacle; see `BodyPoints.clearance`."""
+        return self.body.clearance(self.robot, q, obstacle, enough)
 
     def _generator(self, ways: Sequence[Way | None], avoidance: ArmAvoidance, pins: Array) -> VectorField:
         """The field whose flow takes these ways, with these postures (K, 6) at rest, where the flow meets them."""
@@ -407,7 +384,7 @@ class WholeArm:
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
-        clearance = np.array([self.clearance(q, part) for part in parts]).reshape(len(parts), len(q))
+        clearance = np.array([self.clearance(q, part, BESIDE) for part in parts]).reshape(len(parts), len(q))
         near: Mask = clearance < margin
 
         def escapes(which: Indices) -> list[Array]:
@@ -487,17 +464,6 @@ class _Solver:
             more = min(self._clearing_duration(p[lack > 0]), self._longest - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
-        for _ in range(0 if self._coarse or duration >= self._longest else MAX_ROUNDS):
-            p = (bundle.positions / LEVERS)[self._shaping(bundle)]
-            lack = self._mesh_lack(p)
-            worst = np.argsort(-lack)[:NUM_EXTENDED_FOR]
-            if lack[worst[0]] <= MESH_ROUNDING:
-                break
-            more = self._extension(p[worst[lack[worst] > 0]])
-            if more <= 0:
-                break
-            duration += more
-            bundle, transform = self._continued(bundle, more, duration)
         return self._along(bundle, transform, duration)
 
     def _continued(self, bundle: Bundle, more: float, duration: float) -> tuple[Bundle, Diffeomorphism]:
@@ -556,50 +522,19 @@ class _Solver:
         return refined(bundle, integrated, max(self._spacing, COARSE_SPACING) if self._coarse else self._spacing)
 
     def _lack(self, p: Array) -> Array:
-        """(N,) metres by which the spheres at configurations (N, 6) miss the clearance that is asked for."""
-        margin = max(self._avoidance.margin - OVERSHOOT, 2 * ROUNDING)
-        return self._asked(p, margin, self._room) - self._arm.clearance(p, self._avoidance.obstacle)
+        """(N,) metres by which the arm at configurations (N, 6) misses the clearance that is asked for.
 
-    def _mesh_lack(self, p: Array, beyond: float = 0.0) -> Array:
-        """(N,) metres by which the meshes at configurations (N, 6) miss the clearance that is asked for, and less.
-
-        They are exact down to −`beyond`.
+        That is the margin, or what the starts and goal beside a configuration have. Where more is kept, the lack is
+        exact down to what a contact moves between two looks at it.
         """
-        asked = self._asked(p, self._avoidance.margin, self._mesh_room)
-        return asked - self._arm.mesh_clearance(p, self._avoidance.obstacle, asked + beyond)
-
-    @cached_property
-    def _mesh_room(self) -> Array:
-        pins, margin = self._lifted.pins, self._avoidance.margin
-        return self._arm.mesh_clearance(pins, self._avoidance.obstacle, np.full(len(pins), margin)) - ROUNDING
-
-    def _asked(self, p: Array, margin: float, room: Array) -> Array:
-        """(N,) metres of clearance that are asked for at configurations (N, 6), with this room (K,) at the pins."""
-        return room_asked(np.array(p, order="C"), self._lifted.pins, room, LEVERS, SLOPE, float(margin))
+        margin = max(float(self._avoidance.margin), 2 * ROUNDING)
+        asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, margin)
+        return asked - self._arm.clearance(p, self._avoidance.obstacle, asked + SPEED * SNAPSHOT)
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
         assert self._generator is not None
         return clearing_duration(self._generator, self._arm.limits, p, self._lack, SNAPSHOT, self._longest)
-
-    def _extension(self, p: Array) -> float:
-        """The shortest duration after which the flow has carried the meshes of configurations (N, 6) clear.
-
-        Those that take longer than `MAX_EXTENSION` are left as they are; 0 where all do.
-        """
-        assert self._generator is not None
-        limits, duration = self._arm.limits, 0.0
-        state, lack = limits.forward(p), self._mesh_lack(p)
-        for done in np.arange(0, MAX_EXTENSION, EXTENSION_STEP):
-            state, _ = integrate(rk4, self._generator, state, None, -EXTENSION_STEP, 1)
-            before, lack = lack, self._mesh_lack(limits.inverse(state), SPEED * EXTENSION_STEP)
-            clear = lack <= 0
-            if clear.any():
-                duration = done + EXTENSION_STEP * _crossing(before[clear], lack[clear])
-            state, lack = state[~clear], lack[~clear]
-            if not len(state):
-                break
-        return float(duration)
 
 
 def clearing_duration(

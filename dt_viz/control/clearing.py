@@ -12,8 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm, clearing_duration
-from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, WholeArmField
+from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, ROUNDING, SLOPE, WholeArm, clearing_duration
+from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, SPEED, WholeArmField
 from dt_viz.avoidance.detour import escape_directions
 from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.avoidance.ways import OPPOSITE, turned
@@ -87,7 +87,7 @@ def clearing(
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
     tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     directions = tuple(
-        _direction(arm, points, tangents, part, velocity, avoidance.margin, way, turn)
+        _direction(arm, points, arm.clearance(q, part, BESIDE), tangents, part, velocity, avoidance.margin, way, turn)
         for part, velocity, way in zip(parts, velocities, known, strict=True)
     )
     met = [(part, way) for part, way in zip(parts, directions, strict=True) if way is not None]
@@ -103,6 +103,7 @@ def clearing(
 def _direction(
     arm: WholeArm,
     points: Array,
+    clearance: Array,
     tangents: Array,
     part: Obstacle,
     velocity: Array,
@@ -110,9 +111,10 @@ def _direction(
     before: Array | None,
     turn: float,
 ) -> Array | None:
-    """Choose the escape direction (3,) from one obstacle; that before where no body point (P, 3, N) is too near it."""
-    distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.body.radius[:, None]
-    clearance = distance.min(axis=0)
+    """Choose the escape direction (3,) from one obstacle; that before where the clearance (N,) is enough at all postures.
+
+    Body points (P, 3, N) are at the same postures.
+    """
     near = np.flatnonzero(clearance < margin)
     if not len(near):
         return before
@@ -138,5 +140,5 @@ def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) ->
     pins = NO_PINS if end is None else end[None]
     room = arm.clearance(pins, avoidance.obstacle) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
-    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin - OVERSHOOT))
-    return asked - arm.clearance(p, avoidance.obstacle)
+    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin))
+    return asked - arm.clearance(p, avoidance.obstacle, asked + SPEED * STEP)

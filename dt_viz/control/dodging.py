@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.arm import WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.control.settings import ControllerSettings
 from dt_viz.flows.fields import Array
@@ -52,7 +52,7 @@ class Dodge:
         clear, velocities = dodge(
             LimitedArm(
                 robot.records,
-                self.arm.links.records,
+                self.arm.links.spheres,
                 robot.lower,
                 robot.upper,
                 robot.velocity_limits,
@@ -64,8 +64,8 @@ class Dodge:
                 times,
                 moved,
                 np.outer(deviation, speeds[moving]),
-                settings.clearance - OVERSHOOT,
-                floor - OVERSHOOT,
+                settings.clearance,
+                floor,
                 settings.floor_depth,
             ),
             q,
