@@ -24,10 +24,10 @@ from dt_viz.avoidance.arm_field import (
     JointLimits,
     WholeArmField,
 )
-from dt_viz.avoidance.detour import escape_directions
+from dt_viz.avoidance.clearing import clearing_duration
+from dt_viz.avoidance.detour import Detour, escape_directions, remembered, travel
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.transform import ArmAvoidance
-from dt_viz.avoidance.ways import Way, remembered, travel
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
 from dt_viz.flows.integrators import integrate, rk4
@@ -72,16 +72,16 @@ COARSE_SPACING = 0.025
 TOLERANCE = 3e-9
 """Tolerance of a step of the fine flow, rad."""
 NUM_COMPARED = 60
-"""Colliding samples that ways out are compared by."""
+"""Colliding samples that escapes are compared by."""
 DURATION_CHANGE = 50.0
 """Largest change of the flow time for each metre that an obstacle is dragged: contacts move by 1 cm a millimetre."""
 LONG = 1.0
-"""Flow time beyond which other ways out and stances are tried, too: such motions wind around the obstacle."""
+"""Flow time beyond which other escapes and stances are tried, too: such motions wind around the obstacle."""
 NUM_WAYS = 3
-"""Largest number of ways out of each obstacle that are tried."""
+"""Largest number of escapes from each obstacle that are tried."""
 TOGETHER, OPPOSED = 0.05, -0.5
 """Clearance from another obstacle, metres, up to which a colliding posture meets both, and cosine of the angle between
-their ways out beyond which both are left in one direction."""
+their escapes beyond which both are left in one direction."""
 BESIDE = 0.20
 """Clearance up to which a sample is bent along with the colliding ones, metres."""
 
@@ -183,8 +183,8 @@ class ArmSolution:
     """Guests, counted among all rollouts, that do not keep it."""
     moved: Indices
     """Guests that begin more than `MOVED` away from their start."""
-    ways: tuple[Way | None, ...] = ()
-    """Way out of each obstacle; None for those that are not in the way, empty where none is."""
+    detours: tuple[Detour | None, ...] = ()
+    """Detour around each obstacle; None for those that are not in the way, empty where none is."""
 
     @property
     def cleared(self) -> bool:
@@ -254,7 +254,7 @@ class WholeArm:
         """The motions around the obstacle.
 
         With `auto` the duration is the shortest after which every sample keeps the clearance that is asked for: the
-        margin, or what the start or goal beside it has. Of several ways out the first is taken that works soon, else
+        margin, or what the start or goal beside it has. Of several escapes the first is taken that works soon, else
         the one with the least detour, else the one that comes nearest to working, all by coarse motions. All this looks
         only at rollouts from the task's starts: added ones do not change their motions.
 
@@ -267,38 +267,39 @@ class WholeArm:
             spacing: largest distance between neighbouring samples, metres at the hand, about; in coarse motions it is
                 `COARSE_SPACING` if that is more.
             coarse: whether the flow is integrated for the eye only, in a few equal steps.
-            passing: ways out to keep while obstacles are dragged.
+            passing: detours to keep while obstacles are dragged.
         """
         parts = avoidance.obstacle.parts
         known = remembered(passing.arm, parts)
         sides, pins = self._sides(lifted, avoidance, known), self._pins(lifted)
         best = None
         for attempt in range(min(NUM_WAYS, max(map(len, sides), default=0))):
-            ways = [
-                _way(part, found[min(attempt, len(found) - 1)], last) if found else None
+            detours = [
+                _on_side(part, found[min(attempt, len(found) - 1)], last) if found else None
                 for part, found, last in zip(parts, sides, known, strict=True)
             ]
-            generator = self._generator(ways, avoidance, pins)
+            generator = self._generator(detours, avoidance, pins)
             by_hand = avoidance.duration is not None or avoidance.generator == "probability"
             solver = _Solver(self, lifted, avoidance, generator, spacing, coarse=coarse or not by_hand)
-            tried = replace(solver.solution(), ways=tuple(ways))
+            tried = replace(solver.solution(), detours=tuple(detours))
             if by_hand:
                 return tried
             if best is None or self._better(tried, best):
                 best = tried
-            if tried.soon or (tried.cleared and any(way is not None and way.kept for way in ways)):
+            if tried.soon or (tried.cleared and any(detour is not None and detour.kept for detour in detours)):
                 break
         if best is None:
             return self.undisturbed(lifted, avoidance, spacing)
         if coarse:
             return best
-        generator = self._generator(best.ways, avoidance, pins)
-        return replace(_Solver(self, lifted, avoidance, generator, spacing, coarse=False).solution(), ways=best.ways)
+        generator = self._generator(best.detours, avoidance, pins)
+        exact = _Solver(self, lifted, avoidance, generator, spacing, coarse=False).solution()
+        return replace(exact, detours=best.detours)
 
     def followed(self, lifted: Lift, avoidance: ArmAvoidance, spacing: float, passing: Passing) -> ArmSolution:
         """Coarse motions that follow an obstacle which is dragged: they change no faster than the obstacle moves.
 
-        Ways out turn towards the sides that are to be taken, and the flow's duration changes, by so much for each metre
+        Detours turn towards the sides that are to be taken, and the flow's duration changes, by so much for each metre
         of the drag. So no motion jumps, where a side is changed or none clears it: until the new way is there, motions
         may come nearer to the obstacle than the margin. Where a way is there and does not clear it, the next side is
         turned to. For the other arguments see `avoiding`.
@@ -307,28 +308,28 @@ class WholeArm:
             lifted: the motions below.
             avoidance: what is to be avoided.
             spacing: as in `avoiding`.
-            passing: the ways of the motions where the obstacles were just before, and the duration of their flow.
+            passing: the detours of the motions where the obstacles were just before, and the duration of their flow.
         """
         parts = avoidance.obstacle.parts
         known = remembered(passing.arm, parts)
         failed = not passing.cleared and passing.duration >= MAX_DURATION
-        ways: list[Way | None] = []
+        detours: list[Detour | None] = []
         for part, found, last in zip(parts, self._sides(lifted, avoidance, known), known, strict=True):
             if not found:
-                ways.append(None)
+                detours.append(None)
             elif last is None:
-                ways.append(_way(part, found[0], last))
+                detours.append(_on_side(part, found[0], last))
             else:
                 side = found[1] if failed and last.is_there and len(found) > 1 else found[0]
-                ways.append(_way(part, side, last).turned_from(last, found))
-        if not any(ways):
+                detours.append(_on_side(part, side, last).turned_from(last, found))
+        if not any(detours):
             return self.undisturbed(lifted, avoidance, spacing)
         moved = max(travel(last.obstacle, part) for last, part in zip(known, parts, strict=True) if last is not None)
         change = DURATION_CHANGE * moved
         between = max(passing.duration - change, 0.0), min(passing.duration + change, MAX_DURATION)
-        generator = self._generator(ways, avoidance, self._pins(lifted))
+        generator = self._generator(detours, avoidance, self._pins(lifted))
         solver = _Solver(self, lifted, avoidance, generator, spacing, coarse=True, between=between)
-        return replace(solver.solution(), ways=tuple(ways))
+        return replace(solver.solution(), detours=tuple(detours))
 
     def _pins(self, lifted: Lift) -> Array:
         """The postures (K, 6) that do not move, where the flow meets them."""
@@ -358,23 +359,23 @@ class WholeArm:
             spacing: as in `avoiding`.
         """
         solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
-        return replace(solver.through(full.transform.scaled(fraction), full.duration), ways=full.ways)
+        return replace(solver.through(full.transform.scaled(fraction), full.duration), detours=full.detours)
 
     def clearance(self, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
         """Distance (N,), metres, of arm and end effector from the obstacle; see `BodyPoints.clearance`."""
         return self.body.clearance(self.robot, q, obstacle, enough)
 
-    def _generator(self, ways: Sequence[Way | None], avoidance: ArmAvoidance, pins: Array) -> VectorField:
-        """The field whose flow takes these ways, with these postures (K, 6) at rest, where the flow meets them."""
+    def _generator(self, detours: Sequence[Detour | None], avoidance: ArmAvoidance, pins: Array) -> VectorField:
+        """The field whose flow takes these detours, with these postures (K, 6) at rest, where the flow meets them."""
         reach = REACH_PER_TEMPERATURE * avoidance.temperature
-        met = [way for way in ways if way is not None]
-        obstacles = tuple(way.obstacle for way in met)
+        met = [detour for detour in detours if detour is not None]
+        obstacles = tuple(detour.obstacle for detour in met)
         if avoidance.generator == "probability":
             return GradientField(self.robot, self.body, obstacles, reach)
-        directions = np.stack([way.direction for way in met])
+        directions = np.stack([detour.direction for detour in met])
         return WholeArmField(self.robot, self.body, obstacles, directions, pins, reach)
 
-    def _sides(self, lifted: Lift, avoidance: ArmAvoidance, known: Sequence[Way | None]) -> list[list[Array]]:
+    def _sides(self, lifted: Lift, avoidance: ArmAvoidance, known: Sequence[Detour | None]) -> list[list[Array]]:
         """Escapes (3,) from each obstacle, the most promising first; none where nothing comes too near it.
 
         Obstacles that one posture comes near to are left in one direction where their own ones are opposed: else their
@@ -399,7 +400,7 @@ class WholeArm:
                 Union(tuple(parts[k] for k in which)),
                 margin,
                 num=NUM_WAYS,
-                before=next((way.side for way in (known[k] for k in which) if way is not None), None),
+                previous=next((last.side for last in (known[k] for k in which) if last is not None), None),
             )
 
         sides: list[list[Array]] = [[] for _ in parts]
@@ -534,36 +535,29 @@ class _Solver:
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
         assert self._generator is not None
-        return clearing_duration(self._generator, self._arm.limits, p, self._lack, SNAPSHOT, self._longest)
+        return clearing(self._generator, self._arm.limits, p, self._lack, SNAPSHOT, self._longest)
 
 
-def clearing_duration(
+def clearing(
     field: VectorField, limits: JointLimits, p: Array, lack: Callable[[Array], Array], step: float, longest: float
 ) -> float:
     """The shortest time after which the reverse flow of a field has carried postures clear, or the longest.
 
     Args:
-        field: generator of the flow.
-        limits: the flow acts in its coordinates.
+        field: generator of the flow, in the coordinates of the limits.
+        limits: of the joints.
         p: (N, 6) rad.
         lack: distances (N,), metres, by which postures (N, 6) miss the clearance that is asked for.
         step: flow time between two looks at the clearance.
         longest: flow time.
     """
-    duration, state, lacking = 0.0, limits.forward(p), lack(p)
-    while (lacking > 0).any():
-        if duration >= longest:
-            return longest
-        before = lacking[lacking > 0]
-        state, _ = integrate(rk4, field, state[lacking > 0], None, -step, 1)
-        lacking = lack(limits.inverse(state))
-        duration += step * (_crossing(before, lacking) if (lacking <= 0).all() else 1.0)
-    return duration
+    duration = clearing_duration(field, limits.forward(p), lambda state: lack(limits.inverse(state)), step, longest)
+    return longest if duration is None else duration
 
 
-def _way(obstacle: Obstacle, side: Array, before: Way | None) -> Way:
-    """The way out of an obstacle to a side, which goes on from that before, if any."""
-    return Way(obstacle, side, side, kept=before is not None)
+def _on_side(obstacle: Obstacle, side: Array, previous: Detour | None) -> Detour:
+    """The detour around an obstacle on a side, which goes on from the previous one, if any."""
+    return Detour(obstacle, side, side, kept=previous is not None)
 
 
 def _crossing(before: Array, after: Array) -> float:

@@ -16,6 +16,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from dt_viz.avoidance.clearing import clearing_duration
 from dt_viz.avoidance.transform import (
     MOST_DURATION,
     Built,
@@ -31,7 +32,6 @@ from dt_viz.avoidance.transform import (
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, Chain, Diffeomorphism, Flow, Identity, Integration
 from dt_viz.flows.fields import Array, GaussianGrid, GridRBF, PlacedField, PointField, Projected, VectorField
-from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.kernels.fields import REGION, SHIFT, TERM, Terms
 from dt_viz.obstacles.shapes import Point, as_point
 from dt_viz.warning import Kind, MotionWarning
@@ -202,7 +202,14 @@ class BiasPoint(Transform):
             if at_least > 0:  # the motion itself was not where the places beside the target led
                 moved = Chain([*flows, self._flow(waist, least, motion.tolerance)]).inverse(motion.positions)
                 passing = closest_points(point, replace(motion, positions=moved))[0]
-            more = pulling_duration(waist, point, passing, gathering - least)
+            # the approach to the target is exponential where it ends
+            more = clearing_duration(
+                waist,
+                passing,
+                lambda s: np.log(np.maximum(np.linalg.norm(point.offsets(s), axis=1), 1e-300) / AIM),
+                SNAPSHOT,
+                gathering - least,
+            )
             hopeless = more is None
             if more is not None:
                 # starts and goal in the region move the motion below, the farther the longer: converge sooner
@@ -453,29 +460,3 @@ def closest_points(point: BiasPoint, motion: MotionBelow) -> tuple[Array, Array]
 def closest_distances(point: BiasPoint, motion: MotionBelow) -> Array:
     """(R,) metres: how close each rollout comes to the target, in the plane if the bias acts in one."""
     return np.linalg.norm(point.offsets(closest_points(point, motion)[0]), axis=1)
-
-
-def pulling_duration(field: VectorField, point: BiasPoint, points: Array, longest: float) -> float | None:
-    """The shortest duration after which the reverse flow has carried all `points` (N, 3) to the target.
-
-    γ is a one-parameter group, so one integration with snapshots passes every duration on its way.
-
-    Returns:
-        The duration, or None where some point has not arrived after the `longest`.
-    """
-    duration = 0.0
-    distance = np.linalg.norm(point.offsets(points), axis=1)
-    away = distance > AIM
-    points, distance = points[away], distance[away]
-    while len(points):
-        if duration >= longest:
-            return None
-        points, _ = integrate(rk4, field, points, None, -SNAPSHOT, 1)
-        before, distance = distance, np.linalg.norm(point.offsets(points), axis=1)
-        away = distance > AIM
-        if not away.any():
-            # the approach is exponential where it ends
-            fraction = np.log(before / AIM) / np.log(before / distance)
-            return duration + SNAPSHOT * float(np.clip(fraction, 0, 1).max())
-        points, distance, duration = points[away], distance[away], duration + SNAPSHOT
-    return duration

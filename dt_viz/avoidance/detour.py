@@ -1,6 +1,14 @@
-"""Escape directions: how an arm leaves an obstacle with the least detour."""
+"""Detours: the way out of an obstacle that all motions around it take, and how it changes while that is dragged.
+
+The motions of a hand (a body of one point) and of an arm (a body of many) choose alike: of all directions that with the
+least detour, and the one that was chosen before while that costs little more. In a drag it turns there gradually.
+"""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,8 +18,7 @@ from dt_viz.obstacles.shapes import Obstacle, golden_spiral
 from dt_viz.obstacles.union import Union
 
 NUM_DIRECTIONS = 128
-SIDEWAYS = 2.0
-"""Relative extra cost of a direction along the motion against one across it: it would bend the path sharply."""
+"""Number of directions that are compared."""
 COMING, STRIDE = 1.5, 0.04
 """Time (s) for which a moving obstacle is in the way also of where it will be, and spacing (m) of these places."""
 FARTHEST = 0.16
@@ -20,12 +27,18 @@ TABLE_WEIGHT = 3.0
 """Cost of each metre by which an escape leads below the table, against a metre of detour."""
 ON_THE_WAY = 0.10
 """Length of an escape, metres, beyond which nothing new is in its way: the arm also turns as it moves."""
-ALIKE = np.cos(np.deg2rad(40.0))
+ALIKE = math.cos(math.radians(40.0))
 """Cosine of the largest angle between two directions of one escape."""
 SELECTIVITY = 0.03
 """Relative difference in cost over which a direction's share in its escape falls by a factor e, for smooth drags."""
 STAYING = 1.5
-"""Cost of the way out that was chosen before, relative to the least one, up to which it is kept."""
+"""Cost of the previous escape, relative to the least one, up to which it is kept."""
+TURNING = 5.0
+"""Angle, rad, by which a detour turns while its obstacle moves by its radius."""
+NEARBY = 0.1
+"""Distance that an obstacle may move from one motion to the next for its detour to be kept, metres."""
+OPPOSITE = -0.7
+"""Cosine of the angle between two directions beyond which the one turns to the other through a third."""
 
 
 def escape_directions(
@@ -37,29 +50,33 @@ def escape_directions(
     *,
     num: int = 3,
     velocity: Array | None = None,
-    before: Array | None = None,
+    previous: Array | None = None,
+    plane: Array | None = None,
+    along: float = 2.0,
 ) -> list[Array]:
-    """Find directions in which the arm can escape, the one with the least detour first.
+    """Find directions in which a body can escape, the one with the least detour first.
 
-    The detour of a direction is the distance by which the whole arm would have to be shifted until, at each sample,
+    The detour of a direction is the distance by which the whole body would have to be shifted until, at each sample,
     every sphere that covers it is clear of every ball that covers the obstacle.
 
     Args:
-        points: (P, 3, M) centres of the spheres that cover the arm, metres, at the M samples that collide.
+        points: (P, 3, M) centres of the spheres that cover the body, metres, at the M samples that collide.
         radius: (P,) radii of these spheres, metres.
         tangents: (K, 3) unit directions of the end effector's motion where the escape bends it.
         obstacle: obstacle to escape from.
         margin: required clearance, metres.
         num: largest number of directions.
         velocity: (3,) the obstacle's, m/s; None where it rests. Directions along it are costly: the obstacle
-            would follow the arm.
-        before: (3,) escape that was chosen just before. What is nearest to it comes first, or second where it costs
+            would follow the body.
+        previous: (3,) escape that was chosen just before. What is nearest to it comes first, or second where it costs
             more than `STAYING` times the least.
+        plane: (3, 2) orthonormal columns of the plane that escapes lie in; None is space.
+        along: relative extra cost of a direction along the motion against one across it, which bends the path less.
 
     Returns:
-        Unit vectors (3,), one for each distinct escape; all of them where there is one `before`.
+        Unit vectors (3,), one for each distinct escape; all of them where there is a previous one.
     """
-    directions = golden_spiral(NUM_DIRECTIONS, 0.5)
+    directions = _around(plane)
     centres, radii = obstacle.cover()
     if velocity is not None and (speed := float(np.linalg.norm(velocity))) > 0:
         ahead = np.arange(0, min(COMING * speed, FARTHEST), STRIDE)
@@ -67,13 +84,89 @@ def escape_directions(
         radii = np.tile(radii, len(ahead))
     detour, below = detours(directions, np.ascontiguousarray(points), radius, centres, radii, float(margin), ON_THE_WAY)
     parallel = np.abs(directions @ tangents.T).mean(axis=1)
-    cost = detour * (1 + SIDEWAYS * parallel) + TABLE_WEIGHT * below
+    cost = detour * (1 + along * parallel) + TABLE_WEIGHT * below
 
-    most = num if before is None else len(directions)
-    means, costs = distinct(directions, cost, float(ALIKE), SELECTIVITY, most)
+    most = num if previous is None else len(directions)
+    means, costs = distinct(directions, cost, ALIKE, SELECTIVITY, most)
     found = list(means)
-    if before is not None:
-        kept = int(np.argmax(means @ before))
+    if previous is not None:
+        kept = int(np.argmax(means @ previous))
         if kept:
             found.insert(0 if costs[kept] < STAYING * costs[0] else 1, found.pop(kept))
     return found
+
+
+def _around(plane: Array | None) -> Array:
+    """Unit vectors (`NUM_DIRECTIONS`, 3) all around, in space or in a plane."""
+    if plane is None:
+        return golden_spiral(NUM_DIRECTIONS, 0.5)
+    turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
+    return np.stack([np.cos(turn), np.sin(turn)], axis=1) @ plane.T
+
+
+@dataclass(frozen=True, eq=False)
+class Detour:
+    """The way out of one obstacle that the motions around it take."""
+
+    obstacle: Obstacle
+    side: Array
+    """(3,) unit vector, the direction that was chosen."""
+    direction: Array
+    """(3,) unit vector of the motions' way out: the same, or on its way there from another one."""
+    kept: bool = False
+    """Whether it was carried over from the detour at the obstacle's last pose."""
+    length: float = 0.0
+    """Longest displacement of a motion of the hand along `direction`, metres."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it has turned to its side."""
+        return self.direction is self.side
+
+    @property
+    def offset(self) -> Array:
+        """(3,) that motion's displacement, metres."""
+        return self.length * self.direction
+
+    def turned_from(self, previous: Detour, escapes: Sequence[Array]) -> Detour:
+        """The detour on its way here from the previous one, by an angle for each metre that the obstacle has moved.
+
+        Args:
+            previous: the detour around the same obstacle where it was just before.
+            escapes: (3,) unit vectors, the best one first; see `turned`.
+        """
+        angle = TURNING * travel(previous.obstacle, self.obstacle) / self.obstacle.radius
+        direction = turned(previous.direction, self.side, angle, escapes)
+        return self if direction is self.side else replace(self, direction=direction)
+
+
+def remembered(detours: Sequence[Detour | None], obstacles: Sequence[Obstacle]) -> tuple[Detour | None, ...]:
+    """The detours around obstacles that are dragged, or rest where a drag has ended; None for the others."""
+    if len(detours) != len(obstacles):
+        return (None,) * len(obstacles)
+
+    def known(detour: Detour | None, obstacle: Obstacle) -> Detour | None:
+        moved = math.inf if detour is None else travel(detour.obstacle, obstacle)
+        return detour if detour is not None and moved < NEARBY and (moved > 0 or detour.kept) else None
+
+    return tuple(known(detour, obstacle) for detour, obstacle in zip(detours, obstacles, strict=True))
+
+
+def turned(start: Array, towards: Array, most: float, escapes: Sequence[Array] = ()) -> Array:
+    """The unit vector `start` (3,), turned towards another one by an angle of at most `most`, rad.
+
+    To the opposite it turns over the first of the `escapes` (3,) that is across both.
+    """
+    if start @ towards < OPPOSITE:
+        towards = next((escape for escape in escapes if abs(start @ escape) < -OPPOSITE), towards)
+    across = towards - (towards @ start) * start
+    size = float(np.linalg.norm(across))
+    angle = math.atan2(size, float(towards @ start))
+    return towards if angle <= most else math.cos(most) * start + math.sin(most) / size * across
+
+
+def travel(before: Obstacle, after: Obstacle) -> float:
+    """Distance that an obstacle has moved, metres; infinite where it has also become another one."""
+    if before.moved(after.position, after.wxyz) != after:
+        return math.inf
+    return float(np.linalg.norm(np.subtract(before.position, after.position)))

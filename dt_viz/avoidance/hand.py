@@ -9,7 +9,9 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from dt_viz.avoidance.sides import Passes, held
+from dt_viz.avoidance.clearing import clearing_duration, escape_lengths
+from dt_viz.avoidance.detour import Detour, remembered
+from dt_viz.avoidance.sideways import Encounter, fixing_ends
 from dt_viz.avoidance.transform import (
     MOST_DURATION,
     ArmAvoidance,
@@ -24,11 +26,10 @@ from dt_viz.avoidance.transform import (
     axes_of,
     start_warnings,
 )
-from dt_viz.avoidance.ways import Way, remembered
 from dt_viz.errors import check_between
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Chain, Diffeomorphism, Integration
 from dt_viz.flows.fields import Array, Mask, Projected, VectorField
-from dt_viz.flows.integrators import integrate, integrate_adaptive, rk4
+from dt_viz.flows.integrators import integrate_adaptive
 from dt_viz.obstacles.occupancy import Generator
 from dt_viz.obstacles.shapes import Obstacle, Point
 from dt_viz.obstacles.union import Union
@@ -62,10 +63,8 @@ ACCEPTED_MARGIN = 0.9
 """Smallest part of the margin that samples between the checked ones may keep."""
 BESIDE = 1e-3
 """Tolerance of an obstacle's surface, metres, which is only nearly known, and of the depth of a covered start."""
-NUM_DIRECTIONS, MAX_STEPS_OUT = 360, 200
-"""Number of directions of a plane in which a way out of obstacles is searched, and largest number of steps."""
-SHORTEST = 1e-4
-"""Smallest of these steps, metres; bounds the overshoot beyond the surface."""
+NUM_DIRECTIONS = 360
+"""Number of directions of a plane in which a way out of obstacles is searched."""
 TAIL = 2.0
 """Length of the end of a path to a covered goal that may be inside, in distances from the goal to the nearest free
 place: such a path arrives at up to 60° from the straight way out."""
@@ -188,12 +187,7 @@ class Avoidance(Transform):
             return obstacle.nearest_free(goal)
         turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
         directions = np.column_stack([np.cos(turn), np.sin(turn)]) @ axes_of(self.plane)[:, :2].T
-        length = np.zeros(NUM_DIRECTIONS)
-        for _ in range(MAX_STEPS_OUT):
-            depth = -obstacle.signed_distance(goal + length[:, None] * directions)
-            if depth[length.argmin()] <= 0:
-                break
-            length += np.where(depth > 0, np.maximum(depth, SHORTEST), 0)
+        length = escape_lengths(obstacle, goal, directions)
         return goal + length.min() * directions[length.argmin()]
 
     def build(self, motion: MotionBelow) -> Built:
@@ -204,12 +198,14 @@ class Avoidance(Transform):
         """
         obstacle = self.avoided
         field = self._field()
-        ways, aside, motion = self._aside(motion)
+        detours, aside, motion = self._aside(motion)
         spent = sum(flow.duration for flow in aside)
         at_least = max(0.0, motion.at_least - spent)
         if aside and motion.earlier is not None:
             last = self.integration.of(AdaptiveFlow(field, at_least, motion.tolerance))
-            motion = replace(motion, positions=Chain([held(first, last) for first in aside]).inverse(motion.positions))
+            motion = replace(
+                motion, positions=Chain([fixing_ends(first, last) for first in aside]).inverse(motion.positions)
+            )
         num_demonstrated = len(motion.demonstrated.starts)
         covered = np.flatnonzero(_blocked(obstacle, motion))
         warnings = start_warnings(covered, num_demonstrated, Kind.START_COVERED, "inside the obstacle", motion.name)
@@ -223,7 +219,12 @@ class Avoidance(Transform):
                 crests = _crests(motion, depth, field, self._kept_margin(motion))
                 points = np.concatenate([_deepest(motion, depth), crests])
             margin = self._kept_margin(motion)
-            duration = clearing_duration(field, obstacle, points, margin, at_least=at_least)
+            if at_least > 0:
+                points, _ = integrate_adaptive(field, points, None, -at_least, TOLERANCE)
+            more = clearing_duration(
+                field, points, lambda s: margin - obstacle.signed_distance(s), SNAPSHOT, MAX_DURATION - at_least
+            )
+            duration = None if more is None else at_least + more
             # a coarse flow that is not clear after the time of the exact one needs more steps, not more time
             hopeless = duration is None or (self.integration.by_hand and 0 < duration <= at_least)
             if duration is None:
@@ -236,7 +237,7 @@ class Avoidance(Transform):
                     warnings.append(motion.warning(Kind.STAYS_INSIDE, text))
         flow: Diffeomorphism = self.integration.of(AdaptiveFlow(field, duration, motion.tolerance))
         if aside:
-            flow = Chain([*(held(first, flow) for first in aside), flow])
+            flow = Chain([*(fixing_ends(first, flow) for first in aside), flow])
         goal = self._nearest_free(motion.goal) if motion.keeps_goal else flow.inverse(motion.goal)
         if obstacle.signed_distance(motion.goal) < 0:
             inside = -float(obstacle.signed_distance(goal))
@@ -244,10 +245,10 @@ class Avoidance(Transform):
             warnings.append(motion.warning(Kind.GOAL_COVERED, f"the goal is inside the obstacle: motions {end}"))
         duration += spent
         chosen = {"duration": duration}
-        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, ways, aside)
+        return Built(flow, duration, goal, hopeless, tuple(warnings), self.integration, chosen, detours, aside)
 
-    def _aside(self, motion: MotionBelow) -> tuple[tuple[Way | None, ...], tuple[Aside, ...], MotionBelow]:
-        """Return the ways out of the obstacles, the flows that carry all motions to one side of each, and these there.
+    def _aside(self, motion: MotionBelow) -> tuple[tuple[Detour | None, ...], tuple[Aside, ...], MotionBelow]:
+        """Return detours around the obstacles, the flows that carry all motions to one side of each, and these there.
 
         Further attempts take those of the first, with the motion before them: for starts that the flows have moved into
         the obstacle they would be longer, and move these farther. A flow time by hand is spent on these first. In a
@@ -255,28 +256,28 @@ class Avoidance(Transform):
         alone.
         """
         if motion.earlier is not None:
-            return motion.earlier.ways, motion.earlier.aside, motion
-        ways: list[Way | None] = [None] * len(self.obstacles)
+            return motion.earlier.detours, motion.earlier.aside, motion
+        detours: list[Detour | None] = [None] * len(self.obstacles)
         aside: list[Aside] = []
         if self.generator == "probability":
-            return tuple(ways), (), motion
+            return tuple(detours), (), motion
         plane = None if self.plane is None else axes_of(self.plane)[:, :2]
-        known = remembered(motion.ways if plane is None else (), self.obstacles)
+        known = remembered(motion.detours if plane is None else (), self.obstacles)
         margin = self._kept_margin(motion.demonstrated)
         left = math.inf if self.duration is None else self.duration
-        for k, (obstacle, before) in enumerate(zip(self.obstacles, known, strict=True)):
+        for k, (obstacle, previous) in enumerate(zip(self.obstacles, known, strict=True)):
             seen = motion.demonstrated
-            passes = Passes.of(seen, self._avoidable(seen), obstacle, margin, self.obstacles[:k], plane)
-            if passes is None:
+            met = Encounter.of(seen, self._avoidable(seen), obstacle, margin, self.obstacles[:k], plane)
+            if met is None:
                 continue
-            ways[k] = way = passes.way(before, gradually=motion.gradual)
-            flow = passes.flow(way.direction, motion.tolerance)
+            detours[k] = detour = met.detour(previous, gradually=motion.gradual)
+            flow = met.flow(detour.direction, motion.tolerance)
             flow = self.integration.of(replace(flow, duration=min(flow.duration, left)))
             left -= flow.duration
             if flow.duration > 0:
                 aside.append(flow)
                 motion = replace(motion, positions=flow.inverse(motion.positions))
-        return tuple(ways), tuple(aside), motion
+        return tuple(detours), tuple(aside), motion
 
     def satisfied(self, motion: MotionBelow) -> bool:
         """Return whether all avoidable samples keep (almost) the margin; true for any flow time by hand."""
@@ -379,40 +380,3 @@ def _crests(motion: MotionBelow, depth: Array, field: VectorField, margin: float
     bend, inner = np.zeros_like(s), (same[:-1] & same[1:])[:, None]
     bend[1:-1] = np.diff(step / length, axis=0) / (length[:-1] + length[1:]) * inner
     return s[k] + part * step[k] - part * (1 - part) * length[k] ** 2 * (bend[k] + bend[k + 1]) / 2
-
-
-def clearing_duration(
-    field: VectorField, obstacle: Union | Obstacle, points: Array, margin: float, *, at_least: float = 0.0
-) -> float | None:
-    """Find the shortest duration after which the reverse flow has carried all `points` clear of the obstacle.
-
-    γ is a one-parameter group, so one integration with snapshots passes every duration on its way; and occupancy falls
-    along the reverse flow, so points that are clear stay clear and can be dropped.
-
-    Args:
-        field: generator of the flow.
-        obstacle: true shape.
-        points: (N, 3) points before the flow, metres.
-        margin: clearance wanted, metres.
-        at_least: duration to start from.
-
-    Returns:
-        The duration, or None where some point is not clear after `MAX_DURATION`.
-    """
-    duration = at_least
-    if duration > 0:
-        points, _ = integrate_adaptive(field, points, None, -duration, TOLERANCE)
-    clearance = obstacle.signed_distance(points)
-    inside = clearance < margin
-    points, clearance = points[inside], clearance[inside]
-    while len(points):
-        if duration >= MAX_DURATION:
-            return None
-        points, _ = integrate(rk4, field, points, None, -SNAPSHOT, 1)
-        before, clearance = clearance, obstacle.signed_distance(points)
-        inside = clearance < margin
-        if not inside.any():
-            fraction = (margin - before) / np.maximum(clearance - before, 1e-12)
-            return duration + SNAPSHOT * float(np.clip(fraction, 0, 1).max())
-        points, clearance, duration = points[inside], clearance[inside], duration + SNAPSHOT
-    return duration

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from dt_viz.avoidance.ways import Way, remembered, travel
+from dt_viz.avoidance.detour import Detour, remembered, travel
 from dt_viz.obstacles.shapes import Obstacle
 
 Stance = tuple[float, float, float, float, float, float]
@@ -16,10 +16,10 @@ Stance = tuple[float, float, float, float, float, float]
 class Passing:
     """Sides and stance of a motion, which the next one keeps while an obstacle is dragged."""
 
-    hand: Mapping[int, tuple[Way | None, ...]] = field(default_factory=dict)
-    """Ways of the end effector out of the obstacles of each layer, by its place in the stack."""
-    arm: tuple[Way | None, ...] = ()
-    """Ways of the whole arm out of the obstacles."""
+    hand: Mapping[int, tuple[Detour | None, ...]] = field(default_factory=dict)
+    """Detours of the end effector around the obstacles of each layer, by its place in the stack."""
+    arm: tuple[Detour | None, ...] = ()
+    """Those of the whole arm."""
     duration: float = 0.0
     """t of the flow by which the whole arm avoids."""
     cleared: bool = True
@@ -36,7 +36,7 @@ class Passing:
     def follows(self, obstacles: Sequence[Obstacle]) -> bool:
         """Return whether such an obstacle has moved a little."""
         known = zip(remembered(self.arm, obstacles), obstacles, strict=True)
-        return any(way is not None and travel(way.obstacle, part) > 0 for way, part in known)
+        return any(detour is not None and travel(detour.obstacle, part) > 0 for detour, part in known)
 
 
 ANEW = Passing()

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from dt_viz.avoidance.ways import Way
+from dt_viz.avoidance.detour import Detour
 from dt_viz.flows.diffeomorphisms import AUTO, AdaptiveFlow, Diffeomorphism, Flow, Integration
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.obstacles.occupancy import Generator
@@ -55,8 +55,8 @@ class MotionBelow:
     """Number of rollouts, the first ones, that have a demonstration; None is all. The others begin anywhere."""
     targets: tuple[Point, ...] = ()
     """Places that transforms further down lead the motions to, metres."""
-    ways: tuple[Way | None, ...] = ()
-    """Ways out of the transform's obstacles to keep while these are dragged; see `dt_viz.avoidance.passing`."""
+    detours: tuple[Detour | None, ...] = ()
+    """Detours around the transform's obstacles to keep while these are dragged; see `dt_viz.avoidance.passing`."""
     gradual: bool = False
     """Whether these turn to where they are to be as the obstacles move on; else they are there at once."""
 
@@ -99,8 +99,8 @@ class Built:
     """Integration of its flow; the error of one chosen by hand is checked."""
     chosen: Mapping[str, float] = field(default_factory=dict, compare=False)
     """Values that were chosen automatically, by the transform's fields."""
-    ways: tuple[Way | None, ...] = field(default=(), compare=False)
-    """Ways out of the obstacles that it avoids; None of those that are not in the way."""
+    detours: tuple[Detour | None, ...] = field(default=(), compare=False)
+    """Ways around the obstacles that it avoids; None of those that are not in the way."""
     aside: tuple[Aside, ...] = field(default=(), compare=False)
     """Flows along these, which come before its own."""
 

@@ -12,11 +12,11 @@ from functools import partial
 
 import numpy as np
 
-from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, ROUNDING, SLOPE, WholeArm, clearing_duration
+from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, ROUNDING, SLOPE, WholeArm
+from dt_viz.avoidance.arm import clearing as clearing_time
 from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, SPEED, WholeArmField
-from dt_viz.avoidance.detour import escape_directions
+from dt_viz.avoidance.detour import escape_directions, turned
 from dt_viz.avoidance.transform import ArmAvoidance
-from dt_viz.avoidance.ways import OPPOSITE, turned
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array
 from dt_viz.kernels.blocks import room_asked
@@ -33,7 +33,6 @@ COARSE_STEP = 0.2
 BEYOND = 0.03
 """Reach of the field beyond the margin, metres, at least."""
 NO_PINS = np.empty((0, NUM_JOINTS))
-UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ def clearing(
     reach = max(REACH_PER_TEMPERATURE * avoidance.temperature, avoidance.margin + BEYOND)
     field = WholeArmField(arm.robot, arm.body, obstacles, np.stack(ways), NO_PINS, reach)
     lacking = partial(lack, arm, avoidance=avoidance, end=end)
-    return Clearing(field, directions, clearing_duration(field, arm.limits, q, lacking, STEP, MAX_DURATION))
+    return Clearing(field, directions, clearing_time(field, arm.limits, q, lacking, STEP, MAX_DURATION))
 
 
 def _direction(
@@ -111,9 +110,9 @@ def _direction(
     before: Array | None,
     turn: float,
 ) -> Array | None:
-    """Choose the escape direction (3,) from one obstacle; that before where the clearance (N,) is enough at all postures.
+    """Choose the escape direction (3,) from one obstacle; that before where no posture comes too near it.
 
-    Body points (P, 3, N) are at the same postures.
+    Points (P, 3, N) and clearance (N,) are those of the same postures.
     """
     near = np.flatnonzero(clearance < margin)
     if not len(near):
@@ -121,15 +120,10 @@ def _direction(
     bent = np.flatnonzero(clearance < BESIDE)
     num = NUM_COMPARED // 2 if velocity.any() else NUM_COMPARED
     compared = points[:, :, near[:: max(1, len(near) // num)]]
-    best, *_ = escape_directions(
-        compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity, before=before
+    escapes = escape_directions(
+        compared, arm.body.radius, tangents[bent], part, margin, num=1, velocity=velocity, previous=before
     )
-    if before is None:
-        return best
-    if before @ best < OPPOSITE:
-        best = best + UP + 1e-3 * np.roll(before, 1)
-        best = best / np.linalg.norm(best)
-    return turned(before, best, turn)
+    return escapes[0] if before is None else turned(before, escapes[0], turn, escapes)
 
 
 def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) -> Array:

@@ -136,7 +136,7 @@ def _solved(
     passing = scenario.passing or ANEW
     stack = build_stack(nominal, scenario.active, precision, passing)
     avoidance = scenario.arm_avoidance
-    hand = {applied.place: applied.made.ways for applied in stack.built if any(applied.made.ways)}
+    hand = {applied.place: applied.made.detours for applied in stack.built if any(applied.made.detours)}
     passed = Passing(hand, stance=nominal.stance, left_out=nominal.left_out)
     if avoidance is None:
         return Solved(scenario, nominal, nominal, stack, passing=passed)
@@ -147,7 +147,7 @@ def _solved(
         found = arm.followed(lifted, avoidance, spacing, passing)
     else:
         found = arm.avoiding(lifted, avoidance, spacing, coarse=live, passing=passing)
-    passed = replace(passed, arm=found.ways, duration=found.duration, cleared=found.cleared)
+    passed = replace(passed, arm=found.detours, duration=found.duration, cleared=found.cleared)
     return Solved(scenario, nominal, nominal, stack, found, lifted, passing=passed)
 
 

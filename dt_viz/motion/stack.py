@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.avoidance.detour import Detour
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.transform import Built, MotionBelow, Transform
-from dt_viz.avoidance.ways import Way
 from dt_viz.flows.augmented_systems import OnPlaces, frozen, on_places
 from dt_viz.flows.diffeomorphisms import Chain, Diffeomorphism, Identity
 from dt_viz.flows.fields import Array, Indices
@@ -142,7 +142,7 @@ def build_stack(
         precision: how exactly.
         passing: sides to keep while obstacles are dragged.
     """
-    ways = [passing.hand.get(place, ()) for place, _ in layers]
+    detours = [passing.hand.get(place, ()) for place, _ in layers]
     solution, places = None, nominal.learned.places
     for keeps_goal in (True, False):
         rays, bundle = nominal.rays, nominal.bundle
@@ -159,7 +159,7 @@ def build_stack(
                 num_demonstrated=nominal.num_shaping,
                 gradual=precision is LIVE,
             )
-            built = _build(layers, lowest, earlier, above, ways)
+            built = _build(layers, lowest, earlier, above, detours)
             above = _above([made for _, made in built])
             earlier = [made for _, made in built]
             outer = [made.transform for _, made in built]
@@ -187,14 +187,14 @@ def _build(
     motion: MotionBelow,
     earlier: Sequence[Built | None],
     above: Sequence[Diffeomorphism | None],
-    ways: Sequence[tuple[Way | None, ...]],
+    detours: Sequence[tuple[Detour | None, ...]],
 ) -> list[tuple[MotionBelow, Built]]:
     """Each layer's transform, with the motion that it was made for."""
     built: list[tuple[MotionBelow, Built]] = []
     targets: list[Point] = []
-    for (_, layer), last, outer, known in zip(layers, earlier, above, ways, strict=True):
+    for (_, layer), last, outer, known in zip(layers, earlier, above, detours, strict=True):
         told = {"name": layer.name, "earlier": last, "above": outer, "targets": tuple(targets)}
-        motion = replace(motion, **told, ways=known)
+        motion = replace(motion, **told, detours=known)
         made = layer.transform.build(motion)
         built.append((motion, made))
         if layer.transform.anchor is not None:

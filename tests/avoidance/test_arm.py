@@ -302,7 +302,7 @@ class TestTwoObstacles:
         one, other = (self.first(push, ball)[0] for ball in pair)
         assert one @ other < OPPOSED
         solution = push.avoiding(pair, coarse=True)
-        first, second = solution.ways
+        first, second = solution.detours
         np.testing.assert_array_equal(first.side, second.side)
         assert solution.cleared
         hands = [push.robot.end_effector(p) for p in split(solution, solution.p)]

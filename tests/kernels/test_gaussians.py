@@ -5,7 +5,7 @@ import pytest
 from scipy.special import eval_hermite, expit
 
 from dt_viz.avoidance.bias import RegionField, Shift
-from dt_viz.avoidance.sides import Sideways
+from dt_viz.avoidance.sideways import Sideways
 from dt_viz.flows.fields import GaussianGrid, GridRBF, PlacedField, PointField, Projected, Sum
 from dt_viz.flows.integrators import euler, implicit_euler, integrate, integrate_adaptive, rk4
 from dt_viz.kernels.gaussians import LANES, exponential

@@ -14,7 +14,7 @@ import dt_viz
 from dt_viz.avoidance.arm_field import ArmField, GradientField, JointLimits, WholeArmField
 from dt_viz.avoidance.bias import BiasPoint, Shift, unit_field
 from dt_viz.avoidance.hand import Avoidance
-from dt_viz.avoidance.sides import Sideways
+from dt_viz.avoidance.sideways import Sideways
 from dt_viz.avoidance.transform import Transform
 from dt_viz.baselines.eflow import Coupling, Normalisation
 from dt_viz.baselines.signed_distance import SignedDistanceField

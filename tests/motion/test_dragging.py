@@ -9,10 +9,9 @@ import pytest
 from scenes import changed, frame_at
 
 from dt_viz.avoidance.arm import DURATION_CHANGE
-from dt_viz.avoidance.detour import STAYING, escape_directions
+from dt_viz.avoidance.detour import STAYING, TURNING, escape_directions
 from dt_viz.avoidance.passing import ANEW
 from dt_viz.avoidance.transform import ArmAvoidance
-from dt_viz.avoidance.ways import TURNING
 from dt_viz.metrics import discrete_frechet, resample_by_arc_length
 from dt_viz.motion.following import Follower
 from dt_viz.motion.solve import solve
@@ -81,7 +80,7 @@ def largest_step(frames):
 
 def ways(solved):
     """The ways out of the only obstacle."""
-    (way,) = solved.stack.built[0].made.ways if solved.arm is None else solved.arm.ways
+    (way,) = solved.stack.built[0].made.detours if solved.arm is None else solved.arm.detours
     return way
 
 
@@ -173,7 +172,7 @@ def test_the_escape_before_comes_first_unless_it_costs_much_more():
         points = rng.normal(size=(3, 3, 2)) * 0.002 + np.array([0, 0, 2 + depth])[:, None]
         ball = Sphere((0.0, 0.0, 2.0), 0.12)
         usual = escape_directions(points, radius, tangents, ball)
-        found = escape_directions(points, radius, tangents, ball, before=np.array([0.0, 0.0, -1.0]))
+        found = escape_directions(points, radius, tangents, ball, previous=np.array([0.0, 0.0, -1.0]))
         assert usual[0][2] > 0.9
         nearest = min(found, key=lambda direction: direction[2])
         cheap = (0.1 + depth) < STAYING * (0.1 - depth)
@@ -238,7 +237,7 @@ def test_motions_change_no_faster_than_the_obstacle_moves(new_engine, initial, s
         arm = engine.solved(scenario, LIVE).arm
         if before is not None and engine.solved(scenario, LIVE).nominal.stance == stance:
             assert abs(arm.duration - before.duration) <= 1.001e-3 * DURATION_CHANGE
-            for way, last in zip(arm.ways, before.ways, strict=True):
+            for way, last in zip(arm.detours, before.detours, strict=True):
                 if way is not None and last is not None:
                     assert way.direction @ last.direction > np.cos(1.1 * TURNING * 1e-3 / ball.radius)
         before, stance = arm, engine.solved(scenario, LIVE).nominal.stance

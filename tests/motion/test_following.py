@@ -226,7 +226,7 @@ class TestNoWay:
         arm = lift.avoiding(other.lifted, lift.scenario.arm_avoidance, LIVE.spacing, coarse=True)
         x, y, z = lift.scenario.obstacle.parts[0].position
         moved = changed(lift.scenario, obstacles=Sphere((x, y, z + 0.003)))
-        passing = replace(other.passing, arm=arm.ways, duration=arm.duration)
+        passing = replace(other.passing, arm=arm.detours, duration=arm.duration)
         assert lift.solved(moved, passing=passing).nominal is lift.nominal
 
     def test_starts_from_which_there_is_no_way_are_left_out_and_named_and_not_tried_again_in_a_drag(self, lift):

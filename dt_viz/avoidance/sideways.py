@@ -1,4 +1,4 @@
-"""Sides: on which of them all motions of the end effector pass an obstacle.
+"""Sideways: the flow that carries all motions of the end effector to one side of an obstacle.
 
 The flow out of an occupied region takes each sample out where it is nearest: a motion through the middle is pushed back
 along its own way and then turns sharply, and its neighbours leave on other sides. So all motions together are carried
@@ -7,7 +7,7 @@ to one side n before, as far as they need to be clear, by a flow along it,
     ẏ = n g exp(−½ ‖A(y − c)‖²) Π_e (1 − exp(−‖y − e‖²/2ρ_e²)),
 
 which is broad along the motions and leaves their free starts and goal e where they are. The side is the one with the
-least detour; while an obstacle is dragged, it is kept until another one costs much less.
+least detour, see `dt_viz.avoidance.detour`.
 """
 
 from __future__ import annotations
@@ -17,26 +17,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dt_viz.avoidance.clearing import escape_lengths
+from dt_viz.avoidance.detour import Detour, escape_directions
 from dt_viz.avoidance.transform import Aside, MotionBelow
-from dt_viz.avoidance.ways import Way
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Diffeomorphism
 from dt_viz.flows.fields import Array, Mask, PointField
 from dt_viz.kernels.fields import ASIDE, TERM, Terms
-from dt_viz.obstacles.shapes import Obstacle, golden_spiral
+from dt_viz.obstacles.shapes import Obstacle
 from dt_viz.obstacles.union import Union
 
-NUM_DIRECTIONS, MAX_SAMPLES = 128, 96
-"""Number of sides that are compared, and largest number of samples that they are compared by."""
-SIDEWAYS = 1.0
-"""Relative extra cost of a side along the motions against one across them: it would bend them sharply."""
-SELECTIVITY = 0.05
-"""Relative difference in cost over which a direction's share in a side falls by a factor e, for smooth drags."""
-ALIKE = 0.77
-"""Cosine of the largest angle between two directions of one side."""
-STAYING = 1.5
-"""Cost of the side that was chosen before, relative to the least one, up to which it is kept."""
-ROUNDNESS = 1.1
-"""Size of the ellipsoid that sides are compared by, relative to the obstacle's half sizes."""
+MAX_SAMPLES = 96
+"""Largest number of samples that sides are compared by."""
+ALONG = 1.0
+"""Relative extra cost of a side along the motions against one across them."""
 BREADTH = 0.7
 """Smallest half size of A⁻¹, relative to the longest way to the side; else it is the obstacle's plus the margin."""
 GAIN = 2.0
@@ -50,13 +43,8 @@ SLOWEST = 0.3
 """Smallest speed, in g, that the duration allows for: samples beside an end are hardly carried."""
 LONGEST = 2.0
 """Longest time of the flow, in the same unit: beside covered starts a longer one would squeeze space to nothing."""
-NUM_STEPS, SHORTEST, REACHED = 16, 1e-3, 2e-4
-"""Largest number of steps to a surface, the smallest step and the margin's part that may be missing, metres."""
 SIMPSON = np.array([1, *[4, 2] * 7, 4, 1]) / 48
 """Weights of Simpson's rule, along the way of a sample to the side."""
-UPWARDS = 0.01
-"""Length of a detour, metres, that passing above an obstacle outweighs, where motions turn to the opposite side."""
-TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +75,7 @@ class Sideways(PointField):
         return Terms(term, values)
 
 
-def held(aside: Aside, outer: Diffeomorphism) -> Aside:
+def fixing_ends(aside: Aside, outer: Diffeomorphism) -> Aside:
     """The flow `aside` to a side, zero not at its ends but at their images under `outer`, which is stacked on it.
 
     So `outer` alone moves the ends. Where it brought them into the field, that would carry them far into the obstacle.
@@ -97,7 +85,7 @@ def held(aside: Aside, outer: Diffeomorphism) -> Aside:
 
 
 @dataclass(frozen=True, eq=False)
-class Passes:
+class Encounter:
     """Where the motions that have a demonstration come nearer to an obstacle than a margin."""
 
     obstacle: Obstacle
@@ -123,8 +111,8 @@ class Passes:
         margin: float,
         others: Sequence[Obstacle] = (),
         plane: Array | None = None,
-    ) -> Passes | None:
-        """The passes of a motion, of whose samples only those `avoidable` (N,) count; None where none comes so near."""
+    ) -> Encounter | None:
+        """Find it for a motion, of whose samples only those `avoidable` (N,) count; None where none comes so near."""
         inside = np.flatnonzero(avoidable & (obstacle.signed_distance(motion.positions) < margin))
         if not len(inside):
             return None
@@ -133,65 +121,40 @@ class Passes:
         of_last = motion.index[np.maximum(inside - 1, 0)] == motion.index[inside]
         after, before = (np.clip(inside + by, 0, len(motion.index) - 1) for by in (of_next, -1 * of_last))
         tangents = motion.positions[after] - motion.positions[before]
-        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), TINY)
+        tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         ends = np.concatenate([motion.starts, motion.goal[None]])
         ends = ends[obstacle.signed_distance(ends) >= 0]
         return cls(obstacle, margin, motion.positions[inside], tangents, ends, tuple(others), plane)
 
-    def way(self, before: Way | None, *, gradually: bool) -> Way:
-        """The way out on the side with the least detour, or on the side of before while that costs little more.
+    def detour(self, previous: Detour | None, *, gradually: bool) -> Detour:
+        """Choose the way out, on the side with the least detour, or the previous one while that costs little more.
 
         Where turning there gradually would move the motions farther than going there at once, it is there at once: what
         has just come near may make the way long in between.
 
         Args:
-            before: the way out of the obstacle where it was just before; None where there was none.
+            previous: the detour around the obstacle where it was just before; None where there was none.
             gradually: whether it turns there as the obstacle moves on; else it is there at once.
         """
-        directions = self._directions
-        cost = self.costs(directions)
-        alike = directions @ directions[cost.argmin()] > ALIKE
-        share = np.where(alike, np.exp((cost.min() - cost) / (SELECTIVITY * cost.min())), 0)
-        best = _unit(share @ directions)
-        if before is None:
-            return self._way(best, best, kept=False)
-        keeps = best @ before.side < ALIKE and self.costs(before.side[None])[0] < STAYING * cost.min()
-        side = before.side if keeps else best
-        way = self._way(side, side)
-        if not gradually:
-            return way
-        over = _unit(np.cross(np.linalg.svd(self.tangents, full_matrices=False)[2][0], before.direction))
-        above, below = self.costs(np.stack([over, -over]))
-        turned = way.turned_from(before, [over if above - below < UPWARDS * over[2] else -over])
-        ways = way, self._way(side, turned.direction)
-        return min(ways, key=lambda way: float(np.linalg.norm(way.offset - before.offset)))
+        found = escape_directions(
+            self.points.T[None],
+            np.zeros(1),
+            self.tangents,
+            self._around,
+            self.margin,
+            num=1,
+            previous=None if previous is None else previous.side,
+            plane=self.plane,
+            along=ALONG,
+        )
+        there = self._measured(Detour(self.obstacle, found[0], found[0], kept=previous is not None))
+        if previous is None or not gradually:
+            return there
+        both = there, self._measured(there.turned_from(previous, found))
+        return min(both, key=lambda detour: float(np.linalg.norm(detour.offset - previous.offset)))
 
-    def _way(self, side: Array, direction: Array, *, kept: bool = True) -> Way:
-        return Way(self.obstacle, side, direction, kept, float(self._lengths(direction).max()))
-
-    def costs(self, directions: Array) -> Array:
-        """Longest way (D,), metres, of a sample along unit vectors (D, 3) out of ellipsoids around the obstacles.
-
-        It is longer by up to `SIDEWAYS` times itself for a direction along the motions.
-        """
-        first, *others = (self._crossed(obstacle, directions) for obstacle in (self.obstacle, *self.others))
-        way = first[1]
-        for _ in others:
-            for begins, ends in others:
-                way = np.where((begins < way) & (way < ends), ends, way)
-        parallel = np.abs(directions @ self.tangents.T).mean(axis=1)
-        return way.max(axis=1) * (1 + SIDEWAYS * parallel) + TINY
-
-    def _crossed(self, obstacle: Obstacle, directions: Array) -> tuple[Array, Array]:
-        """Where rays from the samples along unit vectors (D, 3) enter and leave an ellipsoid, both (D, K), metres."""
-        centre, axes = _ellipsoid(obstacle)
-        inverse = np.linalg.inv(axes * (ROUNDNESS + self.margin / np.linalg.norm(axes, axis=0)))
-        u, v = (self.points - centre) @ inverse.T, directions @ inverse.T
-        size, along, squared = (v * v).sum(axis=1)[:, None], v @ u.T, (u * u).sum(axis=1)
-        # it holds all samples in the obstacle: corners of a box stick out
-        surface = max(1.0, float(squared.max())) if obstacle is self.obstacle else 1.0
-        half = np.sqrt(np.maximum(along**2 + size * (surface - squared), 0))
-        return (-half - along) / size, (half - along) / size
+    def _measured(self, detour: Detour) -> Detour:
+        return replace(detour, length=float(self._lengths(detour.direction).max()))
 
     def flow(self, direction: Array, tolerance: float) -> AdaptiveFlow:
         """The flow whose inverse carries all samples along a unit vector (3,) until they keep the margin."""
@@ -210,28 +173,15 @@ class Passes:
 
     def _lengths(self, direction: Array) -> Array:
         """How far (K,), metres, the samples have to go along a unit vector (3,) to keep the margin."""
-        length, around = np.zeros(len(self.points)), Union((self.obstacle, *self.others))
-        for _ in range(NUM_STEPS):
-            lacking = self.margin - around.signed_distance(self.points + length[:, None] * direction)
-            if lacking.max() <= REACHED:
-                break
-            length += np.where(lacking > REACHED, np.maximum(lacking, SHORTEST), 0)
-        return length
+        return escape_lengths(self._around, self.points, direction, self.margin)
 
     @property
-    def _directions(self) -> Array:
-        """(D, 3) unit vectors all around."""
-        if self.plane is None:
-            return golden_spiral(NUM_DIRECTIONS, 0.5)
-        turn = np.linspace(0, 2 * np.pi, NUM_DIRECTIONS, endpoint=False)
-        return np.stack([np.cos(turn), np.sin(turn)], axis=1) @ self.plane.T
+    def _around(self) -> Union:
+        """The obstacle, and those that the way out does not end in."""
+        return Union((self.obstacle, *self.others))
 
 
 def _ellipsoid(obstacle: Obstacle) -> tuple[Array, Array]:
     """Centre (3,) and half axes (3, 3), as columns, metres, of an ellipsoid about as large as an obstacle."""
     placed = obstacle.field("free-space", 1.0)
     return placed.origin, placed.axes
-
-
-def _unit(direction: Array) -> Array:
-    return direction / max(float(np.linalg.norm(direction)), TINY)

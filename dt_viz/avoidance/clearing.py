@@ -1,0 +1,56 @@
+"""Until clear: how long a flow takes to carry points out of something, and how far it is along straight lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dt_viz.flows.fields import Array, VectorField
+from dt_viz.flows.integrators import integrate, rk4
+from dt_viz.obstacles.shapes import Obstacle
+from dt_viz.obstacles.union import Union
+
+MAX_STEPS, SHORTEST = 100, 1e-4
+"""Largest number of steps along a line, and the smallest one, metres: bounds the overshoot beyond the surface."""
+
+
+def clearing_duration(
+    field: VectorField, points: Array, lack: Callable[[Array], Array], step: float, longest: float
+) -> float | None:
+    """Find the shortest duration after which the reverse flow has carried all points clear.
+
+    γ is a one-parameter group, so one integration with snapshots passes every duration on its way; points that are
+    clear stay clear and are dropped. Between the last two snapshots the duration is interpolated.
+
+    Args:
+        field: generator of the flow.
+        points: (N, d) before the flow.
+        lack: what points (N, d) lack to be clear, (N,); at most 0 where they are.
+        step: flow time between two snapshots, one step of RK4.
+        longest: flow time.
+
+    Returns:
+        The duration, or None where some point is not clear after the longest.
+    """
+    duration, lacking = 0.0, lack(points)
+    while (left := lacking > 0).any():
+        if duration >= longest:
+            return None
+        before = lacking[left]
+        points, _ = integrate(rk4, field, points[left], None, -step, 1)
+        lacking = lack(points)
+        part = 1.0 if (lacking > 0).any() else float((before / np.maximum(before - lacking, 1e-12)).clip(0, 1).max())
+        duration += part * step
+    return duration
+
+
+def escape_lengths(obstacle: Obstacle | Union, points: Array, directions: Array, margin: float = 0.0) -> Array:
+    """How far points (N, 3) have to go along unit vectors (N, 3), or one for all, to keep a margin: (N,) metres."""
+    length = np.zeros(np.broadcast_shapes(points.shape, directions.shape)[:-1])
+    for _ in range(MAX_STEPS):
+        lacking = margin - obstacle.signed_distance(points + length[:, None] * directions)
+        if lacking.max() <= 0:
+            break
+        length += np.where(lacking > 0, np.maximum(lacking, SHORTEST), 0)
+    return length
