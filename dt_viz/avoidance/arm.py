@@ -30,7 +30,6 @@ from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.avoidance.transform import ArmAvoidance
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
-from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge

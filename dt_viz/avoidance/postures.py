@@ -58,7 +58,7 @@ class Stances:
         return IN_THE_WAY * (1 + AT_ENDS * near)
 
     def room(self, obstacle: Union | Obstacle, enough: float) -> Array:
-        """Distances (K, R + 1), metres, of the arm from an obstacle at the starts and the goal, up to what is enough."""
+        """Distances (K, R + 1), metres, of the arm from an obstacle at starts and goal, up to what is enough."""
         return self._clearance(np.concatenate([self.at_starts, self.on_path[:, -1:]], axis=1), obstacle, enough)
 
     def _clearance(self, q: Array, obstacle: Union | Obstacle, enough: float) -> Array:

@@ -74,8 +74,9 @@ class RangeLimit:
 class ObstacleLimit:
     """No part of the arm comes nearer to an obstacle than it can stop: a control barrier for each body point.
 
-    With h the distance of what its sphere holds beyond the clearance, ḣ ≥ −γh (Ames et al., "Control Barrier Functions: Theory and
-    Applications", 2019), where ḣ counts the obstacle's own velocity: what approaches moves a robot at rest, too.
+    With h the distance of what its sphere holds beyond the clearance, ḣ ≥ −γh (Ames et al., "Control Barrier Functions:
+    Theory and Applications", 2019), where ḣ counts the obstacle's own velocity: what approaches moves a robot at rest,
+    too.
     """
 
     arm: WholeArm

@@ -275,9 +275,7 @@ def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values
     From `enough` (N,) on it is that.
     """
     result, rows, memory = enough.copy(), np.arange(len(q)), np.empty(1, BLOCK)
-    likely = np.full(
-        len(shapes), len(points) - 1
-    )  # what was nearest just before, so most bounds exclude what they hold
+    likely = np.full(len(shapes), len(points) - 1)  # what was nearest just before: most bounds are beyond it
     block = memory[0]
     away, nearest = block.away, block.nearest
     for first in range(0, len(q), LANES):

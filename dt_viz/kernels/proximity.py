@@ -32,7 +32,7 @@ def _slopes(axes: Array, origins: Array, first: int, last: int, place: Point, aw
 def proximity(
     joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array, reach: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Find what is near an obstacle at the posture q (n,): the pairs of a part of the arm and an obstacle within `reach`.
+    """Find the pairs of a part of the arm and an obstacle that are within `reach` at the posture q (n,).
 
     A part is what an outermost sphere of the tree holds; its place is that of its sphere that is nearest.
 
