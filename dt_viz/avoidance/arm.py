@@ -175,7 +175,8 @@ class ArmSolution:
     duration: float
     """t of the avoidance flow."""
     clearance: float
-    """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres."""
+    """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres; only where it is
+    near, else less."""
     stuck: Indices
     """Hosts that do not keep the clearance that is asked for."""
     too_near: Indices
@@ -384,8 +385,9 @@ class WholeArm:
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
-        clearance = np.array([self.clearance(q, part, BESIDE) for part in parts]).reshape(len(parts), len(q))
-        near: Mask = clearance < margin
+        near: Mask = np.array([self.clearance(q, part, margin) < margin for part in parts]).reshape(len(parts), len(q))
+        clearance = np.array([self.body.outermost.clearance(self.robot, q, part, BESIDE) for part in parts])  # about
+        clearance = clearance.reshape(len(parts), len(q))
 
         def escapes(which: Indices) -> list[Array]:
             """Directions that leave all of these obstacles."""
@@ -439,7 +441,8 @@ class _Solver:
         self._spacing = spacing
         self._coarse = coarse and generator is not None
         self._shortest, self._longest = between
-        self._room = arm.clearance(lifted.pins, avoidance.obstacle) - ROUNDING
+        self._margin = max(float(avoidance.margin), 2 * ROUNDING)
+        self._room = arm.clearance(lifted.pins, avoidance.obstacle, self._margin + ROUNDING) - ROUNDING
 
     def solution(self) -> ArmSolution:
         duration = self._avoidance.duration
@@ -481,13 +484,15 @@ class _Solver:
 
     def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float) -> ArmSolution:
         p = bundle.positions / LEVERS
-        shaping, near = self._shaping(bundle), self._lack(p) > ROUNDING
-        clearance = float(self._arm.clearance(p[shaping], self._avoidance.obstacle).min())
+        asked, kept = self._kept(p)
+        shaping, near = self._shaping(bundle), asked - kept > ROUNDING
         q = self._lifted.at(bundle.index, bundle.fraction)
         stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
         away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
         moved = np.unique(bundle.index[away & ~shaping & (bundle.fraction == 0)])
-        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, stuck, too_near, moved)
+        return ArmSolution(
+            transform, bundle.index, bundle.fraction, q, p, duration, float(kept[shaping].min()), stuck, too_near, moved
+        )
 
     def _shaping(self, bundle: Bundle) -> Mask:
         return bundle.index < self._lifted.num_shaping
@@ -522,14 +527,18 @@ class _Solver:
         return refined(bundle, integrated, max(self._spacing, COARSE_SPACING) if self._coarse else self._spacing)
 
     def _lack(self, p: Array) -> Array:
-        """(N,) metres by which the arm at configurations (N, 6) misses the clearance that is asked for.
+        """(N,) metres by which the arm at configurations (N, 6) misses the clearance that is asked for."""
+        asked, kept = self._kept(p)
+        return asked - kept
 
-        That is the margin, or what the starts and goal beside a configuration have. Where more is kept, the lack is
-        exact down to what a contact moves between two looks at it.
+    def _kept(self, p: Array) -> tuple[Array, Array]:
+        """Clearances (N,), metres, that are asked for at configurations (N, 6), and that are kept.
+
+        Asked for is the margin, or what the starts and goal beside a configuration have. What is kept ends where it is
+        more by what a contact moves between two looks at it.
         """
-        margin = max(float(self._avoidance.margin), 2 * ROUNDING)
-        asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, margin)
-        return asked - self._arm.clearance(p, self._avoidance.obstacle, asked + SPEED * SNAPSHOT)
+        asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, self._margin)
+        return asked, self._arm.clearance(p, self._avoidance.obstacle, asked + SPEED * SNAPSHOT)
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""

@@ -123,14 +123,14 @@ class ContactLimit:
     @classmethod
     def table(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
         """Limit of the links above the table z = 0."""
-        links = body.outermost[body.joint > 0]
+        links = body.indices[body.joint > 0]
         return cls("the table", robot, body, np.stack([np.full(len(links), -1), links], axis=1), clearance, gain)
 
     @classmethod
     def itself(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
         """Limit of the links' distances from each other and the base."""
         a, b = np.nonzero(body.joint[:, None] + JOINTS_BETWEEN <= body.joint)
-        return cls("itself", robot, body, body.outermost[np.stack([a, b], axis=1)], clearance, gain)
+        return cls("itself", robot, body, body.indices[np.stack([a, b], axis=1)], clearance, gain)
 
     def kept(self, q: Array) -> Array:
         """Distances (M,) to keep in a motion whose undisturbed postures are q (N, 6), metres."""

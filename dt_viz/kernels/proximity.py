@@ -164,8 +164,8 @@ def _apart(
         if a < 0:
             gap, found = at[2] - radius, away
         else:
-            gap, found = _from_sphere(points, a, at, axes, origins, nearest + radius)
-            gap -= radius
+            length, found = _from_sphere(points, a, at, axes, origins, nearest + radius)
+            gap = length - radius if length < nearest + radius else nearest
         if gap < nearest and not holds_others(points, i):
             nearest, place, away = gap, at, found
         i = i + 1 if gap < nearest else points[i].end

@@ -216,11 +216,12 @@ class Follower:
 
     def _pedestal_touched(self, learned: Learned, obstacle: Union) -> tuple[MotionWarning, ...]:
         """Warnings about what touches the links that no joint carries away."""
-        for name, link in (("base", self.body.of_joints(-1, 0)), ("link 1", self.body.of_joints(0, 1))):
-            if link.clearance(self.robot, self._demonstrated(learned).pins[:1], obstacle, 0.0) < 0:
-                text = f"the obstacle touches the arm's {name}, which cannot move away"
-                return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
-        return ()
+        posture, pedestal = self._demonstrated(learned).pins[:1], self.body.on_pedestal
+        if pedestal.clearance(self.robot, posture, obstacle, 0.0) >= 0:
+            return ()
+        name = "base" if self.body.of_joints(-1, 0).clearance(self.robot, posture, obstacle, 0.0) < 0 else "link 1"
+        text = f"the obstacle touches the arm's {name}, which cannot move away"
+        return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
 
     def _stances(
         self, learned: Learned, obstacle: Union, margin: float, last: Stance | None, *, keeps: bool

@@ -37,32 +37,39 @@ class BodyPoints:
     """(N,) all spheres for compiled loops, see `dt_viz.kernels.arm.BODY_POINT`."""
 
     @cached_property
-    def outermost(self) -> Indices:
-        """(P,) indices of the spheres that no other one holds."""
+    def indices(self) -> Indices:
+        """(P,) indices of the points' own spheres, those that no other one holds."""
         ends = self.spheres["end"]
         return np.flatnonzero(np.arange(len(ends)) >= np.maximum.accumulate(np.r_[0, ends[:-1]]))
 
     @cached_property
+    def outermost(self) -> BodyPoints:
+        """The points with their own spheres alone."""
+        points = self.spheres[self.indices]
+        points["end"] = np.arange(len(points)) + 1
+        return BodyPoints(points)
+
+    @cached_property
     def joint(self) -> NDArray[np.int_]:
         """(P,) index of each point's joint, not decreasing; −1 for the base, which never moves."""
-        return self.spheres["joint"][self.outermost]
+        return self.spheres["joint"][self.indices]
 
     @cached_property
     def offset(self) -> Array:
         """(P, 3) position in that joint's frame, metres; in the world for the base."""
-        return self.spheres["offset"][self.outermost]
+        return self.spheres["offset"][self.indices]
 
     @cached_property
     def radius(self) -> Array:
         """(P,) radii of the spheres around the points, metres."""
-        return self.spheres["radius"][self.outermost]
+        return self.spheres["radius"][self.indices]
 
-    @property
+    @cached_property
     def on_moving_links(self) -> BodyPoints:
         """Points that joints can move away from an obstacle: not those of the base and of link 1, which only spins."""
         return self.of_joints(1, NUM_JOINTS)
 
-    @property
+    @cached_property
     def on_pedestal(self) -> BodyPoints:
         """Points of the base and link 1, which no motion moves away from anything."""
         return self.of_joints(-1, 1)
@@ -91,13 +98,6 @@ class BodyPoints:
                 turned = (offset @ chain.axes[joint].reshape(3, 3 * num)).reshape(len(offset), 3, num)
                 positions[points] = turned + chain.origins[joint]
         return positions
-
-    @cached_property
-    def records(self) -> NDArray[np.void]:
-        """(P,) the points and their spheres alone, for compiled loops."""
-        points = self.spheres[self.outermost]
-        points["end"] = np.arange(len(points)) + 1
-        return points
 
     def clearance(self, robot: Robot, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
         """Compute distances (N,), metres, of the arm from an obstacle at configurations q (N, 6), rad.

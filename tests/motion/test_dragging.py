@@ -189,7 +189,7 @@ def beside_goal(nominal, distance):
 
 def test_a_stance_is_kept_while_it_leaves_as_many_starts_free(engine, robot, initial):
     nominal, follower = engine.nominal(initial("push_box")), Follower(robot)
-    near, farther = (ArmAvoidance(Union((beside_goal(nominal, distance),))) for distance in (0.11, 0.19))
+    near, farther = (ArmAvoidance(Union((beside_goal(nominal, distance),))) for distance in (0.11, 0.2))
     stance = follower.admission(nominal, near).nominal.stance
     assert stance is not None and follower.admission(nominal, farther).nominal.stance is None
     assert follower.admission(nominal, farther, stance).nominal.stance == stance
@@ -210,7 +210,7 @@ def test_a_stance_is_kept_only_while_something_is_in_the_way(engine, robot, init
 def test_an_engine_keeps_the_stance_that_it_shows_while_an_obstacle_is_dragged(new_engine, initial):
     engine = new_engine()
     nominal = engine.nominal(initial("push_box"))
-    balls = [beside_goal(nominal, distance) for distance in np.arange(0.11, 0.195, 0.01)]
+    balls = [beside_goal(nominal, distance) for distance in np.arange(0.11, 0.205, 0.01)]
     scenarios = [changed(initial("push_box"), obstacles=ball, space="cspace", view=NOTHING_DRAWN) for ball in balls]
     frames = dragged(engine, scenarios)
     stances = [engine.solved(frame.scenario, LIVE).nominal.stance for frame in frames]
