@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -29,7 +30,6 @@ from dt_viz.avoidance.detour import Detour, escape_directions, remembered, trave
 from dt_viz.avoidance.passing import ANEW, Passing
 from dt_viz.flows.diffeomorphisms import AdaptiveFlow, Conjugated, Diffeomorphism, Flow, Identity
 from dt_viz.flows.fields import Array, Indices, Mask, VectorField
-from dt_viz.flows.integrators import integrate, rk4
 from dt_viz.flows.rollouts import Bundle, refined
 from dt_viz.kernels.blocks import room_asked
 from dt_viz.kernels.dodging import Forecast, LimitedArm, dodge
@@ -39,9 +39,11 @@ from dt_viz.obstacles.arrays import records
 from dt_viz.obstacles.shapes import Obstacle, Sphere
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import BodyPoints
-from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import TrackedPath, track
 from dt_viz.robot.robot import NUM_JOINTS, Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 NUM_CONFIGURATIONS = 100
 """Samples of each rollout before refinement."""
@@ -58,20 +60,10 @@ MAX_ROUNDS = 4
 """Rounds of refinement and of a longer flow where the samples that it adds are not clear."""
 SLOPE = 0.1
 """Clearance that is asked for, beside a start or goal that has less itself, for each metre of distance from it."""
-OVERSHOOT = 7e-3
-"""Distance by which the covering spheres stick out of the arm, about, metres: so much less margin is asked of them."""
 MOVED = 5e-3
 """Smallest shift of an added start by the avoidance that is reported, metres."""
 ROUNDING = 1e-3
 """Tolerance of a clearance, metres."""
-MESH_ROUNDING = 0.5e-3
-"""Tolerance of the meshes' clearance, metres: between two samples they may come a little nearer."""
-EXTENSION_STEP = 0.03
-"""Flow time between two looks at the meshes' clearance."""
-MAX_EXTENSION = 0.15
-"""Longest flow time that is added for the meshes: they are at most three centimetres nearer than asked for."""
-NUM_EXTENDED_FOR = 40
-"""Number of samples, those that lack most, that this time is chosen for."""
 COARSE_STEP = 0.25
 """Length of a coarse RK4 step, in flow time: off by at most 1.2 mm at the hand in drags around Draw S and push box."""
 COARSE_SPACING = 0.025
@@ -183,7 +175,8 @@ class ArmSolution:
     duration: float
     """t of the avoidance flow."""
     clearance: float
-    """Smallest distance of the covering spheres from the obstacle along the rollouts that shape the flow, metres."""
+    """Smallest distance of the arm from the obstacle along the rollouts that shape the flow, metres; only where it is
+    near, else less."""
     stuck: Indices
     """Hosts that do not keep the clearance that is asked for."""
     too_near: Indices
@@ -211,7 +204,7 @@ class WholeArm:
         self.robot = robot
         self.links = body.on_moving_links
         """Points of the links."""
-        self.body = self.links.with_end_effector(robot, OVERSHOOT)
+        self.body = self.links.with_end_effector(robot)
         """The same, and what the hand holds."""
         self.limits = JointLimits(robot.lower, robot.upper)
 
@@ -221,7 +214,7 @@ class WholeArm:
         field = WholeArmField(self.robot, self.body, (obstacle,), np.eye(3)[:1], np.empty((0, NUM_JOINTS)))
         points = self.body.of_chain(self.robot.chain(q.T))
         shapes, values = records((obstacle,))
-        joints, links, still = self.robot.records, self.links.records, np.zeros(NUM_JOINTS)
+        joints, links, still = self.robot.records, self.links.spheres, np.zeros(NUM_JOINTS)
         dodging, ones = LimitedArm(joints, links, still, still, still, 1.0), np.ones((1, 1))
         forecast = Forecast(shapes, values, np.ones(1), np.ones((1, 1, 3)), ones, 0.0, 0.0, 1.0)
         calls: tuple[Callable[[], object], ...] = (
@@ -231,8 +224,8 @@ class WholeArm:
             lambda: cubics(np.arange(4.0)[None], np.zeros((1, 4, NUM_JOINTS))),
             lambda: room_asked(q, q, np.zeros(1), LEVERS, SLOPE, 0.0),
             lambda: proximity(joints, links, shapes, values, q[0].copy(), 1.0),
-            lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy()),
-            lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy()),
+            lambda: contacts(joints, links, np.array([[-1, 0]]), q[0].copy(), 1.0),
+            lambda: least_contacts(joints, links, np.array([[-1, 0]]), q.copy(), 1.0),
             lambda: dodge(dodging, forecast, still, still, still, still, 0.0),
             lambda: escape_directions(points, self.body.radius, np.eye(3)[:1], obstacle, margin=2.0),
             lambda: field(q),
@@ -368,25 +361,9 @@ class WholeArm:
         solver = _Solver(self, lifted, avoidance, None, spacing, coarse=True)
         return replace(solver.through(full.transform.scaled(fraction), full.duration), detours=full.detours)
 
-    def touches(self, solution: ArmSolution, num_shaping: int, obstacle: Union) -> bool:
-        """Whether the arm's meshes touch the obstacle on the first `num_shaping` motions."""
-        p = solution.p[solution.index < num_shaping]
-        return bool((self.mesh_clearance(p, obstacle, np.full(len(p), ROUNDING)) < ROUNDING).any())
-
-    def clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
-        """Distance (N,), metres, of the covering spheres at configurations q (N, 6) from the obstacle."""
-        return self.body.clearance(self.robot, q, obstacle)
-
-    def mesh_clearance(self, q: Array, obstacle: Union | Obstacle, enough: Array) -> Array:
-        """Distance (N,), metres, of the arm's meshes at configurations q (N, 6) from the obstacle.
-
-        Beyond `enough` (N,) it is any value from there on that is not too large.
-        """
-        clearance = self.clearance(q, obstacle)  # of the spheres, which is smaller
-        near = np.flatnonzero(clearance < enough)
-        if len(near):
-            clearance[near] = load_collision_model().gaps(q[near], obstacle, enough[near])
-        return clearance
+    def clearance(self, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
+        """Distance (N,), metres, of arm and end effector from the obstacle; see `BodyPoints.clearance`."""
+        return self.body.clearance(self.robot, q, obstacle, enough)
 
     def _generator(self, detours: Sequence[Detour | None], avoidance: ArmAvoidance, pins: Array) -> VectorField:
         """The field whose flow takes these detours, with these postures (K, 6) at rest, where the flow meets them."""
@@ -408,8 +385,9 @@ class WholeArm:
         tangents = np.gradient(self.robot.end_effector(q), axis=1).reshape(-1, 3)
         tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
         q = q.reshape(-1, NUM_JOINTS)
-        clearance = np.array([self.clearance(q, part) for part in parts]).reshape(len(parts), len(q))
-        near: Mask = clearance < margin
+        near: Mask = np.array([self.clearance(q, part, margin) < margin for part in parts]).reshape(len(parts), len(q))
+        clearance = np.array([self.body.outermost.clearance(self.robot, q, part, BESIDE) for part in parts])  # about
+        clearance = clearance.reshape(len(parts), len(q))
 
         def escapes(which: Indices) -> list[Array]:
             """Directions that leave all of these obstacles."""
@@ -464,7 +442,8 @@ class _Solver:
         self._spacing = spacing
         self._coarse = coarse and generator is not None
         self._shortest, self._longest = between
-        self._room = arm.clearance(lifted.pins, avoidance.avoided) - ROUNDING
+        self._margin = max(float(avoidance.margin), 2 * ROUNDING)
+        self._room = arm.clearance(lifted.pins, avoidance.avoided, self._margin + ROUNDING) - ROUNDING
 
     def solution(self) -> ArmSolution:
         duration = self._avoidance.duration
@@ -489,17 +468,6 @@ class _Solver:
             more = min(self._clearing_duration(p[lack > 0]), self._longest - duration)
             duration += more
             bundle, transform = self._continued(bundle, more, duration)
-        for _ in range(0 if self._coarse or duration >= self._longest else MAX_ROUNDS):
-            p = (bundle.positions / LEVERS)[self._shaping(bundle)]
-            lack = self._mesh_lack(p)
-            worst = np.argsort(-lack)[:NUM_EXTENDED_FOR]
-            if lack[worst[0]] <= MESH_ROUNDING:
-                break
-            more = self._extension(p[worst[lack[worst] > 0]])
-            if more <= 0:
-                break
-            duration += more
-            bundle, transform = self._continued(bundle, more, duration)
         return self._along(bundle, transform, duration)
 
     def _continued(self, bundle: Bundle, more: float, duration: float) -> tuple[Bundle, Diffeomorphism]:
@@ -517,13 +485,15 @@ class _Solver:
 
     def _along(self, bundle: Bundle, transform: Diffeomorphism, duration: float) -> ArmSolution:
         p = bundle.positions / LEVERS
-        shaping, near = self._shaping(bundle), self._lack(p) > ROUNDING
-        clearance = float(self._arm.clearance(p[shaping], self._avoidance.avoided).min())
+        asked, kept = self._kept(p)
+        shaping, near = self._shaping(bundle), asked - kept > ROUNDING
         q = self._lifted.at(bundle.index, bundle.fraction)
         stuck, too_near = (np.unique(bundle.index[near & which]) for which in (shaping, ~shaping))
         away = np.linalg.norm(self._arm.robot.end_effector(p) - self._arm.robot.end_effector(q), axis=1) > MOVED
         moved = np.unique(bundle.index[away & ~shaping & (bundle.fraction == 0)])
-        return ArmSolution(transform, bundle.index, bundle.fraction, q, p, duration, clearance, stuck, too_near, moved)
+        return ArmSolution(
+            transform, bundle.index, bundle.fraction, q, p, duration, float(kept[shaping].min()), stuck, too_near, moved
+        )
 
     def _shaping(self, bundle: Bundle) -> Mask:
         return bundle.index < self._lifted.num_shaping
@@ -558,50 +528,23 @@ class _Solver:
         return refined(bundle, integrated, max(self._spacing, COARSE_SPACING) if self._coarse else self._spacing)
 
     def _lack(self, p: Array) -> Array:
-        """(N,) metres by which the spheres at configurations (N, 6) miss the clearance that is asked for."""
-        margin = max(self._avoidance.margin - OVERSHOOT, 2 * ROUNDING)
-        return self._asked(p, margin, self._room) - self._arm.clearance(p, self._avoidance.avoided)
+        """(N,) metres by which the arm at configurations (N, 6) misses the clearance that is asked for."""
+        asked, kept = self._kept(p)
+        return asked - kept
 
-    def _mesh_lack(self, p: Array, beyond: float = 0.0) -> Array:
-        """(N,) metres by which the meshes at configurations (N, 6) miss the clearance that is asked for, and less.
+    def _kept(self, p: Array) -> tuple[Array, Array]:
+        """Clearances (N,), metres, that are asked for at configurations (N, 6), and that are kept.
 
-        They are exact down to −`beyond`.
+        Asked for is the margin, or what the starts and goal beside a configuration have. What is kept ends where it is
+        more by what a contact moves between two looks at it.
         """
-        asked = self._asked(p, self._avoidance.margin, self._mesh_room)
-        return asked - self._arm.mesh_clearance(p, self._avoidance.avoided, asked + beyond)
-
-    @cached_property
-    def _mesh_room(self) -> Array:
-        pins, margin = self._lifted.pins, self._avoidance.margin
-        return self._arm.mesh_clearance(pins, self._avoidance.avoided, np.full(len(pins), margin)) - ROUNDING
-
-    def _asked(self, p: Array, margin: float, room: Array) -> Array:
-        """(N,) metres of clearance that are asked for at configurations (N, 6), with this room (K,) at the pins."""
-        return room_asked(np.array(p, order="C"), self._lifted.pins, room, LEVERS, SLOPE, float(margin))
+        asked = room_asked(np.array(p, order="C"), self._lifted.pins, self._room, LEVERS, SLOPE, self._margin)
+        return asked, self._arm.clearance(p, self._avoidance.avoided, asked + SPEED * SNAPSHOT)
 
     def _clearing_duration(self, p: Array) -> float:
         """The shortest duration after which the flow has carried configurations (N, 6) clear, or the longest."""
         assert self._generator is not None
         return clearing(self._generator, self._arm.limits, p, self._lack, SNAPSHOT, self._longest)
-
-    def _extension(self, p: Array) -> float:
-        """The shortest duration after which the flow has carried the meshes of configurations (N, 6) clear.
-
-        Those that take longer than `MAX_EXTENSION` are left as they are; 0 where all do.
-        """
-        assert self._generator is not None
-        limits, duration = self._arm.limits, 0.0
-        state, lack = limits.forward(p), self._mesh_lack(p)
-        for done in np.arange(0, MAX_EXTENSION, EXTENSION_STEP):
-            state, _ = integrate(rk4, self._generator, state, None, -EXTENSION_STEP, 1)
-            before, lack = lack, self._mesh_lack(limits.inverse(state), SPEED * EXTENSION_STEP)
-            clear = lack <= 0
-            if clear.any():
-                duration = done + EXTENSION_STEP * _crossing(before[clear], lack[clear])
-            state, lack = state[~clear], lack[~clear]
-            if not len(state):
-                break
-        return float(duration)
 
 
 def clearing(

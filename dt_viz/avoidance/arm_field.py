@@ -112,7 +112,7 @@ class WholeArmField(ArmField, CompiledField):
         shapes, values = records(self.obstacles)
         return escape.Escape(
             joints=self.robot.records,
-            points=self.body.records,
+            points=self.body.outermost.spheres,
             hand=np.array(self.robot.end_effector_offset),
             shapes=shapes,
             values=values,

@@ -57,13 +57,13 @@ class Stances:
         near = np.exp(-(ends**2).sum(axis=3) / (2 * ENDS**2)).max(axis=1)
         return IN_THE_WAY * (1 + AT_ENDS * near)
 
-    def room(self, obstacle: Union | Obstacle) -> Array:
-        """Distances (K, R + 1), metres, of the covering spheres from an obstacle, at the starts and the goal."""
-        return self._clearance(np.concatenate([self.at_starts, self.on_path[:, -1:]], axis=1), obstacle)
+    def room(self, obstacle: Union | Obstacle, enough: float) -> Array:
+        """Distances (K, R + 1), metres, of the arm from an obstacle at starts and goal, up to what is enough."""
+        return self._clearance(np.concatenate([self.at_starts, self.on_path[:, -1:]], axis=1), obstacle, enough)
 
-    def _clearance(self, q: Array, obstacle: Union | Obstacle) -> Array:
-        """Distances (K, N), metres, at postures (K, N, 6)."""
-        return self.body.clearance(self.robot, q.reshape(-1, NUM_JOINTS), obstacle).reshape(q.shape[:2])
+    def _clearance(self, q: Array, obstacle: Union | Obstacle, enough: float) -> Array:
+        """Distances (K, N), metres, at postures (K, N, 6), up to what is enough."""
+        return self.body.clearance(self.robot, q.reshape(-1, NUM_JOINTS), obstacle, enough).reshape(q.shape[:2])
 
     def alike(self, stance: int) -> Mask:
         """(K,) which stances are like one of them."""
@@ -77,7 +77,7 @@ class Stances:
             obstacle: what may be in the way.
             asked: clearance that is asked for, metres.
         """
-        lacking = np.maximum(asked - self._clearance(self.on_path, obstacle), 0)
+        lacking = np.maximum(asked - self._clearance(self.on_path, obstacle, asked), 0)
         return self.away + (self._stuck * lacking).mean(axis=1)
 
 

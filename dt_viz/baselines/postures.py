@@ -66,21 +66,20 @@ class PlanningScene:
         turn = np.abs(end - start)
         num = 1 + int(np.ceil((self.model.reach * turn).sum(axis=1).max() / SPACING))
         line = start + np.linspace(0, 1, num + 1)[:, None] * (end - start)
-        # spheres around the links answer most questions
-        points = self.body.positions(self.robot, line)
-        if self.obstacle.parts and not self._clears(line, points):
+        # spheres that cover the links answer most questions
+        if self.obstacle.parts and not self._clears(line):
             return False
-        height = points[..., 2] - self.body.radius
+        height = self.body.positions(self.robot, line)[..., 2] - self.body.radius
         if height.min() <= SPACING / 2 and self.model.nearest_to_table(line[[0, -1]]).distance <= 0:
             return False
         itself = self.model.nearest_to_itself(line[[0, -1]])
         return itself is None or itself.distance > 0
 
-    def _clears(self, line: Array, points: Array) -> bool:
-        """Decide whether the arm clears the obstacle, from samples (N, 6), rad, and the spheres' centres (N, P, 3)."""
+    def _clears(self, line: Array) -> bool:
+        """Decide whether the arm clears the obstacle, from samples (N, 6), rad."""
         if (self.obstacle.signed_distance(self.robot.end_effector(line)) < 0).any():
             return False
-        room = (self.obstacle.signed_distance(points) - self.body.radius).min(axis=1)
+        room = self.body.clearance(self.robot, line, self.obstacle)
         if room.min() > SPACING / 2:
             return True
         deepest = line[np.argsort(room)[:3]]  # tried before the whole line

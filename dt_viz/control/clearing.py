@@ -12,9 +12,9 @@ from functools import partial
 
 import numpy as np
 
-from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, OVERSHOOT, ROUNDING, SLOPE, WholeArm
+from dt_viz.avoidance.arm import BESIDE, MAX_DURATION, ROUNDING, SLOPE, WholeArm
 from dt_viz.avoidance.arm import clearing as clearing_time
-from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, WholeArmField
+from dt_viz.avoidance.arm_field import LEVERS, REACH_PER_TEMPERATURE, SPEED, WholeArmField
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.detour import escape_directions, turned
 from dt_viz.flows.diffeomorphisms import Conjugated, Diffeomorphism, Flow, Identity
@@ -86,7 +86,7 @@ def clearing(
     points, tangents = arm.body.of_chain(chain), np.gradient(chain.position.T, axis=0) if len(q) > 1 else 0 * q[:, :3]
     tangents = tangents / np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-9)
     directions = tuple(
-        _direction(arm, points, tangents, part, velocity, avoidance, way, turn)
+        _direction(arm, points, arm.clearance(q, part, BESIDE), tangents, part, velocity, avoidance, way, turn)
         for part, velocity, way in zip(parts, velocities, known, strict=True)
     )
     met = [(part, way) for part, way in zip(parts, directions, strict=True) if way is not None]
@@ -102,6 +102,7 @@ def clearing(
 def _direction(
     arm: WholeArm,
     points: Array,
+    clearance: Array,
     tangents: Array,
     part: Obstacle,
     velocity: Array,
@@ -109,9 +110,10 @@ def _direction(
     before: Array | None,
     turn: float,
 ) -> Array | None:
-    """Choose the escape direction (3,) from one obstacle; that before where no body point (P, 3, N) is too near it."""
-    distance = part.signed_distance(points.transpose(0, 2, 1)) - arm.body.radius[:, None]
-    clearance = distance.min(axis=0)
+    """Choose the escape direction (3,) from one obstacle; that before where no posture comes too near it.
+
+    Points (P, 3, N) and clearance (N,) are those of the same postures.
+    """
     near = np.flatnonzero(clearance < avoidance.margin)
     if not len(near):
         return before
@@ -140,5 +142,5 @@ def lack(arm: WholeArm, p: Array, avoidance: ArmAvoidance, end: Array | None) ->
     pins = NO_PINS if end is None else end[None]
     room = arm.clearance(pins, avoidance.avoided) - ROUNDING
     pins, room = pins[room > 0], room[room > 0]
-    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin - OVERSHOOT))
-    return asked - arm.clearance(p, avoidance.avoided)
+    asked = room_asked(np.array(p, order="C"), pins, room, LEVERS, SLOPE, float(avoidance.margin))
+    return asked - arm.clearance(p, avoidance.avoided, asked + SPEED * STEP)

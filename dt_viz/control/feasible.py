@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import daqp
 import numpy as np
 
-from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.arm import WholeArm
 from dt_viz.control.limits import AccelerationLimit, ContactLimit, ObstacleLimit, RangeLimit, VelocityLimit
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.control.settings import ControllerSettings
@@ -58,7 +58,7 @@ class FeasibleVelocities:
             for make in (ContactLimit.table, ContactLimit.itself)
         )
         bounds = robot.lower, robot.upper, robot.velocity_limits
-        self._limited = LimitedArm(robot.records, arm.links.records, *bounds, settings.acceleration)
+        self._limited = LimitedArm(robot.records, arm.links.spheres, *bounds, settings.acceleration)
 
     def kept(self, q: Array) -> tuple[Array, ...]:
         """Distances from the table, and of the arm's parts, that are kept in a motion along postures q (N, 6)."""
@@ -125,7 +125,7 @@ class FeasibleVelocities:
         times = np.linspace(0, settings.horizon, settings.num_ahead + 1)[1:]
         moved = np.stack([seen.motions[k].ahead(times + late, settings.returning) for k in moving], axis=1)
         deviation = np.outer(settings.unsure + settings.doubt * times, speeds[moving])
-        kept = settings.clearance - OVERSHOOT, floor - OVERSHOOT, settings.floor_depth
+        kept = settings.clearance, floor, settings.floor_depth
         forecast = Forecast(
             *records(tuple(seen.avoidance.avoided.parts[k] for k in moving)), times, moved, deviation, *kept
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.arm import WholeArm
 from dt_viz.control.obstacle_motion import Sighting
 from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.proximity import contacts, least_contacts, proximity
@@ -24,6 +24,8 @@ STEADIEST = 0.5
 """Part of a distance that goes in one tick at most, however long it is."""
 JOINTS_BETWEEN = 3
 """Number of joints between two parts of the arm from which on they can touch: fewer do not fold them that far."""
+FASTEST = 1.0
+"""Speed, m/s, at which parts of the arm approach each other or the table at most, about."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,9 @@ class RangeLimit:
 class ObstacleLimit:
     """No part of the arm comes nearer to an obstacle than it can stop: a control barrier for each body point.
 
-    With h the distance of its sphere beyond the clearance, ḣ ≥ −γh (Ames et al., "Control Barrier Functions: Theory and
-    Applications", 2019), where ḣ counts the obstacle's own velocity: what approaches moves a robot at rest, too.
+    With h the distance of what its sphere holds beyond the clearance, ḣ ≥ −γh (Ames et al., "Control Barrier Functions:
+    Theory and Applications", 2019), where ḣ counts the obstacle's own velocity: what approaches moves a robot at rest,
+    too.
     """
 
     arm: WholeArm
@@ -90,10 +93,9 @@ class ObstacleLimit:
             return np.empty((0, len(q))), np.empty(0), np.inf
         shapes, values = records(seen.avoidance.avoided.parts)
         robot, links = self.arm.robot, self.arm.links
-        part, distance, slopes, outward = proximity(robot.records, links.records, shapes, values, q, self.reach)
+        part, distance, slopes, outward = proximity(robot.records, links.spheres, shapes, values, q, self.reach)
         if not len(distance):
             return slopes, distance, np.inf
-        distance = distance + OVERSHOOT
         h = distance - min(self.clearance, seen.avoidance.margin / 2)
         near, bounds = _barrier(h, slopes, self.gain, dt)
         approach = np.einsum("ki,ki->k", outward[near], seen.velocities[part[near]])
@@ -121,34 +123,25 @@ class ContactLimit:
     @classmethod
     def table(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
         """Limit of the links above the table z = 0."""
-        (links,) = np.nonzero(body.joint > 0)
+        links = body.indices[body.joint > 0]
         return cls("the table", robot, body, np.stack([np.full(len(links), -1), links], axis=1), clearance, gain)
 
     @classmethod
     def itself(cls, robot: Robot, body: BodyPoints, clearance: float, gain: float) -> ContactLimit:
         """Limit of the links' distances from each other and the base."""
         a, b = np.nonzero(body.joint[:, None] + JOINTS_BETWEEN <= body.joint)
-        return cls("itself", robot, body, np.stack([a, b], axis=1), clearance, gain)
+        return cls("itself", robot, body, body.indices[np.stack([a, b], axis=1)], clearance, gain)
 
     def kept(self, q: Array) -> Array:
         """Distances (M,) to keep in a motion whose undisturbed postures are q (N, 6), metres."""
-        least = least_contacts(self.robot.records, self.body.records, self.pairs, np.array(q, order="C"))
-        return np.minimum(self.clearance, least + OVERSHOOT)
+        return least_contacts(self.robot.records, self.body.spheres, self.pairs, np.array(q, order="C"), self.clearance)
 
     def rows(self, q: Array, kept: Array, dt: float) -> tuple[Array, Array]:
         """Slopes s (K, 6) and bounds b (K,) with s·q̇ ≥ b at q (6,) where distances (M,) are kept."""
-        apart, slopes = self._contacts(q)
-        h = apart - kept
-        # the others do not come near enough, however fast the joints are
-        (able,) = (min(self.gain, STEADIEST / dt) * h < np.abs(slopes) @ self.robot.velocity_limits).nonzero()
-        if not len(able):
-            return slopes[able], h[able]
-        near, bounds = _barrier(h[able], slopes[able], self.gain, dt)
-        return slopes[able[near]], bounds
-
-    def _contacts(self, q: Array) -> tuple[Array, Array]:
-        apart, slopes = contacts(self.robot.records, self.body.records, self.pairs, q)
-        return apart + OVERSHOOT, slopes
+        reach = self.clearance + FASTEST / min(self.gain, STEADIEST / dt)
+        which, apart, slopes = contacts(self.robot.records, self.body.spheres, self.pairs, q, reach)
+        near, bounds = _barrier(apart - kept[which], slopes, self.gain, dt)
+        return slopes[near], bounds
 
 
 def _barrier(h: Array, slopes: Array, gain: float, dt: float) -> tuple[Indices, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dt_viz.avoidance.arm import WholeArm
-from dt_viz.avoidance.transform import ArmAvoidance
+from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.clearing import Clearing, clearing
 from dt_viz.control.courses import Course, Progress
 from dt_viz.control.obstacle_motion import NOTHING_SEEN

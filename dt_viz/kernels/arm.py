@@ -22,16 +22,20 @@ BODY_POINT = np.dtype(
         ("joint", np.int64),  # that it moves with
         ("offset", np.float64, 3),  # position in that joint's frame, metres
         ("radius", np.float64),  # of its sphere, metres
+        ("end", np.int64),  # index of the next one that it does not hold
     ]
 )
-"""A point of a link, which is covered by such spheres."""
+"""A point of a link with its sphere. A list of them is a tree, depth first: each holds those up to its `end`.
+
+The spheres that hold no others cover the links. They are inside all that hold them, which bound their distances.
+"""
 
 Array = NDArray[Any]
 """Of floats, or of complex numbers for derivatives."""
 Joints = NDArray[Any]
 """(n,) joints of dtype `JOINT`, from the base to the hand."""
 BodyPoints = NDArray[Any]
-"""(P,) body points of dtype `BODY_POINT`."""
+"""(P,) body points of dtype `BODY_POINT`, not decreasing by joint."""
 
 
 @compiled
@@ -56,6 +60,12 @@ def chain(joints: Joints, q: Array, axes: Array, origins: Array) -> None:
             axes[i, 0, k] = x * cos + y * sin
             axes[i, 1, k] = y * cos - x * sin
             axes[i, 2, k] = z
+
+
+@compiled
+def holds_others(points: BodyPoints, p: int) -> bool:
+    """Return whether the sphere of body point p holds others."""
+    return points[p].end > p + 1
 
 
 @compiled

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dt_viz.kernels.arm import Array, BodyPoints, Joints
+from dt_viz.kernels.arm import Array, BodyPoints, Joints, holds_others
 from dt_viz.kernels.compiled import compiled, short_kernel
 from dt_viz.kernels.distances import (
     BOX,
@@ -126,10 +126,14 @@ def _sine_cosine(block: Record, i: int) -> None:
 
 @compiled
 def put(offset: Array, joint: int, block: Record) -> None:
-    """Find the place of what is fixed to a joint at an offset (3,), metres."""
+    """Find the place of what is fixed to a joint, or to the base where that is −1, at an offset (3,), metres."""
     axes, origins, place = block.axes, block.origins, block.place
     u, v, w = offset[0], offset[1], offset[2]
     for k in range(3):
+        if joint < 0:
+            for lane in range(LANES):
+                place[k, lane] = offset[k]
+            continue
         for lane in range(LANES):
             turned = u * axes[joint, 0, k, lane] + v * axes[joint, 1, k, lane] + w * axes[joint, 2, k, lane]
             place[k, lane] = origins[joint, k, lane] + turned
@@ -234,6 +238,15 @@ def _measure_on_grid(shape: Record, values: Values, radius: float, enough: float
 
 
 @compiled
+def _largest(values: Array) -> float:
+    """Largest of the lanes' values."""
+    most = values[0]
+    for lane in range(LANES):
+        most = values[lane] if values[lane] > most else most
+    return most
+
+
+@compiled
 def _least(values: Array) -> float:
     """Smallest of the lanes' values."""
     least = values[0]
@@ -260,24 +273,38 @@ def room_asked(q: Array, pins: Array, room: Array, levers: Array, slope: float, 
 
 
 @short_kernel
-def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array) -> Array:
-    """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad."""
-    result, memory = np.full(len(q), np.inf), np.empty(1, BLOCK)
+def clearance(joints: Joints, points: BodyPoints, shapes: Shapes, values: Values, q: Array, enough: Array) -> Array:
+    """Smallest distance (N,), metres, of body points' spheres from any of the obstacles, at angles q (N, n), rad.
+
+    From `enough` (N,) on it is that.
+    """
+    result, memory = enough.copy(), np.empty(1, BLOCK)
+    likely = np.full(len(shapes), len(points) - 1)  # what was nearest just before: most bounds are beyond it
     block = memory[0]
     away, nearest = block.away, block.nearest
     for first in range(0, len(q), LANES):
         num = load(block, q, first)
         chain(joints, block)
-        nearest[:] = np.inf
-        for p in range(len(points) - 1, -1, -1):  # what is near the hand is most often nearest
-            put(points[p].offset, points[p].joint, block)
-            for k in range(len(shapes)):
-                most = nearest[0]
+        for lane in range(LANES):
+            nearest[lane] = enough[first + min(lane, num - 1)]
+        for k in range(len(shapes)):
+            tried, p = False, 0
+            while p < len(points):
+                at = p if tried else likely[k]
+                most = _largest(nearest)
+                put(points[at].offset, points[at].joint, block)
+                measure(shapes[k], values, points[at].radius, most, block)
+                nearer = 0
                 for lane in range(LANES):
-                    most = nearest[lane] if nearest[lane] > most else most
-                measure(shapes[k], values, points[p].radius, most, block)
-                for lane in range(LANES):
-                    nearest[lane] = away[lane] if away[lane] < nearest[lane] else nearest[lane]
+                    nearer += away[lane] < nearest[lane]
+                if not holds_others(points, at):
+                    if away[0] < nearest[0]:
+                        likely[k] = at
+                    for lane in range(LANES):
+                        nearest[lane] = away[lane] if away[lane] < nearest[lane] else nearest[lane]
+                if tried:
+                    p = p + 1 if nearer > 0 else points[p].end
+                tried = True
         for lane in range(num):
             result[first + lane] = nearest[lane]
     keep(memory)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, placed
+from dt_viz.kernels.arm import Array, BodyPoints, Joints, chain, holds_others, placed
 from dt_viz.kernels.compiled import compiled, short_kernel
 from dt_viz.kernels.distances import Shapes, Values, distance
 
@@ -69,15 +69,21 @@ def _room(arm: LimitedArm, forecast: Forecast, q: Array, velocity: Array, wanted
             turned = velocity[i] * t + np.sign(change) * arm.acceleration * ramp * (t - ramp / 2)
             p[i] = min(max(q[i] + turned, arm.lower[i]), arm.upper[i])
         chain(arm.joints, p, axes, origins)
-        for k in range(len(points)):
+        k = 0
+        while k < len(points):
             offset, joint, radius = points[k].offset, points[k].joint, points[k].radius
             x, y = placed(offset, joint, axes, origins, 0), placed(offset, joint, axes, origins, 1)
             z = placed(offset, joint, axes, origins, 2)
-            smallest = min(smallest, (z - radius - forecast.floor) / forecast.depth)
+            room = (z - radius - forecast.floor) / forecast.depth
             for o in range(len(forecast.shapes)):
                 u, v, w = x - moved[m, o, 0], y - moved[m, o, 1], z - moved[m, o, 2]
                 away = distance(forecast.shapes[o], forecast.values, u, v, w) - radius - forecast.kept
-                smallest = min(smallest, away / forecast.deviation[m, o])
+                room = min(room, away / forecast.deviation[m, o])
+            if holds_others(points, k):
+                k = k + 1 if room < smallest else points[k].end
+                continue
+            smallest = min(smallest, room)
+            k += 1
         if smallest < least:
             break
     return smallest

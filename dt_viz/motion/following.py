@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 
-from dt_viz.avoidance.arm import NUM_CONFIGURATIONS, OVERSHOOT, Lift, WholeArm, joined, lift
+from dt_viz.avoidance.arm import NUM_CONFIGURATIONS, Lift, WholeArm, joined, lift
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.avoidance.passing import Stance
 from dt_viz.avoidance.postures import Stances, stances
@@ -20,9 +20,9 @@ from dt_viz.motion.nominal import Learned, Nominal, NominalTrajectory
 from dt_viz.motion.stack import Solution
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.body_points import load_body_points
-from dt_viz.robot.collision import SELF_MARGIN, CollisionModel, load_collision_model
+from dt_viz.robot.collision import SELF_MARGIN, load_collision_model
 from dt_viz.robot.inverse_kinematics import TrackedPath, UnreachableError, drawn_onto, inverse_kinematics, track
-from dt_viz.robot.robot import NUM_JOINTS, Robot, collision_meshes, load_jaco
+from dt_viz.robot.robot import NUM_JOINTS, Robot
 from dt_viz.scenario.scenario import MAX_STARTS
 from dt_viz.scenario.tasks import Task
 from dt_viz.warning import ARM, Kind, MotionWarning
@@ -217,17 +217,12 @@ class Follower:
 
     def _pedestal_touched(self, learned: Learned, obstacle: Union) -> tuple[MotionWarning, ...]:
         """Warnings about what touches the links that no joint carries away."""
-        pedestal, posture = self.body.on_pedestal, self._demonstrated(learned).pins[:1]
-        for part in obstacle.parts:
-            distance = part.signed_distance(pedestal.positions(self.robot, posture[0])) - pedestal.radius
-            if (distance >= 0).all():
-                continue
-            # the spheres are larger than the arm: ask the meshes
-            (gap,), (link,) = load_pedestal().obstacle_distance(posture, part)
-            if gap < 0:
-                text = f"the obstacle touches the arm's {load_pedestal().links[link].name}, which cannot move away"
-                return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
-        return ()
+        posture, pedestal = self._demonstrated(learned).pins[:1], self.body.on_pedestal
+        if pedestal.clearance(self.robot, posture, obstacle, 0.0) >= 0:
+            return ()
+        name = "base" if self.body.of_joints(-1, 0).clearance(self.robot, posture, obstacle, 0.0) < 0 else "link 1"
+        text = f"the obstacle touches the arm's {name}, which cannot move away"
+        return (MotionWarning(Kind.ARM_BLOCKED, text, ARM),)
 
     def _stances(
         self, learned: Learned, obstacle: Union, margin: float, last: Stance | None, *, keeps: bool
@@ -241,19 +236,15 @@ class Follower:
             A stance, None for the usual one; which of the starts and the goal (R + 1,) it leaves free.
         """
         if keeps and last is not None:
-            free = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle) >= 0
+            free = self.whole_arm.clearance(self._demonstrated(learned, last).pins, obstacle, 0.0) >= 0
             if free[-1] and free[:-1].any():
                 yield last, free
-        usual, asked = self._demonstrated(learned), max(margin - OVERSHOOT, 0.0)
-        near = self.whole_arm.clearance(usual.pins, obstacle)
-        enough = bool((near >= asked).all())
-        room = near if enough else self._true_room(usual.pins, obstacle, near, margin)
-        if last is None and (enough or (room >= margin).all() or (keeps and room[-1] >= 0 and room[:-1].max() >= 0)):
+        room = self.whole_arm.clearance(self._demonstrated(learned).pins, obstacle, margin)
+        if last is None and ((room >= margin).all() or (keeps and room[-1] >= 0 and room[:-1].max() >= 0)):
             yield None, room >= 0
         known = self.stances(learned)
-        clearance = known.room(obstacle)  # of the spheres, which are larger than the arm
+        clearance = known.room(obstacle, margin)
         free, ample = clearance >= 0, clearance >= margin
-        free[0], ample[0] = room >= 0, room >= margin
         # the goal first, then as many starts as possible, then as much room as is asked for
         most = free[:, -1] * free.shape[1] + free.sum(axis=1)
         kept = np.zeros(len(free), bool) if last is None else (known.references == last).all(axis=1)
@@ -262,7 +253,7 @@ class Follower:
             best = int(np.argmax(kept))
             yield last, free[best]
             left &= ~known.alike(best)
-        merit = [most, kept, ample.sum(axis=1), -known.cost(obstacle, asked)]
+        merit = [most, kept, ample.sum(axis=1), -known.cost(obstacle, margin)]
         for best in np.lexsort(merit[::-1])[::-1]:
             stance = None if best == 0 else _as_stance(known.references[best])
             if left[best] and (stance is None or self._sound(learned, stance)):
@@ -281,21 +272,6 @@ class Follower:
             learned,
             lambda: stances(self.robot, self.whole_arm.body, usual, learned.task.starts, _mean(paths)),
         )
-
-    def _true_room(self, q: Array, obstacle: Union, near: Array, enough: float) -> Array:
-        """Distances (N,), metres, of the arm at configurations q (N, 6) where `near` is not enough already.
-
-        They are those of its meshes and of the end effector, the point between the fingers. Where one of them is in the
-        obstacle it is some negative number.
-        """
-        room, model = near.copy(), load_collision_model()
-        close = np.flatnonzero(near < enough)
-        room[close] = model.gaps(q[close], obstacle, np.full(len(close), enough))
-        apart = close[room[close] >= 0]  # or the obstacle is inside a link, which takes longer to tell
-        if len(apart):
-            room[apart] = np.min([model.obstacle_distance(q[apart], part)[0] for part in obstacle.parts], axis=0)
-        room[close] = np.minimum(room[close], obstacle.signed_distance(self.robot.end_effector(q[close])))
-        return room
 
     def _sound(self, learned: Learned, stance: Stance) -> bool:
         """Whether the arm can follow the task's motions in a stance without coming near itself."""
@@ -348,8 +324,7 @@ class Follower:
         candidates = np.flatnonzero(~far)[num:]
         if len(candidates):
             postures = np.stack([self.undisturbed_along(nominal, k).tracked.q[0, 0] for k in candidates])
-            near = self.whole_arm.clearance(postures, obstacle)
-            touches[candidates] = self._true_room(postures, obstacle, near, 0.0) < 0
+            touches[candidates] = self.whole_arm.clearance(postures, obstacle, 0.0) < 0
         if not (far | touches).any():
             return nominal
         numbers = np.array(nominal.numbers)
@@ -434,7 +409,7 @@ def arm_samples(num: int) -> Indices:
 
 
 def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Array:
-    """Distance (N,), metres, of the arm's covering spheres from the obstacle where the hand rests at `places` (N, 3).
+    """Distance (N,), metres, of the arm from the obstacle where the hand rests at `places` (N, 3).
 
     Raises:
         UnreachableError: the arm cannot get to the task's starts, near whose posture it stays.
@@ -443,9 +418,3 @@ def room_at_rest(robot: Robot, task: Task, obstacle: Union, places: Array) -> Ar
     start = np.broadcast_to(reference, (len(places), NUM_JOINTS))
     postures = track(robot, places[:, None], start, reference=start).q[:, 0]
     return WholeArm(robot, load_body_points()).clearance(postures, obstacle)
-
-
-@lru_cache(maxsize=1)
-def load_pedestal() -> CollisionModel:
-    """The base and link 1, which no joint can carry away from an obstacle."""
-    return CollisionModel(load_jaco(), [mesh for mesh in collision_meshes() if mesh.joint < 1])

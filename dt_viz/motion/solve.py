@@ -73,7 +73,7 @@ def solve(scenario: Scenario, nominal: Nominal, precision: Precision, follower: 
     solved = _with_a_way(scenario, nominal, follower)
     if precision is not LIVE:
         solved = _solved(scenario, solved.nominal, precision, follower)
-    return _unless_it_touches(solved, follower)
+    return _unless_it_touches(solved)
 
 
 def _with_a_way(scenario: Scenario, nominal: Nominal, follower: Follower) -> Solved:
@@ -106,12 +106,9 @@ def _only(nominal: Nominal, rollouts: Sequence[int] | Indices) -> Nominal:
     return nominal.only(rollouts, (*nominal.warnings, *said))
 
 
-def _unless_it_touches(solved: Solved, follower: Follower) -> Solved:
+def _unless_it_touches(solved: Solved) -> Solved:
     """The motion, marked as blocked where the arm finds no way and touches the obstacle."""
-    avoidance = solved.scenario.arm_avoidance
-    if solved.cleared or solved.arm is None or avoidance is None:
-        return solved
-    if not follower.whole_arm.touches(solved.arm, solved.nominal.num_shaping, avoidance.avoided):
+    if solved.cleared or solved.arm is None or solved.arm.clearance >= 0:
         return solved
     text = "the arm finds no way around the obstacle between starts and goal"
     return replace(solved, blocked=(MotionWarning(Kind.NO_WAY, text, ARM),))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dt_viz.flows.fields import Array, Mask
+from dt_viz.flows.fields import Array, Indices
 from dt_viz.kernels.arm import BODY_POINT
 from dt_viz.kernels.blocks import clearance
 from dt_viz.obstacles.arrays import records
@@ -17,36 +18,73 @@ from dt_viz.obstacles.union import Union
 from dt_viz.robot.robot import NUM_JOINTS, KinematicChain, Robot
 from dt_viz.shipped import ASSETS
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+PROTRUSION = 5e-3
+"""Largest distance by which the spheres that cover the links stick out of these, metres; 3 mm on average."""
+
 
 @dataclass(frozen=True, eq=False)
 class BodyPoints:
-    """Spheres that move with the links and cover them: each triangle of a link's mesh lies in one of them."""
+    """Points that move with the links, and spheres around them that hold all of the arm.
 
-    joint: NDArray[np.int_]
-    """(P,) index of each point's joint, not decreasing; −1 for the base, which never moves."""
-    offset: Array
-    """(P, 3) position in that joint's frame, metres; in the world for the base."""
-    radius: Array
-    """(P,) radii of the spheres, metres."""
+    In each of these spheres smaller ones cover the collision meshes and stick out by `PROTRUSION` at most, 3 mm on
+    average: what is measured from obstacles are these.
+    """
 
-    @property
+    spheres: NDArray[np.void]
+    """(N,) all spheres for compiled loops, see `dt_viz.kernels.arm.BODY_POINT`."""
+
+    @cached_property
+    def indices(self) -> Indices:
+        """(P,) indices of the points' own spheres, those that no other one holds."""
+        ends = self.spheres["end"]
+        return np.flatnonzero(np.arange(len(ends)) >= np.maximum.accumulate(np.r_[0, ends[:-1]]))
+
+    @cached_property
+    def outermost(self) -> BodyPoints:
+        """The points with their own spheres alone."""
+        points = self.spheres[self.indices]
+        points["end"] = np.arange(len(points)) + 1
+        return BodyPoints(points)
+
+    @cached_property
+    def joint(self) -> NDArray[np.int_]:
+        """(P,) index of each point's joint, not decreasing; −1 for the base, which never moves."""
+        return self.spheres["joint"][self.indices]
+
+    @cached_property
+    def offset(self) -> Array:
+        """(P, 3) position in that joint's frame, metres; in the world for the base."""
+        return self.spheres["offset"][self.indices]
+
+    @cached_property
+    def radius(self) -> Array:
+        """(P,) radii of the spheres around the points, metres."""
+        return self.spheres["radius"][self.indices]
+
+    @cached_property
     def on_moving_links(self) -> BodyPoints:
         """Points that joints can move away from an obstacle: not those of the base and of link 1, which only spins."""
-        return self._where(self.joint >= 1)
+        return self.of_joints(1, NUM_JOINTS)
 
-    @property
+    @cached_property
     def on_pedestal(self) -> BodyPoints:
         """Points of the base and link 1, which no motion moves away from anything."""
-        return self._where(self.joint < 1)
+        return self.of_joints(-1, 1)
 
-    def with_end_effector(self, robot: Robot, radius: float) -> BodyPoints:
-        """The same and the robot's end effector, where the hand holds something, as a sphere of a radius, metres."""
-        joint = np.append(self.joint, NUM_JOINTS - 1)
-        offset = np.concatenate([self.offset, robot.end_effector_offset[None]])
-        return BodyPoints(joint, offset, np.append(self.radius, radius))
+    def with_end_effector(self, robot: Robot) -> BodyPoints:
+        """The same and the robot's end effector, a point that keeps clear, too, for what the hand holds."""
+        hand = (NUM_JOINTS - 1, robot.end_effector_offset, 0.0, len(self.spheres) + 1)
+        return BodyPoints(np.append(self.spheres, np.array(hand, BODY_POINT)))
 
-    def _where(self, keep: Mask) -> BodyPoints:
-        return BodyPoints(self.joint[keep], self.offset[keep], self.radius[keep])
+    def of_joints(self, first: int, end: int) -> BodyPoints:
+        """Those of the joints before `end`, from the first one on."""
+        begin, end = np.searchsorted(self.spheres["joint"], [first, end])
+        spheres = self.spheres[begin:end].copy()
+        spheres["end"] -= begin
+        return BodyPoints(spheres)
 
     def of_chain(self, chain: KinematicChain) -> Array:
         """Compute the positions (P, 3, N), metres, of the points at N configurations."""
@@ -61,17 +99,14 @@ class BodyPoints:
                 positions[points] = turned + chain.origins[joint]
         return positions
 
-    @cached_property
-    def records(self) -> NDArray[np.void]:
-        """(P,) the points for compiled loops; all are on joints."""
-        points = np.zeros(len(self.joint), BODY_POINT)
-        points["joint"], points["offset"], points["radius"] = self.joint, self.offset, self.radius
-        return points
+    def clearance(self, robot: Robot, q: Array, obstacle: Union | Obstacle, enough: ArrayLike = np.inf) -> Array:
+        """Compute distances (N,), metres, of the arm from an obstacle at configurations q (N, 6), rad.
 
-    def clearance(self, robot: Robot, q: Array, obstacle: Union | Obstacle) -> Array:
-        """Compute distances (N,), metres, of the nearest sphere from an obstacle at configurations q (N, 6), rad."""
+        They are too small by `PROTRUSION` at most, and at most `enough` (N,).
+        """
         shapes, values = records(obstacle.parts if isinstance(obstacle, Union) else (obstacle,))
-        return clearance(robot.records, self.records, shapes, values, np.array(q, order="C"))
+        most = np.array(np.broadcast_to(enough, len(q)), dtype=float)
+        return clearance(robot.records, self.spheres, shapes, values, np.array(q, order="C"), most)
 
     @cached_property
     def by_joint(self) -> list[tuple[int, slice]]:
@@ -94,4 +129,7 @@ class BodyPoints:
 def load_body_points() -> BodyPoints:
     """The JACO's body points, made by ``python -m assets.make_body_points``."""
     with np.load(ASSETS / "body_points.npz", allow_pickle=False) as data:
-        return BodyPoints(data["joint"], data["offset"], data["radius"])
+        spheres = np.zeros(len(data["joint"]), BODY_POINT)
+        for name in BODY_POINT.names or ():
+            spheres[name] = data[name]
+    return BodyPoints(spheres)

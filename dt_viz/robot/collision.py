@@ -23,7 +23,6 @@ from dt_viz.robot.link_distances import (
     Link,
     Measure,
     Poses,
-    Skin,
     measure_from,
 )
 from dt_viz.robot.robot import NUM_JOINTS, LinkMesh, Robot, collision_meshes, load_jaco
@@ -261,29 +260,6 @@ class CollisionModel:
                 if distance < distances[row]:
                     distances[row], nearest[row] = distance, item
         return distances, nearest
-
-    @cached_property
-    def _skins(self) -> tuple[Skin, ...]:
-        frames = sorted({link.frame for link in self.links})
-        return tuple(Skin([link for link in self.links if link.frame == frame]) for frame in frames)
-
-    def gaps(self, q: Array, obstacle: Union | Obstacle, enough: Array) -> Array:
-        """Compute the distances of the moving links from an obstacle that they do not touch.
-
-        Args:
-            q: (N, 6) configurations, rad.
-            obstacle: in the base frame.
-            enough: (N,) distances beyond which they are not measured, metres.
-
-        Returns:
-            (N,) metres, at most `enough`, exact to a few tenths of a millimetre; negative where links are touched.
-        """
-        poses, gaps = Poses.of(self.robot, q), enough
-        for part in obstacle.parts if isinstance(obstacle, Union) else (obstacle,):
-            for skin in self._skins:
-                if skin.frame > 1:
-                    gaps = skin.gaps(poses, part, gaps)
-        return gaps
 
     def nearest_to_obstacle(self, q: ArrayLike, obstacle: Union | Obstacle) -> Nearest:
         """Find the smallest signed distance of the arm from the obstacle on a path q (T, 6), rad.

@@ -35,16 +35,10 @@ RESOLUTION = 3.5e-3
 """Largest error of a reported depth in an obstacle that is no ball, metres; 1.5 mm on a link's surface."""
 CERTAIN = 3e-3
 """Depth, metres, greater than the error of an obstacle's signed distance: a deeper point surely is inside."""
-SKIN_SPACING = 1.5e-3
-"""Size of the cells of which a `Skin` has one point each, metres."""
-SKIN_GROUP_SIZE = 0.012
-"""Size of the cells into which the points of a `Skin` are grouped, metres."""
 GROUP_SIZE = 0.02
 """Size of the cells into which these points are grouped, metres."""
 BALL_SIZE = 0.06
 """Size of the cells into which a link is divided for quick bounds, metres."""
-AT_ONCE = 8
-"""Number of groups whose points are measured in one step."""
 
 
 class Poses(NamedTuple):
@@ -118,18 +112,14 @@ class Link:
         self.hull = np.array(self.surface.convex.points())
 
     @cached_property
-    def on_surface(self) -> Array:
-        """Points (N, 3) of the surface, at most `SURFACE_SPACING` apart, metres."""
-        return np.concatenate([self._vertices, surface_samples(self._triangles, SURFACE_SPACING)[0]])
-
-    @cached_property
     def groups(self) -> _Groups:
         """Points of the solid, so dense that each place in it has one within `RESOLUTION`."""
         shape = tuple(int(n) for n in np.ceil(2 * self.half_size / INNER_SPACING) + 1)
         origin = self.centre - INNER_SPACING * (np.array(shape) - 1) / 2
         inside = inside_of_grid(self._triangles, origin, INNER_SPACING, shape)
         inner = grid_nodes(origin, INNER_SPACING, shape)[inside.ravel()]
-        return _Groups.of(np.concatenate([self.on_surface, inner]), GROUP_SIZE)
+        on_surface = surface_samples(self._triangles, SURFACE_SPACING)[0]
+        return _Groups.of(np.concatenate([self._vertices, on_surface, inner]), GROUP_SIZE)
 
     @cached_property
     def balls(self) -> _Groups:
@@ -276,48 +266,12 @@ class _FromShape(_OfLinks):
 
     def _deepest(self, link: Link, turn: Array, origin: Array) -> float:
         """Return the smallest signed distance of the link's points, at most 0."""
-        groups, deepest = link.groups, 0.0
-        lower = self._obstacle.signed_distance(groups.centres @ turn.T + origin) - groups.radii
-        order = np.argsort(lower)
-        order = order[lower[order] < 0]
-        for first in range(0, len(order), AT_ONCE):
-            some = [group for group in order[first : first + AT_ONCE] if lower[group] < deepest]
-            if not some:
-                break
-            points = np.concatenate([groups.of_group(group) for group in some])
-            deepest = min(deepest, float(self._obstacle.signed_distance(points @ turn.T + origin).min()))
-        return deepest
-
-
-class Skin:
-    """Points on the surfaces of links that move together, so dense that distances of obstacles outside are known.
-
-    An obstacle at the distance d appears farther away by `SKIN_SPACING`²/d at most.
-    """
-
-    def __init__(self, links: Sequence[Link]) -> None:
-        (self.frame,) = {link.frame for link in links}
-        points = np.concatenate([link.on_surface for link in links])
-        x, y, z = np.floor((points - points.min(axis=0)) / SKIN_SPACING).astype(np.intp).T
-        _, kept = np.unique((x * (y.max() + 1) + y) * (z.max() + 1) + z, return_index=True)  # quicker than of rows
-        self._groups = _Groups.of(points[kept], SKIN_GROUP_SIZE)
-
-    def gaps(self, poses: Poses, obstacle: Obstacle, enough: Array) -> Array:
-        """Compute the smallest distances (N,), metres, of the points from an obstacle, where below `enough` (N,)."""
-        turns, origins, groups = poses.rotations[:, self.frame], poses.origins[:, self.frame], self._groups
-        centres = groups.centres @ turns.transpose(0, 2, 1) + origins[:, None]
-        distance, gaps = obstacle.signed_distance(centres), enough.copy()
-        nearest = np.minimum(gaps, (distance + groups.radii).min(axis=1))
-        rows, found = np.nonzero(distance - groups.radii < nearest[:, None])
-        if not len(rows):
-            return gaps
-        begins, sizes = np.r_[0, groups.ends[:-1]][found], np.diff(groups.ends, prepend=0)[found]
-        firsts = np.cumsum(sizes) - sizes
-        members = np.repeat(begins - firsts, sizes) + np.arange(sizes.sum())
-        of_row = np.repeat(rows, sizes)
-        points = np.einsum("nij,nj->ni", turns[of_row], groups.points[members]) + origins[of_row]
-        np.minimum.at(gaps, rows, np.minimum.reduceat(obstacle.signed_distance(points), firsts))
-        return gaps
+        groups = link.groups
+        distance = self._obstacle.signed_distance(groups.centres @ turn.T + origin)
+        # others have no point that is as deep as all of some group
+        (near,) = np.nonzero(distance - groups.radii < min(0.0, float((distance + groups.radii).min())))
+        points = np.concatenate([groups.points[:1], *(groups.of_group(group) for group in near)])
+        return min(0.0, float(self._obstacle.signed_distance(points @ turn.T + origin).min()))
 
 
 def _coal_shape(obstacle: Obstacle) -> coal.CollisionGeometry:

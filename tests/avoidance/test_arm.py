@@ -10,7 +10,6 @@ from dt_viz.avoidance import arm as whole_arm
 from dt_viz.avoidance.arm import (
     COARSE_SPACING,
     MAX_DURATION,
-    MAX_EXTENSION,
     OPPOSED,
     ROUNDING,
     ArmSolution,
@@ -23,6 +22,7 @@ from dt_viz.metrics import resample_by_arc_length, sharpest_turn
 from dt_viz.motion.following import Follower
 from dt_viz.motion.stack import FINE, LIVE
 from dt_viz.obstacles.shapes import Box, Sphere, as_point
+from dt_viz.robot.body_points import PROTRUSION
 from dt_viz.robot.collision import load_collision_model
 from dt_viz.robot.inverse_kinematics import track
 from dt_viz.scenario.scenario import Scenario
@@ -163,23 +163,18 @@ class TestAroundTheMiddle:
 
 @pytest.mark.parametrize("shape", ["ball", pytest.param("box", marks=pytest.mark.slow)])
 class TestMargin:
-    """The covering spheres stick out of the arm: where they do so little, the meshes keep less than is asked for."""
+    """What is asked for is kept by the meshes, and hardly more than that."""
 
     @pytest.fixture(name="obstacle")
     def _obstacle(self, push, shape):
         place = as_point(push.nominal.task.mean_path[40] + [0.0, 0.02, 0.01])
         return Sphere(place, 0.15) if shape == "ball" else Box(place, (0.12, 0.1, 0.14), (0.8, 0.6, 0.0, 0.0))
 
-    def test_the_meshes_keep_what_is_asked_for_by_the_same_flow_for_longer(self, push, obstacle):
-        margin = push.scenario.arm_avoidance.margin
-        by_spheres, solution = (push.avoiding(obstacle, coarse=coarse) for coarse in (True, False))
-        assert push.truth(by_spheres, obstacle) < margin - 0.5e-3  # so there is something to do
-        assert margin - 1e-3 <= push.truth(solution, obstacle) < margin + 1e-3
-        assert 0 < solution.duration - by_spheres.duration < MAX_EXTENSION
-        q = push.arm.limits.inside(solution.q)
-        assert np.abs(solution.transform.inverse(q) - solution.p).max() < 1e-5
-        longer = push.avoiding(obstacle, coarse=True, duration=solution.duration)
-        assert np.abs(longer.transform.inverse(q) - solution.p).max() < 1e-2  # a coarse flow
+    @pytest.mark.parametrize("coarse", [True, False])
+    def test_the_meshes_keep_what_is_asked_for_and_hardly_more(self, push, obstacle, coarse):
+        margin, solution = push.scenario.arm_avoidance.margin, push.avoiding(obstacle, coarse=coarse)
+        assert margin - ROUNDING <= push.truth(solution, obstacle) < margin + PROTRUSION + ROUNDING
+        assert solution.clearance < margin + 2 * ROUNDING
 
 
 def test_a_manual_duration_is_taken_as_it_is_and_motions_that_are_to_avoid_nothing_may_collide(case):
@@ -242,7 +237,8 @@ def test_any_size_and_temperature_is_cleared_or_that_is_said(case, diameter, tem
     solution = case.avoiding(obstacle, coarse=True, temperature=temperature)
     assert np.isfinite(solution.p).all()
     touched_at_rest = case.arm.clearance(case.lifted.pins, obstacle).min() < 0
-    assert touched_at_rest or solution.cleared == (solution.clearance > 0)
+    kept = solution.clearance
+    assert touched_at_rest or (kept > 0 if solution.cleared else kept < case.scenario.arm_avoidance.margin)
 
 
 def test_the_forearm_clears_what_the_hand_never_comes_near_and_the_hand_hardly_leaves_its_path(push):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from body_spheres import cover
 from scenes import changed
 
 from dt_viz.avoidance.avoidance import ArmAvoidance
@@ -156,18 +157,33 @@ def test_a_robot_that_is_folded_does_not_touch_itself(live):
 
 
 def test_distances_of_contacts_have_these_slopes(live):
-    body, rng = live.follower.body, np.random.default_rng(0)
+    body, rng, joints, reach = live.follower.body, np.random.default_rng(0), live.robot.records, 0.3
+    whole, small = body.spheres, cover(body)
+    owner = np.searchsorted(body.indices, np.flatnonzero(whole["end"] == np.arange(len(whole)) + 1), side="right") - 1
     for limit in (ContactLimit.table(live.robot, body, 5e-3, 20.0), ContactLimit.itself(live.robot, body, 5e-3, 20.0)):
         q = live.q + rng.normal(scale=0.3, size=6)
-        at = body.positions(live.robot, q)
-        apart, slopes = contacts(live.robot.records, body.records, limit.pairs, q)
-        a, b = limit.pairs.T
-        exact = np.linalg.norm(at[b] - at[a], axis=1) - body.radius[a] - body.radius[b]
-        exact = np.where(a < 0, at[b, 2] - body.radius[b], exact)
-        np.testing.assert_allclose(apart, exact, atol=1e-12)
+
+        def exact(q, limit=limit):
+            at, found = small.positions(live.robot, q), []
+            for a, b in limit.pairs:
+                of_b = owner == np.searchsorted(body.indices, b)
+                if a < 0:
+                    found.append((at[of_b, 2] - small.radius[of_b]).min())
+                    continue
+                of_a = owner == np.searchsorted(body.indices, a)
+                away = np.linalg.norm(at[of_a, None] - at[of_b], axis=2) - small.radius[of_b]
+                found.append((away - small.radius[of_a, None]).min())
+            return np.array(found)
+
+        which, apart, slopes = contacts(joints, whole, limit.pairs, q, reach)
+        every = exact(q)
+        np.testing.assert_array_equal(which, np.flatnonzero(every < reach))
+        assert len(which)
+        np.testing.assert_allclose(apart, every[which], atol=1e-12)
         way = rng.normal(size=6)
-        there = contacts(live.robot.records, body.records, limit.pairs, q + 1e-6 * way)[0]
-        np.testing.assert_allclose((there - apart) / 1e-6, slopes @ way, atol=1e-4)
-        motion = q + rng.normal(scale=0.3, size=(5, 6))
-        least = np.min([contacts(live.robot.records, body.records, limit.pairs, row)[0] for row in motion], axis=0)
-        np.testing.assert_array_equal(least_contacts(live.robot.records, body.records, limit.pairs, motion), least)
+        behind, ahead = ((exact(q + step * way) - every)[which] / step for step in (-1e-7, 1e-7))
+        slope = slopes @ way  # of one of those that are nearest, of which the smallest distance is left
+        assert (ahead - 1e-4 < slope).all() and (slope < behind + 1e-4).all()
+        motion = q + rng.normal(scale=0.3, size=(3, 6))
+        least = np.minimum(np.min([exact(row) for row in motion], axis=0), 0.1)
+        np.testing.assert_allclose(least_contacts(joints, whole, limit.pairs, motion, 0.1), least, atol=1e-12)

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from body_spheres import cover
 
-from dt_viz.avoidance.arm import OVERSHOOT, WholeArm
+from dt_viz.avoidance.arm import WholeArm
 from dt_viz.avoidance.avoidance import ArmAvoidance
 from dt_viz.control.limits import AccelerationLimit, ObstacleLimit, RangeLimit, VelocityLimit
 from dt_viz.control.obstacle_motion import ObstacleMotion, Sighting
@@ -28,12 +29,11 @@ def _barrier(arm):
 
 
 def distances(arm: WholeArm, q, seen, moved=0.0):
-    """Distances h of the moving links' spheres from the parts, for all pairs, after the parts have moved for a time."""
-    points, parts = arm.links.positions(arm.robot, q), seen.avoidance.avoided.parts
-    moving = zip(parts, moved * seen.velocities, strict=True)
-    return np.concatenate([part.signed_distance(points - shift) - arm.links.radius for part, shift in moving]) + (
-        OVERSHOOT - min(KEPT, seen.avoidance.margin / 2)
-    )
+    """Distances h of the spheres that cover moving links, for all pairs, after the parts have moved for a time."""
+    body, parts = cover(arm.links), seen.avoidance.avoided.parts
+    points, moving = body.positions(arm.robot, q), zip(parts, moved * seen.velocities, strict=True)
+    distances = [part.signed_distance(points - shift) - body.radius for part, shift in moving]
+    return np.concatenate(distances) - min(KEPT, seen.avoidance.margin / 2)
 
 
 def scenes(arm: WholeArm, num):

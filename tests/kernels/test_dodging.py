@@ -4,6 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from body_spheres import cover
 
 from dt_viz.kernels.dodging import ENOUGH, Forecast, LimitedArm, dodge
 from dt_viz.obstacles.arrays import records
@@ -13,10 +14,11 @@ from dt_viz.robot.robot import load_jaco
 
 ROBOT = load_jaco()
 LINKS = load_body_points().on_moving_links
+COVER = cover(LINKS)
 FLOOR, DEPTH, KEPT = 0.05, 0.02, 0.01
 UP = np.array([0.0, 0.0, 1.0])
 ACCELERATION, TIMES = 4.0, np.linspace(0, 0.4, 9)[1:]
-ARM = LimitedArm(ROBOT.records, LINKS.records, ROBOT.lower, ROBOT.upper, ROBOT.velocity_limits, ACCELERATION)
+ARM = LimitedArm(ROBOT.records, LINKS.spheres, ROBOT.lower, ROBOT.upper, ROBOT.velocity_limits, ACCELERATION)
 
 
 def room(parts, moved, deviation, q, velocity, wanted):
@@ -26,10 +28,10 @@ def room(parts, moved, deviation, q, velocity, wanted):
         steps = np.linspace(0, t, 4001)
         ramped = velocity + np.clip(wanted - velocity, -ACCELERATION * steps[:, None], ACCELERATION * steps[:, None])
         p = np.clip(q + t * (ramped[1:] + ramped[:-1]).mean(axis=0) / 2, ROBOT.lower, ROBOT.upper)
-        points = LINKS.positions(ROBOT, p)
-        smallest = min(smallest, (points[:, 2] - LINKS.radius - FLOOR).min() / DEPTH)
+        points = COVER.positions(ROBOT, p)
+        smallest = min(smallest, (points[:, 2] - COVER.radius - FLOOR).min() / DEPTH)
         for part, place, most in zip(parts, places, unsure, strict=True):
-            away = part.signed_distance(points - place) - LINKS.radius - KEPT
+            away = part.signed_distance(points - place) - COVER.radius - KEPT
             smallest = min(smallest, away.min() / most)
     return smallest
 

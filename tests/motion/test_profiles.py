@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from body_spheres import cover
 from hypothesis import given
 from hypothesis import strategies as st
 from scenes import changed, frame_at
@@ -81,7 +82,7 @@ def test_clearance_agrees_with_the_signed_distance(shown, robot):
     assert profiles.shown.clearance.min() == pytest.approx(frame.certificates.clearance, abs=0.03)
     assert profiles.undisturbed.depth > 0.03 and profiles.shown.depth < 1e-3
     if profiles.of_body:
-        points, q = load_body_points().on_moving_links, frame.arm.q[[0]]
+        points, q = cover(load_body_points().on_moving_links), frame.arm.q[[0]]
         first = (obstacle.signed_distance(points.positions(robot, q[0])) - points.radius).min()
         assert profiles.shown.clearance[0] == pytest.approx(first, abs=1e-9)
         return

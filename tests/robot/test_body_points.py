@@ -7,21 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from body_spheres import cover
 from pinocchio_arm import random_configurations
 from scipy.spatial import KDTree
 
 from dt_viz.obstacles.shapes import Sphere
-from dt_viz.robot.body_points import BodyPoints, load_body_points
+from dt_viz.robot.body_points import PROTRUSION, BodyPoints, load_body_points
 from dt_viz.robot.collision import load_collision_model
-from dt_viz.robot.robot import LinkMesh, Robot, collision_meshes
+from dt_viz.robot.robot import LinkMesh, collision_meshes
 from dt_viz.shipped import ASSETS
 
 SCRIPT = Path(__file__).parents[2] / "assets" / "make_body_points.py"
-OVERSHOOT = {-1: 0.0375, 0: 0.0295, 1: 0.0455, 2: 0.043, 3: 0.031, 4: 0.031, 5: 0.0255}
-"""How far the spheres of each joint may stick out of its links, metres: about a millimetre more than they do."""
+JOINTS = range(-1, 6)
+MEAN_PROTRUSION = 3.5e-3
 
 each_link = pytest.mark.parametrize("mesh", collision_meshes(), ids=lambda mesh: mesh.name)
-each_joint = pytest.mark.parametrize("joint", OVERSHOOT)
+each_joint = pytest.mark.parametrize("joint", JOINTS)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def surface_of_joints() -> dict[int, KDTree]:
     """Points less than a millimetre apart on all the links that move with a joint."""
     return {
         joint: KDTree(np.concatenate([on_surface(mesh) for mesh in collision_meshes() if mesh.joint == joint]))
-        for joint in OVERSHOOT
+        for joint in JOINTS
     }
 
 
@@ -57,40 +58,59 @@ def unit_sphere(num: int) -> np.ndarray:
 
 
 def beyond_spheres(points: np.ndarray, body: BodyPoints, joint: int) -> np.ndarray:
-    """Signed distances (N, S) of points (N, 3) from each of a joint's spheres, negative inside."""
+    """Signed distances (N, S) of points (N, 3) from each sphere of a joint, negative inside."""
     own = body.joint == joint
     return np.linalg.norm(points[:, None] - body.offset[own], axis=-1) - body.radius[own]
 
 
-def clearance(body: BodyPoints, robot: Robot, q: np.ndarray, obstacle: Sphere) -> float:
-    """Of all spheres from the obstacle at one configuration, metres."""
-    return float((obstacle.signed_distance(body.positions(robot, q)) - body.radius).min())
+def uncovered(body: BodyPoints, mesh: LinkMesh, num: int = 10_000) -> float:
+    """How far a link's surface is outside the spheres of its joint at most, metres."""
+    return float(beyond_spheres(on_surface(mesh, num)[-num:], body, mesh.joint).min(axis=1).max())
+
+
+def protrusions(body: BodyPoints, joint: int) -> np.ndarray:
+    """How far the outside of a joint's spheres is off its links, metres, at points spread evenly over it."""
+    own = np.flatnonzero(body.joint == joint)
+    points = []
+    for k in own:
+        sphere = body.offset[k] + body.radius[k] * unit_sphere(int(4e5 * body.radius[k] ** 2) + 8)
+        others = own[np.linalg.norm(body.offset[own] - body.offset[k], axis=1) < body.radius[own] + body.radius[k]]
+        away = np.linalg.norm(sphere[:, None] - body.offset[others], axis=-1) - body.radius[others]
+        points.append(sphere[away.min(axis=1) > -1e-9])
+    return surface_of_joints()[joint].query(np.concatenate(points))[0]
+
+
+def changed(body: BodyPoints, radius: float = 0.0, offset: float = 0.0) -> BodyPoints:
+    """The same with larger spheres, metres, all farther along x in their joint's frame."""
+    spheres = body.spheres.copy()
+    spheres["radius"] += radius
+    spheres["offset"] += [offset, 0.0, 0.0]
+    return BodyPoints(spheres)
 
 
 class TestCover:
     @each_link
-    def test_no_point_of_a_link_sticks_out_of_its_joints_spheres_and_each_triangle_lies_in_one(self, body, mesh):
-        assert beyond_spheres(on_surface(mesh), body, mesh.joint).min(axis=1).max() <= 1e-6
-        of_corners = beyond_spheres(mesh.vertices, body, mesh.joint)[mesh.faces]
-        assert of_corners.max(axis=1).min(axis=1).max() <= 1e-6
+    def test_the_smallest_spheres_of_a_joint_cover_its_links(self, body, mesh):
+        smallest = cover(body)
+        assert uncovered(smallest, mesh) <= 3e-4
+        # which would be seen otherwise
+        assert uncovered(changed(smallest, radius=-2e-3), mesh) > 5e-4
+        assert uncovered(changed(smallest, offset=5e-3), mesh) > 5e-4
 
     @each_joint
-    def test_no_sphere_sticks_out_of_the_links_by_more_than_it_must(self, body, joint):
-        own = body.joint == joint
-        spheres = body.offset[own, None] + body.radius[own, None, None] * unit_sphere(2000)
-        farthest = surface_of_joints()[joint].query(spheres)[0].max()
-        assert OVERSHOOT[joint] - 0.002 < farthest < OVERSHOOT[joint]
+    def test_they_stick_out_as_little_as_is_said(self, body, joint):
+        off = protrusions(cover(body), joint)
+        assert 0.8 * PROTRUSION < off.max() < PROTRUSION + 4e-4 and off.mean() < MEAN_PROTRUSION
+        assert protrusions(changed(cover(body), radius=2e-3), joint).mean() > MEAN_PROTRUSION
 
-    def test_no_sphere_could_be_left_out(self, body):
-        for leave_out, joint in enumerate(body.joint):
-            keep = np.arange(len(body.joint)) != leave_out
-            rest = BodyPoints(body.joint[keep], body.offset[keep], body.radius[keep])
-            sticks_out = [
-                beyond_spheres(mesh.vertices, rest, joint).min(axis=1).max()
-                for mesh in collision_meshes()
-                if mesh.joint == joint
-            ]
-            assert max(sticks_out) > 0.002
+    def test_they_are_inside_all_spheres_that_hold_them(self, body):
+        spheres, smallest, holds = body.spheres, body.spheres["end"] == np.arange(len(body.spheres)) + 1, 0
+        for k, (joint, offset, radius, end) in enumerate(spheres):
+            assert (spheres["joint"][k:end] == joint).all() and (spheres["end"][k:end] <= end).all()
+            inside = spheres[k:end][smallest[k:end]]
+            holds += len(inside)
+            assert (np.linalg.norm(inside["offset"] - offset, axis=1) + inside["radius"] <= radius + 3e-5).all()
+        assert holds > 3 * len(spheres) and len(body.joint) == 29
 
     @pytest.mark.slow
     def test_the_script_makes_the_file_that_ships(self):
@@ -99,26 +119,20 @@ class TestCover:
             assert set(made) == set(shipped.files)
             np.testing.assert_array_equal(made["joint"], shipped["joint"])
             # Another platform's mathematics may round the last digit differently.
+            np.testing.assert_array_equal(made["end"], shipped["end"])
             np.testing.assert_allclose(made["offset"], shipped["offset"], rtol=0, atol=2.1e-5)
-            np.testing.assert_allclose(made["radius"], shipped["radius"], rtol=0, atol=1.1e-4)
+            np.testing.assert_allclose(made["radius"], shipped["radius"], rtol=0, atol=2.1e-5)
 
-    def test_the_scripts_balls_are_the_smallest(self):
-        """Around a ball's own points the ball itself, whatever lies within; around two points the one between them."""
+    def test_the_scripts_balls_around_others_are_hardly_larger_than_they_must_be(self):
+        """Around spheres inside a ball, some of which touch it from within, it is that ball, or 2 % larger."""
         rng = np.random.default_rng(0)
-        smallest_ball = script()._smallest_ball
         for num in (4, 20, 300):
-            directions = unit_sphere(num)
+            directions, radii = unit_sphere(num), rng.uniform(0.0, 0.02, num)
             directions[: num // 2] = -directions[num // 2 :]  # in opposite pairs: no smaller ball holds them
-            inside = 0.9 * rng.uniform(size=(200, 1)) * unit_sphere(200)
-            points = np.array([0.3, -0.2, 0.1]) + 0.05 * np.concatenate([inside, directions])
-            centre, radius = smallest_ball(rng.permutation(points))
-            np.testing.assert_allclose(centre, [0.3, -0.2, 0.1], atol=1e-6)
-            assert radius == pytest.approx(0.05, abs=1e-8)
-        for points in rng.normal(size=(20, 2, 3)):
-            centre, radius = smallest_ball(points)
-            np.testing.assert_allclose(centre, points.mean(axis=0), atol=1e-9)
-            assert radius == pytest.approx(np.linalg.norm(points[1] - points[0]) / 2)
-        assert smallest_ball(np.ones((5, 3)))[1] == 0.0
+            spheres = np.column_stack([[0.3, -0.2, 0.1] + (0.05 - radii)[:, None] * directions, radii])
+            ball = script()._around(np.concatenate([spheres, [[0.31, -0.2, 0.1, 0.02]]]))
+            assert 0.05 - 1e-9 <= ball[3] < 0.051
+            assert (np.linalg.norm(spheres[:, :3] - ball[:3], axis=1) + spheres[:, 3]).max() <= ball[3]
 
 
 class TestPositions:
@@ -135,13 +149,13 @@ class TestPositions:
             np.testing.assert_allclose(positions[..., i, :], np.broadcast_to(expected, (*shape, 3)), atol=1e-14)
 
     def test_pedestal_and_moving_links_are_all_there_is_and_the_end_effector_is_one_more(self, body, robot):
-        q, more = random_configurations(robot, 1, (3,)), body.with_end_effector(robot, 0.01)
+        q, more = random_configurations(robot, 1, (3,)), body.with_end_effector(robot)
         positions, parts = more.positions(robot, q), [body.on_pedestal, body.on_moving_links]
         together = np.concatenate([part.positions(robot, q) for part in parts], axis=1)
         np.testing.assert_array_equal(together, body.positions(robot, q))
         np.testing.assert_array_equal(together, positions[:, :-1])
         np.testing.assert_allclose(positions[:, -1], robot.end_effector(q), atol=1e-12)
-        assert (parts[0].joint.max(), parts[1].joint.min(), more.radius[-1]) == (0, 1, 0.01)
+        assert (parts[0].joint.max(), parts[1].joint.min(), more.radius[-1]) == (0, 1, 0.0)
         for part in (body, more, *parts):
             covered = np.concatenate([np.arange(len(part.joint))[points] for _, points in part.by_joint])
             np.testing.assert_array_equal(covered, np.arange(len(part.joint)))
@@ -151,21 +165,35 @@ class TestPositions:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("diameter", [0.02, 0.15, 0.4])
 def test_where_the_spheres_clear_an_obstacle_the_meshes_clear_it_by_at_least_as_much(body, robot, seed, diameter):
-    model, rng = load_collision_model(), np.random.default_rng(seed)
-    checked = 0
+    """And by no more than they stick out. What is smaller or elsewhere is found out, by coal's distances of meshes."""
+    model, rng, checked, found_out = load_collision_model(), np.random.default_rng(seed), 0, np.zeros(3, int)
     for q in random_configurations(robot, seed, (40,)):
         # An obstacle near some sphere, though perhaps in the way of another.
         beside = rng.integers(len(body.joint))
         direction = rng.normal(size=3)
-        away = body.radius[beside] + diameter / 2 + rng.uniform(0.0, 0.1)
+        away = body.radius[beside] + diameter / 2 + rng.uniform(-0.02, 0.1)
         centre = body.positions(robot, q)[beside] + away * direction / np.linalg.norm(direction)
         obstacle = Sphere((float(centre[0]), float(centre[1]), float(centre[2])), diameter)
-        promised = clearance(body, robot, q, obstacle)
-        if promised > 0:
-            true = model.obstacle_distance(q[None], obstacle)[0][0]
-            assert promised - 1e-6 <= true <= promised + max(OVERSHOOT.values())
+        true = model.obstacle_distance(q[None], obstacle)[0][0]
+
+        def wrong(body, q=q, obstacle=obstacle, true=true):
+            promised = body.clearance(robot, q[None], obstacle)[0]
+            return not promised - 3e-4 <= true <= promised + PROTRUSION + 4e-4
+
+        if true > 0:
+            assert not wrong(body)
             checked += 1
-    assert checked >= 10
+            found_out += [wrong(changed(body, radius=-6e-3)), wrong(changed(body, offset=0.01)), wrong(body.outermost)]
+    assert checked >= 10 and (found_out > checked / 4).all()
+
+
+def test_distances_end_where_they_are_enough(body, robot):
+    q, ball = random_configurations(robot, 0, (50,)), Sphere((0.2, -0.3, 0.3), 0.1)
+    exact, enough = body.clearance(robot, q, ball), np.linspace(-0.05, 0.3, 50)
+    np.testing.assert_allclose(body.clearance(robot, q, ball, enough), np.minimum(exact, enough), rtol=0, atol=1e-12)
+    points = cover(body)
+    expected = (ball.signed_distance(points.positions(robot, q)) - points.radius).min(axis=1)
+    np.testing.assert_allclose(exact, expected, rtol=0, atol=1e-12)
 
 
 @lru_cache(maxsize=1)

@@ -200,24 +200,6 @@ class TestShapes:
             assert found >= fine - 0.03  # between two of the fine samples
 
 
-class TestGaps:
-    """Distances of many postures at once, from points of the meshes."""
-
-    @pytest.mark.parametrize(
-        "obstacle", [Sphere((0.15, -0.35, 0.35), 0.12), Box((0.1, -0.4, 0.3), wxyz=TILTED)], ids=str
-    )
-    def test_they_are_those_of_the_meshes_up_to_what_is_enough(self, model, obstacle):
-        q = some_configurations(3, 60)
-        truth, nearest = model.obstacle_distance(q, obstacle)
-        moving = np.array([link.frame > 1 for link in model.links])[nearest]
-        apart, enough = moving & (truth > 2e-3), np.linspace(0.02, 0.2, len(q))
-        assert apart.sum() > 20 and (truth < enough)[apart].any() and (truth > enough)[apart].any()
-        gaps = model.gaps(q, obstacle, enough)
-        np.testing.assert_allclose(gaps[apart], np.minimum(truth, enough)[apart], rtol=0, atol=5e-4)
-        touching = moving & (truth < -5e-3)
-        assert touching.any() and (gaps[touching] < 0).all()
-
-
 class TestBetweenSamples:
     def test_both_ends_are_clear_and_the_middle_collides(self, model, robot):
         ball = Sphere(tuple(robot.end_effector(robot.home)))
