@@ -14,14 +14,13 @@ from dt_viz.flows.diffeomorphisms import MAX_STEPS, Method
 from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import WHOLE_ARM, transform_of, with_transform
 from dt_viz.session.frame import Frame
+from dt_viz.ui.bindings import KEEP, Bindings
 from dt_viz.ui.controls import Control
-from dt_viz.ui.panel.bindings import KEEP, Bindings
 
 Chosen = Callable[[Scenario], str | None]
 """Function that returns the name of the layer whose settings are shown; None where there is none."""
 Offered = Callable[[type[Transform]], Iterable[Setting]]
 """Function that returns the settings of a kind that are shown."""
-METHOD_LABELS: Mapping[Method, str] = {"auto": "auto", "rk4": "RK4", "euler": "Euler (the paper's)"}
 
 
 def add_settings(
@@ -38,6 +37,15 @@ def add_settings(
     """
     for setting in dict.fromkeys(setting for kind in registry.KINDS for setting in offered(kind)):
         _BUILDERS[type(setting)](gui, _SettingField(bindings, offered, chosen, setting), setting, order)
+
+
+def settings_of_purpose(kind: type[Transform]) -> tuple[Setting, ...]:
+    """Return the settings of a kind that are about what it is for, not about its flow."""
+    return tuple(
+        setting
+        for setting in kind.settings
+        if isinstance(setting, Switch) or (isinstance(setting, Number) and not setting.of_flow)
+    )
 
 
 def chosen_values(frame: Frame) -> dict[str, Mapping[str, float]]:
@@ -149,10 +157,11 @@ def _add_choice(gui: viser.GuiApi, field: _SettingField, setting: Choice, order:
 
 def _add_integration(gui: viser.GuiApi, field: _SettingField, _setting: FlowIntegration, order: float | None) -> None:
     hint = "auto: errors stay invisible; the others take equal steps, and the status warns of their errors"
-    methods = {label: method for method, label in METHOD_LABELS.items()}
+    methods: dict[str, Method] = {"auto": "auto", "RK4": "rk4", "Euler (the paper's)": "euler"}
+    labels = {method: label for label, method in methods.items()}
     field.bind(
         gui.add_dropdown("Integrator", tuple(methods), order=order, visible=False, hint=hint),
-        lambda integration: METHOD_LABELS[integration.method],
+        lambda integration: labels[integration.method],
         lambda before, label: replace(before, method=methods[label]),
     )
     field.bind(
