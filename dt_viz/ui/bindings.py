@@ -85,6 +85,10 @@ class Bindings:
             handle, read, lambda session, value: session.edit(handle.label, **change(session.scenario, value))
         )
 
+    def field(self, handle: Any, name: str) -> Control:  # noqa: ANN401
+        """Bind an input to a field of the scenario."""
+        return self.input(handle, lambda s: getattr(s, name), lambda _s, value: {name: value})
+
     def view(
         self,
         handle: Any,  # noqa: ANN401
@@ -101,9 +105,23 @@ class Bindings:
 
     def checkbox(self, gui: viser.GuiApi, name: str, **options: Any) -> Control:  # noqa: ANN401
         """Add the checkbox of a field of `View` where the panel is being built; the options are viser's."""
-        offer = OFFERS[name]
-        handle = gui.add_checkbox(offer.label, bool(getattr(View(), name)), hint=offer.hint, **options)
+        handle = gui.add_checkbox(OFFERS[name].label, bool(getattr(View(), name)), hint=OFFERS[name].hint, **options)
         return self.view(handle, name, bool)
+
+    def slider(
+        self,
+        gui: viser.GuiApi,
+        name: str,
+        low: float,
+        high: float,
+        step: float,
+        **options: Any,  # noqa: ANN401
+    ) -> Any:  # noqa: ANN401 - viser's handle
+        """Add the slider of a field of `View` likewise, and return its handle."""
+        initial = getattr(View(), name)
+        handle = gui.add_slider(OFFERS[name].label, low, high, step, initial, hint=OFFERS[name].hint, **options)
+        self.view(handle, name, meant=type(initial))
+        return handle
 
     def choice(
         self,

@@ -209,8 +209,7 @@ def add_avoid_and_imitate(gui: viser.GuiApi, bindings: Bindings) -> None:
         lambda s, name: {"stack": avoiding_with(s, SPACES.get(name))},
     )
     hint = "off: without what was learned, every motion is straight to the goal, and still avoids"
-    imitate = gui.add_checkbox("Imitate", True, hint=hint)
-    bindings.input(imitate, lambda s: s.imitation, lambda _s, value: {"imitation": value})
+    bindings.field(gui.add_checkbox("Imitate", True, hint=hint), "imitation")
 
 
 def avoids_with(scenario: Scenario) -> str:

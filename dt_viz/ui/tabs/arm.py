@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from dt_viz.scenario.roaming import Chase, MovingGoal
-from dt_viz.scenario.scenario import OFFERS, Scenario
+from dt_viz.scenario.scenario import Scenario
 from dt_viz.session import player
 from dt_viz.session.frame import Stage
 from dt_viz.session.session import Session
@@ -28,8 +28,7 @@ def add_arm(gui: viser.GuiApi, bindings: Bindings) -> viser.GuiButtonHandle:
     play = gui.add_button("Pause")
     bindings.properties(play, label=lambda s: "Pause" if s.view.playing else "Play")
     bindings.on(play, play_or_pause)
-    offer = OFFERS["speed"]
-    bindings.view(gui.add_slider(offer.label, 0.25, 3.0, 0.25, 1.0, hint=offer.hint), "speed")
+    bindings.slider(gui, "speed", 0.25, 3.0, 0.25)
     push = gui.add_button("Push the hand", icon=viser.Icon.HAND_FINGER, disabled=True, hint=PUSH_HINT)
 
     def stands(scenario: Scenario) -> bool:

@@ -25,9 +25,10 @@ MAX_SPEED = 200
 """Largest speed in the plot, percent of the joint's limit: a joint that leaps would flatten all other curves."""
 
 
-def small(text: str) -> str:
-    """Return HTML as small text, with the margins of the controls."""
-    return f"<div style='font-size:0.8em;line-height:1.4;padding:0.1em 0.9em 0.4em;opacity:0.85'>{text}</div>"
+def small(text: str, below: float = 0.4) -> str:
+    """Return HTML as small text, with the margins of the controls; the one below it in em."""
+    style = f"font-size:0.8em;line-height:1.35;padding:0.1em 0.9em {below}em;opacity:0.85"
+    return f"<div style='{style}'>{text}</div>"
 
 
 def add_plot(
@@ -43,7 +44,7 @@ def add_plot(
         height: height, pixels.
     """
     if title:
-        gui.add_html(small(title))
+        gui.add_html(small(title, below=0))
     font = "11px sans-serif"
     return gui.add_uplot(
         (np.zeros(2),) * (1 + len(curves)),
@@ -75,7 +76,7 @@ def legend(marks: Mapping[str, str], height: str, heading: str = "", note: str =
         f"<span style='white-space:nowrap;margin-right:0.8em'>{mark};{style}'></span>{text}</span>"
         for text, style in marks.items()
     )
-    return small(f"{heading and _pale(heading + ' ')}{items}{note and '<br/>' + _pale(note)}")
+    return small(f"{heading and _pale(heading + ' ')}{items}{note and '<br/>' + _pale(note)}", below=0)
 
 
 def _pale(text: str) -> str:
@@ -168,10 +169,10 @@ class HealthPlots(Shown):
         self.lyapunov.data = columns(along, shown.lyapunov, without.lyapunov)
         self.distance.data = columns(along, 1e3 * shown.distance, 1e3 * without.distance)
         which = "mean demonstration" if profiles.of_mean else "demonstration"
-        self._to.content = small(f"Distance to the {which} [mm]")
+        self._to.content = small(f"Distance to the {which} [mm]", below=0)
         bounded = bool(np.isfinite(shown.clearance).all())
         whose = "body points" if profiles.of_body else "end effector"
-        self._whose.content = small(f"Clearance of the {whose} [mm]" if bounded else "Clearance: no obstacle")
+        self._whose.content = small(f"Clearance of the {whose} [mm]" if bounded else "Clearance: no obstacle", below=0)
         self.clearance.visible = bounded
         if bounded:
             clearances = 1e3 * shown.clearance, 1e3 * without.clearance

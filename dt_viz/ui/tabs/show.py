@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
 import viser
 
@@ -62,12 +61,9 @@ class ShowTab:
                 bindings.input(box, lambda s: bool(s.view.panels), _with_panels)
             else:
                 bindings.checkbox(gui, name)
-        offer = OFFERS["generator_layer"]
         # up to three flows, until a picture of the generator says how many there are
-        flow = gui.add_slider(offer.label, 0, 3, 1, 0, visible=False, hint=offer.hint)
-        num_flows = partial(_num_flows, bindings)
-        bindings.properties(flow, visible=lambda s: s.view.generator, max=lambda _s: num_flows())
-        bindings.view(flow, "generator_layer", meant=int)
+        flow = bindings.slider(gui, "generator_layer", 0, 3, 1, visible=False)
+        bindings.properties(flow, visible=lambda s: s.view.generator, max=lambda _s: _num_flows(bindings.frame))
 
     def draw(self, frame: Frame) -> None:
         """Show a frame in the plots."""
@@ -88,9 +84,7 @@ class SlicePanel:
         names = {label: name for name, label in COLOUR_LABELS.items()}
         colour = gui.add_dropdown("Slice colour", tuple(names), hint="quantity shown as colour on the slice")
         bindings.view(colour, "colour", COLOUR_LABELS.__getitem__, names.__getitem__)
-        offer = OFFERS["phase"]
-        phase = gui.add_slider(offer.label, 0.0, 1.0, 0.01, 1.0, hint=offer.hint, visible=False)
-        bindings.view(phase, "phase")
+        phase = bindings.slider(gui, "phase", 0.0, 1.0, 0.01, visible=False)
         take = gui.add_button("Take the arm's phase", visible=False)
         bindings.on(take, lambda session, _pressed: session.take_phase())
         for handle in (phase, take):
@@ -128,8 +122,8 @@ def _with_panels(scenario: Scenario, shown: bool) -> dict[str, object]:
     return {"view": replace(scenario.view, panels=side_by_side(scenario) if shown else ())}
 
 
-def _num_flows(bindings: Bindings) -> int:
-    picture = None if bindings.frame is None else bindings.frame.pictures.generator
+def _num_flows(frame: Frame | None) -> int:
+    picture = None if frame is None else frame.pictures.generator
     return KEEP if picture is None else picture.num_flows
 
 

@@ -212,7 +212,7 @@ def add_warp(gui: viser.GuiApi, bindings: Bindings, order: float) -> None:
     """Build the slider of the warp and the button that plays it, from an order in their folder on."""
     hint = "part of its time that each flow runs. 0: motions and space are straight; 1: the stack is complete"
     slider = gui.add_slider(WARP, 0.0, 1.0, 0.01, 1.0, order=order, hint=hint)
-    bindings.input(slider, lambda s: s.warp, lambda _s, value: {"warp": value})
+    bindings.field(slider, "warp")
     buttons = gui.add_button_group("Play warp", (PLAY,), order=order + 1)
 
     def show(playing: bool) -> None:
@@ -240,20 +240,20 @@ def add_transform_settings(gui: viser.GuiApi, bindings: Bindings, order: float) 
     order += 1
     hint = "what is fitted to the demonstrations: whole motions, or velocities as in eq. (3) of the paper"
     objective = gui.add_dropdown("Objective", OBJECTIVES, order=order, hint=hint)
-    bindings.input(objective, lambda s: s.objective, lambda _s, value: {"objective": value})
+    bindings.field(objective, "objective")
     hint = (
         "plain: the paper's, one field that needs no memory. augmented: remembers its phase and where it began, so "
         "that it crosses itself, comes back, and draws the figure from other starts. auto: plain, unless the "
         "demonstrations conflict or are missed by it"
     )
     state = gui.add_dropdown("State", STATES, order=order, hint=hint)
-    bindings.input(state, lambda s: s.state, lambda _s, value: {"state": value})
+    bindings.field(state, "state")
     hint = "how another hand draws, taken off its demonstrations of one letter and put on this one (augmented)"
     style = gui.add_dropdown("Style", (NO_STYLE, *STYLES), order=order, hint=hint)
     bindings.input(style, lambda s: s.style or NO_STYLE, lambda _s, name: {"style": "" if name == NO_STYLE else name})
     hint = "part of the style that is put on; below 0 it is taken off"
     amount = gui.add_slider("Amount", -1.0, 2.0, 0.05, 1.0, order=order, hint=hint)
-    bindings.input(amount, lambda s: s.style_amount, lambda _s, value: {"style_amount": value})
+    bindings.field(amount, "style_amount")
     bindings.properties(style, visible=lambda s: _is_imitation(s) and _is_drawing(bindings.frame))
     bindings.properties(amount, visible=lambda s: _is_imitation(s) and bool(s.style))
     note = gui.add_html("", order=order)
