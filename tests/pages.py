@@ -294,7 +294,8 @@ class Edited:
         self.scenario = replace(self.scenario, **changes)
         self._adopt()
 
-    def end_gesture(self) -> None:
+    def step(self, gesture: str, **changes: Any) -> None:
+        self.edit(gesture, **changes)
         self.steps += 1
 
     def say(self, text: str, severity: Severity) -> None:

@@ -66,9 +66,7 @@ class View:
     slice: SlicePose | None = None
     """Pose of the slice; None is the task's."""
     move_slice: bool = _offered(
-        False,
-        "Move the slice",
-        "handles that move and tilt the slice, the plane on which arrows and colours are shown",
+        False, "Move the slice", "handles that move and tilt the slice, the plane on which arrows and colours are shown"
     )
     """Whether the slice has handles, instead of obstacles and bias points."""
     colour: SliceColour = "none"
@@ -129,9 +127,7 @@ class View:
     )
     """The warped grid: lines of base space seen through ψ⁻¹."""
     panels: tuple[Panel, ...] = _offered(
-        (),
-        "Stack side by side",
-        "the base attractor, with motions straight to the goal, and each level of the stack",
+        (), "Stack side by side", "the base attractor, with motions straight to the goal, and each level of the stack"
     )
     """Systems beside the scene, such as the base attractor."""
     click_to_start: bool = _offered(

@@ -198,6 +198,11 @@ class Session:
         if not self._unadopted:
             self._adopt()
 
+    def step(self, gesture: str, **changes: Any) -> None:  # noqa: ANN401 - the fields of Scenario
+        """Edit as `edit` does, as a step of its own for undo."""
+        self.edit(gesture, **changes)
+        self.end_gesture()
+
     def begin_gesture(self) -> None:
         """The user took hold of something: edits until `end_gesture` are undone together, however slow."""
         with self._lock:
@@ -205,8 +210,7 @@ class Session:
 
     def take_phase(self) -> None:
         """Show augmented motions on the slice at the phase at which the arm is."""
-        self.edit("phase", view=replace(self.scenario.view, phase=round(self._engine.arm.left, 2)))
-        self.end_gesture()
+        self.step("phase", view=replace(self.scenario.view, phase=round(self._engine.arm.left, 2)))
 
     def end_gesture(self) -> None:
         """The user let go: the next edit is a step of its own for undo. What ends as it began is no step."""
@@ -227,7 +231,7 @@ class Session:
             if self.scenario.scene:  # of the paper: leaves nothing behind
                 self._begin("task", self._as_seen(fresh))
                 return
-            self.edit(
+            self.step(
                 "task",
                 task=name,
                 arm_rollout=0,
@@ -235,7 +239,6 @@ class Session:
                 stack=as_fresh(self.scenario, fresh),
                 view=replace(self.scenario.view, slice=None),
             )
-            self.end_gesture()
 
     def reset(self) -> None:
         """Back to how the task or the scene began, and was looked at; the motion's part of it can be undone."""
@@ -257,8 +260,7 @@ class Session:
 
     def _begin(self, gesture: str, fresh: Scenario) -> None:
         changes = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__ if name != "passing"}
-        self.edit(gesture, anew=True, **changes)
-        self.end_gesture()
+        self.step(gesture, anew=True, **changes)
 
     def _as_seen(self, other: Scenario) -> Scenario:
         """Another scenario, looked at as this one, on the slice that it had.

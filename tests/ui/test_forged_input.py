@@ -39,7 +39,7 @@ TURNS = [(0.0,) * 4, (math.nan, 0.0, 0.0, 0.0), (1e300, 0.0, 0.0, 0.0), (1.0, 0.
 @pytest.fixture(autouse=True)
 def _at_rest(page):
     """No presentation, and a camera that stays where it is put: something forged may have begun others."""
-    page.visitor._panel.presentation.on = False
+    page.visitor._panel.presentation.show(False)
     for switch in page.inputs:
         if switch.label in ("Orbit", "Lock camera") and switch.value:
             page.claim(switch, False)

@@ -104,7 +104,7 @@ def table_html(comparison: Sequence[Compared]) -> str:
     head = f"<tr><th style='{pale};text-align:left'>mm</th>{heads}</tr>"
     rows = "".join(_row(compared) for compared in comparison)
     table = f"<table style='border-collapse:collapse;width:100%'>{head}{rows}</table>"
-    return small(table)
+    return small(table, tight=True)
 
 
 _CELL = "font-weight:600;text-align:right;padding:0 0 0 0.4em;white-space:nowrap"

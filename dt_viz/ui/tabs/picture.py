@@ -67,7 +67,7 @@ class PictureTab:
             enlarge: takes whether the type is large.
             save_png: makes a picture, given the resolution's name and whether it is transparent.
         """
-        self._tripod, self._presentation = tripod, presentation
+        self._tripod = tripod
         gui.add_html(ROW)
         Control(gui.add_button_group("View", (*VIEWS, HAND, HOME)), tripod.view)
 
@@ -82,7 +82,7 @@ class PictureTab:
         self._dark = bindings.later(dark, lambda _session, on: darken(on))
         big = box("Big type", "larger type and controls in a wider panel, to be read from afar")
         self._big = Control(big, enlarge)
-        on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), presentation.begin)
+        on_press(gui.add_button("Presentation", icon=viser.Icon.PRESENTATION), lambda: presentation.show(True))
         self._resolution = Control(gui.add_dropdown("Resolution", tuple(RESOLUTIONS)))
         self._transparent = Control(gui.add_checkbox("Transparent", False))
         self._save, self._save_png = gui.add_button("Save PNG", icon=viser.Icon.CAMERA), save_png
@@ -154,23 +154,23 @@ class Presentation:
         """Whether the panel is hidden, and the caption shown."""
         return self._html.visible
 
-    @on.setter
-    def on(self, on: bool) -> None:
+    @property
+    def commands(self) -> list[Command]:
+        """Begin and end it; the scenes can be turned with the panel, too."""
+        return [
+            Command("Presentation: the scene without the panel, or with it", lambda _: self.show(not self.on), "P"),
+            Command("End the presentation", lambda _: self.show(False), "escape"),
+            Command("Next scene", lambda _: self._turn(1), "pagedown"),
+            Command("Previous scene", lambda _: self._turn(-1), "pageup"),
+        ]
+
+    def show(self, on: bool) -> None:
+        """Begin it, or end it."""
         if on != self.on:
             if on:
                 self._panel.expand()  # what is folded away has no caption either
             self._html.visible = self._buttons.visible = on
             self._present(on)
-
-    @property
-    def commands(self) -> list[Command]:
-        """Begin and end it; the scenes can be turned with the panel, too."""
-        return [
-            Command("Presentation: the scene without the panel, or with it", lambda _: self._toggle(), "P"),
-            Command("End the presentation", lambda _: self._press(END), "escape"),
-            Command("Next scene", lambda _: self._turn(1), "pagedown"),
-            Command("Previous scene", lambda _: self._turn(-1), "pageup"),
-        ]
 
     def entitle(self, title: str) -> None:
         """Take the title of what is shown."""
@@ -186,15 +186,8 @@ class Presentation:
         title, caption = html.escape(self._title), html.escape(self._caption)
         self._html.content = f"{ALONE}<div class='dt-caption'><h1>{title}</h1><p>{caption}</p></div>"
 
-    def begin(self) -> None:
-        """Begin it."""
-        self.on = True
-
-    def _toggle(self) -> None:
-        self.on = not self.on
-
     def _press(self, button: str) -> None:
         if button == END:
-            self.on = False
+            self.show(False)
         else:
             self._turn(1 if button == ON else -1)

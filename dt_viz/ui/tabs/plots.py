@@ -25,10 +25,12 @@ MAX_SPEED = 200
 """Largest speed in the plot, percent of the joint's limit: a joint that leaps would flatten all other curves."""
 
 
-def small(text: str, below: float = 0.4) -> str:
-    """Return HTML as small text, with the margins of the controls; the one below it in em."""
-    style = f"font-size:0.8em;line-height:1.35;padding:0.1em 0.9em {below}em;opacity:0.85"
-    return f"<div style='{style}'>{text}</div>"
+def small(text: str, *, tight: bool = False) -> str:
+    """Return HTML as small text, with the margins of the controls, or `tight` above what it is about."""
+    room = (
+        "0.75em;line-height:1.3;padding:0.2em 0.9em 0" if tight else "0.8em;line-height:1.4;padding:0.1em 0.9em 0.4em"
+    )
+    return f"<div style='font-size:{room};opacity:0.85'>{text}</div>"
 
 
 def add_plot(
@@ -44,7 +46,7 @@ def add_plot(
         height: height, pixels.
     """
     if title:
-        gui.add_html(small(title, below=0))
+        gui.add_html(small(title, tight=True))
     font = "11px sans-serif"
     return gui.add_uplot(
         (np.zeros(2),) * (1 + len(curves)),
@@ -76,7 +78,7 @@ def legend(marks: Mapping[str, str], height: str, heading: str = "", note: str =
         f"<span style='white-space:nowrap;margin-right:0.8em'>{mark};{style}'></span>{text}</span>"
         for text, style in marks.items()
     )
-    return small(f"{heading and _pale(heading + ' ')}{items}{note and '<br/>' + _pale(note)}", below=0)
+    return small(f"{heading and _pale(heading + ' ')}{items}{note and '<br/>' + _pale(note)}", tight=True)
 
 
 def _pale(text: str) -> str:
@@ -169,10 +171,12 @@ class HealthPlots(Shown):
         self.lyapunov.data = columns(along, shown.lyapunov, without.lyapunov)
         self.distance.data = columns(along, 1e3 * shown.distance, 1e3 * without.distance)
         which = "mean demonstration" if profiles.of_mean else "demonstration"
-        self._to.content = small(f"Distance to the {which} [mm]", below=0)
+        self._to.content = small(f"Distance to the {which} [mm]", tight=True)
         bounded = bool(np.isfinite(shown.clearance).all())
         whose = "body points" if profiles.of_body else "end effector"
-        self._whose.content = small(f"Clearance of the {whose} [mm]" if bounded else "Clearance: no obstacle", below=0)
+        self._whose.content = small(
+            f"Clearance of the {whose} [mm]" if bounded else "Clearance: no obstacle", tight=True
+        )
         self.clearance.visible = bounded
         if bounded:
             clearances = 1e3 * shown.clearance, 1e3 * without.clearance

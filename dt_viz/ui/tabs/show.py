@@ -114,8 +114,7 @@ class SlicePanel:
 
 
 def _put_back(session: Session, _pressed: bool) -> None:
-    session.edit("slice", view=replace(session.scenario.view, slice=None))
-    session.end_gesture()
+    session.step("slice", view=replace(session.scenario.view, slice=None))
 
 
 def _with_panels(scenario: Scenario, shown: bool) -> dict[str, object]:

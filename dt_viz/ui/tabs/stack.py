@@ -108,8 +108,7 @@ class StackPanel:
 
 def press(session: Session, name: str, button: str) -> None:
     """Do what a button of the row of this name does."""
-    session.edit(f"{name} {button}", **_ACTIONS[button](session.scenario, name))
-    session.end_gesture()
+    session.step(f"{name} {button}", **_ACTIONS[button](session.scenario, name))
 
 
 def rows(scenario: Scenario, durations: Mapping[str, float | None]) -> tuple[StackRow, ...]:

@@ -237,5 +237,4 @@ class StatusLine:
     def _mend(self, session: Session) -> None:
         found = None if self._shown is None else remedy(self._shown, session.scenario)
         if found is not None:
-            session.edit(found.label, **found.changes)
-            session.end_gesture()
+            session.step(found.label, **found.changes)

@@ -19,7 +19,7 @@ from dt_viz.obstacles.shapes import Box, CloudObstacle, Cylinder, MeshObstacle, 
 from dt_viz.obstacles.union import Union
 from dt_viz.robot.inverse_kinematics import UnreachableError
 from dt_viz.robot.robot import load_jaco
-from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario, Start
+from dt_viz.scenario.scenario import MAX_DIAMETER, MAX_MARGIN, MAX_OBSTACLES, MIN_DIAMETER, Scenario
 from dt_viz.scenario.stack import (
     added,
     selected,
@@ -172,8 +172,7 @@ def delete(session: Session) -> None:
 def _replace(session: Session, obstacles: tuple[Obstacle, ...], selected: int) -> None:
     """Replace the obstacles, as one step for undo."""
     view = replace(session.scenario.view, selected=selected)
-    session.edit("obstacles", stack=with_avoidance(session.scenario, obstacles=obstacles), view=view)
-    session.end_gesture()
+    session.step("obstacles", stack=with_avoidance(session.scenario, obstacles=obstacles), view=view)
 
 
 def _names(scenario: Scenario) -> tuple[str, ...]:
@@ -234,16 +233,14 @@ def add_transform(session: Session, kind: type[Transform]) -> None:
     scenario = session.scenario
     if kind.title in _offered(scenario):
         stack, name = with_added(scenario, kind.beside(surroundings(session.task, scenario)))
-        session.edit("add", stack=stack, view=replace(scenario.view, bias=name))
-        session.end_gesture()
+        session.step("add", stack=stack, view=replace(scenario.view, bias=name))
 
 
 def delete_transform(session: Session) -> None:
     """Delete the selected transform."""
     name = selected(session.scenario)
     if name is not None:
-        session.edit("delete", stack=without(session.scenario, name))
-        session.end_gesture()
+        session.step("delete", stack=without(session.scenario, name))
 
 
 def addable() -> dict[str, type[Transform]]:
@@ -285,7 +282,8 @@ def add_grid(session: Session) -> None:
     except UnreachableError as error:
         session.say(f"the arm cannot reach the starts: {error}", Severity.WARNING)
         return
-    _with_starts(session, "grid of starts", grid.starts, followed(scenario, len(task.demonstrations)))
+    arm_rollout = followed(scenario, len(task.demonstrations))
+    session.step("grid of starts", starts=grid.starts, arm_rollout=arm_rollout)
     reasons = (
         (grid.num_blocked, "at or inside an obstacle, or the arm is there"),
         (grid.num_far, "where the hand cannot be"),
@@ -303,19 +301,13 @@ def remove_start(session: Session) -> None:
         index = len(starts) - 1
         if arm_rollout >= num_demonstrated:
             index, arm_rollout = arm_rollout - num_demonstrated, 0
-        _with_starts(session, "remove start", (*starts[:index], *starts[index + 1 :]), arm_rollout)
+        session.step("remove start", starts=(*starts[:index], *starts[index + 1 :]), arm_rollout=arm_rollout)
 
 
 def clear_starts(session: Session) -> None:
     """Remove all added starts."""
     number = followed(session.scenario, len(session.task.demonstrations))
-    _with_starts(session, "clear starts", (), number if number < len(session.task.demonstrations) else 0)
-
-
-def _with_starts(session: Session, gesture: str, starts: tuple[Start, ...], arm_rollout: int) -> None:
-    """Replace the added starts, as one step for undo."""
-    session.edit(gesture, starts=starts, arm_rollout=arm_rollout)
-    session.end_gesture()
+    session.step("clear starts", starts=(), arm_rollout=number if number < len(session.task.demonstrations) else 0)
 
 
 def _labelled(scenario: Scenario, num_demonstrated: int, label: float | None) -> dict[str, Any]:
