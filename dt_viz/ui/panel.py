@@ -15,7 +15,8 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame
-from dt_viz.session.session import Message, Progress, Session
+from dt_viz.session.progress import Message, Progress
+from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.legend import Legend
 from dt_viz.ui.scene.picture import Colour

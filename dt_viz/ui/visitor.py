@@ -20,7 +20,8 @@ from dt_viz.scenario.stack import selected, transform_of, with_avoidance, with_t
 from dt_viz.scenario.starts import followed, with_moved_start, with_start
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Display, Pace, Progress, Session
+from dt_viz.session.progress import Display, Pace, Progress
+from dt_viz.session.session import Session
 from dt_viz.ui.controls import on_press
 from dt_viz.ui.panel import ControlPanel
 from dt_viz.ui.playback import Playback

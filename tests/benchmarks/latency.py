@@ -51,7 +51,8 @@ from dt_viz.scenario.scenario import Scenario
 from dt_viz.scenario.stack import anchored, plane_of, with_added, with_avoidance, with_transform
 from dt_viz.scenario.tasks import Task
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Display, Pace, Progress, Session
+from dt_viz.session.progress import Display, Pace, Progress
+from dt_viz.session.session import Session
 
 EDITS_PER_SECOND = 60
 WARM_UP_SECONDS = 1.0

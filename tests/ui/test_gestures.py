@@ -14,7 +14,7 @@ from dt_viz.scenario.panels import BASE_PANEL
 from dt_viz.scenario.scenario import OFFERS, View
 from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.frame import Stage
-from dt_viz.session.session import Pace
+from dt_viz.session.progress import Pace
 from dt_viz.ui.tabs.show import IN_SCENE
 
 PACE = Pace(0.02, 10.0, 0)

@@ -24,7 +24,8 @@ from dt_viz.scenario.tasks import TASKS
 from dt_viz.session.engine import Engine
 from dt_viz.session.frame import Frame, Stage
 from dt_viz.session.jobs import Jobs
-from dt_viz.session.session import Message, Pace, Progress, Session
+from dt_viz.session.progress import Message, Pace, Progress
+from dt_viz.session.session import Session
 from dt_viz.ui.tabs.status import BUTTON, CHANGED, HINT, LEADING, PALE, REASON, details_html, hint
 from dt_viz.ui.tabs.verdict import COMPUTING, FAILED, HOLDS, WARP_HINT, Verdict, concerns, remedy, verdict
 from dt_viz.warning import ARM, Concern, Kind, MotionWarning, Severity

@@ -101,31 +101,19 @@ class FileLoader:
         Raises:
             UnwantedError: the visitor has left.
         """
-        self._upload.disabled = True
-        try:
-            self._load(self._bindings.session, content, name, scale)
-        finally:
-            self._upload.disabled = False
-            self.again.visible = self._refused is not None
-
-    def load_again(self) -> None:
-        """Add what the file holds that was refused for its size, in the unit that was suggested."""
-        if self._refused is not None:
-            content, name, unit = self._refused
-            self.unit.value = unit
-            self.load(content, name, UNITS[unit])
-
-    def _load(self, session: Session, content: bytes, name: str, scale: float) -> None:
-        self._refused = None
+        session, self._refused, self._upload.disabled = self._bindings.session, None, True
         left = partial(session.jobs.superseded, LANE)
-        waits = partial(session.say, "Another visitor's file is being read; yours is read after it.", Severity.WARNING)
+        wait = "Another visitor's file is being read; yours is read after it."
         try:
             if not has_room(session.scenario):
                 raise ShapeError(
                     name, "scene", f"{MAX_OBSTACLES} obstacles", f"at most {MAX_OBSTACLES}: delete one first"
                 )
-            with turn(waits, left):
+            with turn(partial(session.say, wait, Severity.WARNING), left):
                 obstacle, notes = from_file(content, name, scale, left)
+            self._add(session, obstacle)
+            if notes:
+                session.say(f"{name}: {'; '.join(notes)}", Severity.WARNING)
         except SizeError as error:
             if error.unit is not None:
                 self._refused = content, name, error.unit
@@ -133,10 +121,15 @@ class FileLoader:
             session.say(error.question or str(error), Severity.WARNING if error.question else Severity.ALARM)
         except ShapeError as error:
             session.say(str(error), Severity.ALARM)
-        else:
-            self._add(session, obstacle)
-            if notes:
-                session.say(f"{name}: {'; '.join(notes)}", Severity.WARNING)
+        finally:
+            self._upload.disabled, self.again.visible = False, self._refused is not None
+
+    def load_again(self) -> None:
+        """Add what the file holds that was refused for its size, in the unit that was suggested."""
+        if self._refused is not None:
+            content, name, unit = self._refused
+            self.unit.value = unit
+            self.load(content, name, UNITS[unit])
 
 
 def from_file(

@@ -11,7 +11,8 @@ from dt_viz.robot.collision import SELF_REACH, CollisionReport
 from dt_viz.scenario.paper_scenes import SCENES
 from dt_viz.scenario.scenario import View
 from dt_viz.session.frame import Frame, Stage
-from dt_viz.session.session import Pace, Progress, Session
+from dt_viz.session.progress import Pace, Progress
+from dt_viz.session.session import Session
 from dt_viz.ui.bindings import Bindings
 from dt_viz.ui.scene.palette import ink, paper
 from dt_viz.ui.scene.picture import Colour

@@ -9,7 +9,7 @@ from typing import Any
 from dt_viz.scenario.scenario import Scenario, View
 from dt_viz.scenario.stack import avoidance_layer, avoiding_with, transform_of, with_avoidance, with_transform
 from dt_viz.session.frame import Frame
-from dt_viz.session.session import Progress
+from dt_viz.session.progress import Progress
 from dt_viz.warning import ARM, Kind, Mend, MotionWarning, Severity
 
 COMPUTING = "computing …"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import UnionType
@@ -55,15 +55,17 @@ LABEL_HINT = (
 
 
 @dataclass(frozen=True)
-class _Size:
+class _Length:
     """A slider [cm] for a length of obstacles of one shape, metres."""
 
     label: str
     shape: type[Obstacle] | UnionType
     low: float
     high: float
-    read: Callable[[Any], float]
-    change: Callable[[Any, float], Obstacle]
+    field: str
+    """Name of the shape's field."""
+    place: int | None = None
+    """Place of the length where the field is a tuple of them."""
     hint: str | None = None
 
     def add(self, gui: viser.GuiApi, bindings: Bindings) -> None:
@@ -71,51 +73,48 @@ class _Size:
 
         def shown(scenario: Scenario) -> float:
             chosen = _selected(scenario)
-            return round(100 * self.read(chosen), 3) if isinstance(chosen, self.shape) else KEEP
+            if not isinstance(chosen, self.shape):
+                return KEEP
+            value = getattr(chosen, self.field)
+            return round(100 * (value if self.place is None else value[self.place]), 3)
 
         def changed(scenario: Scenario, value: float) -> dict[str, Any]:
             chosen = _selected(scenario)
             if not isinstance(chosen, self.shape):
                 return {}
             index, before = scenario.selected or 0, scenario.obstacles
-            changed = (*before[:index], self.change(chosen, value / 100), *before[index + 1 :])
+            changed = (*before[:index], self._with(chosen, value / 100), *before[index + 1 :])
             return {"stack": with_avoidance(scenario, obstacles=changed)}
 
         slider = gui.add_slider(self.label, 100 * self.low, 100 * self.high, 0.5, 15.0, hint=self.hint)
         bindings.properties(slider, visible=lambda s: isinstance(_selected(s), self.shape))
         bindings.input(slider, shown, changed)
 
+    def _with(self, obstacle: Any, length: float) -> Obstacle:  # noqa: ANN401 - of the shape
+        if isinstance(obstacle, MeshObstacle | CloudObstacle):
+            return obstacle.resized(length)
+        before = getattr(obstacle, self.field)
+        lengths = length if self.place is None else (*before[: self.place], length, *before[self.place + 1 :])
+        return replace(obstacle, **{self.field: lengths})
 
-def _sizes() -> tuple[_Size, ...]:
-    side = 0.03, 0.40  # smallest and largest, metres
 
-    def diameter(shape: type[Obstacle]) -> _Size:
-        def change(obstacle: Any, diameter: float) -> Obstacle:  # noqa: ANN401 - of the shape
-            return replace(obstacle, diameter=diameter)
-
-        return _Size("Diameter [cm]", shape, MIN_DIAMETER, MAX_DIAMETER, lambda o: o.diameter, change)
-
-    def box(k: int, axis: str) -> _Size:
-        def change(obstacle: Any, size: float) -> Obstacle:  # noqa: ANN401 - a box
-            return replace(obstacle, sizes=(*obstacle.sizes[:k], size, *obstacle.sizes[k + 1 :]))
-
-        return _Size(f"Size {axis} [cm]", Box, *side, lambda o: o.sizes[k], change)
-
-    return (
-        diameter(Sphere),
-        diameter(Cylinder),
-        _Size("Height [cm]", Cylinder, *side, lambda o: o.height, lambda o, height: replace(o, height=height)),
-        *(box(k, axis) for k, axis in enumerate("xyz")),
-        _Size(
-            "Size [cm]",
-            MeshObstacle | CloudObstacle,
-            shapes.MIN_SIZE,
-            shapes.MAX_SIZE,
-            lambda o: o.size,
-            lambda o, size: o.resized(size),
-            "largest side of its bounding box",
-        ),
-    )
+SIDE = 0.03, 0.40
+"""Smallest and largest side of a box, and height of a cylinder, metres."""
+LENGTHS = (
+    _Length("Diameter [cm]", Sphere, MIN_DIAMETER, MAX_DIAMETER, "diameter"),
+    _Length("Diameter [cm]", Cylinder, MIN_DIAMETER, MAX_DIAMETER, "diameter"),
+    _Length("Height [cm]", Cylinder, *SIDE, "height"),
+    *(_Length(f"Size {axis} [cm]", Box, *SIDE, "sizes", place) for place, axis in enumerate("xyz")),
+    _Length(
+        "Size [cm]",
+        MeshObstacle | CloudObstacle,
+        shapes.MIN_SIZE,
+        shapes.MAX_SIZE,
+        "size",
+        hint="largest side of its bounding box",
+    ),
+)
+"""Sliders for the lengths of all shapes."""
 
 
 def add_obstacles(gui: viser.GuiApi, bindings: Bindings) -> FileLoader:
@@ -137,8 +136,8 @@ def add_obstacles(gui: viser.GuiApi, bindings: Bindings) -> FileLoader:
         change = gui.add_button_group("Change", tuple(changes), hint="the selected obstacle")
         bindings.properties(change, visible=lambda s: bool(s.obstacles))
         bindings.later(change, lambda session, name: changes[name](session))
-        for size in _sizes():
-            size.add(gui, bindings)
+        for length in LENGTHS:
+            length.add(gui, bindings)
         hint = "clearance that the automatic flow time keeps"
         bindings.input(
             gui.add_slider("Margin [cm]", 0.0, 100 * MAX_MARGIN, 0.1, 1.0, hint=hint),
